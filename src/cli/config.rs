@@ -1,0 +1,25 @@
+//! `whereabouts config`.
+
+use std::path::PathBuf;
+
+use crate::config::{Config, DEFAULTS, Overrides};
+
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The configuration file to read
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Print the commented defaults instead: a file to start from
+    #[arg(long)]
+    defaults: bool,
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    if args.defaults {
+        print!("{DEFAULTS}");
+        return Ok(());
+    }
+    let config = Config::load(args.config.as_deref(), &Overrides::default())?;
+    print!("{}", toml::to_string(&config)?);
+    Ok(())
+}

@@ -1,0 +1,162 @@
+//! `whereabouts demo`: everything once, on a town that the binary draws itself.
+//!
+//! The demo starts a real server on a free port and uses it as any client would: it indexes a
+//! folder, posts frames, and waits for their jobs.
+
+mod account;
+mod pictures;
+mod town;
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::Context;
+use tokio::net::TcpListener;
+use tokio::sync::oneshot;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+use self::town::{Folders, Frame};
+use super::client::{Client, ServerArg};
+use super::index;
+use crate::config::{Config, Overrides};
+use crate::demo::TownSpec;
+use crate::domain::{Job, Scene};
+use crate::service::Answer;
+use crate::{startup, telemetry};
+
+/// The map's name.
+const MAP: &str = "town";
+
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Where to put the pictures and the data; what an earlier demo left there is replaced
+    #[arg(long, value_name = "DIR", default_value = "demo-out")]
+    out: PathBuf,
+    /// Places in the town; each gives one map image and one frame
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u16).range(2..=5000))]
+    places: u16,
+    /// Which town
+    #[arg(long, default_value_t = 7)]
+    seed: u64,
+    /// The model
+    #[arg(long, value_name = "NAME")]
+    model: Option<String>,
+    /// Print the outcome as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// One frame, with what the server said about it.
+pub(super) struct Visit {
+    frame: Frame,
+    answer: Answer,
+    job: Job,
+}
+
+pub async fn run(args: Args) -> anyhow::Result<()> {
+    let start = Instant::now();
+    let folders = Folders::fresh(&args.out)?;
+    let spec = TownSpec { seed: args.seed, places: usize::from(args.places), ..TownSpec::default() };
+    account::heading(&args, "1. A town");
+    let frames = town::render(spec, &folders)?;
+    account::rendered(&args, &folders, frames.len(), start.elapsed());
+
+    account::heading(&args, "2. A server, and the town's pictures in a map");
+    let server = Server::start(&folders, args.model.clone()).await?;
+    let client = Client::new(&server.address)?;
+    let indexed = index_town(&client, &server.address, &folders).await?;
+    account::indexed(&args, &indexed, &server.address.server);
+
+    account::heading(&args, "3. Frames from the same places on another day");
+    let visits = localize_all(&client, frames).await?;
+    pictures::side_by_side(&visits, &folders)?;
+    account::visits(&args, &visits, &folders, start.elapsed())?;
+    server.stop().await
+}
+
+async fn index_town(
+    client: &Client,
+    server: &ServerArg,
+    folders: &Folders,
+) -> anyhow::Result<index::Outcome> {
+    let args = index::Args {
+        dir: folders.map.clone(),
+        map: MAP.parse()?,
+        poses: None,
+        scene: Some(Scene::Outdoor),
+        descriptor: None,
+        frame: None,
+        concurrency: 4,
+        json: false,
+        server: server.clone(),
+    };
+    index::add_folder(client, &args).await
+}
+
+/// Posts every frame, one after another as a robot would, and then waits for the jobs.
+async fn localize_all(client: &Client, frames: Vec<Frame>) -> anyhow::Result<Vec<Visit>> {
+    let mut answered = Vec::with_capacity(frames.len());
+    for frame in frames {
+        let bytes = std::fs::read(&frame.file)?;
+        let request = client
+            .post(&format!("/localize?map={MAP}&k=10&refine=async"))
+            .header("content-type", "image/jpeg")
+            .body(bytes);
+        let answer: Answer = client.json(request).await?;
+        answered.push((frame, answer));
+    }
+    let mut visits = Vec::with_capacity(answered.len());
+    for (frame, answer) in answered {
+        let link = answer.job.as_ref().context("the server queued no job")?;
+        let job: Job = client.json(client.get(&format!("{}?wait=60", link.href))).await?;
+        visits.push(Visit { frame, answer, job });
+    }
+    Ok(visits)
+}
+
+/// A server of the demo's own, in this process.
+struct Server {
+    address: ServerArg,
+    shutdown: CancellationToken,
+    running: JoinHandle<anyhow::Result<()>>,
+}
+
+impl Server {
+    async fn start(folders: &Folders, model: Option<String>) -> anyhow::Result<Self> {
+        let flags = Overrides::default()
+            .listen(Some(([127, 0, 0, 1], 0).into()))
+            .data(Some(folders.data.clone()))
+            .model(model);
+        let mut config = Config::load(None, &flags)?;
+        "warn".clone_into(&mut config.log.filter);
+        telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
+        let listener = TcpListener::bind(config.server.listen).await?;
+        let (announce, ready) = oneshot::channel();
+        let shutdown = CancellationToken::new();
+        let running = tokio::spawn(startup::serve(config, listener, shutdown.clone(), |address| {
+            let _ = announce.send(address);
+            Ok(())
+        }));
+        match ready.await {
+            Ok(address) => {
+                let address = ServerArg { server: format!("http://{address}") };
+                Ok(Self { address, shutdown, running })
+            }
+            Err(_) => match running.await? {
+                Ok(()) => anyhow::bail!("the server ended before it was ready"),
+                Err(error) => Err(error),
+            },
+        }
+    }
+
+    async fn stop(self) -> anyhow::Result<()> {
+        self.shutdown.cancel();
+        self.running.await?
+    }
+}
+
+/// A path as a user would type it.
+fn shown(path: &Path) -> String {
+    path.display().to_string()
+}

@@ -1,0 +1,258 @@
+//! `whereabouts index`: a folder of images into a map, over HTTP.
+
+mod poses;
+
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use futures_util::StreamExt;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use reqwest::StatusCode;
+use reqwest::multipart::{Form, Part};
+use serde::Serialize;
+use walkdir::WalkDir;
+
+use self::poses::PoseSource;
+use super::client::{Client, ServerArg, segment};
+use crate::domain::{DescriptorKind, Frame, ImageId, MapName, MediaType, Scene};
+use crate::service::{ImageMeta, MapChange};
+
+/// Poses come from a CSV file (--poses, or poses.csv in the folder), from file names of the form
+/// @easting@northing@..., or from EXIF GPS. It is safe to run this again: what is there already is
+/// left as it is.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The folder; folders in it are searched too
+    pub dir: PathBuf,
+    /// The map; made if it is not there
+    #[arg(long)]
+    pub map: MapName,
+    /// A CSV file with a header: file, and lat,lon[,alt,heading] or x,y[,z,qx,qy,qz,qw]
+    #[arg(long, value_name = "FILE")]
+    pub poses: Option<PathBuf>,
+    /// What the map shows
+    #[arg(long)]
+    pub scene: Option<Scene>,
+    /// The descriptor of a new map
+    #[arg(long)]
+    pub descriptor: Option<DescriptorKind>,
+    /// The frame of a new map; otherwise it follows from the poses
+    #[arg(long)]
+    pub frame: Option<Frame>,
+    /// Images sent side by side
+    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u16).range(1..=64))]
+    pub concurrency: u16,
+    /// Print the outcome as JSON
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    pub server: ServerArg,
+}
+
+/// What became of the folder.
+#[derive(Debug, Serialize)]
+pub struct Outcome {
+    map: MapName,
+    /// Images in the folder.
+    pub images: usize,
+    added: usize,
+    present: usize,
+    without_pose: usize,
+    failed: Vec<Failure>,
+    /// How long it took.
+    pub seconds: f64,
+    images_per_second: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct Failure {
+    file: PathBuf,
+    error: String,
+}
+
+pub async fn run(args: Args) -> anyhow::Result<()> {
+    let outcome = add_folder(&Client::new(&args.server)?, &args).await?;
+    report(&outcome, args.json)
+}
+
+/// Adds a folder to a map; what became of each image is in the outcome.
+pub async fn add_folder(client: &Client, args: &Args) -> anyhow::Result<Outcome> {
+    let files = pictures(&args.dir)?;
+    let source = Arc::new(PoseSource::find(&args.dir, args.poses.as_deref(), &files)?);
+    let change = MapChange {
+        scene: args.scene,
+        descriptor: args.descriptor,
+        frame: args.frame.or(source.frame()),
+        ..MapChange::default()
+    };
+    let path = format!("/maps/{}", segment(args.map.as_str()));
+    client.send(client.put(&path).json(&change)).await?;
+
+    let start = Instant::now();
+    let progress = Progress::new(files.len());
+    let path = Arc::new(format!("{path}/images"));
+    let mut sent = futures_util::stream::iter(files.iter().cloned())
+        .map(|file| {
+            let (client, path, source) = (client.clone(), Arc::clone(&path), Arc::clone(&source));
+            let dir = args.dir.clone();
+            async move {
+                let result = send(&client, &path, &dir, &file, &source).await;
+                (file, result)
+            }
+        })
+        .buffer_unordered(usize::from(args.concurrency));
+    let mut outcome = Outcome {
+        map: args.map.clone(),
+        images: files.len(),
+        added: 0,
+        present: 0,
+        without_pose: 0,
+        failed: Vec::new(),
+        seconds: 0.0,
+        images_per_second: 0.0,
+    };
+    while let Some((file, result)) = sent.next().await {
+        match result {
+            Ok(Sent { new, posed }) => {
+                outcome.added += usize::from(new);
+                outcome.present += usize::from(!new);
+                outcome.without_pose += usize::from(!posed);
+            }
+            Err(error) => {
+                progress.say(&format!("{}: {error:#}", file.display()));
+                outcome.failed.push(Failure { file, error: format!("{error:#}") });
+            }
+        }
+        progress.step();
+    }
+    progress.end();
+    outcome.seconds = start.elapsed().as_secs_f64();
+    outcome.images_per_second = files.len() as f64 / outcome.seconds.max(1e-9);
+    Ok(outcome)
+}
+
+/// Prints the outcome; an image that was not added is an error.
+pub fn report(outcome: &Outcome, json: bool) -> anyhow::Result<()> {
+    if json {
+        println!("{}", serde_json::to_string(outcome)?);
+    } else {
+        println!(
+            "{}: {} added, {} there already, {} failed, {} without a pose; {:.1} s, {:.1} images/s",
+            outcome.map,
+            outcome.added,
+            outcome.present,
+            outcome.failed.len(),
+            outcome.without_pose,
+            outcome.seconds,
+            outcome.images_per_second
+        );
+    }
+    if !outcome.failed.is_empty() {
+        bail!("{} of {} images were not added", outcome.failed.len(), outcome.images);
+    }
+    Ok(())
+}
+
+struct Sent {
+    new: bool,
+    posed: bool,
+}
+
+async fn send(
+    client: &Client,
+    path: &str,
+    dir: &Path,
+    file: &Path,
+    source: &PoseSource,
+) -> anyhow::Result<Sent> {
+    let bytes: bytes::Bytes = tokio::fs::read(file).await.context("cannot be read")?.into();
+    let media_type = MediaType::sniff(&bytes).context("is not a JPEG, PNG or WebP picture")?;
+    let id = image_id(dir, file)?;
+    let pose = source.pose(id.as_str(), &bytes)?;
+    let posed = pose.is_some();
+    let meta = ImageMeta {
+        id: Some(id.to_string()),
+        pose: pose.map(serde_json::to_value).transpose()?,
+        ..ImageMeta::default()
+    };
+    let meta = serde_json::to_string(&meta)?;
+    let response = client
+        .send_patiently(|| {
+            let picture = Part::stream(bytes.clone()).mime_str(media_type.as_str())?;
+            let form = Form::new().part("image", picture).text("meta", meta.clone());
+            Ok(client.post(path).multipart(form))
+        })
+        .await?;
+    Ok(Sent { new: response.status() == StatusCode::CREATED, posed })
+}
+
+/// The id of a file: its path below the folder.
+fn image_id(dir: &Path, file: &Path) -> anyhow::Result<ImageId> {
+    let below = file.strip_prefix(dir).unwrap_or(file);
+    let text = below.to_str().context("its name is not UTF-8; rename it")?;
+    Ok(text.parse::<ImageId>()?)
+}
+
+fn pictures(dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let known = |path: &Path| {
+        let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or("");
+        matches!(extension.to_ascii_lowercase().as_str(), "jpg" | "jpeg" | "png" | "webp")
+    };
+    let mut files = Vec::new();
+    for entry in WalkDir::new(dir).follow_links(true).sort_by_file_name() {
+        let entry = entry.with_context(|| format!("cannot read the folder {}", dir.display()))?;
+        if entry.file_type().is_file() && known(entry.path()) {
+            files.push(entry.into_path());
+        }
+    }
+    if files.is_empty() {
+        bail!("there is no .jpg, .jpeg, .png or .webp file in {}", dir.display());
+    }
+    Ok(files)
+}
+
+/// A bar on a terminal, a line every few seconds in a pipe.
+struct Progress {
+    bar: ProgressBar,
+    on_terminal: bool,
+    last_line: std::cell::Cell<Instant>,
+}
+
+impl Progress {
+    fn new(total: usize) -> Self {
+        let on_terminal = std::io::stderr().is_terminal();
+        let target =
+            if on_terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+        let bar = ProgressBar::with_draw_target(Some(total as u64), target);
+        if let Ok(style) = ProgressStyle::with_template(
+            "{bar:40} {pos}/{len} images, {per_sec}, {eta} left",
+        ) {
+            bar.set_style(style);
+        }
+        Self { bar, on_terminal, last_line: std::cell::Cell::new(Instant::now()) }
+    }
+
+    fn step(&self) {
+        const PAUSE: Duration = Duration::from_secs(5);
+        self.bar.inc(1);
+        if !self.on_terminal && self.last_line.get().elapsed() >= PAUSE {
+            self.last_line.set(Instant::now());
+            eprintln!(
+                "{}/{} images",
+                self.bar.position(),
+                self.bar.length().unwrap_or_default()
+            );
+        }
+    }
+
+    fn say(&self, text: &str) {
+        self.bar.suspend(|| eprintln!("{text}"));
+    }
+
+    fn end(&self) {
+        self.bar.finish_and_clear();
+    }
+}

@@ -1,0 +1,73 @@
+//! The command line: one file for each command. Client commands talk to a server.
+
+mod client;
+mod config;
+mod demo;
+mod healthcheck;
+mod index;
+mod jobs;
+mod localize;
+mod openapi;
+mod serve;
+
+use std::future::Future;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Tells a robot where it is from one camera frame.
+#[derive(Debug, Parser)]
+#[command(name = "whereabouts", version, about, max_term_width = 100)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run the server
+    Serve(serve::Args),
+    /// Add a folder of images to a map on a server
+    Index(index::Args),
+    /// Localize a picture on a server
+    Localize(localize::Args),
+    /// List jobs on a server, or show one
+    Jobs(jobs::Args),
+    /// Build a town, index it, localize frames in it, and print what happened
+    Demo(demo::Args),
+    /// Print the settings in force, or every setting with its default
+    Config(config::Args),
+    /// Print the OpenAPI description
+    Openapi,
+    /// Ask a server whether it is ready; exit code 0 if so
+    Healthcheck(healthcheck::Args),
+}
+
+impl Cli {
+    /// Runs the command: 0 is success, 1 failure; clap itself ends with 2 on wrong usage.
+    pub fn run(self) -> ExitCode {
+        // Only the first call sets it; a library user may have chosen another.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let outcome = match self.command {
+            Command::Serve(args) => block_on(serve::run(args)),
+            Command::Index(args) => block_on(index::run(args)),
+            Command::Localize(args) => block_on(localize::run(args)),
+            Command::Jobs(args) => block_on(jobs::run(args)),
+            Command::Demo(args) => block_on(demo::run(args)),
+            Command::Config(args) => config::run(&args),
+            Command::Openapi => openapi::run(),
+            Command::Healthcheck(args) => block_on(healthcheck::run(args)),
+        };
+        match outcome {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                eprintln!("whereabouts: {error:#}");
+                ExitCode::FAILURE
+            }
+        }
+    }
+}
+
+fn block_on(work: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
+    tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(work)
+}

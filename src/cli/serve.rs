@@ -1,0 +1,75 @@
+//! `whereabouts serve`.
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use tokio::net::TcpListener;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+
+use crate::config::{Config, Overrides, Refiner};
+use crate::{startup, telemetry};
+
+/// The settings that a flag can set; all others are in the file and the environment.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// A configuration file; `whereabouts config --defaults` prints one with every key
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// The folder where everything is kept
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+    /// Where to listen; port 0 takes any free one
+    #[arg(long, value_name = "HOST:PORT")]
+    listen: Option<SocketAddr>,
+    /// Write the address here once the server is ready
+    #[arg(long, value_name = "FILE")]
+    address_file: Option<PathBuf>,
+    /// The model
+    #[arg(long, value_name = "NAME")]
+    model: Option<String>,
+    /// Who refines the candidates
+    #[arg(long)]
+    refiner: Option<Refiner>,
+}
+
+pub async fn run(args: Args) -> anyhow::Result<()> {
+    let flags = Overrides::default()
+        .listen(args.listen)
+        .data(args.data)
+        .model(args.model)
+        .refiner(args.refiner);
+    let config = Config::load(args.config.as_deref(), &flags)?;
+    telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
+    let listener = TcpListener::bind(config.server.listen).await.with_context(|| {
+        format!("cannot listen on {}; choose another with --listen", config.server.listen)
+    })?;
+    let shutdown = CancellationToken::new();
+    tokio::spawn(cancel_on_signal(shutdown.clone()));
+    startup::serve(config, listener, shutdown, |address| {
+        args.address_file.as_deref().map_or(Ok(()), |file| write_address(file, address))
+    })
+    .await
+}
+
+async fn cancel_on_signal(shutdown: CancellationToken) {
+    let (Ok(mut terminate), Ok(mut interrupt)) =
+        (signal(SignalKind::terminate()), signal(SignalKind::interrupt()))
+    else {
+        return tracing::error!("signals cannot be caught; stop the server with SIGKILL");
+    };
+    tokio::select! {
+        _ = terminate.recv() => {}
+        _ = interrupt.recv() => {}
+    }
+    shutdown.cancel();
+}
+
+/// Writes beside and renames, so that whoever waits for the file never reads half an address.
+fn write_address(file: &Path, address: SocketAddr) -> anyhow::Result<()> {
+    let beside = file.with_extension("tmp");
+    std::fs::write(&beside, format!("{address}\n"))
+        .and_then(|()| std::fs::rename(&beside, file))
+        .with_context(|| format!("cannot write the address to {}", file.display()))
+}

@@ -1,0 +1,369 @@
+//! Settings: typed, with every default in one commented file, checked together at start.
+//!
+//! Defaults (`deploy/whereabouts.toml`) < the file of `--config` < environment < flags.
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use figment::Figment;
+use figment::providers::{Env, Format, Serialized, Toml};
+use serde::{Deserialize, Serialize};
+
+use crate::domain::RefinerKind;
+
+/// The default settings, every key with a comment.
+pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
+
+/// All settings.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// The HTTP server.
+    pub server: Server,
+    /// The embedded store.
+    pub data: Data,
+    /// The model.
+    pub model: Model,
+    /// Decoding.
+    pub image: Image,
+    /// Search.
+    pub index: Index,
+    /// Answers.
+    pub localize: Localize,
+    /// Refinement jobs.
+    pub jobs: Jobs,
+    /// The refiner.
+    pub refine: Refine,
+    /// Logs.
+    pub log: Log,
+}
+
+/// `[server]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Server {
+    /// Where to listen.
+    pub listen: SocketAddr,
+    /// The largest request body, in bytes.
+    pub body_limit_bytes: usize,
+    /// The longest request, in seconds.
+    pub request_timeout_s: u64,
+    /// The most requests in progress.
+    pub max_requests: usize,
+    /// The longest drain, in seconds.
+    pub drain_timeout_s: u64,
+}
+
+/// `[data]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Data {
+    /// The folder of the embedded store.
+    pub dir: PathBuf,
+    /// sled's page cache, in bytes.
+    pub db_cache_bytes: u64,
+    /// The most changes in one commit.
+    pub commit_batch: usize,
+}
+
+/// `[model]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Model {
+    /// The model's name.
+    pub name: String,
+    /// The assets folder; empty for the usual places.
+    pub assets: PathBuf,
+    /// Sessions side by side.
+    pub sessions: usize,
+    /// Threads in a session; 0 for one a core.
+    pub threads: usize,
+    /// The most pictures in one run.
+    pub max_batch: usize,
+}
+
+/// `[image]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Image {
+    /// The most pixels that are decoded.
+    pub max_pixels: u64,
+    /// Decoding threads; 0 for two a core.
+    pub threads: usize,
+    /// Pictures that may wait.
+    pub queue: usize,
+}
+
+/// `[index]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Index {
+    /// The largest map that is searched exactly, in images.
+    pub exact_up_to: usize,
+    /// HNSW: neighbours of a point.
+    pub m: usize,
+    /// HNSW: points looked at when inserting.
+    pub ef_construction: usize,
+    /// HNSW: points looked at when searching.
+    pub ef_search: usize,
+}
+
+/// `[localize]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Localize {
+    /// Candidates in an answer by default.
+    pub k: usize,
+    /// Candidates in an answer at the most.
+    pub max_k: usize,
+    /// The least similarity of a known place.
+    pub known_similarity: f32,
+}
+
+/// `[jobs]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Jobs {
+    /// Jobs that may wait or run.
+    pub queue: usize,
+    /// Jobs refined side by side.
+    pub workers: usize,
+    /// The lease of a job, in seconds.
+    pub lease_s: u64,
+    /// The longest a job may take, in seconds.
+    pub timeout_s: u64,
+    /// How often a job is tried.
+    pub attempts: u32,
+    /// The longest wait of a caller, in seconds.
+    pub max_wait_s: u64,
+}
+
+/// `[refine]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Refine {
+    /// Who refines.
+    pub refiner: Refiner,
+    /// Candidates that are compared.
+    pub candidates: usize,
+    /// Memory for dense features, in bytes.
+    pub dense_cache_bytes: usize,
+}
+
+/// Who refines, if anybody.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Refiner {
+    /// Geometric matching of dense features.
+    Local,
+    /// Nobody.
+    Off,
+}
+
+impl Refiner {
+    /// The refiner of a new job, if there is one.
+    pub fn kind(self) -> Option<RefinerKind> {
+        match self {
+            Self::Local => Some(RefinerKind::Local),
+            Self::Off => None,
+        }
+    }
+}
+
+/// `[log]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Log {
+    /// How lines look.
+    pub format: LogFormat,
+    /// What is logged.
+    pub filter: String,
+}
+
+/// How log lines look.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LogFormat {
+    /// Pretty on a terminal, JSON elsewhere.
+    Auto,
+    /// For people.
+    Pretty,
+    /// One JSON object a line.
+    Json,
+}
+
+/// Settings from the command line, which go over all others.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Overrides {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    server: Option<serde_json::Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    data: Option<serde_json::Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    model: Option<serde_json::Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    refine: Option<serde_json::Value>,
+}
+
+impl Overrides {
+    /// Sets `[server] listen`.
+    pub fn listen(mut self, listen: Option<SocketAddr>) -> Self {
+        self.server = listen.map(|listen| serde_json::json!({ "listen": listen }));
+        self
+    }
+
+    /// Sets `[data] dir`.
+    pub fn data(mut self, dir: Option<PathBuf>) -> Self {
+        self.data = dir.map(|dir| serde_json::json!({ "dir": dir }));
+        self
+    }
+
+    /// Sets `[model] name`.
+    pub fn model(mut self, name: Option<String>) -> Self {
+        self.model = name.map(|name| serde_json::json!({ "name": name }));
+        self
+    }
+
+    /// Sets `[refine] refiner`.
+    pub fn refiner(mut self, refiner: Option<Refiner>) -> Self {
+        self.refine = refiner.map(|refiner| serde_json::json!({ "refiner": refiner }));
+        self
+    }
+}
+
+/// Settings that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// A value is missing, unknown or of the wrong type.
+    #[error("the configuration cannot be read: {0}")]
+    Malformed(Box<figment::Error>),
+    /// The file that was named is not there.
+    #[error("there is no configuration file {0}")]
+    NoFile(PathBuf),
+    /// Values contradict each other.
+    #[error("the configuration contradicts itself: {0}")]
+    Contradiction(String),
+}
+
+impl Config {
+    /// Layers the defaults, the file, the environment and the flags.
+    pub fn load(file: Option<&Path>, flags: &Overrides) -> Result<Self, ConfigError> {
+        let mut layers = Figment::from(Toml::string(DEFAULTS));
+        if let Some(file) = file {
+            if !file.is_file() {
+                return Err(ConfigError::NoFile(file.to_owned()));
+            }
+            layers = layers.merge(Toml::file_exact(file));
+        }
+        // A variable without "__" names no setting: WHEREABOUTS_DATA and the like are for others.
+        let environment = Env::prefixed("WHEREABOUTS_")
+            .filter(|key| key.as_str().contains("__"))
+            .split("__");
+        let config: Self = layers
+            .merge(environment)
+            .merge(Serialized::defaults(flags))
+            .extract()
+            .map_err(|error| ConfigError::Malformed(Box::new(error)))?;
+        match config.contradiction() {
+            Some(why) => Err(ConfigError::Contradiction(why)),
+            None => Ok(config),
+        }
+    }
+
+    fn contradiction(&self) -> Option<String> {
+        let at_least_one = [
+            ("server.body_limit_bytes", self.server.body_limit_bytes),
+            ("server.max_requests", self.server.max_requests),
+            ("data.commit_batch", self.data.commit_batch),
+            ("model.sessions", self.model.sessions),
+            ("model.max_batch", self.model.max_batch),
+            ("image.queue", self.image.queue),
+            ("index.m", self.index.m),
+            ("index.ef_construction", self.index.ef_construction),
+            ("index.ef_search", self.index.ef_search),
+            ("localize.k", self.localize.k),
+            ("jobs.queue", self.jobs.queue),
+            ("jobs.workers", self.jobs.workers),
+            ("jobs.attempts", self.jobs.attempts as usize),
+            ("refine.candidates", self.refine.candidates),
+        ];
+        if let Some((key, _)) = at_least_one.iter().find(|(_, value)| *value == 0) {
+            return Some(format!("{key} must be at least 1"));
+        }
+        if self.localize.max_k > 100 || self.localize.k > self.localize.max_k {
+            return Some("localize.k <= localize.max_k <= 100 must hold".into());
+        }
+        if self.refine.candidates > self.localize.max_k {
+            return Some("refine.candidates must not exceed localize.max_k".into());
+        }
+        if self.index.m > 256 {
+            return Some("index.m must not exceed 256".into());
+        }
+        if self.jobs.lease_s <= self.jobs.timeout_s {
+            return Some(format!(
+                "jobs.lease_s ({}) must outlast jobs.timeout_s ({}), or two workers would refine \
+                 one job",
+                self.jobs.lease_s, self.jobs.timeout_s
+            ));
+        }
+        None
+    }
+}
+
+impl Server {
+    /// The longest request.
+    pub fn request_timeout(&self) -> Duration {
+        Duration::from_secs(self.request_timeout_s)
+    }
+
+    /// The longest drain.
+    pub fn drain_timeout(&self) -> Duration {
+        Duration::from_secs(self.drain_timeout_s)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn with_file(text: &str) -> Result<Config, ConfigError> {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        Config::load(Some(file.path()), &Overrides::default())
+    }
+
+    #[test]
+    fn the_defaults_are_whole_and_consistent() {
+        let config = Config::load(None, &Overrides::default()).unwrap();
+        assert_eq!(config.localize.k, 10);
+        assert_eq!(config.refine.refiner.kind(), Some(RefinerKind::Local));
+    }
+
+    #[test]
+    fn a_flag_goes_over_the_file() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "[model]\nname = \"a\"\nthreads = 3").unwrap();
+        let flags = Overrides::default().model(Some("b".into()));
+        let config = Config::load(Some(file.path()), &flags).unwrap();
+        assert_eq!((config.model.name.as_str(), config.model.threads), ("b", 3));
+    }
+
+    #[test]
+    fn a_misspelt_key_is_named() {
+        let error = with_file("[server]\nlisen = \"1.2.3.4:5\"").unwrap_err().to_string();
+        assert!(error.contains("lisen"), "{error}");
+    }
+
+    #[test]
+    fn a_lease_shorter_than_the_job_is_refused() {
+        let error = with_file("[jobs]\nlease_s = 10\ntimeout_s = 10").unwrap_err().to_string();
+        assert!(error.contains("must outlast"), "{error}");
+    }
+
+    #[test]
+    fn a_missing_file_is_an_error() {
+        let error = Config::load(Some(Path::new("no-such.toml")), &Overrides::default());
+        assert!(matches!(error, Err(ConfigError::NoFile(_))));
+    }
+}

@@ -1,0 +1,174 @@
+//! A procedural town for demonstrations, load tests and honest accuracy checks without a data set.
+//!
+//! A [`Town`] renders what a camera on a street sees: façades, shop signs, trees, traffic and
+//! people, in true perspective, with exact ground-truth poses. [`Town::reference`] gives the map
+//! image of a place and [`Town::query`] a later visit to it: from a couple of metres away, turned
+//! by up to 13°, in another light and other traffic. Building styles and shop chains come from a
+//! small pool and recur in every street, so places look alike and recognising one is real work.
+//!
+//! Every picture is a pure function of the seed and the numbers asked for; nothing is cached, and
+//! places may be asked for in any order and from any thread. Writing files, building a map and
+//! scoring answers are left to the callers.
+
+mod camera;
+mod dice;
+mod facade;
+mod font;
+mod geometry;
+mod ground;
+mod layout;
+mod light;
+mod massing;
+mod props;
+mod raster;
+mod scene;
+mod styles;
+mod surface;
+mod traffic;
+mod vehicles;
+
+#[cfg(test)]
+mod tests;
+
+use image::RgbImage;
+
+use camera::{Camera, Pose};
+use dice::Dice;
+use geometry::vec3;
+use layout::{PLACES_PER_STREET, Street};
+use light::Lighting;
+use traffic::{Bustle, Traffic};
+
+pub use light::Light;
+
+/// A retrieved reference counts as correct when it was taken within this distance of the query,
+/// in metres.
+///
+/// Places are at least 16 m apart and a query at most 2.6 m from its place, so the true place is
+/// always inside the radius and every other one outside. Each place has a single heading, so
+/// distance alone is a fair criterion.
+pub const SUCCESS_RADIUS_M: f64 = 10.0;
+
+/// Which town to render, and at what size.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TownSpec {
+    /// Two towns with the same seed are the same to the last pixel.
+    pub seed: u64,
+    /// Number of places; 0 is treated as 1.
+    pub places: usize,
+    /// Image width in pixels; 0 is treated as 1.
+    pub width: u32,
+    /// Image height in pixels; 0 is treated as 1.
+    pub height: u32,
+}
+
+impl Default for TownSpec {
+    fn default() -> Self {
+        TownSpec { seed: 7, places: 60, width: 640, height: 480 }
+    }
+}
+
+/// A town whose places can be photographed.
+#[derive(Clone, Debug)]
+pub struct Town {
+    spec: TownSpec,
+}
+
+/// A rendered picture with its ground truth.
+#[derive(Clone, Debug)]
+pub struct Shot {
+    /// The place shown, in `0..Town::places()`.
+    pub place: usize,
+    /// The picture, in display (sRGB-like) colours.
+    pub image: RgbImage,
+    /// Camera position, in metres east of the town's origin.
+    pub x: f64,
+    /// Camera position, in metres north of the town's origin.
+    pub y: f64,
+    /// Compass heading of the optical axis, in degrees `0.0..360.0`, clockwise from north.
+    pub heading: f64,
+    /// The light the picture was taken in.
+    pub light: Light,
+}
+
+impl Town {
+    /// Lays out a town. Nothing is rendered yet.
+    pub fn new(spec: TownSpec) -> Town {
+        Town {
+            spec: TownSpec {
+                places: spec.places.max(1),
+                width: spec.width.max(1),
+                height: spec.height.max(1),
+                ..spec
+            },
+        }
+    }
+
+    /// Number of places, at least 1.
+    pub fn places(&self) -> usize {
+        self.spec.places
+    }
+
+    /// The map image of a place, taken by day in thin traffic. `place` wraps around at
+    /// [`Town::places`].
+    pub fn reference(&self, place: usize) -> Shot {
+        let place = place % self.places();
+        let (street, pose) = self.survey(place);
+        let mut dice = street.dice(1_000 + place as u64);
+        self.photograph(place, &street, pose, Light::Day, Bustle::SURVEY, &mut dice)
+    }
+
+    /// A later visit to a place; each `variant` is another visit, and any four consecutive
+    /// variants are taken in the four lights. `place` wraps around at [`Town::places`].
+    pub fn query(&self, place: usize, variant: u32) -> Shot {
+        let place = place % self.places();
+        let (street, survey) = self.survey(place);
+        let mut dice = street.dice(2_000 + place as u64).fork(u64::from(variant) + 1);
+        let first = street.dice(3_000 + place as u64).below(Light::ALL.len());
+        let light = Light::ALL[(first + variant as usize) % Light::ALL.len()];
+        let pose = revisit(survey, &mut dice);
+        self.photograph(place, &street, pose, light, Bustle::EVERYDAY, &mut dice)
+    }
+
+    fn survey(&self, place: usize) -> (Street, Pose) {
+        let street = Street::new(self.spec.seed, place / PLACES_PER_STREET);
+        let pose = street.survey_pose(place % PLACES_PER_STREET);
+        (street, pose)
+    }
+
+    fn photograph(
+        &self,
+        place: usize,
+        street: &Street,
+        pose: Pose,
+        light: Light,
+        bustle: Bustle,
+        dice: &mut Dice,
+    ) -> Shot {
+        let TownSpec { width, height, .. } = self.spec;
+        let camera = Camera::new(&pose, width, height);
+        let lighting = Lighting::new(light, street, &camera, dice);
+        let traffic = Traffic::new(street, pose.eye, pose.yaw, bustle, dice);
+        let scene = scene::Scene::new(street, &camera, &traffic, lighting);
+        let (x, y) = street.on_plan(pose.eye);
+        Shot {
+            place,
+            image: raster::render(&scene, &camera, (width, height), dice),
+            x,
+            y,
+            heading: street.compass(pose.yaw),
+            light,
+        }
+    }
+}
+
+/// The pose of a camera that comes by a place again.
+fn revisit(survey: Pose, dice: &mut Dice) -> Pose {
+    let turn = dice.between(-13.0, 13.0).to_radians();
+    Pose {
+        eye: survey.eye + vec3(dice.between(-2.2, 2.2), dice.between(-1.2, 1.2), dice.around(0.25)),
+        yaw: survey.yaw + turn,
+        pitch: survey.pitch + dice.around(3.0).to_radians(),
+        roll: dice.around(1.5).to_radians(),
+    }
+}

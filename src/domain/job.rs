@@ -1,0 +1,140 @@
+//! Jobs: one refinement of the candidates of one query.
+
+use std::fmt;
+use std::str::FromStr;
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use uuid::Uuid;
+
+use super::map::display_as_written;
+use super::{ImageId, InvalidName, MapName, Ranking};
+
+/// Who compares a query with its candidates.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum RefinerKind {
+    /// Geometric matching of dense features, on this machine.
+    #[default]
+    Local,
+    /// A multimodal LLM.
+    Mllm,
+}
+
+/// How far a job has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum JobState {
+    /// Waits for a worker.
+    Queued,
+    /// A worker holds it.
+    Running,
+    /// Ended with a ranking.
+    Succeeded,
+    /// Ended with a ranking of which part fell back to the coarse order; `error` says why.
+    Degraded,
+    /// Ended without a ranking; `error` says why.
+    Failed,
+    /// Ended because a caller asked for it.
+    Cancelled,
+}
+
+display_as_written!(RefinerKind { Local => "local", Mllm => "mllm" });
+display_as_written!(JobState {
+    Queued => "queued",
+    Running => "running",
+    Succeeded => "succeeded",
+    Degraded => "degraded",
+    Failed => "failed",
+    Cancelled => "cancelled"
+});
+
+impl JobState {
+    /// Whether the job has ended for good.
+    pub fn is_final(self) -> bool {
+        !matches!(self, Self::Queued | Self::Running)
+    }
+}
+
+/// The text that compares the query with one candidate.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Description {
+    /// The candidate.
+    pub image_id: ImageId,
+    /// What agrees and what differs, in words.
+    pub text: String,
+    /// Whether the text was known from an earlier job.
+    pub cached: bool,
+    /// What it cost.
+    pub usage: Usage,
+}
+
+/// What a refinement cost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+pub struct Usage {
+    /// Calls to a model outside.
+    pub calls: u32,
+    /// Descriptions that were known from an earlier job.
+    pub cached: u32,
+    /// Tokens sent.
+    pub prompt_tokens: u64,
+    /// Tokens received.
+    pub completion_tokens: u64,
+}
+
+/// One refinement.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Job {
+    /// Its id; ids of later jobs sort after those of earlier ones.
+    pub id: Uuid,
+    /// The map of the query.
+    pub map: MapName,
+    /// The query.
+    pub query_id: Uuid,
+    /// Who refines.
+    pub refiner: RefinerKind,
+    /// How far it has come.
+    pub state: JobState,
+    /// When it was queued.
+    pub created_at: Timestamp,
+    /// When a worker first took it.
+    pub started_at: Option<Timestamp>,
+    /// When it ended.
+    pub finished_at: Option<Timestamp>,
+    /// How often a worker has taken it.
+    pub attempts: u32,
+    /// One text for each candidate compared so far, in coarse order.
+    pub descriptions: Vec<Description>,
+    /// The refined order, once there is one.
+    #[schema(nullable)]
+    pub ranking: Option<Ranking>,
+    /// Why the ranking is as it is.
+    pub reasoning: Option<String>,
+    /// What it cost so far.
+    pub usage: Usage,
+    /// What went wrong, if anything did.
+    pub error: Option<String>,
+}
+
+impl Job {
+    /// A new job, queued.
+    pub fn queued(map: MapName, query_id: Uuid, refiner: RefinerKind, now: Timestamp) -> Self {
+        Self {
+            id: Uuid::now_v7(),
+            map,
+            query_id,
+            refiner,
+            state: JobState::Queued,
+            created_at: now,
+            started_at: None,
+            finished_at: None,
+            attempts: 0,
+            descriptions: Vec::new(),
+            ranking: None,
+            reasoning: None,
+            usage: Usage::default(),
+            error: None,
+        }
+    }
+}

@@ -1,0 +1,169 @@
+//! Maps: named sets of reference images that share a model, a descriptor and a frame.
+
+use std::fmt;
+use std::str::FromStr;
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use uuid::Uuid;
+
+use super::{Digest, InvalidName};
+
+/// The name of a map: 1 to 64 of `a-z 0-9 . _ -`, starting with a letter or a digit.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, ToSchema)]
+#[serde(try_from = "String", into = "String")]
+pub struct MapName(String);
+
+impl MapName {
+    /// The name as text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl FromStr for MapName {
+    type Err = InvalidName;
+
+    fn from_str(text: &str) -> Result<Self, InvalidName> {
+        let allowed = |b: u8| matches!(b, b'a'..=b'z' | b'0'..=b'9' | b'.' | b'_' | b'-');
+        let starts = text.bytes().next().is_some_and(|b| b.is_ascii_alphanumeric());
+        if text.len() > 64 || !starts || !text.bytes().all(allowed) {
+            return Err(InvalidName(format!(
+                "a map name is 1 to 64 of a-z, 0-9, '.', '_' and '-', starting with a letter or a \
+                 digit; got {:?}",
+                text.chars().take(80).collect::<String>()
+            )));
+        }
+        Ok(Self(text.to_owned()))
+    }
+}
+
+impl TryFrom<String> for MapName {
+    type Error = InvalidName;
+
+    fn try_from(text: String) -> Result<Self, InvalidName> {
+        text.parse()
+    }
+}
+
+impl From<MapName> for String {
+    fn from(name: MapName) -> Self {
+        name.0
+    }
+}
+
+impl fmt::Display for MapName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// What kind of place a map shows; it chooses the words of the refiner's prompts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Scene {
+    /// Streets, yards, fields.
+    #[default]
+    Outdoor,
+    /// Corridors, halls, shops.
+    Indoor,
+}
+
+/// Which global descriptor a map compares.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum DescriptorKind {
+    /// Generalised-mean pooling over the local features.
+    #[default]
+    Gem,
+    /// The `[CLS]` token of a transformer.
+    Cls,
+}
+
+/// The frame of reference of a map's poses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Frame {
+    /// Latitude and longitude in degrees.
+    #[default]
+    Wgs84,
+    /// Metres in a frame of the map's own.
+    Metric,
+}
+
+macro_rules! display_as_written {
+    ($type:ty { $($variant:ident => $text:literal),+ }) => {
+        impl $type {
+            /// The word that the API uses.
+            pub fn as_str(self) -> &'static str {
+                match self { $(Self::$variant => $text),+ }
+            }
+        }
+
+        impl fmt::Display for $type {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(self.as_str())
+            }
+        }
+
+        impl FromStr for $type {
+            type Err = InvalidName;
+
+            fn from_str(text: &str) -> Result<Self, InvalidName> {
+                match text {
+                    $($text => Ok(Self::$variant),)+
+                    _ => Err(InvalidName(format!(
+                        "expected one of {}; got {text:?}", [$($text),+].join(", ")
+                    ))),
+                }
+            }
+        }
+    };
+}
+pub(super) use display_as_written;
+
+display_as_written!(Scene { Outdoor => "outdoor", Indoor => "indoor" });
+display_as_written!(DescriptorKind { Gem => "gem", Cls => "cls" });
+display_as_written!(Frame { Wgs84 => "wgs84", Metric => "metric" });
+
+/// A map as it is stored.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Map {
+    /// Tells this map from an earlier, deleted one of the same name.
+    pub uid: Uuid,
+    /// Its name.
+    pub name: MapName,
+    /// Indoor or outdoor.
+    pub scene: Scene,
+    /// Which descriptor it compares.
+    pub descriptor: DescriptorKind,
+    /// The frame of its poses.
+    pub frame: Frame,
+    /// The name of the model that makes its descriptors.
+    pub model: String,
+    /// The digest of that model's ONNX file: descriptors of different weights do not mix.
+    pub model_digest: Digest,
+    /// Numbers in a descriptor.
+    pub dim: usize,
+    /// What a person wrote about it.
+    #[serde(default)]
+    pub description: Option<String>,
+    /// When it was created.
+    pub created_at: Timestamp,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_map_name_is_safe_in_a_path_and_a_label() {
+        for name in ["a", "tokyo-247", "0.floor_2"] {
+            assert!(name.parse::<MapName>().is_ok(), "{name}");
+        }
+        for name in ["", ".", "..", "-a", "a/b", "A", "a b", "é", &"a".repeat(65)] {
+            assert!(name.parse::<MapName>().is_err(), "{name}");
+        }
+    }
+}

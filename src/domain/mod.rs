@@ -1,0 +1,27 @@
+//! The words of the service as plain types: map, image, pose, descriptor, candidate, job.
+//!
+//! A value of these types obeys its rules by construction (a [`Descriptor`] has unit norm, a
+//! [`Ranking`] is a permutation), so nobody downstream checks again. No I/O happens here.
+
+mod candidate;
+pub mod dense;
+mod descriptor;
+mod digest;
+mod image;
+mod job;
+mod map;
+mod pose;
+
+pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
+pub use dense::DenseFeatures;
+pub use descriptor::{Descriptor, DescriptorError};
+pub use digest::Digest;
+pub use self::image::{Image, ImageId, MediaType};
+pub use job::{Description, Job, JobState, RefinerKind, Usage};
+pub use map::{DescriptorKind, Frame, Map, MapName, Scene};
+pub use pose::{GeographicPose, MetricPose, Pose, PoseError};
+
+/// A text that does not obey the rules of the type it was meant for.
+#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+#[error("{0}")]
+pub struct InvalidName(pub String);

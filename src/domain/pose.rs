@@ -1,0 +1,249 @@
+//! Where a camera stood: on the globe or in a map's own metric frame.
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use utoipa::ToSchema;
+
+use super::Frame;
+
+/// Where a camera stood, in the frame of its map.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(untagged)]
+pub enum Pose {
+    /// In a `wgs84` map.
+    Geographic(GeographicPose),
+    /// In a `metric` map.
+    Metric(MetricPose),
+}
+
+/// A pose on the globe (WGS84).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct GeographicPose {
+    /// Latitude in degrees, −90 to 90.
+    pub lat: f64,
+    /// Longitude in degrees, −180 to 180.
+    pub lon: f64,
+    /// Height above the ellipsoid in metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alt: Option<f64>,
+    /// Viewing direction in degrees clockwise from north, 0 to 360.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub heading: Option<f64>,
+}
+
+/// A pose in a map's own frame: metres and a unit quaternion.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct MetricPose {
+    /// Metres along the frame's x axis.
+    pub x: f64,
+    /// Metres along the frame's y axis.
+    pub y: f64,
+    /// Metres along the frame's z axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub z: Option<f64>,
+    /// Orientation, x part of the unit quaternion; all four parts are given or none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qx: Option<f64>,
+    /// Orientation, y part.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qy: Option<f64>,
+    /// Orientation, z part.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qz: Option<f64>,
+    /// Orientation, scalar part.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qw: Option<f64>,
+}
+
+/// Why a pose was refused.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum PoseError {
+    /// The fields are not those of the map's frame.
+    #[error("the pose does not fit a {frame} map, which takes {expected}: {detail}")]
+    Fields {
+        /// The map's frame.
+        frame: &'static str,
+        /// The fields that a pose of this frame has.
+        expected: &'static str,
+        /// What the reader said.
+        detail: String,
+    },
+    /// A number lies outside its range.
+    #[error("{field} is {value}; it must be {range}")]
+    Range {
+        /// The field.
+        field: &'static str,
+        /// Its value.
+        value: f64,
+        /// What it may be.
+        range: &'static str,
+    },
+    /// The orientation is given in part, or is not a unit quaternion.
+    #[error("{0}")]
+    Quaternion(&'static str),
+}
+
+/// Farther from the origin than any building, city or orbit of the Earth; keeps typing errors out.
+const FARTHEST_METRES: f64 = 1e8;
+
+impl Pose {
+    /// Reads a pose written in JSON for a map of the given frame.
+    pub fn from_json(frame: Frame, value: Value) -> Result<Self, PoseError> {
+        let (name, expected) = match frame {
+            Frame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading"),
+            Frame::Metric => ("metric", "x, y and, if known, z, qx, qy, qz, qw"),
+        };
+        let fields = |error: serde_json::Error| PoseError::Fields {
+            frame: name,
+            expected,
+            detail: error.to_string(),
+        };
+        match frame {
+            Frame::Wgs84 => {
+                serde_json::from_value::<GeographicPose>(value).map_err(fields)?.checked()
+            }
+            Frame::Metric => serde_json::from_value::<MetricPose>(value).map_err(fields)?.checked(),
+        }
+    }
+
+    /// The frame it belongs to.
+    pub fn frame(&self) -> Frame {
+        match self {
+            Self::Geographic(_) => Frame::Wgs84,
+            Self::Metric(_) => Frame::Metric,
+        }
+    }
+
+    /// Checks the ranges of a pose that was built in code.
+    pub fn checked(self) -> Result<Self, PoseError> {
+        match self {
+            Self::Geographic(pose) => pose.checked(),
+            Self::Metric(pose) => pose.checked(),
+        }
+    }
+
+    /// Distance in metres to another pose of the same frame, `None` across frames.
+    ///
+    /// On the globe this is the great-circle distance of the haversine formula over a sphere of
+    /// the mean Earth radius 6,371,008.8 m (IUGG), good to 0.6 %.
+    pub fn distance_m(&self, other: &Self) -> Option<f64> {
+        match (self, other) {
+            (Self::Geographic(a), Self::Geographic(b)) => Some(a.haversine_m(b)),
+            (Self::Metric(a), Self::Metric(b)) => {
+                let dz = a.z.zip(b.z).map_or(0.0, |(a, b)| a - b);
+                Some(((a.x - b.x).powi(2) + (a.y - b.y).powi(2) + dz.powi(2)).sqrt())
+            }
+            _ => None,
+        }
+    }
+}
+
+impl GeographicPose {
+    fn checked(self) -> Result<Pose, PoseError> {
+        within("lat", Some(self.lat), -90.0, 90.0, "between -90 and 90 degrees")?;
+        within("lon", Some(self.lon), -180.0, 180.0, "between -180 and 180 degrees")?;
+        within("alt", self.alt, -FARTHEST_METRES, FARTHEST_METRES, "within 100,000 km")?;
+        within("heading", self.heading, 0.0, 360.0, "between 0 and 360 degrees")?;
+        Ok(Pose::Geographic(self))
+    }
+
+    fn haversine_m(&self, other: &Self) -> f64 {
+        const EARTH_RADIUS_M: f64 = 6_371_008.8;
+        let (a, b) = (self.lat.to_radians(), other.lat.to_radians());
+        let half_lat = ((b - a) / 2.0).sin();
+        let half_lon = ((other.lon - self.lon).to_radians() / 2.0).sin();
+        let h = half_lat.powi(2) + a.cos() * b.cos() * half_lon.powi(2);
+        2.0 * EARTH_RADIUS_M * h.sqrt().min(1.0).asin()
+    }
+}
+
+impl MetricPose {
+    fn checked(self) -> Result<Pose, PoseError> {
+        for (field, value) in [("x", Some(self.x)), ("y", Some(self.y)), ("z", self.z)] {
+            within(field, value, -FARTHEST_METRES, FARTHEST_METRES, "within 100,000 km")?;
+        }
+        match [self.qx, self.qy, self.qz, self.qw] {
+            [None, None, None, None] => {}
+            [Some(x), Some(y), Some(z), Some(w)] => {
+                let norm = (x * x + y * y + z * z + w * w).sqrt();
+                if !((norm - 1.0).abs() < 1e-3) {
+                    return Err(PoseError::Quaternion(
+                        "qx, qy, qz, qw must be a unit quaternion (norm 1 to within 0.001)",
+                    ));
+                }
+            }
+            _ => {
+                return Err(PoseError::Quaternion(
+                    "an orientation needs all of qx, qy, qz and qw, or none of them",
+                ));
+            }
+        }
+        Ok(Pose::Metric(self))
+    }
+}
+
+fn within(
+    field: &'static str,
+    value: Option<f64>,
+    low: f64,
+    high: f64,
+    range: &'static str,
+) -> Result<(), PoseError> {
+    match value {
+        Some(value) if !(low..=high).contains(&value) => {
+            Err(PoseError::Range { field, value, range })
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn a_pose_out_of_range_names_the_field_and_the_range() {
+        let error = Pose::from_json(Frame::Wgs84, json!({"lat": 91.0, "lon": 0.0})).unwrap_err();
+        assert_eq!(error.to_string(), "lat is 91; it must be between -90 and 90 degrees");
+        assert!(Pose::from_json(Frame::Metric, json!({"x": 1e9, "y": 0.0})).is_err());
+    }
+
+    #[test]
+    fn a_pose_of_the_other_frame_says_what_this_map_takes() {
+        let error = Pose::from_json(Frame::Wgs84, json!({"x": 1.0, "y": 2.0})).unwrap_err();
+        assert!(error.to_string().contains("takes lat, lon"), "{error}");
+        let error = Pose::from_json(Frame::Metric, json!({"lat": 1.0, "lon": 2.0})).unwrap_err();
+        assert!(error.to_string().contains("takes x, y"), "{error}");
+    }
+
+    #[test]
+    fn an_orientation_is_whole_and_of_unit_norm() {
+        let with = |q: [f64; 4]| {
+            json!({"x": 0, "y": 0, "qx": q[0], "qy": q[1], "qz": q[2], "qw": q[3]})
+        };
+        assert!(Pose::from_json(Frame::Metric, with([0.0, 0.0, 0.6, 0.8])).is_ok());
+        assert!(Pose::from_json(Frame::Metric, with([0.0, 0.0, 0.6, 0.6])).is_err());
+        assert!(Pose::from_json(Frame::Metric, json!({"x": 0, "y": 0, "qw": 1})).is_err());
+    }
+
+    #[test]
+    fn a_degree_of_latitude_is_111_kilometres() {
+        let at = |lat| {
+            Pose::Geographic(GeographicPose { lat, lon: 139.7, alt: None, heading: None })
+        };
+        let distance = at(35.0).distance_m(&at(36.0)).unwrap();
+        assert!((distance - 111_195.0).abs() < 10.0, "{distance}");
+    }
+
+    #[test]
+    fn poses_of_different_frames_have_no_distance() {
+        let metric = Pose::from_json(Frame::Metric, json!({"x": 3.0, "y": 4.0})).unwrap();
+        let origin = Pose::from_json(Frame::Metric, json!({"x": 0.0, "y": 0.0})).unwrap();
+        let globe = Pose::from_json(Frame::Wgs84, json!({"lat": 0.0, "lon": 0.0})).unwrap();
+        assert_eq!(metric.distance_m(&origin), Some(5.0));
+        assert_eq!(metric.distance_m(&globe), None);
+    }
+}

@@ -1,0 +1,70 @@
+//! Alive, ready, metrics, and the description of the API.
+
+use axum::extract::State;
+use axum::http::header::{CONTENT_SECURITY_POLICY, CONTENT_TYPE};
+use axum::response::{Html, IntoResponse, Redirect, Response};
+use axum::Json;
+
+use super::problem::Problem;
+use super::state::{AppState, Ready};
+use crate::service::{ErrorKind, ServiceError};
+
+/// Whether the process runs
+#[utoipa::path(get, path = "/livez", tag = "service", responses((status = 200, body = String)))]
+pub(super) async fn livez() -> &'static str {
+    "alive\n"
+}
+
+/// Whether requests are taken
+#[utoipa::path(get, path = "/readyz", tag = "service", responses(
+    (status = 200, body = String),
+    (status = 503, body = Problem, description = "Starting or draining", content_type = "application/problem+json"),
+))]
+pub(super) async fn readyz(State(state): State<AppState>) -> Result<&'static str, Problem> {
+    state.service()?;
+    if state.is_draining() {
+        return Err(Problem::new(ErrorKind::Unavailable, "the server is draining; use another"));
+    }
+    Ok("ready\n")
+}
+
+/// Metrics for Prometheus
+#[utoipa::path(get, path = "/metrics", tag = "service", responses(
+    (status = 200, body = String, content_type = "application/openmetrics-text"),
+))]
+pub(super) async fn metrics(Ready(service): Ready) -> Result<impl IntoResponse, Problem> {
+    const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+    let text = service.metrics_text().await?;
+    Ok(([(CONTENT_TYPE, OPEN_METRICS)], text))
+}
+
+pub(super) async fn openapi_json(description: utoipa::openapi::OpenApi) -> Response {
+    Json(description).into_response()
+}
+
+pub(super) async fn to_docs() -> Redirect {
+    Redirect::temporary("/docs")
+}
+
+/// The page that shows `/openapi.json` to people; all of it is in the binary.
+pub(super) async fn docs() -> impl IntoResponse {
+    const POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; script-src \
+                          'unsafe-inline'; connect-src 'self'";
+    ([(CONTENT_SECURITY_POLICY, POLICY)], Html(include_str!("docs.html")))
+}
+
+impl crate::service::Service {
+    /// All metrics as text, with the levels of this moment.
+    pub(super) async fn metrics_text(&self) -> Result<String, ServiceError> {
+        let maps: Vec<(String, usize)> = self
+            .list_maps()
+            .await?
+            .into_iter()
+            .map(|map| (map.name.to_string(), map.images))
+            .collect();
+        self.metrics.set_levels(&maps, self.jobs.queued().await?, self.dense.bytes());
+        self.metrics
+            .encode()
+            .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))
+    }
+}

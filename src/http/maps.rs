@@ -1,0 +1,76 @@
+//! `/maps`.
+
+use axum::Json;
+use axum::http::StatusCode;
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::body::{JsonBody, Segments};
+use super::problem::Problem;
+use super::state::Ready;
+use crate::domain::MapName;
+use crate::service::{MapChange, MapState};
+
+/// All maps.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct MapList {
+    /// By name.
+    maps: Vec<MapState>,
+}
+
+pub(super) fn map_name(text: &str) -> Result<MapName, Problem> {
+    Ok(text.parse().map_err(crate::service::ServiceError::from)?)
+}
+
+/// List the maps
+#[utoipa::path(get, path = "/maps", tag = "maps", responses(
+    (status = 200, body = MapList),
+    (status = 503, body = Problem, description = "Starting", content_type = "application/problem+json"),
+))]
+pub(super) async fn list_maps(Ready(service): Ready) -> Result<Json<MapList>, Problem> {
+    Ok(Json(MapList { maps: service.list_maps().await? }))
+}
+
+/// One map
+#[utoipa::path(get, path = "/maps/{map}", tag = "maps", params(("map" = String, Path)), responses(
+    (status = 200, body = MapState),
+    (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+))]
+pub(super) async fn get_map(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+) -> Result<Json<MapState>, Problem> {
+    Ok(Json(service.get_map(&map_name(&map)?).await?))
+}
+
+/// Create a map, or change it
+#[utoipa::path(put, path = "/maps/{map}", tag = "maps", params(("map" = String, Path)),
+    request_body(content = MapChange, description = "What to set; what is left out keeps its value"),
+    responses(
+        (status = 200, body = MapState, description = "Changed"),
+        (status = 201, body = MapState, description = "Created"),
+        (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "Fixed, because the map has images", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "Not possible with this model", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn put_map(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+    JsonBody(change): JsonBody<MapChange>,
+) -> Result<(StatusCode, Json<MapState>), Problem> {
+    let (state, new) = service.put_map(map_name(&map)?, change).await?;
+    Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(state)))
+}
+
+/// Remove a map with all its images
+#[utoipa::path(delete, path = "/maps/{map}", tag = "maps", params(("map" = String, Path)), responses(
+    (status = 204, description = "Removed"),
+    (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+))]
+pub(super) async fn delete_map(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+) -> Result<StatusCode, Problem> {
+    service.delete_map(&map_name(&map)?).await?;
+    Ok(StatusCode::NO_CONTENT)
+}

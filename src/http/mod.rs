@@ -1,0 +1,80 @@
+//! HTTP: extract, call the service, convert. No decision about maps or frames is taken here.
+
+mod body;
+mod guard;
+mod health;
+mod images;
+mod jobs;
+mod localize;
+mod maps;
+mod problem;
+mod state;
+
+use axum::Router;
+use axum::extract::DefaultBodyLimit;
+use axum::middleware::{from_fn, from_fn_with_state};
+use tower_http::catch_panic::CatchPanicLayer;
+use utoipa::OpenApi;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+pub use state::{AppState, HttpSettings};
+
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "whereabouts",
+        description = "Tells a robot where it is from one camera frame. Maps of reference images \
+                       are searched by global descriptor; a job then compares the frame with each \
+                       candidate and orders them anew. Errors are RFC 9457 problems.",
+        license(name = "Apache-2.0", identifier = "Apache-2.0")
+    ),
+    components(schemas(problem::Problem)),
+    tags(
+        (name = "maps", description = "Named sets of reference images"),
+        (name = "images", description = "Reference images with their poses"),
+        (name = "localize", description = "From a frame to candidates"),
+        (name = "jobs", description = "Refinements of the candidates"),
+        (name = "service", description = "Health, metrics and this description")
+    )
+)]
+struct Description;
+
+fn described() -> OpenApiRouter<AppState> {
+    OpenApiRouter::with_openapi(Description::openapi())
+        .routes(routes!(maps::list_maps))
+        .routes(routes!(maps::get_map, maps::put_map, maps::delete_map))
+        .routes(routes!(images::list_images, images::add_image))
+        .routes(routes!(images::get_image, images::delete_image))
+        .routes(routes!(images::image_content))
+        .routes(routes!(localize::localize))
+        .routes(routes!(jobs::list_jobs))
+        .routes(routes!(jobs::get_job))
+        .routes(routes!(jobs::cancel_job))
+        .routes(routes!(jobs::retry_job))
+        .routes(routes!(health::livez))
+        .routes(routes!(health::readyz))
+        .routes(routes!(health::metrics))
+}
+
+/// The OpenAPI 3.1 description, generated from the handlers.
+pub fn openapi() -> utoipa::openapi::OpenApi {
+    described().into_openapi()
+}
+
+/// All routes with what guards them.
+pub fn router(state: AppState) -> Router {
+    let (router, description) = described().split_for_parts();
+    router
+        .route("/openapi.json", axum::routing::get(move || health::openapi_json(description)))
+        .route("/docs", axum::routing::get(health::docs))
+        .route("/", axum::routing::get(health::to_docs))
+        .fallback(problem::no_such_path)
+        .method_not_allowed_fallback(problem::no_such_method)
+        .layer(DefaultBodyLimit::max(state.settings.body_limit_bytes))
+        .layer(CatchPanicLayer::custom(problem::panicked))
+        .layer(from_fn_with_state(state.clone(), guard::bound))
+        .layer(from_fn(problem::render))
+        .layer(from_fn_with_state(state.clone(), guard::observe))
+        .with_state(state)
+}

@@ -1,0 +1,28 @@
+//! `whereabouts` tells a robot where it is from one camera frame.
+//!
+//! | module | what it is for |
+//! |---|---|
+//! | [`domain`] | the words: map, image, pose, descriptor, candidate, job; no I/O |
+//! | [`retrieve`] | the coarse retriever: decode, preprocess, inference, pooling, index |
+//! | [`refine`] | the vision-language refiner: compare, describe, rank; the worker |
+//! | [`store`] | what must outlive the process |
+//! | [`service`] | the use cases: the one meaning behind HTTP and the command line |
+//! | [`http`] | axum: extract, call the service, convert |
+//! | [`cli`] | one file for each command |
+//! | [`demo`] | a procedural town, to try it all on |
+//! | [`config`], [`telemetry`], [`startup`] | settings, logs and metrics, wiring |
+//!
+//! Dependencies point one way: `cli, http → service → retrieve, refine, store → domain`. Only
+//! [`startup`] sees everything.
+
+pub mod cli;
+pub mod config;
+pub mod demo;
+pub mod domain;
+pub mod http;
+pub mod refine;
+pub mod retrieve;
+pub mod service;
+pub mod startup;
+pub mod store;
+pub mod telemetry;

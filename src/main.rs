@@ -1,0 +1,10 @@
+//! Parses the command line and dispatches.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use whereabouts::cli::Cli;
+
+fn main() -> ExitCode {
+    Cli::parse().run()
+}

@@ -1,0 +1,252 @@
+//! A pair in words: what agreed, where, how it moved, what found no counterpart, and how much that
+//! is worth.
+
+use super::{Motion, PairMatch};
+
+/// The ninths of a picture, row by row.
+const NINTHS: [&str; 9] = [
+    "upper left",
+    "top",
+    "upper right",
+    "left",
+    "centre",
+    "right",
+    "lower left",
+    "bottom",
+    "lower right",
+];
+
+/// Whole rows and columns of ninths, so that three names become one.
+const STRIPS: [([usize; 3], &str); 6] = [
+    ([0, 1, 2], "along the top edge"),
+    ([6, 7, 8], "along the bottom edge"),
+    ([0, 3, 6], "along the left edge"),
+    ([2, 5, 8], "along the right edge"),
+    ([3, 4, 5], "across the middle"),
+    ([1, 4, 7], "down the middle"),
+];
+
+/// Votes for a candidate, per region of the query and in units of its fair share, from which the
+/// agreement is called strong. Among ten candidates compared on XFeat features of two buildings and
+/// a rendered town, two in three above it were right.
+const STRONG: f32 = 0.5;
+
+/// The same, for some agreement. Nine in ten right candidates were above it.
+const SOME: f32 = 0.3;
+
+/// Describes one pair in plain English, three to six sentences. The same pair always gives the same
+/// text.
+pub fn describe(pair: &PairMatch) -> String {
+    if pair.matches.is_empty() {
+        return nothing_agrees(pair);
+    }
+    let parts = Parts::of(pair);
+    let mut sentences = vec![how_much(pair), parts.agreement()];
+    sentences.extend(distinctiveness(pair));
+    sentences.push(movement(pair));
+    sentences.push(parts.gaps());
+    sentences.push(verdict(pair));
+    sentences.join(" ")
+}
+
+fn nothing_agrees(pair: &PairMatch) -> String {
+    format!(
+        "None of the {} of the query has a counterpart in the candidate that moved together with \
+         its surroundings. {} resembled each other best, but not in the \
+         same arrangement. There is no sign that this is the same place.",
+        regions(pair.cells),
+        pairs_of_regions(pair.mutual),
+    )
+}
+
+fn how_much(pair: &PairMatch) -> String {
+    format!(
+        "{} of {} of the query ({} %) have a counterpart in the candidate that moved together \
+         with its surroundings; {} more resembled each other but not in the same arrangement.",
+        pair.matches.len(),
+        regions(pair.cells),
+        percent(share(pair)),
+        pair.mutual.saturating_sub(pair.matches.len()),
+    )
+}
+
+fn distinctiveness(pair: &PairMatch) -> Option<String> {
+    let among = match pair.rivals {
+        0 => return None,
+        1 => "in the other candidate".to_owned(),
+        rivals => format!("in any of the other {rivals} candidates"),
+    };
+    Some(format!("{} of them have no better counterpart {among}.", pair.distinctive))
+}
+
+fn movement(pair: &PairMatch) -> String {
+    let follow = percent(pair.motion.support as f32 / pair.matches.len().max(1) as f32);
+    let changes = Changes::of(&pair.motion);
+    let rest = match follow {
+        90.. => "",
+        50.. => "; the others moved by other amounts, as nearer and farther things do",
+        _ => "; most moved otherwise, so this says little",
+    };
+    let cause = changes.viewpoint();
+    format!(
+        "Seen from the query to the candidate, {follow} % of the agreeing regions {}{}{rest}.",
+        changes.seen(),
+        if cause.is_empty() { String::new() } else { format!(", as if the candidate was {cause}") },
+    )
+}
+
+/// Judged by the votes rather than by the number of matches: among ten candidates, one that shares
+/// the lens rim and the floor alone has many matches and few votes.
+fn verdict(pair: &PairMatch) -> String {
+    let fair_share = 1.0 / (pair.rivals + 1) as f32;
+    match pair.score / fair_share {
+        evidence if evidence >= STRONG => "Strong agreement: probably the same place.",
+        evidence if evidence >= SOME => {
+            "Some agreement: possibly the same place, or one built like it."
+        }
+        _ => "Weak agreement: what matches may be chance or a repeated pattern.",
+    }
+    .to_owned()
+}
+
+fn share(pair: &PairMatch) -> f32 {
+    pair.matches.len() as f32 / pair.cells.max(1) as f32
+}
+
+fn percent(share: f32) -> usize {
+    (share * 100.0).round() as usize
+}
+
+fn regions(count: usize) -> String {
+    if count == 1 { "1 region".to_owned() } else { format!("{count} regions") }
+}
+
+fn pairs_of_regions(count: usize) -> String {
+    if count == 1 { "1 pair of regions".to_owned() } else { format!("{count} pairs of regions") }
+}
+
+/// The share of each ninth of the query that agrees.
+struct Parts([f32; 9]);
+
+impl Parts {
+    fn of(pair: &PairMatch) -> Self {
+        let mut counts = [0usize; 9];
+        for found in &pair.matches {
+            let [column, row] = found.query.map(|x| ((x * 3.0) as usize).min(2));
+            counts[row * 3 + column] += 1;
+        }
+        let cells = pair.cells.max(1) as f32 / 9.0;
+        Self(counts.map(|count| count as f32 / cells))
+    }
+
+    fn agreement(&self) -> String {
+        let best = self.0.into_iter().fold(0.0, f32::max);
+        let chosen = self.0.map(|share| share >= 0.5 * best);
+        format!("They lie mostly {}.", places(chosen))
+    }
+
+    fn gaps(&self) -> String {
+        let empty = self.0.map(|share| share < 0.03);
+        if empty.contains(&true) {
+            format!("Hardly anything {} found a counterpart.", places(empty))
+        } else {
+            "No part of the picture is without a counterpart.".to_owned()
+        }
+    }
+}
+
+/// Names a choice of ninths: whole strips first, then what is left.
+fn places(chosen: [bool; 9]) -> String {
+    if chosen == [true; 9] {
+        return "all over the picture".to_owned();
+    }
+    let mut left = chosen;
+    let mut names: Vec<String> = Vec::new();
+    for (strip, name) in STRIPS {
+        if strip.iter().all(|&ninth| chosen[ninth]) && strip.iter().any(|&ninth| left[ninth]) {
+            strip.iter().for_each(|&ninth| left[ninth] = false);
+            names.push(name.to_owned());
+        }
+    }
+    let single: Vec<&str> =
+        NINTHS.iter().zip(left).filter(|(_, left)| *left).map(|(name, _)| *name).collect();
+    if !single.is_empty() {
+        names.push(format!("in the {}", list(&single)));
+    }
+    list(&names)
+}
+
+/// `a`, `a and b`, `a, b and c`.
+fn list(names: &[impl AsRef<str>]) -> String {
+    match names {
+        [] => String::new(),
+        [only] => only.as_ref().to_owned(),
+        [first @ .., last] => {
+            let first: Vec<&str> = first.iter().map(AsRef::as_ref).collect();
+            format!("{} and {}", first.join(", "), last.as_ref())
+        }
+    }
+}
+
+/// A motion as a reader sees it; what is too small to be seen is 0.
+struct Changes {
+    /// Percent of the edges, right and down positive.
+    shift: [i32; 2],
+    scale: f32,
+    /// Degrees, clockwise positive.
+    rotation: i32,
+}
+
+impl Changes {
+    fn of(motion: &Motion) -> Self {
+        let visible = |amount: f32, least: f32| {
+            if amount.abs() < least { 0 } else { amount.round() as i32 }
+        };
+        let scale = motion.scale();
+        Self {
+            shift: motion.shift().map(|x| visible(x * 100.0, 2.0)),
+            scale: if (0.95..=1.05).contains(&scale) { 1.0 } else { scale },
+            rotation: visible(motion.rotation(), 3.0),
+        }
+    }
+
+    /// What happened to the regions.
+    fn seen(&self) -> String {
+        let mut seen = Vec::new();
+        let [x, y] = self.shift;
+        if x != 0 {
+            let side = if x < 0 { "left" } else { "right" };
+            seen.push(format!("shifted {} % of the width to the {side}", x.abs()));
+        }
+        if y != 0 {
+            let side = if y < 0 { "up" } else { "down" };
+            seen.push(format!("shifted {} % of the height {side}", y.abs()));
+        }
+        if self.scale > 1.0 {
+            seen.push(format!("became {:.1} times larger", self.scale));
+        } else if self.scale < 1.0 {
+            seen.push(format!("became {:.1} times smaller", 1.0 / self.scale));
+        }
+        if self.rotation != 0 {
+            let way = if self.rotation > 0 { "clockwise" } else { "anticlockwise" };
+            seen.push(format!("turned {}° {way}", self.rotation.abs()));
+        }
+        if seen.is_empty() { "stayed where they were".to_owned() } else { list(&seen) }
+    }
+
+    /// Where the camera must have been. A turn and a step to the side look alike here.
+    fn viewpoint(&self) -> String {
+        let mut from = Vec::new();
+        if self.scale > 1.0 {
+            from.push("closer");
+        } else if self.scale < 1.0 {
+            from.push("farther back");
+        }
+        match self.shift[0] {
+            ..0 => from.push("further right or turned to the right"),
+            0 => {}
+            1.. => from.push("further left or turned to the left"),
+        }
+        if from.is_empty() { String::new() } else { format!("taken from {}", list(&from)) }
+    }
+}

@@ -1,0 +1,179 @@
+//! The one motion that explains most of the agreeing matches, for a reader rather than for the
+//! ranking: parallax makes every single motion an approximation.
+//!
+//! Deterministic: the most telling matches propose a shift at each of a few scales, the proposal
+//! with the most weight behind it wins, and an affine motion is then fitted by iteratively
+//! re-weighted least squares with Tukey's biweight (Holland & Welsch, 1977).
+
+use super::Match;
+use crate::domain::dense::DenseFeatures;
+
+/// Matches that propose a shift.
+const PROPOSERS: usize = 12;
+
+/// Scales that each of them proposes it at: from half to double.
+const SCALES: [f32; 9] = [0.5, 0.6, 0.71, 0.84, 1.0, 1.19, 1.41, 1.68, 2.0];
+
+/// How firmly the fit holds on to the scale of the winning proposal, as a share of the evidence
+/// that matches spread over the whole picture would give.
+const HOLD: f32 = 0.01;
+
+/// The mean square distance from its middle of a coordinate spread evenly over the picture.
+const EVEN_SPREAD: f32 = 1.0 / 12.0;
+
+/// An affine motion from the query to the candidate, both in fractions of the picture's edges.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Motion {
+    /// `[[a, b, c], [d, e, f]]`: `(x, y)` of the query lies at `(a·x + b·y + c, d·x + e·y + f)` of
+    /// the candidate.
+    pub matrix: [[f32; 3]; 2],
+    /// Width over height of the grid of cells, so that a rotation can be told from a shear.
+    pub aspect: f32,
+    /// Matches within tolerance of it.
+    pub support: usize,
+}
+
+impl Motion {
+    /// Nothing moved.
+    fn still(aspect: f32) -> Self {
+        Self { matrix: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], aspect, support: 0 }
+    }
+
+    /// A shift of the picture's centre by `shift` after scaling about it.
+    fn scaled(scale: f32, shift: [f32; 2], aspect: f32) -> Self {
+        let [x, y] = shift.map(|s| s + 0.5 * (1.0 - scale));
+        Self { matrix: [[scale, 0.0, x], [0.0, scale, y]], aspect, support: 0 }
+    }
+
+    /// Where a point of the query lies in the candidate.
+    pub fn apply(&self, point: [f32; 2]) -> [f32; 2] {
+        self.matrix.map(|[a, b, c]| a * point[0] + b * point[1] + c)
+    }
+
+    /// How far the picture's centre moved, `[x, y]` in fractions of the edges; positive is right
+    /// and down.
+    pub fn shift(&self) -> [f32; 2] {
+        self.apply([0.5, 0.5]).map(|x| x - 0.5)
+    }
+
+    /// How many times larger things are in the candidate, along an edge: the square root of the
+    /// change of area.
+    pub fn scale(&self) -> f32 {
+        self.determinant().max(0.0).sqrt()
+    }
+
+    /// How far things turned, in degrees, clockwise positive: the rotation nearest to the linear
+    /// part, once both axes have the same unit.
+    pub fn rotation(&self) -> f32 {
+        let [[a, b, _], [d, e, _]] = self.matrix;
+        (d / self.aspect - b * self.aspect).atan2(a + e).to_degrees()
+    }
+
+    fn determinant(&self) -> f32 {
+        let [[a, b, _], [d, e, _]] = self.matrix;
+        a * e - b * d
+    }
+
+    /// Whether a camera could have caused it: not mirrored, and within a factor of 2.5 in size.
+    fn is_plausible(&self) -> bool {
+        (0.16..=6.25).contains(&self.determinant()) && self.matrix[0][0] > 0.0
+    }
+
+    /// How well it explains a match: 1 on the spot, 0 from `tolerance` on.
+    fn explains(&self, found: &Match, tolerance: [f32; 2]) -> f32 {
+        let at = self.apply(found.query);
+        let [x, y] = [0, 1].map(|axis| (at[axis] - found.candidate[axis]) / tolerance[axis]);
+        let inside = (1.0 - x * x - y * y).max(0.0);
+        inside * inside
+    }
+}
+
+/// Fits the motion to `matches`, most telling first, of which each counts by its weight.
+pub(super) fn fit(
+    matches: &[Match],
+    weights: &[f32],
+    tolerance: [f32; 2],
+    query: &DenseFeatures,
+    rounds: usize,
+) -> Motion {
+    let aspect = query.width() as f32 / query.height() as f32;
+    let mut motion = propose(matches, weights, tolerance, aspect);
+    for _ in 0..rounds {
+        match improve(&motion, matches, weights, tolerance) {
+            Some(better) if better.is_plausible() => motion = better,
+            _ => break,
+        }
+    }
+    motion.support = matches.iter().filter(|m| motion.explains(m, tolerance) > 0.0).count();
+    motion
+}
+
+fn propose(matches: &[Match], weights: &[f32], tolerance: [f32; 2], aspect: f32) -> Motion {
+    let mut best = (0.0, Motion::still(aspect));
+    for proposer in matches.iter().take(PROPOSERS) {
+        for scale in SCALES {
+            let shift = [0, 1]
+                .map(|axis| proposer.candidate[axis] - 0.5 - scale * (proposer.query[axis] - 0.5));
+            let motion = Motion::scaled(scale, shift, aspect);
+            let backing: f32 = matches
+                .iter()
+                .zip(weights)
+                .map(|(found, weight)| weight * motion.explains(found, tolerance))
+                .sum();
+            if backing > best.0 {
+                best = (backing, motion);
+            }
+        }
+    }
+    best.1
+}
+
+/// One round of weighted least squares for the correction that `motion` needs. Coordinates are
+/// taken from the picture's centre, so that size and shift hardly depend on each other.
+fn improve(
+    motion: &Motion,
+    matches: &[Match],
+    weights: &[f32],
+    tolerance: [f32; 2],
+) -> Option<Motion> {
+    let mut normal = [[0.0f32; 3]; 3];
+    let mut right = [[0.0f32; 2]; 3];
+    for (found, weight) in matches.iter().zip(weights) {
+        let weight = weight * motion.explains(found, tolerance);
+        let at = motion.apply(found.query);
+        let error = [0, 1].map(|axis| found.candidate[axis] - at[axis]);
+        let basis = [found.query[0] - 0.5, found.query[1] - 0.5, 1.0];
+        for i in 0..3 {
+            for j in 0..3 {
+                normal[i][j] += weight * basis[i] * basis[j];
+            }
+            for axis in 0..2 {
+                right[i][axis] += weight * basis[i] * error[axis];
+            }
+        }
+    }
+    let hold = HOLD * EVEN_SPREAD * normal[2][2];
+    normal[0][0] += hold;
+    normal[1][1] += hold;
+    let inverse = inverse(normal)?;
+
+    let mut better = *motion;
+    for (axis, row) in better.matrix.iter_mut().enumerate() {
+        let [da, db, dc] =
+            inverse.map(|line| line.iter().zip(&right).map(|(i, r)| i * r[axis]).sum::<f32>());
+        *row = [row[0] + da, row[1] + db, row[2] + dc - 0.5 * (da + db)];
+    }
+    Some(better)
+}
+
+/// The inverse of a symmetric 3×3 matrix by its cofactors; `None` where there is none.
+fn inverse(m: [[f32; 3]; 3]) -> Option<[[f32; 3]; 3]> {
+    let cofactor = |i: usize, j: usize| {
+        let [r0, r1] = [(i + 1) % 3, (i + 2) % 3];
+        let [c0, c1] = [(j + 1) % 3, (j + 2) % 3];
+        m[r0][c0] * m[r1][c1] - m[r0][c1] * m[r1][c0]
+    };
+    let determinant: f32 = (0..3).map(|j| m[0][j] * cofactor(0, j)).sum();
+    (determinant > f32::MIN_POSITIVE)
+        .then(|| [0, 1, 2].map(|i| [0, 1, 2].map(|j| cofactor(j, i) / determinant)))
+}

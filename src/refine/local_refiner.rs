@@ -1,0 +1,178 @@
+//! The refiner `local`: fetches what the matcher needs, and turns its findings into a ranking.
+
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+
+use super::local::{LocalMatcher, PairMatch, describe, rank};
+use super::{DenseCache, RefineError, Refinement, Refiner};
+use crate::domain::{
+    Candidate, DenseFeatures, Description, DescriptorKind, Digest, Map, Ranking, RefinerKind, Usage,
+};
+use crate::retrieve::{CpuPool, ExtractError, Extractor};
+use crate::store::{BlobStore, JobRecord, MapStore};
+
+/// Geometric matching of dense features, on this machine.
+pub struct LocalRefiner {
+    /// Where the candidates' records are.
+    pub maps: Arc<dyn MapStore>,
+    /// Where their bytes are.
+    pub blobs: Arc<dyn BlobStore>,
+    /// Makes dense features that the cache has lost.
+    pub extractor: Arc<Extractor>,
+    /// Dense features.
+    pub dense: Arc<DenseCache>,
+    /// Where matching runs.
+    pub pool: CpuPool,
+    /// Compares.
+    pub matcher: LocalMatcher,
+}
+
+/// A picture whose dense features are known, or whose bytes are.
+enum Source {
+    Dense(Arc<DenseFeatures>),
+    Bytes(Digest, Bytes),
+}
+
+#[async_trait]
+impl Refiner for LocalRefiner {
+    fn kind(&self) -> RefinerKind {
+        RefinerKind::Local
+    }
+
+    async fn refine(&self, record: &JobRecord) -> Result<Refinement, RefineError> {
+        let map = match self.maps.map(&record.job.map).await? {
+            Some(map) if map.uid == record.map_uid => map,
+            _ => return Err(RefineError::Hopeless("the map was removed".into())),
+        };
+        let query = self
+            .source(record.query.digest)
+            .await?
+            .ok_or_else(|| RefineError::Hopeless("the frame is missing from the store".into()))?;
+        let mut present = Vec::new();
+        let mut sources = Vec::new();
+        for (index, candidate) in record.candidates.iter().enumerate() {
+            if let Some(source) = self.candidate_source(&map, candidate).await? {
+                present.push(index);
+                sources.push(source);
+            }
+        }
+        let (extractor, dense, matcher) =
+            (Arc::clone(&self.extractor), Arc::clone(&self.dense), self.matcher.clone());
+        let pairs = self
+            .pool
+            .run(move || compare(&extractor, &dense, &matcher, query, sources))
+            .await
+            .map_err(|error| RefineError::Passing(error.to_string()))??;
+        conclude(&record.candidates, &present, &pairs)
+    }
+}
+
+impl LocalRefiner {
+    async fn candidate_source(
+        &self,
+        map: &Map,
+        candidate: &Candidate,
+    ) -> Result<Option<Source>, RefineError> {
+        match self.maps.image(map, &candidate.image_id).await? {
+            Some(image) => self.source(image.digest).await,
+            None => Ok(None),
+        }
+    }
+
+    async fn source(&self, digest: Digest) -> Result<Option<Source>, RefineError> {
+        if let Some(features) = self.dense.get(&digest) {
+            return Ok(Some(Source::Dense(features)));
+        }
+        let bytes = self.blobs.blob(&digest).await?;
+        Ok(bytes.map(|bytes| Source::Bytes(digest, bytes)))
+    }
+}
+
+/// Extracts what is missing and compares; blocks.
+fn compare(
+    extractor: &Extractor,
+    dense: &DenseCache,
+    matcher: &LocalMatcher,
+    query: Source,
+    candidates: Vec<Source>,
+) -> Result<Vec<PairMatch>, RefineError> {
+    let features = |source: Source| match source {
+        Source::Dense(features) => Ok(features),
+        Source::Bytes(digest, bytes) => {
+            let extraction = extractor
+                .extract(&bytes, DescriptorKind::Gem)
+                .map_err(|error: ExtractError| RefineError::Passing(error.to_string()))?;
+            let features = Arc::new(extraction.dense);
+            dense.insert(digest, Arc::clone(&features));
+            Ok(features)
+        }
+    };
+    let query = features(query)?;
+    let candidates =
+        candidates.into_iter().map(features).collect::<Result<Vec<_>, RefineError>>()?;
+    let candidates: Vec<&DenseFeatures> = candidates.iter().map(AsRef::as_ref).collect();
+    matcher
+        .compare_all(&query, &candidates)
+        .map_err(|error| RefineError::Hopeless(error.to_string()))
+}
+
+/// Orders those that could be compared, and puts those that are gone behind them.
+fn conclude(
+    candidates: &[Candidate],
+    present: &[usize],
+    pairs: &[PairMatch],
+) -> Result<Refinement, RefineError> {
+    let compared: Vec<usize> = rank(pairs).into_iter().map(|place| present[place]).collect();
+    let gone = (0..candidates.len()).filter(|index| !present.contains(index));
+    let order: Vec<usize> = compared.iter().copied().chain(gone).collect();
+    let ranking = Ranking::new(candidates, &order)
+        .map_err(|error| RefineError::Hopeless(error.to_string()))?;
+    let missing = candidates.len() - present.len();
+    Ok(Refinement {
+        descriptions: present
+            .iter()
+            .zip(pairs)
+            .map(|(&index, pair)| Description {
+                image_id: candidates[index].image_id.clone(),
+                text: describe(pair),
+                cached: false,
+                usage: Usage::default(),
+            })
+            .collect(),
+        reasoning: reasoning(candidates, present, pairs, &compared),
+        ranking,
+        usage: Usage::default(),
+        degraded: (missing > 0).then(|| {
+            format!("{missing} of {} candidates were removed from the map", candidates.len())
+        }),
+    })
+}
+
+/// One sentence on why the first is the first.
+fn reasoning(
+    candidates: &[Candidate],
+    present: &[usize],
+    pairs: &[PairMatch],
+    order: &[usize],
+) -> Option<String> {
+    let score = |index: usize| {
+        let place = present.iter().position(|&known| known == index)?;
+        pairs.get(place).map(|pair| pair.score * 100.0)
+    };
+    let first = *order.first()?;
+    let best = format!(
+        "{} shares the most with the frame: {:.1} % of the frame's regions speak for it",
+        candidates[first].image_id,
+        score(first)?
+    );
+    Some(match order.get(1) {
+        Some(&second) => format!(
+            "{best}, against {:.1} % for {}, the next best.",
+            score(second)?,
+            candidates[second].image_id
+        ),
+        None => format!("{best}."),
+    })
+}

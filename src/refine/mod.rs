@@ -1,0 +1,67 @@
+//! The vision-language refiner: compares a query with each of its candidates, puts what agrees and
+//! what differs into words, and orders the candidates anew.
+//!
+//! A [`Refiner`] does this for one job; the [`Worker`] takes jobs from the queue and hands them to
+//! it. [`LocalRefiner`] compares dense features on this machine.
+
+mod dense_cache;
+pub mod local;
+mod local_refiner;
+mod worker;
+
+use async_trait::async_trait;
+
+pub use dense_cache::DenseCache;
+pub use local_refiner::LocalRefiner;
+pub use worker::{Worker, WorkerSettings};
+
+use crate::domain::{Description, Ranking, RefinerKind, Usage};
+use crate::store::{JobRecord, StoreError};
+
+/// Compares and orders the candidates of one job.
+#[async_trait]
+pub trait Refiner: Send + Sync {
+    /// Which refiner this is.
+    fn kind(&self) -> RefinerKind;
+    /// Refines one job. Dropping the call stops it.
+    async fn refine(&self, record: &JobRecord) -> Result<Refinement, RefineError>;
+}
+
+/// What a refiner found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Refinement {
+    /// One text for each candidate that could be compared, in coarse order.
+    pub descriptions: Vec<Description>,
+    /// The new order.
+    pub ranking: Ranking,
+    /// Why it is so.
+    pub reasoning: Option<String>,
+    /// What it cost.
+    pub usage: Usage,
+    /// Why part of the order is the coarse one, if it is.
+    pub degraded: Option<String>,
+}
+
+/// Why there is no refinement.
+#[derive(Debug, thiserror::Error)]
+pub enum RefineError {
+    /// Trying again would change nothing.
+    #[error("{0}")]
+    Hopeless(String),
+    /// It may work the next time.
+    #[error("{0}")]
+    Passing(String),
+}
+
+impl From<StoreError> for RefineError {
+    fn from(error: StoreError) -> Self {
+        match error {
+            StoreError::NotFound(_) | StoreError::Conflict(_) | StoreError::Damaged(_) => {
+                Self::Hopeless(error.to_string())
+            }
+            StoreError::QueueFull { .. } | StoreError::Failed(_) => {
+                Self::Passing(error.to_string())
+            }
+        }
+    }
+}

@@ -1,0 +1,154 @@
+//! The worker: takes a job, has it refined, writes down how it ended.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+use tokio::sync::broadcast::error::RecvError;
+use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
+
+use super::{RefineError, Refinement, Refiner};
+use crate::domain::{Job, JobState};
+use crate::store::{JobRecord, JobStore, StoreError};
+use crate::telemetry::Metrics;
+
+/// Bounds on a worker's patience.
+#[derive(Debug, Clone, Copy)]
+pub struct WorkerSettings {
+    /// How long a job is held without a sign of life.
+    pub lease: Duration,
+    /// The longest a job may take.
+    pub timeout: Duration,
+    /// How often a job is tried.
+    pub attempts: u32,
+}
+
+/// Refines one job after another.
+pub struct Worker {
+    /// The queue.
+    pub jobs: Arc<dyn JobStore>,
+    /// Who refines.
+    pub refiner: Arc<dyn Refiner>,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
+    /// Its patience.
+    pub settings: WorkerSettings,
+}
+
+/// Why a refinement was given up.
+enum Stopped {
+    Failed(RefineError),
+    Cancelled,
+    ShuttingDown,
+}
+
+impl Worker {
+    /// Works until `shutdown`. A job in progress then goes back to the queue.
+    pub async fn run(&self, shutdown: CancellationToken) {
+        let mut changes = self.jobs.changes();
+        while !shutdown.is_cancelled() {
+            match self.step(&shutdown).await {
+                Ok(true) => continue,
+                Ok(false) => {}
+                Err(error) => tracing::error!(%error, "the job queue cannot be worked on"),
+            }
+            // A notice wakes the worker at once; the pause finds jobs whose lease ran out.
+            let pause = tokio::time::sleep(self.settings.lease.min(Duration::from_secs(5)));
+            tokio::select! {
+                () = shutdown.cancelled() => {}
+                () = pause => {}
+                _ = changes.recv() => {}
+            }
+        }
+    }
+
+    /// Takes one job and sees it through; `false` if none waits.
+    pub async fn step(&self, shutdown: &CancellationToken) -> Result<bool, StoreError> {
+        let now = Timestamp::now();
+        let lease = SignedDuration::try_from(self.settings.lease).unwrap_or(SignedDuration::MAX);
+        let until = now.saturating_add(lease).unwrap_or(Timestamp::MAX);
+        let Some(record) = self.jobs.claim(now, until).await? else { return Ok(false) };
+        let job = record.job.clone();
+        match self.refine(&record, shutdown).await {
+            Ok(refinement) => self.end(succeeded(job, refinement)).await?,
+            Err(Stopped::Cancelled) => {}
+            Err(Stopped::ShuttingDown) => {
+                self.jobs.release(job.id, "the server was stopped".into()).await?;
+            }
+            Err(Stopped::Failed(RefineError::Passing(why)))
+                if job.attempts < self.settings.attempts =>
+            {
+                tracing::warn!(job = %job.id, attempt = job.attempts, why, "a job is tried again");
+                self.jobs.release(job.id, why).await?;
+            }
+            Err(Stopped::Failed(error)) => self.end(failed(job, &error)).await?,
+        }
+        Ok(true)
+    }
+
+    async fn refine(
+        &self,
+        record: &JobRecord,
+        shutdown: &CancellationToken,
+    ) -> Result<Refinement, Stopped> {
+        let timeout = self.settings.timeout;
+        tokio::select! {
+            () = shutdown.cancelled() => Err(Stopped::ShuttingDown),
+            () = self.cancelled(record.job.id) => Err(Stopped::Cancelled),
+            outcome = tokio::time::timeout(timeout, self.refiner.refine(record)) => match outcome {
+                Ok(refined) => refined.map_err(Stopped::Failed),
+                Err(_) => Err(Stopped::Failed(RefineError::Passing(format!(
+                    "it took longer than {} s (jobs.timeout_s)",
+                    timeout.as_secs()
+                )))),
+            },
+        }
+    }
+
+    /// Returns when the job has been cancelled.
+    async fn cancelled(&self, id: Uuid) {
+        let mut changes = self.jobs.changes();
+        loop {
+            let look = match changes.recv().await {
+                Ok(changed) => changed == id,
+                Err(RecvError::Lagged(_)) => true,
+                Err(RecvError::Closed) => return std::future::pending().await,
+            };
+            if look
+                && let Ok(Some(record)) = self.jobs.job(id).await
+                && record.job.state == JobState::Cancelled
+            {
+                return;
+            }
+        }
+    }
+
+    async fn end(&self, job: Job) -> Result<(), StoreError> {
+        self.metrics.job_ended(&job);
+        self.jobs.finish(job).await
+    }
+}
+
+fn succeeded(job: Job, refinement: Refinement) -> Job {
+    let Refinement { descriptions, ranking, reasoning, usage, degraded } = refinement;
+    Job {
+        state: if degraded.is_some() { JobState::Degraded } else { JobState::Succeeded },
+        finished_at: Some(Timestamp::now()),
+        descriptions,
+        ranking: Some(ranking),
+        reasoning,
+        usage,
+        error: degraded,
+        ..job
+    }
+}
+
+fn failed(job: Job, error: &RefineError) -> Job {
+    Job {
+        state: JobState::Failed,
+        finished_at: Some(Timestamp::now()),
+        error: Some(error.to_string()),
+        ..job
+    }
+}

@@ -1,0 +1,55 @@
+//! Approximate search: an HNSW graph (Malkov and Yashunin, 2018) built by `hnsw_rs`.
+
+use hnsw_rs::prelude::{Distance, FilterT, Hnsw};
+
+use super::{Found, IndexSettings, exact};
+
+/// One minus the dot product of unit vectors.
+///
+/// The crate's own `DistDot` panics on a dot product slightly above 1, which rounding produces.
+#[derive(Clone, Copy, Default)]
+struct CosineDistance;
+
+impl Distance<f32> for CosineDistance {
+    fn eval(&self, a: &[f32], b: &[f32]) -> f32 {
+        (1.0 - exact::dot(a, b)).max(0.0)
+    }
+}
+
+pub(super) struct Graph {
+    hnsw: Hnsw<'static, f32, CosineDistance>,
+}
+
+impl Graph {
+    pub fn new(settings: &IndexSettings) -> Self {
+        // The number of elements is a hint for the first allocation, not a bound.
+        const EXPECTED: usize = 16_384;
+        const LAYERS: usize = 16;
+        let hnsw =
+            Hnsw::new(settings.m, EXPECTED, LAYERS, settings.ef_construction, CosineDistance);
+        Self { hnsw }
+    }
+
+    pub fn insert(&self, slot: usize, vector: &[f32]) {
+        self.hnsw.insert((vector, slot));
+    }
+
+    /// The `k` nearest among the slots that `keep` lets through.
+    pub fn search(
+        &self,
+        query: &[f32],
+        k: usize,
+        ef: usize,
+        keep: &dyn Fn(usize) -> bool,
+    ) -> Vec<Found> {
+        let filter = |slot: &usize| keep(*slot);
+        self.hnsw
+            .search_filter(query, k, ef, Some(&filter as &dyn FilterT))
+            .into_iter()
+            .map(|neighbour| Found {
+                slot: neighbour.d_id,
+                similarity: 1.0 - neighbour.distance,
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,263 @@
+//! The manifest: what a TOML file beside an ONNX file says about it.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use crate::domain::{DescriptorKind, Digest};
+
+/// All that is needed to feed a model and to pool what comes out.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// The name by which maps refer to the model.
+    pub name: String,
+    /// One sentence for people.
+    #[serde(default)]
+    pub description: String,
+    /// The ONNX file, beside the manifest.
+    pub file: PathBuf,
+    /// The digest that the file must have, if pinned.
+    pub sha256: Option<Digest>,
+    /// The licence of the weights.
+    pub licence: String,
+    /// Where the weights come from.
+    pub source: String,
+    /// What goes in.
+    pub input: Input,
+    /// What comes out.
+    pub output: Output,
+    /// How the output becomes a descriptor.
+    pub pooling: Pooling,
+}
+
+/// The input tensor: N × 3 × height × width, RGB.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Input {
+    /// Its name in the graph.
+    pub name: String,
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// How a picture of another shape is fitted.
+    pub resize: Resize,
+    /// The filter; both are antialiased.
+    pub interpolation: Interpolation,
+    /// Both edges are multiples of this many pixels.
+    pub multiple: u32,
+    /// Subtracted from each channel after scaling to 0..1.
+    pub mean: [f32; 3],
+    /// Divides each channel after that.
+    pub std: [f32; 3],
+}
+
+/// How a picture is fitted to the input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Resize {
+    /// Stretch to width × height.
+    Squash,
+    /// Cut the largest centred part of the right shape, then scale it.
+    CentreCrop,
+    /// Keep the shape; the longer edge becomes the longer of width and height at the most, and
+    /// both edges are rounded to multiples.
+    LongestEdge,
+}
+
+/// The resampling filter.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Interpolation {
+    /// Keys' cubic convolution with a = −0.5, as Pillow and torchvision use when antialiasing.
+    Bicubic,
+    /// The triangle filter.
+    Bilinear,
+}
+
+/// The output tensors.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Output {
+    /// The name of the local features in the graph.
+    pub features: String,
+    /// How they are laid out.
+    pub layout: Layout,
+    /// The name of the N × 1 × h × w reliability map, if the model has one.
+    pub reliability: Option<String>,
+    /// Numbers for each local feature.
+    pub channels: usize,
+    /// Input pixels for each cell, in both directions (the patch size of a transformer).
+    pub stride: u32,
+    /// Register tokens between the `[CLS]` token and the patches.
+    #[serde(default)]
+    pub registers: usize,
+    /// Whether a `[CLS]` token leads.
+    #[serde(default)]
+    pub cls: bool,
+}
+
+/// How local features are laid out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Layout {
+    /// N × channels × h × w.
+    Map,
+    /// N × (cls + registers + h·w) × channels, patches row by row.
+    Tokens,
+}
+
+/// How local features become a descriptor.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pooling {
+    /// The exponent of the generalised mean.
+    pub gem_p: f32,
+    /// Rows and columns of the spatial grid; `[1, 1]` pools the whole picture at once.
+    pub grid: [usize; 2],
+    /// Numbers in the GeM descriptor: channels × rows × columns.
+    pub dimension: usize,
+}
+
+/// Why a manifest cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ManifestError {
+    /// The file cannot be read.
+    #[error("cannot read {path}: {source}; `make build` puts the built-in model in place")]
+    Read {
+        /// The manifest.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file is not a manifest.
+    #[error("{path} is not a model manifest: {detail}")]
+    Malformed {
+        /// The manifest.
+        path: PathBuf,
+        /// What the reader said.
+        detail: String,
+    },
+    /// The numbers contradict each other.
+    #[error("{path}: {detail}")]
+    Inconsistent {
+        /// The manifest.
+        path: PathBuf,
+        /// Which ones, and how.
+        detail: String,
+    },
+}
+
+impl Manifest {
+    /// Reads and checks `manifest.toml` in a model's folder.
+    pub fn read(path: &Path) -> Result<Self, ManifestError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| ManifestError::Read { path: path.to_owned(), source })?;
+        Self::parse(&text, path)
+    }
+
+    /// Reads a manifest from its text; `path` is for messages.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, ManifestError> {
+        let manifest: Self = toml::from_str(text).map_err(|error| ManifestError::Malformed {
+            path: path.to_owned(),
+            detail: error.to_string(),
+        })?;
+        match manifest.contradiction() {
+            Some(detail) => Err(ManifestError::Inconsistent { path: path.to_owned(), detail }),
+            None => Ok(manifest),
+        }
+    }
+
+    /// Numbers in a descriptor of the given kind; `None` if the model cannot make one.
+    pub fn dimension(&self, kind: DescriptorKind) -> Option<usize> {
+        match kind {
+            DescriptorKind::Gem => Some(self.pooling.dimension),
+            DescriptorKind::Cls => self.output.cls.then_some(self.output.channels),
+        }
+    }
+
+    fn contradiction(&self) -> Option<String> {
+        const LARGEST_EDGE: u32 = 4096;
+        const MOST_CHANNELS: usize = 1 << 14;
+        let (input, output, pooling) = (&self.input, &self.output, &self.pooling);
+        let [rows, columns] = pooling.grid;
+        if self.file.components().count() != 1 || self.file.file_name().is_none() {
+            return Some("file must be a plain file name beside the manifest".into());
+        }
+        if input.multiple == 0 || output.stride == 0 {
+            return Some("input.multiple and output.stride must be at least 1".into());
+        }
+        if !(1..=MOST_CHANNELS).contains(&output.channels) {
+            return Some(format!("output.channels must be 1 to {MOST_CHANNELS}"));
+        }
+        for (edge, pixels) in [("width", input.width), ("height", input.height)] {
+            if pixels == 0 || pixels > LARGEST_EDGE || pixels % input.multiple != 0 {
+                return Some(format!(
+                    "input.{edge} = {pixels} must be a multiple of {} up to {LARGEST_EDGE}",
+                    input.multiple
+                ));
+            }
+        }
+        if input.multiple % output.stride != 0 {
+            return Some("input.multiple must be a multiple of output.stride".into());
+        }
+        if rows == 0 || columns == 0 || rows * columns > 1024 {
+            return Some("pooling.grid must have 1 to 1024 parts".into());
+        }
+        if pooling.dimension != output.channels * rows * columns {
+            return Some(format!(
+                "pooling.dimension is {}, but channels × rows × columns is {}",
+                pooling.dimension,
+                output.channels * rows * columns
+            ));
+        }
+        if !(pooling.gem_p > 0.0 && pooling.gem_p.is_finite()) {
+            return Some("pooling.gem_p must be above 0".into());
+        }
+        if input.std.iter().any(|&s| !(s > 0.0)) {
+            return Some("input.std must be above 0".into());
+        }
+        if output.layout == Layout::Map && (output.cls || output.registers > 0) {
+            return Some("a map layout has neither a [CLS] token nor registers".into());
+        }
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const XFEAT: &str = include_str!("../../deploy/models/xfeat.toml");
+
+    fn parse(text: &str) -> Result<Manifest, ManifestError> {
+        Manifest::parse(text, Path::new("manifest.toml"))
+    }
+
+    #[test]
+    fn the_built_in_manifest_is_consistent() {
+        let manifest = parse(XFEAT).unwrap();
+        assert_eq!(manifest.dimension(DescriptorKind::Gem), Some(576));
+        assert_eq!(manifest.dimension(DescriptorKind::Cls), None);
+    }
+
+    #[test]
+    fn contradictions_are_named() {
+        for (from, to, named) in [
+            ("dimension = 576", "dimension = 64", "dimension"),
+            ("width = 320", "width = 321", "width"),
+            ("file = \"model.onnx\"", "file = \"../model.onnx\"", "file"),
+            ("gem_p = 3.0", "gem_p = 0.0", "gem_p"),
+            ("cls = false", "cls = true", "CLS"),
+        ] {
+            let error = parse(&XFEAT.replace(from, to)).unwrap_err().to_string();
+            assert!(error.contains(named), "{to}: {error}");
+        }
+    }
+
+    #[test]
+    fn an_unknown_key_is_refused() {
+        assert!(parse(&format!("colour = 1\n{XFEAT}")).is_err());
+    }
+}

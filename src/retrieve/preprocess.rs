@@ -1,0 +1,187 @@
+//! Pixels to the input tensor that a manifest asks for.
+
+use fast_image_resize::images::{ImageRef, Image as Canvas};
+use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
+use image::RgbImage;
+
+use super::manifest::{Input, Interpolation, Resize};
+
+/// One picture as a model takes it: 3 × height × width, RGB planes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tensor {
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// `3 * height * width` numbers, plane by plane.
+    pub data: Vec<f32>,
+}
+
+/// Why a picture could not be resized.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot resize a picture of {width}×{height} pixels: {reason}")]
+pub struct PreprocessError {
+    width: u32,
+    height: u32,
+    reason: String,
+}
+
+/// Fits a picture to the input, with an antialiased filter, and normalises its channels.
+pub fn preprocess(pixels: &RgbImage, input: &Input) -> Result<Tensor, PreprocessError> {
+    let (width, height) = target_size(pixels.dimensions(), input);
+    let resized = resize(pixels, width, height, input)?;
+    let plane = width as usize * height as usize;
+    let mut data = vec![0.0; 3 * plane];
+    for (channel, out) in data.chunks_exact_mut(plane).enumerate() {
+        // One multiplication and one addition: x / 255, minus mean, over std.
+        let scale = 1.0 / (255.0 * input.std[channel]);
+        let offset = -input.mean[channel] / input.std[channel];
+        for (value, pixel) in out.iter_mut().zip(resized.chunks_exact(3)) {
+            *value = f32::from(pixel[channel]) * scale + offset;
+        }
+    }
+    Ok(Tensor { height: height as usize, width: width as usize, data })
+}
+
+/// Scales a picture so that neither edge exceeds `max_edge`; a smaller one stays as it is.
+pub fn shrink_to(pixels: &RgbImage, max_edge: u32) -> Result<RgbImage, PreprocessError> {
+    let (width, height) = pixels.dimensions();
+    let longest = width.max(height);
+    if longest <= max_edge {
+        return Ok(pixels.clone());
+    }
+    let scaled = |edge: u32| {
+        let exact = f64::from(edge) * f64::from(max_edge) / f64::from(longest);
+        (exact.round() as u32).max(1)
+    };
+    let (to_width, to_height) = (scaled(width), scaled(height));
+    let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(FilterType::CatmullRom));
+    let buffer = run_resize(pixels, to_width, to_height, &options)?;
+    RgbImage::from_raw(to_width, to_height, buffer)
+        .ok_or_else(|| failure(pixels, "the resized buffer has the wrong size"))
+}
+
+fn target_size((width, height): (u32, u32), input: &Input) -> (u32, u32) {
+    if input.resize != Resize::LongestEdge {
+        return (input.width, input.height);
+    }
+    let longest = f64::from(input.width.max(input.height));
+    let scale = longest / f64::from(width.max(height).max(1));
+    let multiple = f64::from(input.multiple);
+    let fit = |edge: u32| {
+        let cells = (f64::from(edge) * scale / multiple).round().max(1.0);
+        ((cells * multiple).min(longest)) as u32
+    };
+    (fit(width), fit(height))
+}
+
+fn resize(
+    pixels: &RgbImage,
+    width: u32,
+    height: u32,
+    input: &Input,
+) -> Result<Vec<u8>, PreprocessError> {
+    if pixels.dimensions() == (width, height) {
+        return Ok(pixels.as_raw().clone());
+    }
+    let filter = match input.interpolation {
+        Interpolation::Bicubic => FilterType::CatmullRom,
+        Interpolation::Bilinear => FilterType::Bilinear,
+    };
+    let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(filter));
+    let options = match input.resize {
+        Resize::CentreCrop => options.fit_into_destination(Some((0.5, 0.5))),
+        Resize::Squash | Resize::LongestEdge => options,
+    };
+    run_resize(pixels, width, height, &options)
+}
+
+fn run_resize(
+    pixels: &RgbImage,
+    width: u32,
+    height: u32,
+    options: &ResizeOptions,
+) -> Result<Vec<u8>, PreprocessError> {
+    let source =
+        ImageRef::new(pixels.width(), pixels.height(), pixels.as_raw(), PixelType::U8x3)
+            .map_err(|error| failure(pixels, &error.to_string()))?;
+    let mut canvas = Canvas::new(width, height, PixelType::U8x3);
+    Resizer::new()
+        .resize(&source, &mut canvas, options)
+        .map_err(|error| failure(pixels, &error.to_string()))?;
+    Ok(canvas.into_vec())
+}
+
+fn failure(pixels: &RgbImage, reason: &str) -> PreprocessError {
+    PreprocessError {
+        width: pixels.width(),
+        height: pixels.height(),
+        reason: reason.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::Rgb;
+
+    fn input(resize: Resize) -> Input {
+        Input {
+            name: "image".into(),
+            width: 32,
+            height: 16,
+            resize,
+            interpolation: Interpolation::Bicubic,
+            multiple: 8,
+            mean: [0.5, 0.0, 0.0],
+            std: [0.5, 1.0, 1.0],
+        }
+    }
+
+    #[test]
+    fn channels_are_normalised_plane_by_plane() {
+        let grey = RgbImage::from_pixel(32, 16, Rgb([255, 51, 0]));
+        let tensor = preprocess(&grey, &input(Resize::Squash)).unwrap();
+        assert_eq!(tensor.data.len(), 3 * 32 * 16);
+        let plane = |c: usize| tensor.data[c * 512];
+        assert!((plane(0) - 1.0).abs() < 1e-6);
+        assert!((plane(1) - 0.2).abs() < 1e-6);
+        assert_eq!(plane(2), 0.0);
+    }
+
+    #[test]
+    fn a_crop_keeps_the_centre_and_the_shape() {
+        let mut wide = RgbImage::from_pixel(96, 16, Rgb([0, 0, 0]));
+        for x in 32..64 {
+            for y in 0..16 {
+                wide.put_pixel(x, y, Rgb([0, 255, 0]));
+            }
+        }
+        let tensor = preprocess(&wide, &input(Resize::CentreCrop)).unwrap();
+        assert!(tensor.data[512..1024].iter().all(|&green| green == 1.0));
+    }
+
+    #[test]
+    fn the_longest_edge_bounds_a_picture_of_any_shape() {
+        let shape = |width, height| target_size((width, height), &input(Resize::LongestEdge));
+        assert_eq!(shape(640, 480), (32, 24));
+        assert_eq!(shape(480, 640), (24, 32));
+        assert_eq!(shape(10_000, 1), (32, 8));
+        assert_eq!(shape(1, 1), (32, 32));
+    }
+
+    #[test]
+    fn downsizing_averages_instead_of_skipping() {
+        let stripes = RgbImage::from_fn(320, 160, |x, _| Rgb([if x % 2 == 0 { 0 } else { 255 }; 3]));
+        let tensor = preprocess(&stripes, &input(Resize::Squash)).unwrap();
+        assert!(tensor.data[512..].iter().all(|&value| (value - 0.5).abs() < 0.05));
+    }
+
+    #[test]
+    fn shrinking_keeps_the_shape_and_never_enlarges() {
+        let picture = RgbImage::new(400, 100);
+        assert_eq!(shrink_to(&picture, 200).unwrap().dimensions(), (200, 50));
+        assert_eq!(shrink_to(&picture, 800).unwrap().dimensions(), (400, 100));
+        assert_eq!(shrink_to(&picture, 1).unwrap().dimensions(), (1, 1));
+    }
+}

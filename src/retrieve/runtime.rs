@@ -1,0 +1,101 @@
+//! Where ONNX Runtime and the installed models are found.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use ort::environment::Environment;
+
+/// The folder that `make build` fills: `onnxruntime/` and `models/`.
+#[derive(Debug, Clone)]
+pub struct Assets {
+    candidates: Vec<PathBuf>,
+}
+
+/// Why ONNX Runtime or a model is not there.
+#[derive(Debug, thiserror::Error)]
+pub enum RuntimeError {
+    /// No shared library was found.
+    #[error(
+        "ONNX Runtime was not found ({looked}); run `make build` in the checkout, or set \
+         ORT_DYLIB_PATH to a libonnxruntime of version 1.24 or later"
+    )]
+    NoLibrary {
+        /// The places that were looked at.
+        looked: String,
+    },
+    /// The library does not load.
+    #[error("ONNX Runtime at {path} cannot be loaded: {reason}; `make build` installs one that can")]
+    Library {
+        /// The library.
+        path: PathBuf,
+        /// What the loader said.
+        reason: String,
+    },
+    /// No such model is installed.
+    #[error("the model {name:?} is not installed ({looked}); `make build` installs \"xfeat\"")]
+    NoModel {
+        /// The model.
+        name: String,
+        /// The places that were looked at.
+        looked: String,
+    },
+}
+
+impl Assets {
+    /// The folder given, or else the usual places: `assets` beside the binary or two folders
+    /// above it (a checkout's `target/release`), then `/usr/lib/whereabouts`.
+    pub fn locate(configured: Option<&Path>) -> Self {
+        let candidates = match configured {
+            Some(path) => vec![path.to_owned()],
+            None => std::env::current_exe()
+                .ok()
+                .iter()
+                .flat_map(|binary| binary.ancestors().skip(1).take(4))
+                .map(|folder| folder.join("assets"))
+                .chain([PathBuf::from("/usr/lib/whereabouts")])
+                .collect(),
+        };
+        Self { candidates }
+    }
+
+    /// The folder of the model called `name`.
+    pub fn model(&self, name: &str) -> Result<PathBuf, RuntimeError> {
+        let plain = !name.is_empty() && !name.contains(['/', '\\']) && name != "..";
+        let folders = self.candidates.iter().map(|folder| folder.join("models").join(name));
+        folders
+            .into_iter()
+            .find(|folder| plain && folder.join("manifest.toml").is_file())
+            .ok_or_else(|| RuntimeError::NoModel { name: name.to_owned(), looked: self.looked() })
+    }
+
+    /// Loads ONNX Runtime: `ORT_DYLIB_PATH` if set, else the library among the assets.
+    pub fn load_onnxruntime(&self) -> Result<Arc<Environment>, RuntimeError> {
+        let path = self.onnxruntime()?;
+        let failed = |reason: String| RuntimeError::Library { path: path.clone(), reason };
+        let environment = ort::init_from(&path)
+            .map_err(|error| failed(error.to_string()))?
+            .with_name("whereabouts")
+            .with_telemetry(false)
+            .build()
+            .map_err(|error| failed(error.to_string()))?;
+        Ok(Arc::new(environment))
+    }
+
+    fn onnxruntime(&self) -> Result<PathBuf, RuntimeError> {
+        if let Some(path) = std::env::var_os("ORT_DYLIB_PATH").filter(|path| !path.is_empty()) {
+            return Ok(path.into());
+        }
+        let name =
+            format!("{}onnxruntime{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
+        self.candidates
+            .iter()
+            .map(|folder| folder.join("onnxruntime").join(&name))
+            .find(|path| path.is_file())
+            .ok_or_else(|| RuntimeError::NoLibrary { looked: self.looked() })
+    }
+
+    fn looked(&self) -> String {
+        let places: Vec<_> = self.candidates.iter().map(|path| path.display().to_string()).collect();
+        format!("looked in {}", places.join(", "))
+    }
+}

@@ -1,0 +1,210 @@
+//! Reference images: add, list, show, remove.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use utoipa::ToSchema;
+
+use super::{Service, ServiceError};
+use crate::domain::{Digest, Image, ImageId, Map, MapName, MediaType, Pose};
+use crate::retrieve::{decode, preprocess};
+use crate::store::Added;
+
+/// What a caller says about an image.
+#[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ImageMeta {
+    /// Its id; without one, the head of the digest of its bytes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub id: Option<String>,
+    /// Where it was taken from, in the frame of the map.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<Pose>)]
+    pub pose: Option<Value>,
+    /// When it was taken.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub captured_at: Option<Timestamp>,
+    /// Up to 32 words, each up to 64 characters.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub tags: Vec<String>,
+}
+
+/// An image to add.
+#[derive(Debug)]
+pub struct NewImage {
+    /// Its bytes: JPEG, PNG or WebP.
+    pub bytes: Bytes,
+    /// What the caller says about it.
+    pub meta: ImageMeta,
+}
+
+/// Some images, by id.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct ImagePage {
+    /// The images.
+    pub images: Vec<Image>,
+    /// Where the next page starts: `cursor=` of the next request. Null on the last page.
+    pub next_cursor: Option<String>,
+}
+
+impl Service {
+    /// Stores an image with its descriptor.
+    pub async fn add_image(&self, map: &MapName, new: NewImage) -> Result<Added, ServiceError> {
+        let map = self.searchable_map(map).await?;
+        let meta = CheckedMeta::new(new.meta, &map)?;
+        if new.bytes.is_empty() {
+            return Err(empty_body());
+        }
+        let extraction = self.extract(new.bytes.clone(), map.descriptor).await?;
+        let digest = Digest::of(&new.bytes);
+        let image = Image {
+            id: meta.id.unwrap_or_else(|| ImageId::from_digest(&digest)),
+            digest,
+            pose: meta.pose,
+            captured_at: meta.captured_at,
+            tags: meta.tags,
+            media_type: extraction.media_type,
+            width: extraction.width,
+            height: extraction.height,
+            created_at: Timestamp::now(),
+        };
+        let _pin = self.blobs.put_blob(digest, new.bytes).await?;
+        Ok(self.maps.add_image(&map, image, extraction.descriptor).await?)
+    }
+
+    /// One image.
+    pub async fn get_image(&self, map: &MapName, id: &ImageId) -> Result<Image, ServiceError> {
+        let map = self.known_map(map).await?;
+        self.maps.image(&map, id).await?.ok_or_else(|| no_image(&map.name, id))
+    }
+
+    /// Images by id, a page at a time.
+    pub async fn list_images(
+        &self,
+        map: &MapName,
+        cursor: Option<&ImageId>,
+        limit: Option<usize>,
+    ) -> Result<ImagePage, ServiceError> {
+        let limit = page_size(limit)?;
+        let map = self.known_map(map).await?;
+        let mut images = self.maps.images(&map, cursor, limit + 1).await?;
+        let next_cursor = (images.len() > limit)
+            .then(|| images.get(limit - 1).map(|image| image.id.to_string()))
+            .flatten();
+        images.truncate(limit);
+        Ok(ImagePage { images, next_cursor })
+    }
+
+    /// The picture itself: as it was sent, or as a JPEG no larger than `max_edge` pixels.
+    pub async fn image_content(
+        &self,
+        map: &MapName,
+        id: &ImageId,
+        max_edge: Option<u32>,
+    ) -> Result<(MediaType, Bytes), ServiceError> {
+        let image = self.get_image(map, id).await?;
+        let bytes = self.blobs.blob(&image.digest).await?.ok_or_else(|| {
+            ServiceError::new(
+                super::ErrorKind::Internal,
+                format!("the bytes of {id} ({}) are missing from the store", image.digest),
+            )
+        })?;
+        let Some(max_edge) = max_edge else { return Ok((image.media_type, bytes)) };
+        if !(16..=4096).contains(&max_edge) {
+            return Err(ServiceError::unprocessable("max_edge must be between 16 and 4096 pixels"));
+        }
+        let limits = self.extractor.limits();
+        let jpeg = self
+            .on_pool(move || {
+                let picture = decode::decode(&bytes, limits)?;
+                let small = preprocess::shrink_to(&picture.pixels, max_edge)?;
+                Ok(decode::encode_jpeg(&small)?)
+            })
+            .await?;
+        Ok((MediaType::Jpeg, jpeg.into()))
+    }
+
+    /// Removes an image.
+    pub async fn delete_image(&self, map: &MapName, id: &ImageId) -> Result<(), ServiceError> {
+        let map = self.known_map(map).await?;
+        match self.maps.delete_image(&map, id).await? {
+            true => Ok(()),
+            false => Err(no_image(&map.name, id)),
+        }
+    }
+
+    pub(super) async fn extract(
+        &self,
+        bytes: Bytes,
+        kind: crate::domain::DescriptorKind,
+    ) -> Result<crate::retrieve::Extraction, ServiceError> {
+        let (extractor, metrics) = (Arc::clone(&self.extractor), Arc::clone(&self.metrics));
+        self.on_pool(move || {
+            let extraction = extractor.extract(&bytes, kind)?;
+            metrics.observe_stages(extraction.times);
+            Ok(extraction)
+        })
+        .await
+    }
+
+    async fn on_pool<T, F>(&self, work: F) -> Result<T, ServiceError>
+    where
+        T: Send + 'static,
+        F: FnOnce() -> Result<T, crate::retrieve::ExtractError> + Send + 'static,
+    {
+        use crate::retrieve::PoolError;
+        match self.pool.run(work).await {
+            Ok(result) => Ok(result?),
+            Err(PoolError::Overloaded(overloaded)) => Err(overloaded.into()),
+            Err(error @ PoolError::BrokeOff) => {
+                Err(ServiceError::new(super::ErrorKind::Internal, error.to_string()))
+            }
+        }
+    }
+}
+
+/// What remains of [`ImageMeta`] when it is in order.
+struct CheckedMeta {
+    id: Option<ImageId>,
+    pose: Option<Pose>,
+    captured_at: Option<Timestamp>,
+    tags: Vec<String>,
+}
+
+impl CheckedMeta {
+    fn new(meta: ImageMeta, map: &Map) -> Result<Self, ServiceError> {
+        let too_many = meta.tags.len() > 32;
+        if too_many || meta.tags.iter().any(|tag| tag.is_empty() || tag.chars().count() > 64) {
+            return Err(ServiceError::unprocessable(
+                "an image has at most 32 tags, each of 1 to 64 characters",
+            ));
+        }
+        Ok(Self {
+            id: meta.id.map(|id| id.parse()).transpose()?,
+            pose: meta.pose.map(|pose| Pose::from_json(map.frame, pose)).transpose()?,
+            captured_at: meta.captured_at,
+            tags: meta.tags,
+        })
+    }
+}
+
+pub(super) fn empty_body() -> ServiceError {
+    ServiceError::malformed(
+        "the body is empty; send the bytes of a picture, for example with curl --data-binary \
+         @frame.jpg",
+    )
+}
+
+pub(super) fn page_size(limit: Option<usize>) -> Result<usize, ServiceError> {
+    match limit.unwrap_or(100) {
+        limit @ 1..=1000 => Ok(limit),
+        _ => Err(ServiceError::unprocessable("limit must be between 1 and 1000")),
+    }
+}
+
+fn no_image(map: &MapName, id: &ImageId) -> ServiceError {
+    ServiceError::not_found(format!("there is no image {:?} in the map {map}", id.as_str()))
+}

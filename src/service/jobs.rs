@@ -1,0 +1,101 @@
+//! Jobs: look at them, wait for them, cancel and retry them.
+
+use std::time::Duration;
+
+use serde::Serialize;
+use tokio::sync::broadcast::Receiver;
+use tokio::sync::broadcast::error::RecvError;
+use utoipa::ToSchema;
+use uuid::Uuid;
+
+use super::images::page_size;
+use super::{ErrorKind, Service, ServiceError};
+use crate::domain::Job;
+use crate::store::JobFilter;
+
+/// Some jobs, newest first.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct JobPage {
+    /// The jobs.
+    pub jobs: Vec<Job>,
+    /// Where the next page starts: `cursor=` of the next request. Null on the last page.
+    pub next_cursor: Option<Uuid>,
+}
+
+impl Service {
+    /// One job, at once or when it has ended, but after `wait` at the latest.
+    pub async fn get_job(&self, id: Uuid, wait: Option<Duration>) -> Result<Job, ServiceError> {
+        match wait {
+            Some(wait) if wait > self.settings.max_wait => {
+                Err(ServiceError::unprocessable(format!(
+                    "wait must be at most {} seconds",
+                    self.settings.max_wait.as_secs()
+                )))
+            }
+            Some(wait) => self.wait_for(id, wait).await,
+            None => self.known_job(id).await,
+        }
+    }
+
+    /// Jobs, newest first, a page at a time.
+    pub async fn list_jobs(
+        &self,
+        filter: JobFilter,
+        cursor: Option<Uuid>,
+        limit: Option<usize>,
+    ) -> Result<JobPage, ServiceError> {
+        let limit = page_size(limit)?;
+        let mut jobs = self.jobs.jobs(&filter, cursor, limit + 1).await?;
+        let more = jobs.len() > limit;
+        jobs.truncate(limit);
+        let next_cursor = jobs.last().filter(|_| more).map(|job| job.id);
+        Ok(JobPage { jobs, next_cursor })
+    }
+
+    /// Cancels a job; one that has ended stays as it is.
+    pub async fn cancel_job(&self, id: Uuid) -> Result<Job, ServiceError> {
+        Ok(self.jobs.cancel(id).await?)
+    }
+
+    /// Queues a job again that ended without success.
+    pub async fn retry_job(&self, id: Uuid) -> Result<Job, ServiceError> {
+        Ok(self.jobs.retry(id).await?)
+    }
+
+    /// Waits until the job has ended, but no longer than `longest`; the job as it then is.
+    pub(super) async fn wait_for(&self, id: Uuid, longest: Duration) -> Result<Job, ServiceError> {
+        let mut changes = self.jobs.changes();
+        let ended = async {
+            loop {
+                let job = self.known_job(id).await?;
+                if job.state.is_final() {
+                    return Ok(job);
+                }
+                // Other jobs change too; only this one's change is worth a look.
+                while next_change(&mut changes).await?.is_some_and(|changed| changed != id) {}
+            }
+        };
+        match tokio::time::timeout(longest, ended).await {
+            Ok(job) => job,
+            Err(_) => self.known_job(id).await,
+        }
+    }
+
+    async fn known_job(&self, id: Uuid) -> Result<Job, ServiceError> {
+        match self.jobs.job(id).await? {
+            Some(record) => Ok(record.job),
+            None => Err(ServiceError::not_found(format!("there is no job {id}"))),
+        }
+    }
+}
+
+/// The next job that changes; `None` if notices were lost, any of which may have been the one.
+async fn next_change(changes: &mut Receiver<Uuid>) -> Result<Option<Uuid>, ServiceError> {
+    match changes.recv().await {
+        Ok(id) => Ok(Some(id)),
+        Err(RecvError::Lagged(_)) => Ok(None),
+        Err(RecvError::Closed) => {
+            Err(ServiceError::new(ErrorKind::Unavailable, "the store has been closed"))
+        }
+    }
+}

@@ -1,0 +1,213 @@
+//! Localize a frame: extract, search, answer, and queue its refinement.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use bytes::Bytes;
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use uuid::Uuid;
+
+use super::images::empty_body;
+use super::{ErrorKind, Service, ServiceError};
+use crate::domain::{Candidate, Digest, ImageId, Job, JobState, Map, MapName, Pose};
+use crate::retrieve::index::SearchMode;
+use crate::store::{JobRecord, Query, StoreError};
+
+/// What becomes of the candidates after the first answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum RefineMode {
+    /// A job refines them; the answer does not wait.
+    #[default]
+    Async,
+    /// A job refines them; the answer waits for it, and its estimate follows the refined order.
+    Wait,
+    /// Nothing.
+    Off,
+}
+
+/// A frame to localize.
+#[derive(Debug)]
+pub struct LocalizeRequest {
+    /// In which map.
+    pub map: MapName,
+    /// How many candidates to answer; by default the configured number.
+    pub k: Option<usize>,
+    /// What becomes of them.
+    pub refine: RefineMode,
+    /// The bytes of the frame: JPEG, PNG or WebP.
+    pub frame: Bytes,
+}
+
+/// Where the frame was probably taken.
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
+pub struct Answer {
+    /// The id of this query.
+    pub query_id: Uuid,
+    /// The map.
+    pub map: MapName,
+    /// The model that made the descriptor.
+    pub model: String,
+    /// The most similar images, best first.
+    pub candidates: Vec<Candidate>,
+    /// The best guess; null in an empty map.
+    #[schema(nullable)]
+    pub estimate: Option<Estimate>,
+    /// The refinement; null if there is none.
+    #[schema(nullable)]
+    pub job: Option<JobLink>,
+    /// How long the stages took.
+    pub timing_ms: TimingMs,
+}
+
+/// The best guess of where the frame was taken.
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
+pub struct Estimate {
+    /// The image that shows the place.
+    pub image_id: ImageId,
+    /// Its pose, if known.
+    pub pose: Option<Pose>,
+    /// The image's cosine similarity to the frame, from 0 (none) to 1.
+    pub confidence: f32,
+    /// Whether the confidence reaches the configured bound, below which the place is probably not
+    /// in the map.
+    pub known: bool,
+}
+
+/// Where to find a job.
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
+pub struct JobLink {
+    /// Its id.
+    pub id: Uuid,
+    /// Its address.
+    pub href: String,
+    /// How far it has come.
+    pub state: JobState,
+}
+
+/// How long the stages of an answer took, in milliseconds.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize, ToSchema)]
+pub struct TimingMs {
+    /// Decoding and resizing.
+    pub decode: f64,
+    /// Inference and pooling, including the wait for a free session.
+    pub extract: f64,
+    /// Search.
+    pub search: f64,
+    /// Everything until the answer, including the wait for a free thread and for the disk.
+    pub total: f64,
+}
+
+impl Service {
+    /// Answers with the most similar images and queues their refinement.
+    pub async fn localize(&self, request: LocalizeRequest) -> Result<Answer, ServiceError> {
+        let start = Instant::now();
+        let k = self.checked_k(request.k)?;
+        let map = self.searchable_map(&request.map).await?;
+        if request.frame.is_empty() {
+            return Err(empty_body());
+        }
+        let refined = request.refine != RefineMode::Off && self.refiner.is_some();
+        if refined && self.jobs.queued().await? >= self.settings.job_queue {
+            // Before any work is done: a robot that needs no job asks without one.
+            return Err(StoreError::QueueFull { limit: self.settings.job_queue }.into());
+        }
+        let extraction = self.extract(request.frame.clone(), map.descriptor).await?;
+        let searching = Instant::now();
+        let wanted = if refined { k.max(self.settings.candidates) } else { k };
+        let mut candidates =
+            self.maps.search(&map, extraction.descriptor, wanted, SearchMode::Fast).await?;
+        let searched = searching.elapsed();
+        self.metrics.observe_search(searched);
+
+        let query_id = Uuid::now_v7();
+        let mut job = None;
+        if refined && !candidates.is_empty() {
+            let query = Query {
+                id: query_id,
+                digest: Digest::of(&request.frame),
+                media_type: extraction.media_type,
+                created_at: Timestamp::now(),
+            };
+            self.dense.insert(query.digest, Arc::new(extraction.dense));
+            let compared = candidates.iter().take(self.settings.candidates).cloned().collect();
+            job = Some(self.submit(&map, query, compared, request.frame).await?);
+        }
+        candidates.truncate(k);
+        let mut estimate = candidates.first().map(|best| self.estimate(best));
+        if request.refine == RefineMode::Wait
+            && let Some(queued) = &mut job
+        {
+            *queued = self.wait_for(queued.id, self.settings.max_wait).await?;
+            estimate = self.refined_estimate(queued, &candidates).or(estimate);
+        }
+        let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
+        Ok(Answer {
+            query_id,
+            map: map.name,
+            model: map.model,
+            candidates,
+            estimate,
+            job: job.map(|job| JobLink {
+                id: job.id,
+                href: format!("/jobs/{}", job.id),
+                state: job.state,
+            }),
+            timing_ms: TimingMs {
+                decode: ms(extraction.times.decode),
+                extract: ms(extraction.times.extract),
+                search: ms(searched),
+                total: ms(start.elapsed()),
+            },
+        })
+    }
+
+    fn checked_k(&self, k: Option<usize>) -> Result<usize, ServiceError> {
+        let k = k.unwrap_or(self.settings.k);
+        if (1..=self.settings.max_k).contains(&k) {
+            return Ok(k);
+        }
+        Err(ServiceError::unprocessable(format!(
+            "k is {k}; it must be between 1 and {}",
+            self.settings.max_k
+        )))
+    }
+
+    fn estimate(&self, best: &Candidate) -> Estimate {
+        Estimate {
+            image_id: best.image_id.clone(),
+            pose: best.pose,
+            confidence: best.similarity.max(0.0),
+            known: best.similarity >= self.settings.known_similarity,
+        }
+    }
+
+    /// The refined first place; only if it is among the candidates answered has it a similarity
+    /// to report.
+    fn refined_estimate(&self, job: &Job, candidates: &[Candidate]) -> Option<Estimate> {
+        let first = job.ranking.as_ref()?.first()?;
+        let best = candidates.iter().find(|candidate| candidate.image_id == first.image_id)?;
+        Some(self.estimate(best))
+    }
+
+    async fn submit(
+        &self,
+        map: &Map,
+        query: Query,
+        candidates: Vec<Candidate>,
+        frame: Bytes,
+    ) -> Result<Job, ServiceError> {
+        let Some(refiner) = &self.refiner else {
+            return Err(ServiceError::new(ErrorKind::Internal, "there is no refiner"));
+        };
+        let job = Job::queued(map.name.clone(), query.id, refiner.kind(), query.created_at);
+        let record =
+            JobRecord { job: job.clone(), map_uid: map.uid, query, candidates };
+        let _pin = self.blobs.put_blob(record.query.digest, frame).await?;
+        self.jobs.submit(record, self.settings.job_queue).await?;
+        self.metrics.job_submitted();
+        Ok(job)
+    }
+}

@@ -1,0 +1,62 @@
+//! The use cases: what a request means, whoever brings it.
+//!
+//! HTTP and the command line convert to and from these calls and decide nothing. A [`Service`]
+//! knows the stores by their traits alone.
+
+mod error;
+mod images;
+mod jobs;
+mod localize;
+mod maps;
+
+use std::sync::Arc;
+
+pub use self::error::{ErrorKind, ServiceError};
+pub use self::images::{ImageMeta, ImagePage, NewImage};
+pub use self::jobs::JobPage;
+pub use self::localize::{Answer, Estimate, JobLink, LocalizeRequest, RefineMode, TimingMs};
+pub use self::maps::{MapChange, MapState};
+use crate::refine::DenseCache;
+use crate::refine::Refiner;
+use crate::retrieve::{CpuPool, Extractor};
+use crate::store::{BlobStore, JobStore, MapStore};
+use crate::telemetry::Metrics;
+
+/// Bounds and defaults of the use cases.
+#[derive(Debug, Clone)]
+pub struct ServiceSettings {
+    /// Candidates in an answer by default.
+    pub k: usize,
+    /// Candidates in an answer at the most.
+    pub max_k: usize,
+    /// The least similarity of a known place.
+    pub known_similarity: f32,
+    /// Candidates that a job compares.
+    pub candidates: usize,
+    /// Jobs that may wait or run.
+    pub job_queue: usize,
+    /// The longest wait for a job.
+    pub max_wait: std::time::Duration,
+}
+
+/// Everything a use case needs.
+pub struct Service {
+    /// Maps, images, descriptors.
+    pub maps: Arc<dyn MapStore>,
+    /// Image bytes.
+    pub blobs: Arc<dyn BlobStore>,
+    /// Jobs.
+    pub jobs: Arc<dyn JobStore>,
+    /// The model.
+    pub extractor: Arc<Extractor>,
+    /// Where decoding and inference run.
+    pub pool: CpuPool,
+    /// Who refines, if anybody.
+    pub refiner: Option<Arc<dyn Refiner>>,
+    /// Dense features that a job will need soon.
+    pub dense: Arc<DenseCache>,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
+    /// Bounds and defaults.
+    pub settings: ServiceSettings,
+}

@@ -1,0 +1,162 @@
+//! The only place where everything is wired: build, serve, drain.
+
+use std::net::SocketAddr;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use tokio::net::TcpListener;
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+
+use crate::config::{Config, Refiner as ConfiguredRefiner};
+use crate::http::{AppState, HttpSettings, router};
+use crate::refine::local::{LocalMatcher, LocalSettings};
+use crate::refine::{DenseCache, LocalRefiner, Refiner, Worker, WorkerSettings};
+use crate::retrieve::index::IndexSettings;
+use crate::retrieve::{Assets, CpuPool, Extractor, ExtractorSettings, ImageLimits};
+use crate::service::{Service, ServiceSettings};
+use crate::store::JobStore;
+use crate::store::embedded::{EmbeddedSettings, EmbeddedStore};
+use crate::telemetry::Metrics;
+
+/// Serves on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200.
+pub async fn serve(
+    config: Config,
+    listener: TcpListener,
+    shutdown: CancellationToken,
+    on_ready: impl FnOnce(SocketAddr) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    let address = listener.local_addr().context("the listener has no address")?;
+    let metrics = Arc::new(Metrics::new());
+    let state = AppState::new(http_settings(&config), Arc::clone(&metrics));
+    let server = {
+        let (router, shutdown) = (router(state.clone()), shutdown.clone());
+        tokio::spawn(async move {
+            axum::serve(listener, router).with_graceful_shutdown(shutdown.cancelled_owned()).await
+        })
+    };
+    let drain_timeout = config.server.drain_timeout();
+    let building = tokio::task::spawn_blocking(move || build(&config, metrics));
+    let (service, workers) = building.await.context("the start broke off")??;
+    state.set_ready(Arc::new(service));
+    let mut running = JoinSet::new();
+    for worker in workers {
+        let shutdown = shutdown.clone();
+        running.spawn(async move { worker.run(shutdown).await });
+    }
+    on_ready(address)?;
+    tracing::info!(%address, "ready");
+
+    shutdown.cancelled().await;
+    tracing::info!("draining");
+    state.set_draining();
+    let drained = async {
+        let served = server.await;
+        while running.join_next().await.is_some() {}
+        served
+    };
+    match tokio::time::timeout(drain_timeout, drained).await {
+        Ok(served) => served.context("the server broke off")?.context("the server failed")?,
+        Err(_) => tracing::warn!(
+            seconds = drain_timeout.as_secs(),
+            "requests were still in progress when the drain timed out"
+        ),
+    }
+    tracing::info!("stopped");
+    Ok(())
+}
+
+fn http_settings(config: &Config) -> HttpSettings {
+    HttpSettings {
+        body_limit_bytes: config.server.body_limit_bytes,
+        request_timeout: config.server.request_timeout(),
+        max_wait: Duration::from_secs(config.jobs.max_wait_s),
+        max_requests: config.server.max_requests,
+    }
+}
+
+/// Opens the store, loads the model, and puts the service together. Blocks.
+fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec<Worker>)> {
+    let store = Arc::new(EmbeddedStore::open(&EmbeddedSettings {
+        dir: config.data.dir.clone(),
+        index: IndexSettings {
+            exact_up_to: config.index.exact_up_to,
+            m: config.index.m,
+            ef_construction: config.index.ef_construction,
+            ef_search: config.index.ef_search,
+        },
+        db_cache_bytes: config.data.db_cache_bytes,
+        commit_batch: config.data.commit_batch,
+    })?);
+    let extractor = Arc::new(load_model(config)?);
+    let pool = CpuPool::new("frames", threads_or(config.image.threads, 2), config.image.queue)?;
+    let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
+    let refiner: Option<Arc<dyn Refiner>> = match config.refine.refiner {
+        ConfiguredRefiner::Off => None,
+        ConfiguredRefiner::Local => Some(Arc::new(LocalRefiner {
+            maps: store.clone(),
+            blobs: store.clone(),
+            extractor: Arc::clone(&extractor),
+            dense: Arc::clone(&dense),
+            pool: CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?,
+            matcher: LocalMatcher::new(LocalSettings::default()),
+        })),
+    };
+    let jobs: Arc<dyn JobStore> = store.clone();
+    let workers = refiner.iter().flat_map(|refiner| {
+        (0..config.jobs.workers).map(|_| Worker {
+            jobs: Arc::clone(&jobs),
+            refiner: Arc::clone(refiner),
+            metrics: Arc::clone(&metrics),
+            settings: WorkerSettings {
+                lease: Duration::from_secs(config.jobs.lease_s),
+                timeout: Duration::from_secs(config.jobs.timeout_s),
+                attempts: config.jobs.attempts,
+            },
+        })
+    });
+    let workers = workers.collect();
+    let service = Service {
+        maps: store.clone(),
+        blobs: store.clone(),
+        jobs,
+        extractor,
+        pool,
+        refiner,
+        dense,
+        metrics,
+        settings: ServiceSettings {
+            k: config.localize.k,
+            max_k: config.localize.max_k,
+            known_similarity: config.localize.known_similarity,
+            candidates: config.refine.candidates,
+            job_queue: config.jobs.queue,
+            max_wait: Duration::from_secs(config.jobs.max_wait_s),
+        },
+    };
+    Ok((service, workers))
+}
+
+fn load_model(config: &Config) -> anyhow::Result<Extractor> {
+    let configured = Some(config.model.assets.as_path()).filter(|path| *path != Path::new(""));
+    let settings = ExtractorSettings {
+        model: config.model.name.clone(),
+        sessions: config.model.sessions,
+        threads: threads_or(config.model.threads, 1),
+        max_batch: config.model.max_batch,
+        limits: ImageLimits { max_pixels: config.image.max_pixels },
+    };
+    let extractor = Extractor::load(&Assets::locate(configured), &settings)?;
+    tracing::info!(model = extractor.manifest().name, digest = %extractor.digest(), "model loaded");
+    Ok(extractor)
+}
+
+/// The configured number of threads, or so many for each core.
+fn threads_or(configured: usize, for_each_core: usize) -> usize {
+    match configured {
+        0 => std::thread::available_parallelism().map_or(1, usize::from) * for_each_core,
+        threads => threads,
+    }
+}

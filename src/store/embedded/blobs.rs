@@ -1,0 +1,109 @@
+//! Image bytes in a content-addressed folder: `images/ab/cdef…`, named by their SHA-256.
+
+use std::collections::HashMap;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytes::Bytes;
+
+use super::super::StoreError;
+use super::make_folder;
+use super::trees::Trees;
+use crate::domain::Digest;
+
+/// The folder. Clones share it.
+#[derive(Clone)]
+pub(super) struct Blobs {
+    dir: PathBuf,
+    /// Bytes that were put and may not be referred to yet, with how many callers wait for that.
+    pinned: Arc<Mutex<HashMap<Digest, usize>>>,
+}
+
+/// Keeps bytes from being removed while it lives.
+pub(super) struct Pin {
+    digest: Digest,
+    pinned: Arc<Mutex<HashMap<Digest, usize>>>,
+}
+
+impl Drop for Pin {
+    fn drop(&mut self) {
+        let mut pinned = self.pinned.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(count) = pinned.get_mut(&self.digest) {
+            *count -= 1;
+            if *count == 0 {
+                pinned.remove(&self.digest);
+            }
+        }
+    }
+}
+
+impl Blobs {
+    pub fn open(dir: PathBuf) -> Result<Self, StoreError> {
+        make_folder(&dir)?;
+        Ok(Self { dir, pinned: Arc::default() })
+    }
+
+    /// Stores bytes durably; the pin is taken first, so that nobody removes them in between.
+    pub fn put(&self, digest: Digest, bytes: &Bytes) -> Result<Pin, StoreError> {
+        *self.pinned.lock().unwrap_or_else(PoisonError::into_inner).entry(digest).or_insert(0) += 1;
+        let pin = Pin { digest, pinned: Arc::clone(&self.pinned) };
+        let path = self.path(&digest);
+        // Bytes of the right length under this name were whole when they were renamed to it.
+        if fs::metadata(&path).is_ok_and(|found| found.len() == bytes.len() as u64) {
+            return Ok(pin);
+        }
+        write_durably(&path, bytes).map_err(|error| {
+            StoreError::Failed(format!("cannot store {}: {error}", path.display()))
+        })?;
+        Ok(pin)
+    }
+
+    pub fn get(&self, digest: &Digest) -> Result<Option<Bytes>, StoreError> {
+        match fs::read(self.path(digest)) {
+            Ok(bytes) => Ok(Some(bytes.into())),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(StoreError::Failed(format!("cannot read {digest}: {error}"))),
+        }
+    }
+
+    /// Removes bytes that nobody needs any more. What cannot be removed stays as rubbish, which
+    /// harms nobody.
+    pub fn remove_unreferenced(&self, digest: &Digest, trees: &Trees) {
+        let pinned = self.pinned.lock().unwrap_or_else(PoisonError::into_inner);
+        if pinned.contains_key(digest) || !trees.is_unreferenced(digest) {
+            return;
+        }
+        if let Err(error) = fs::remove_file(self.path(digest)) {
+            tracing::warn!(%digest, %error, "cannot remove image bytes");
+        }
+    }
+
+    fn path(&self, digest: &Digest) -> PathBuf {
+        let hex = digest.hex();
+        self.dir.join(&hex[..2]).join(&hex[2..])
+    }
+}
+
+fn write_durably(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let folder = path.parent().ok_or_else(|| io::Error::other("no parent folder"))?;
+    if !folder.is_dir() {
+        fs::create_dir_all(folder)?;
+        if let Some(above) = folder.parent() {
+            File::open(above)?.sync_all()?;
+        }
+    }
+    // A name of its own, so that two writers of the same bytes do not meet.
+    let beside = path.with_extension(format!("{}.tmp", uuid::Uuid::now_v7().simple()));
+    let written = File::create(&beside).and_then(|mut file| {
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&beside, path)?;
+        File::open(folder)?.sync_all()
+    });
+    if written.is_err() {
+        let _ = fs::remove_file(&beside);
+    }
+    written
+}

@@ -1,0 +1,60 @@
+//! The thread that brings graphs up to date behind the backs of searches.
+
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Weak};
+use std::thread;
+
+use super::super::StoreError;
+use super::live_map::LiveMap;
+
+/// Slots put into a graph before the next map has its turn.
+const TURN: usize = 64;
+
+/// Builds graphs in the background.
+pub(super) struct Indexer {
+    wake: SyncSender<Weak<LiveMap>>,
+}
+
+impl Indexer {
+    pub fn start() -> Result<Self, StoreError> {
+        let (wake, maps) = sync_channel(1024);
+        thread::Builder::new()
+            .name("indexer".into())
+            .spawn(move || run(&maps))
+            .map_err(|error| StoreError::Failed(error.to_string()))?;
+        Ok(Self { wake })
+    }
+
+    /// Asks for a map to be brought up to date.
+    pub fn look_at(&self, map: &Arc<LiveMap>) {
+        if !map.index.is_behind() {
+            return;
+        }
+        match self.wake.try_send(Arc::downgrade(map)) {
+            // So many notices wait that this map's next image will bring another.
+            Ok(()) | Err(TrySendError::Full(_)) => {}
+            Err(TrySendError::Disconnected(_)) => tracing::error!("the indexer has stopped"),
+        }
+    }
+}
+
+fn run(wake: &Receiver<Weak<LiveMap>>) {
+    let mut behind: Vec<Weak<LiveMap>> = Vec::new();
+    loop {
+        if behind.is_empty() {
+            let Ok(map) = wake.recv() else { return };
+            behind.push(map);
+        }
+        for map in wake.try_iter() {
+            if !behind.iter().any(|known| known.ptr_eq(&map)) {
+                behind.push(map);
+            }
+        }
+        behind.retain(|map| {
+            map.upgrade().is_some_and(|map| {
+                map.index.catch_up(map.vectors.as_ref(), TURN);
+                map.index.is_behind()
+            })
+        });
+    }
+}

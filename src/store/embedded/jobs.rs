@@ -1,0 +1,242 @@
+//! Jobs and their queue.
+//!
+//! A job that has not ended has an entry in the `queue` tree, whose value says until when a worker
+//! holds it. Ids are UUIDs of version 7, so that key order is the order of submission.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use async_trait::async_trait;
+use jiff::Timestamp;
+use sled::Transactional;
+use tokio::sync::broadcast;
+use uuid::Uuid;
+
+use super::super::{JobFilter, JobRecord, JobStore, StoreError};
+use super::trees::{
+    BlobOwner, Lease, Trees, blob_ref_key, decode, encode, failed, put, transaction_failed,
+};
+use super::{EmbeddedStore, blocking};
+use crate::domain::{Job, JobState};
+
+impl EmbeddedStore {
+    /// Applies a change to one job and tells the listeners.
+    async fn change<F>(&self, id: Uuid, change: F) -> Result<Job, StoreError>
+    where
+        F: FnOnce(&Trees, JobRecord) -> Result<JobRecord, StoreError> + Send + 'static,
+    {
+        let inner = Arc::clone(&self.inner);
+        self.inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    let record = trees.job(id)?.ok_or_else(|| no_job(id))?;
+                    let (before, record) = (record.job.state, change(trees, record)?);
+                    Ok((before, record.job))
+                },
+                move |(before, job)| {
+                    match (before.is_final(), job.state.is_final()) {
+                        (false, true) => inner.queued.fetch_sub(1, Ordering::Relaxed),
+                        (true, false) => inner.queued.fetch_add(1, Ordering::Relaxed),
+                        _ => 0,
+                    };
+                    let _ = inner.changes.send(id);
+                },
+            )
+            .await
+            .map(|(_, job)| job)
+    }
+}
+
+#[async_trait]
+impl JobStore for EmbeddedStore {
+    async fn submit(&self, record: JobRecord, limit: usize) -> Result<(), StoreError> {
+        let (inner, id) = (Arc::clone(&self.inner), record.job.id);
+        let counting = Arc::clone(&self.inner);
+        self.inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    // Counted here, on the writer thread, so that no two submissions share the
+                    // last place.
+                    if counting.queued.fetch_add(1, Ordering::Relaxed) >= limit {
+                        counting.queued.fetch_sub(1, Ordering::Relaxed);
+                        return Err(StoreError::QueueFull { limit });
+                    }
+                    insert_job(trees, &record).inspect_err(|_| {
+                        counting.queued.fetch_sub(1, Ordering::Relaxed);
+                    })
+                },
+                move |()| {
+                    let _ = inner.changes.send(id);
+                },
+            )
+            .await
+    }
+
+    async fn queued(&self) -> Result<usize, StoreError> {
+        Ok(self.inner.queued.load(Ordering::Relaxed))
+    }
+
+    async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {
+        let inner = Arc::clone(&self.inner);
+        blocking(move || inner.trees.job(id)).await
+    }
+
+    async fn jobs(
+        &self,
+        filter: &JobFilter,
+        before: Option<Uuid>,
+        limit: usize,
+    ) -> Result<Vec<Job>, StoreError> {
+        let (inner, filter) = (Arc::clone(&self.inner), filter.clone());
+        blocking(move || {
+            let end = before.unwrap_or(Uuid::max());
+            let matches = |job: &Job| {
+                filter.map.as_ref().is_none_or(|map| *map == job.map)
+                    && filter.state.is_none_or(|state| state == job.state)
+            };
+            inner
+                .trees
+                .jobs
+                .range(..end.as_bytes().to_vec())
+                .rev()
+                .map(|entry| Ok(decode::<JobRecord>(&entry.map_err(failed)?.1)?.job))
+                .filter(|job: &Result<Job, StoreError>| job.as_ref().map_or(true, matches))
+                .take(limit)
+                .collect()
+        })
+        .await
+    }
+
+    async fn claim(
+        &self,
+        now: Timestamp,
+        lease_until: Timestamp,
+    ) -> Result<Option<JobRecord>, StoreError> {
+        let inner = Arc::clone(&self.inner);
+        self.inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    let Some(mut record) = next_waiting(trees, now)? else { return Ok(None) };
+                    record.job.state = JobState::Running;
+                    record.job.started_at.get_or_insert(now);
+                    record.job.attempts += 1;
+                    write_job(trees, &record, Some(Some(lease_until)))?;
+                    Ok(Some(record))
+                },
+                move |claimed: &Option<JobRecord>| {
+                    if let Some(record) = claimed {
+                        let _ = inner.changes.send(record.job.id);
+                    }
+                },
+            )
+            .await
+    }
+
+    async fn release(&self, id: Uuid, why: String) -> Result<(), StoreError> {
+        self.change(id, move |trees, mut record| {
+            if record.job.state == JobState::Running {
+                record.job.state = JobState::Queued;
+                record.job.error = Some(why);
+                write_job(trees, &record, Some(None))?;
+            }
+            Ok(record)
+        })
+        .await
+        .map(drop)
+    }
+
+    async fn finish(&self, job: Job) -> Result<(), StoreError> {
+        self.change(job.id, move |trees, mut record| {
+            if record.job.state == JobState::Running {
+                record.job = job;
+                write_job(trees, &record, None)?;
+            }
+            Ok(record)
+        })
+        .await
+        .map(drop)
+    }
+
+    async fn cancel(&self, id: Uuid) -> Result<Job, StoreError> {
+        self.change(id, move |trees, mut record| {
+            if !record.job.state.is_final() {
+                record.job.state = JobState::Cancelled;
+                record.job.finished_at = Some(Timestamp::now());
+                write_job(trees, &record, None)?;
+            }
+            Ok(record)
+        })
+        .await
+    }
+
+    async fn retry(&self, id: Uuid) -> Result<Job, StoreError> {
+        self.change(id, move |trees, mut record| {
+            let job = &mut record.job;
+            match job.state {
+                JobState::Failed | JobState::Cancelled | JobState::Degraded => {}
+                state => {
+                    return Err(StoreError::Conflict(format!(
+                        "the job is {state}; only a failed, degraded or cancelled one is retried"
+                    )));
+                }
+            }
+            job.state = JobState::Queued;
+            (job.attempts, job.finished_at, job.error) = (0, None, None);
+            write_job(trees, &record, Some(None))?;
+            Ok(record)
+        })
+        .await
+    }
+
+    fn changes(&self) -> broadcast::Receiver<Uuid> {
+        self.inner.changes.subscribe()
+    }
+}
+
+fn no_job(id: Uuid) -> StoreError {
+    StoreError::NotFound(format!("there is no job {id}"))
+}
+
+/// The oldest job that nobody holds.
+fn next_waiting(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, StoreError> {
+    for entry in trees.queue.iter() {
+        let (key, lease) = entry.map_err(failed)?;
+        let held = decode::<Lease>(&lease)?.is_some_and(|until| until > now);
+        if held {
+            continue;
+        }
+        match Uuid::from_slice(&key).ok().map(|id| trees.job(id)).transpose()?.flatten() {
+            Some(record) => return Ok(Some(record)),
+            None => {
+                trees.queue.remove(key).map_err(failed)?;
+            }
+        }
+    }
+    Ok(None)
+}
+
+fn insert_job(trees: &Trees, record: &JobRecord) -> Result<(), StoreError> {
+    let reference = blob_ref_key(&record.query.digest, &BlobOwner::Query(record.query.id));
+    put(&trees.blob_refs, &reference, &())?;
+    write_job(trees, record, Some(None))
+}
+
+/// Writes a job and its place in the queue: a lease, or `None` to take it out.
+fn write_job(trees: &Trees, record: &JobRecord, queue: Option<Lease>) -> Result<(), StoreError> {
+    let key = record.job.id.as_bytes();
+    let value = encode(record)?;
+    let lease = queue.map(|lease| encode(&lease)).transpose()?;
+    (&trees.jobs, &trees.queue)
+        .transaction(|(jobs, queue)| {
+            jobs.insert(key, value.as_slice())?;
+            match &lease {
+                Some(lease) => queue.insert(key, lease.as_slice())?,
+                None => queue.remove(key)?,
+            };
+            Ok(())
+        })
+        .map_err(transaction_failed)
+}

@@ -1,0 +1,348 @@
+//! Maps and images: every change goes through the writer, every read past it.
+
+use std::path::Path;
+use std::sync::{Arc, PoisonError};
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use sled::Transactional;
+use uuid::Uuid;
+
+use super::super::{Added, BlobPin, BlobStore, IndexState, MapStore, StoreError};
+use super::blobs::Blobs;
+use super::live_map::LiveMap;
+use super::trees::{
+    BlobOwner, StoredImage, Trees, blob_ref_key, decode, encode, failed, get, image_key, put,
+    transaction_failed,
+};
+use super::{EmbeddedStore, Inner, blocking};
+use crate::domain::{Candidate, Descriptor, Digest, Image, ImageId, Map, MapName};
+use crate::retrieve::index::SearchMode;
+
+/// Images removed in one transaction when a whole map goes.
+const SWEEP: usize = 256;
+
+impl Inner {
+    fn live(&self, map: &Map) -> Result<Arc<LiveMap>, StoreError> {
+        let maps = self.maps.read().unwrap_or_else(PoisonError::into_inner);
+        match maps.get(&map.name) {
+            Some(live) if live.map().uid == map.uid => Ok(Arc::clone(live)),
+            _ => Err(StoreError::NotFound(format!("the map {:?} was removed", map.name.as_str()))),
+        }
+    }
+
+    /// Stores the map's record; on the writer thread.
+    fn apply_put(&self, trees: &Trees, wanted: Map) -> Result<(Map, bool), StoreError> {
+        let stored: Option<Map> = get(&trees.maps, wanted.name.as_str().as_bytes())?;
+        let (map, new) = match stored {
+            None => (wanted, true),
+            Some(stored) => {
+                let same = stored.model_digest == wanted.model_digest
+                    && stored.descriptor == wanted.descriptor
+                    && stored.frame == wanted.frame;
+                let has_images = trees.images.scan_prefix(stored.uid.as_bytes()).next().is_some();
+                if !same && has_images {
+                    return Err(StoreError::Conflict(format!(
+                        "the map {:?} has images, so its model ({}), descriptor ({}) and frame \
+                         ({}) are fixed; make a new map, or delete this one first",
+                        stored.name.as_str(),
+                        stored.model,
+                        stored.descriptor,
+                        stored.frame
+                    )));
+                }
+                // Descriptors of another shape go to another folder.
+                let uid = if same { stored.uid } else { wanted.uid };
+                (Map { uid, created_at: stored.created_at, ..wanted }, false)
+            }
+        };
+        put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
+        Ok((map, new))
+    }
+
+    fn publish_map(&self, map: &Map) {
+        let mut maps = self.maps.write().unwrap_or_else(PoisonError::into_inner);
+        match maps.get(&map.name) {
+            Some(live) if live.map().uid == map.uid => live.set_map(map.clone()),
+            _ => match LiveMap::load(map.clone(), &self.descriptors, self.index, &self.trees) {
+                Ok(live) => {
+                    maps.insert(map.name.clone(), Arc::new(live));
+                }
+                Err(error) => tracing::error!(map = %map.name, %error, "cannot open a new map"),
+            },
+        }
+    }
+}
+
+#[async_trait]
+impl MapStore for EmbeddedStore {
+    async fn put_map(&self, map: Map) -> Result<(Map, bool), StoreError> {
+        let (apply, publish) = (Arc::clone(&self.inner), Arc::clone(&self.inner));
+        self.inner
+            .writer
+            .commit(
+                move |trees, _| apply.apply_put(trees, map),
+                move |(map, _)| publish.publish_map(map),
+            )
+            .await
+    }
+
+    async fn map(&self, name: &MapName) -> Result<Option<Map>, StoreError> {
+        let maps = self.inner.maps.read().unwrap_or_else(PoisonError::into_inner);
+        Ok(maps.get(name).map(|live| live.map()))
+    }
+
+    async fn maps(&self) -> Result<Vec<Map>, StoreError> {
+        let maps = self.inner.maps.read().unwrap_or_else(PoisonError::into_inner);
+        Ok(maps.values().map(|live| live.map()).collect())
+    }
+
+    async fn delete_map(&self, name: &MapName) -> Result<bool, StoreError> {
+        let (name, inner) = (name.clone(), Arc::clone(&self.inner));
+        let removed: Option<Map> = self
+            .inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    let record = trees.maps.remove(name.as_str()).map_err(failed)?;
+                    record.map(|record| decode(&record)).transpose()
+                },
+                move |removed: &Option<Map>| {
+                    if let Some(map) = removed {
+                        let mut maps = inner.maps.write().unwrap_or_else(PoisonError::into_inner);
+                        maps.remove(&map.name);
+                    }
+                },
+            )
+            .await?;
+        let Some(map) = removed else { return Ok(false) };
+        // The map is gone for every caller; what it leaves behind is cleared away in small steps,
+        // and by the next start if this process ends before.
+        let inner = Arc::clone(&self.inner);
+        blocking(move || sweep(map.uid, &inner.trees, &inner.blobs, &inner.descriptors)).await?;
+        Ok(true)
+    }
+
+    async fn index_state(&self, map: &Map) -> Result<IndexState, StoreError> {
+        let live = self.inner.live(map)?;
+        Ok(IndexState {
+            images: live.index.len(),
+            graph: live.index.graphed() > 0,
+            behind: live.index.is_behind(),
+        })
+    }
+
+    async fn add_image(
+        &self,
+        map: &Map,
+        image: Image,
+        descriptor: Descriptor,
+    ) -> Result<Added, StoreError> {
+        let live = self.inner.live(map)?;
+        let (uid, writing, publishing) = (map.uid, Arc::clone(&live), Arc::clone(&live));
+        let inner = Arc::clone(&self.inner);
+        let (stored, new) = self
+            .inner
+            .writer
+            .commit(
+                move |trees, touched| {
+                    if let Some(present) = trees.image(uid, &image.id)? {
+                        return same_bytes(present, &image).map(|present| (present, false));
+                    }
+                    if get::<Map>(&trees.maps, writing.map().name.as_str().as_bytes())?
+                        .is_none_or(|map| map.uid != uid)
+                    {
+                        return Err(StoreError::NotFound("the map was removed".into()));
+                    }
+                    let slot = writing.take_slot();
+                    writing.vectors.write(slot, descriptor.as_slice())?;
+                    touched.vectors.push(Arc::clone(&writing.vectors));
+                    let stored = StoredImage { image, slot };
+                    insert_image(trees, uid, &stored)?;
+                    Ok((stored, true))
+                },
+                move |(stored, new)| {
+                    if *new {
+                        publishing.publish(stored);
+                        inner.indexer.look_at(&publishing);
+                    }
+                },
+            )
+            .await?;
+        Ok(if new { Added::Created(stored.image) } else { Added::Present(stored.image) })
+    }
+
+    async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
+        let (inner, uid, id) = (Arc::clone(&self.inner), map.uid, id.clone());
+        blocking(move || Ok(inner.trees.image(uid, &id)?.map(|stored| stored.image))).await
+    }
+
+    async fn images(
+        &self,
+        map: &Map,
+        after: Option<&ImageId>,
+        limit: usize,
+    ) -> Result<Vec<Image>, StoreError> {
+        let (inner, uid, after) = (Arc::clone(&self.inner), map.uid, after.cloned());
+        blocking(move || {
+            let start = match &after {
+                // The smallest key behind the cursor's.
+                Some(id) => [image_key(uid, id), vec![0]].concat(),
+                None => uid.as_bytes().to_vec(),
+            };
+            inner
+                .trees
+                .images
+                .range(start..)
+                .take_while(|entry| {
+                    entry.as_ref().map_or(true, |(key, _)| key.starts_with(uid.as_bytes()))
+                })
+                .take(limit)
+                .map(|entry| {
+                    let (_, value) = entry.map_err(failed)?;
+                    Ok(decode::<StoredImage>(&value)?.image)
+                })
+                .collect()
+        })
+        .await
+    }
+
+    async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {
+        let live = self.inner.live(map)?;
+        let (uid, id, inner) = (map.uid, id.clone(), Arc::clone(&self.inner));
+        let removed = self
+            .inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    let stored = trees.image(uid, &id)?;
+                    if let Some(stored) = &stored {
+                        remove_images(trees, uid, std::slice::from_ref(stored))?;
+                    }
+                    Ok(stored)
+                },
+                move |stored: &Option<StoredImage>| {
+                    if let Some(stored) = stored {
+                        live.withdraw(stored.slot);
+                        inner.blobs.remove_unreferenced(&stored.image.digest, &inner.trees);
+                    }
+                },
+            )
+            .await?;
+        Ok(removed.is_some())
+    }
+
+    async fn search(
+        &self,
+        map: &Map,
+        query: Descriptor,
+        k: usize,
+        mode: SearchMode,
+    ) -> Result<Vec<Candidate>, StoreError> {
+        let live = self.inner.live(map)?;
+        if query.dim() != map.dim {
+            return Err(StoreError::Conflict(format!(
+                "a descriptor of {} numbers cannot be searched in a map of {}",
+                query.dim(),
+                map.dim
+            )));
+        }
+        blocking(move || Ok(live.search(query.as_slice(), k, mode))).await
+    }
+}
+
+#[async_trait]
+impl BlobStore for EmbeddedStore {
+    async fn put_blob(&self, digest: Digest, bytes: Bytes) -> Result<BlobPin, StoreError> {
+        let inner = Arc::clone(&self.inner);
+        blocking(move || Ok(Box::new(inner.blobs.put(digest, &bytes)?) as BlobPin)).await
+    }
+
+    async fn blob(&self, digest: &Digest) -> Result<Option<Bytes>, StoreError> {
+        let (inner, digest) = (Arc::clone(&self.inner), *digest);
+        blocking(move || inner.blobs.get(&digest)).await
+    }
+}
+
+fn same_bytes(present: StoredImage, sent: &Image) -> Result<StoredImage, StoreError> {
+    if present.image.digest == sent.digest {
+        return Ok(present);
+    }
+    Err(StoreError::Conflict(format!(
+        "the image id {:?} is taken by other bytes ({}); choose another id, or delete that image \
+         first",
+        sent.id.as_str(),
+        present.image.digest
+    )))
+}
+
+fn insert_image(trees: &Trees, uid: Uuid, stored: &StoredImage) -> Result<(), StoreError> {
+    let key = image_key(uid, &stored.image.id);
+    let owner = BlobOwner::Image { map_uid: uid, id: &stored.image.id };
+    let reference = blob_ref_key(&stored.image.digest, &owner);
+    let value = encode(stored)?;
+    (&trees.images, &trees.blob_refs)
+        .transaction(|(images, refs)| {
+            images.insert(key.as_slice(), value.as_slice())?;
+            refs.insert(reference.as_slice(), &[] as &[u8])?;
+            Ok(())
+        })
+        .map_err(transaction_failed)
+}
+
+fn remove_images(trees: &Trees, uid: Uuid, stored: &[StoredImage]) -> Result<(), StoreError> {
+    (&trees.images, &trees.blob_refs)
+        .transaction(|(images, refs)| {
+            for StoredImage { image, .. } in stored {
+                images.remove(image_key(uid, &image.id))?;
+                let owner = BlobOwner::Image { map_uid: uid, id: &image.id };
+                refs.remove(blob_ref_key(&image.digest, &owner))?;
+            }
+            Ok(())
+        })
+        .map_err(transaction_failed)
+}
+
+/// Clears away what deleted maps left behind when the process ended too soon.
+pub(super) fn sweep_deleted(
+    trees: &Trees,
+    blobs: &Blobs,
+    descriptors: &Path,
+) -> Result<(), StoreError> {
+    let known: Vec<Uuid> = trees.maps()?.iter().map(|map| map.uid).collect();
+    let mut at = Uuid::nil();
+    while let Some(entry) = trees.images.range(at.as_bytes().to_vec()..).next() {
+        let (key, _) = entry.map_err(failed)?;
+        let Some(uid) = key.get(..16).and_then(|uid| Uuid::from_slice(uid).ok()) else { break };
+        if !known.contains(&uid) {
+            sweep(uid, trees, blobs, descriptors)?;
+        }
+        match uid.as_u128().checked_add(1) {
+            Some(next) => at = Uuid::from_u128(next),
+            None => break,
+        }
+    }
+    trees.flush()
+}
+
+/// Clears away the images, references, bytes and descriptors of a map that is gone.
+fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs, descriptors: &Path) -> Result<(), StoreError> {
+    loop {
+        let some: Vec<StoredImage> = trees.images_of(uid).take(SWEEP).collect::<Result<_, _>>()?;
+        if some.is_empty() {
+            break;
+        }
+        remove_images(trees, uid, &some)?;
+        trees.flush()?;
+        for stored in &some {
+            blobs.remove_unreferenced(&stored.image.digest, trees);
+        }
+    }
+    let folder = descriptors.join(uid.simple().to_string());
+    if let Err(error) = std::fs::remove_dir_all(&folder)
+        && error.kind() != std::io::ErrorKind::NotFound
+    {
+        tracing::warn!(folder = %folder.display(), %error, "cannot remove old descriptors");
+    }
+    Ok(())
+}

@@ -1,0 +1,151 @@
+//! The embedded store: one folder, one process.
+//!
+//! ```text
+//! DATA/lock              held while a process uses the folder
+//! DATA/db/               sled: records of maps, images, queries and jobs
+//! DATA/descriptors/UID/  append-only segments of one map's descriptors, memory-mapped
+//! DATA/images/ab/…       image bytes by digest
+//! ```
+//!
+//! One writer thread applies every change and makes those that arrived together durable together.
+//! The graph of a map is derived from its segments and is built in the background.
+
+mod blobs;
+mod indexer;
+mod jobs;
+mod live_map;
+mod maps;
+mod segments;
+mod trees;
+mod writer;
+
+use std::collections::BTreeMap;
+use std::fs::{File, TryLockError};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicUsize;
+use std::sync::{Arc, PoisonError, RwLock};
+
+use tokio::sync::broadcast;
+use uuid::Uuid;
+
+use self::blobs::Blobs;
+use self::indexer::Indexer;
+use self::live_map::LiveMap;
+use self::trees::Trees;
+use self::writer::Writer;
+use super::StoreError;
+use crate::domain::MapName;
+use crate::retrieve::index::IndexSettings;
+
+/// How the embedded store works.
+#[derive(Debug, Clone)]
+pub struct EmbeddedSettings {
+    /// Its folder; made if it is not there.
+    pub dir: PathBuf,
+    /// How maps are indexed.
+    pub index: IndexSettings,
+    /// Memory for sled's page cache, in bytes.
+    pub db_cache_bytes: u64,
+    /// The most changes that are made durable together.
+    pub commit_batch: usize,
+}
+
+/// The embedded store; clones share it.
+#[derive(Clone)]
+pub struct EmbeddedStore {
+    inner: Arc<Inner>,
+}
+
+struct Inner {
+    trees: Trees,
+    writer: Writer,
+    blobs: Blobs,
+    maps: RwLock<BTreeMap<MapName, Arc<LiveMap>>>,
+    indexer: Indexer,
+    index: IndexSettings,
+    descriptors: PathBuf,
+    queued: AtomicUsize,
+    changes: broadcast::Sender<Uuid>,
+    /// Held, never read: the lock ends with the file handle.
+    _lock: File,
+}
+
+/// Change notices kept for a slow listener.
+const CHANGES_KEPT: usize = 1024;
+
+impl EmbeddedStore {
+    /// Opens the store and loads every map. Blocks; call it before serving.
+    pub fn open(settings: &EmbeddedSettings) -> Result<Self, StoreError> {
+        let dir = &settings.dir;
+        make_folder(dir)?;
+        let lock = lock(dir)?;
+        let trees = Trees::open(&dir.join("db"), settings.db_cache_bytes)?;
+        let descriptors = dir.join("descriptors");
+        make_folder(&descriptors)?;
+        let blobs = Blobs::open(dir.join("images"))?;
+        maps::sweep_deleted(&trees, &blobs, &descriptors)?;
+        let mut loaded = BTreeMap::new();
+        for map in trees.maps()? {
+            let name = map.name.clone();
+            let live = LiveMap::load(map, &descriptors, settings.index, &trees)?;
+            loaded.insert(name, Arc::new(live));
+        }
+        let queued = trees.requeue_claimed()?;
+        let inner = Inner {
+            writer: Writer::start(trees.clone(), settings.commit_batch)?,
+            indexer: Indexer::start()?,
+            trees,
+            blobs,
+            maps: RwLock::new(loaded),
+            index: settings.index,
+            descriptors,
+            queued: AtomicUsize::new(queued),
+            changes: broadcast::channel(CHANGES_KEPT).0,
+            _lock: lock,
+        };
+        for live in inner.maps.read().unwrap_or_else(PoisonError::into_inner).values() {
+            inner.indexer.look_at(live);
+        }
+        Ok(Self { inner: Arc::new(inner) })
+    }
+}
+
+fn make_folder(path: &Path) -> Result<(), StoreError> {
+    std::fs::create_dir_all(path).map_err(|error| {
+        StoreError::Failed(format!(
+            "cannot make the folder {}: {error}; choose another with --data",
+            path.display()
+        ))
+    })
+}
+
+fn lock(dir: &Path) -> Result<File, StoreError> {
+    let path = dir.join("lock");
+    let file = File::options()
+        .create(true)
+        .truncate(false)
+        .write(true)
+        .open(&path)
+        .map_err(|error| StoreError::Failed(format!("cannot write {}: {error}", path.display())))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(StoreError::Conflict(format!(
+            "another process uses the data folder {}; stop it first, or choose another with --data",
+            dir.display()
+        ))),
+        Err(TryLockError::Error(error)) => {
+            Err(StoreError::Failed(format!("cannot lock {}: {error}", path.display())))
+        }
+    }
+}
+
+/// Runs a read that may touch the disk away from the async threads.
+async fn blocking<T, F>(work: F) -> Result<T, StoreError>
+where
+    T: Send + 'static,
+    F: FnOnce() -> Result<T, StoreError> + Send + 'static,
+{
+    tokio::task::spawn_blocking(work)
+        .await
+        .unwrap_or_else(|error| Err(StoreError::Failed(format!("a read broke off: {error}"))))
+}

@@ -1,0 +1,169 @@
+//! The records in sled, and how they are keyed.
+
+use std::path::Path;
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use uuid::Uuid;
+
+use super::super::{JobRecord, StoreError};
+use crate::domain::{Digest, Image, ImageId, JobState, Map};
+
+/// The sled trees. Clones share them.
+#[derive(Clone)]
+pub(super) struct Trees {
+    db: sled::Db,
+    /// Map name → [`Map`].
+    pub maps: sled::Tree,
+    /// Map uid, image id → [`StoredImage`].
+    pub images: sled::Tree,
+    /// Digest, owner → nothing: who needs which image bytes.
+    pub blob_refs: sled::Tree,
+    /// Job id → [`JobRecord`].
+    pub jobs: sled::Tree,
+    /// Job id → when its lease ends ([`Lease`]), for jobs that have not ended.
+    pub queue: sled::Tree,
+}
+
+/// An image and where its descriptor is.
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+pub(super) struct StoredImage {
+    pub image: Image,
+    pub slot: usize,
+}
+
+/// Until when a worker holds a job; `None` while it waits.
+pub(super) type Lease = Option<jiff::Timestamp>;
+
+/// Who needs the bytes of a blob.
+pub(super) enum BlobOwner<'a> {
+    Image { map_uid: Uuid, id: &'a ImageId },
+    Query(Uuid),
+}
+
+impl Trees {
+    pub fn open(path: &Path, cache_bytes: u64) -> Result<Self, StoreError> {
+        let db = sled::Config::new()
+            .path(path)
+            .cache_capacity(cache_bytes)
+            // The writer flushes; a flush by the clock would only split what belongs together.
+            .flush_every_ms(None)
+            .open()
+            .map_err(failed)?;
+        let tree = |name: &str| db.open_tree(name).map_err(failed);
+        Ok(Self {
+            maps: tree("maps")?,
+            images: tree("images")?,
+            blob_refs: tree("blob_refs")?,
+            jobs: tree("jobs")?,
+            queue: tree("queue")?,
+            db,
+        })
+    }
+
+    /// Makes every change so far durable.
+    pub fn flush(&self) -> Result<(), StoreError> {
+        self.db.flush().map(drop).map_err(failed)
+    }
+
+    pub fn maps(&self) -> Result<Vec<Map>, StoreError> {
+        self.maps.iter().values().map(|value| decode(&value.map_err(failed)?)).collect()
+    }
+
+    pub fn image(&self, map_uid: Uuid, id: &ImageId) -> Result<Option<StoredImage>, StoreError> {
+        get(&self.images, &image_key(map_uid, id))
+    }
+
+    /// The images of a map, by id.
+    pub fn images_of(
+        &self,
+        map_uid: Uuid,
+    ) -> impl Iterator<Item = Result<StoredImage, StoreError>> + use<> {
+        self.images
+            .scan_prefix(map_uid.as_bytes())
+            .values()
+            .map(|value| decode(&value.map_err(failed)?))
+    }
+
+    pub fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {
+        get(&self.jobs, id.as_bytes())
+    }
+
+    /// Whether nobody needs the bytes of `digest` any more.
+    pub fn is_unreferenced(&self, digest: &Digest) -> bool {
+        self.blob_refs.scan_prefix(digest.hex()).next().is_none()
+    }
+
+    /// Gives every claimed job back to the queue: whoever held it ended with the last process.
+    /// Returns how many jobs wait.
+    pub fn requeue_claimed(&self) -> Result<usize, StoreError> {
+        let mut waiting = 0;
+        for key in self.queue.iter().keys() {
+            let key = key.map_err(failed)?;
+            waiting += 1;
+            put(&self.queue, &key, &Lease::None)?;
+            if let Some(mut record) = get::<JobRecord>(&self.jobs, &key)?
+                && record.job.state == JobState::Running
+            {
+                record.job.state = JobState::Queued;
+                put(&self.jobs, &key, &record)?;
+            }
+        }
+        self.flush()?;
+        Ok(waiting)
+    }
+}
+
+pub(super) fn image_key(map_uid: Uuid, id: &ImageId) -> Vec<u8> {
+    [map_uid.as_bytes().as_slice(), id.as_str().as_bytes()].concat()
+}
+
+pub(super) fn blob_ref_key(digest: &Digest, owner: &BlobOwner<'_>) -> Vec<u8> {
+    let mut key = digest.hex().into_bytes();
+    match owner {
+        BlobOwner::Image { map_uid, id } => {
+            key.push(b'i');
+            key.extend(image_key(*map_uid, id));
+        }
+        BlobOwner::Query(id) => {
+            key.push(b'q');
+            key.extend(id.as_bytes());
+        }
+    }
+    key
+}
+
+pub(super) fn get<T: DeserializeOwned>(
+    tree: &sled::Tree,
+    key: &[u8],
+) -> Result<Option<T>, StoreError> {
+    tree.get(key).map_err(failed)?.map(|value| decode(&value)).transpose()
+}
+
+pub(super) fn put<T: Serialize>(tree: &sled::Tree, key: &[u8], value: &T) -> Result<(), StoreError> {
+    tree.insert(key, encode(value)?).map(drop).map_err(failed)
+}
+
+pub(super) fn encode<T: Serialize>(value: &T) -> Result<Vec<u8>, StoreError> {
+    serde_json::to_vec(value).map_err(|error| StoreError::Failed(error.to_string()))
+}
+
+pub(super) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, StoreError> {
+    serde_json::from_slice(bytes).map_err(|error| {
+        StoreError::Damaged(format!("a record cannot be read ({error}); restore a backup"))
+    })
+}
+
+pub(super) fn failed(error: sled::Error) -> StoreError {
+    StoreError::Failed(error.to_string())
+}
+
+/// What a transaction that never aborts on its own account returns when it fails.
+pub(super) fn transaction_failed(error: sled::transaction::TransactionError<()>) -> StoreError {
+    match error {
+        sled::transaction::TransactionError::Abort(()) => {
+            StoreError::Failed("a transaction was given up".into())
+        }
+        sled::transaction::TransactionError::Storage(error) => failed(error),
+    }
+}

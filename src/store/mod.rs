@@ -1,0 +1,189 @@
+//! What must outlive the process: maps, images, descriptors, image bytes, queries and jobs.
+//!
+//! The traits say what a store promises; `embedded` keeps the promise with sled and plain files.
+//! Every call that returns `Ok` after a change means that the change is on disk.
+
+pub mod embedded;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use tokio::sync::broadcast;
+use uuid::Uuid;
+
+use crate::domain::{
+    Candidate, Descriptor, Digest, Image, ImageId, Job, JobState, Map, MapName, MediaType,
+};
+use crate::retrieve::index::SearchMode;
+
+/// Why a store did not do what it was asked.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// There is no such thing.
+    #[error("{0}")]
+    NotFound(String),
+    /// It contradicts what is stored.
+    #[error("{0}")]
+    Conflict(String),
+    /// The job queue has reached its bound.
+    #[error("the refinement queue holds {limit} jobs, its bound (jobs.queue)")]
+    QueueFull {
+        /// The bound.
+        limit: usize,
+    },
+    /// The disk or the database failed.
+    #[error("the store failed: {0}")]
+    Failed(String),
+    /// What is stored is not what was written.
+    #[error("the store is damaged: {0}")]
+    Damaged(String),
+}
+
+/// What became of an image that was sent.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Added {
+    /// It is new.
+    Created(Image),
+    /// The same id with the same bytes was there already; nothing changed.
+    Present(Image),
+}
+
+/// Maps, their images and their descriptors.
+#[async_trait]
+pub trait MapStore: Send + Sync {
+    /// Creates the map, or changes the one of that name: scene and description always, model,
+    /// descriptor and frame while it has no images ([`StoreError::Conflict`] afterwards).
+    /// Returns the map as stored, and whether it is new.
+    async fn put_map(&self, map: Map) -> Result<(Map, bool), StoreError>;
+    /// The map of that name.
+    async fn map(&self, name: &MapName) -> Result<Option<Map>, StoreError>;
+    /// All maps, by name.
+    async fn maps(&self) -> Result<Vec<Map>, StoreError>;
+    /// Removes a map and all its images; `false` if there was none.
+    async fn delete_map(&self, name: &MapName) -> Result<bool, StoreError>;
+    /// How a map is indexed at the moment.
+    async fn index_state(&self, map: &Map) -> Result<IndexState, StoreError>;
+
+    /// Adds an image; its bytes must be among the stored blobs.
+    /// [`StoreError::Conflict`] if the id is taken by other bytes.
+    async fn add_image(
+        &self,
+        map: &Map,
+        image: Image,
+        descriptor: Descriptor,
+    ) -> Result<Added, StoreError>;
+    /// One image.
+    async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError>;
+    /// Images by id, those after `after`, at most `limit`.
+    async fn images(
+        &self,
+        map: &Map,
+        after: Option<&ImageId>,
+        limit: usize,
+    ) -> Result<Vec<Image>, StoreError>;
+    /// Removes an image; `false` if there was none.
+    async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError>;
+
+    /// The `k` most similar images, best first.
+    async fn search(
+        &self,
+        map: &Map,
+        query: Descriptor,
+        k: usize,
+        mode: SearchMode,
+    ) -> Result<Vec<Candidate>, StoreError>;
+}
+
+/// How a map is indexed at the moment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct IndexState {
+    /// Images in the map.
+    pub images: usize,
+    /// Whether a graph is in use.
+    pub graph: bool,
+    /// Whether images wait to be put into the graph; they are searched exactly.
+    pub behind: bool,
+}
+
+/// Image bytes, by digest.
+#[async_trait]
+pub trait BlobStore: Send + Sync {
+    /// Stores bytes. They stay at least until the returned pin is dropped, and after that as long
+    /// as an image or a query refers to them.
+    async fn put_blob(&self, digest: Digest, bytes: Bytes) -> Result<BlobPin, StoreError>;
+    /// The bytes of that digest.
+    async fn blob(&self, digest: &Digest) -> Result<Option<Bytes>, StoreError>;
+}
+
+/// Keeps fresh bytes from being collected before something refers to them.
+pub type BlobPin = Box<dyn std::any::Any + Send>;
+
+/// What a robot posted, kept because a job needs it.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Query {
+    /// Its id.
+    pub id: Uuid,
+    /// The digest of the frame.
+    pub digest: Digest,
+    /// The frame's format.
+    pub media_type: MediaType,
+    /// When it came.
+    pub created_at: Timestamp,
+}
+
+/// A job with what its worker needs.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct JobRecord {
+    /// What callers see.
+    pub job: Job,
+    /// Tells the map from a later one of the same name.
+    pub map_uid: Uuid,
+    /// The query.
+    pub query: Query,
+    /// The candidates in coarse order.
+    pub candidates: Vec<Candidate>,
+}
+
+/// Which jobs to list.
+#[derive(Debug, Clone, Default)]
+pub struct JobFilter {
+    /// Only those of this map.
+    pub map: Option<MapName>,
+    /// Only those in this state.
+    pub state: Option<JobState>,
+}
+
+/// Jobs and their queue.
+#[async_trait]
+pub trait JobStore: Send + Sync {
+    /// Queues a job unless `limit` jobs wait already ([`StoreError::QueueFull`]).
+    async fn submit(&self, record: JobRecord, limit: usize) -> Result<(), StoreError>;
+    /// Jobs that wait.
+    async fn queued(&self) -> Result<usize, StoreError>;
+    /// One job.
+    async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError>;
+    /// Jobs, newest first, those older than `before`, at most `limit`.
+    async fn jobs(
+        &self,
+        filter: &JobFilter,
+        before: Option<Uuid>,
+        limit: usize,
+    ) -> Result<Vec<Job>, StoreError>;
+    /// Takes the oldest waiting job, or one whose lease ran out, until `lease_until`.
+    async fn claim(
+        &self,
+        now: Timestamp,
+        lease_until: Timestamp,
+    ) -> Result<Option<JobRecord>, StoreError>;
+    /// Gives a claimed job back to the queue.
+    async fn release(&self, id: Uuid, why: String) -> Result<(), StoreError>;
+    /// Ends a claimed job with what its worker found. A job that was cancelled meanwhile stays so.
+    async fn finish(&self, job: Job) -> Result<(), StoreError>;
+    /// Cancels a job that has not ended; returns it as it then is.
+    async fn cancel(&self, id: Uuid) -> Result<Job, StoreError>;
+    /// Queues a job again that ended without success.
+    async fn retry(&self, id: Uuid) -> Result<Job, StoreError>;
+    /// The ids of jobs that changed, as they change. A slow listener loses the oldest.
+    fn changes(&self) -> broadcast::Receiver<Uuid>;
+}

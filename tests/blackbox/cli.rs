@@ -1,0 +1,154 @@
+//! The commands, as a user types them.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+use super::support::{BINARY, Server, frame, reference, server};
+
+fn whereabouts(args: &[&str]) -> Output {
+    Command::new(BINARY).args(args).output().unwrap()
+}
+
+fn json(output: &Output) -> Value {
+    let text = String::from_utf8_lossy(&output.stdout);
+    serde_json::from_str(&text).unwrap_or_else(|_| panic!("{text}\n{}", error(output)))
+}
+
+fn error(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn write_places(dir: &Path, names: &[&str]) {
+    for (place, name) in names.iter().enumerate() {
+        let file = dir.join(name);
+        std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+        std::fs::write(file, reference(place)).unwrap();
+    }
+}
+
+fn index(server: &Server, dir: &Path, map: &str) -> Output {
+    let dir = dir.to_str().unwrap();
+    whereabouts(&["index", dir, "--map", map, "--json", "--server", &server.url])
+}
+
+#[tokio::test]
+async fn a_folder_is_indexed_once_however_often_it_is_sent() {
+    let (_dir, server) = server();
+    let folder = TempDir::new().unwrap();
+    let names = ["@0100.50@0200.25@.jpg", "north/@0110.50@0200.25@.jpg"];
+    write_places(folder.path(), &names);
+    let first = json(&index(&server, folder.path(), "m"));
+    assert_eq!((&first["added"], &first["present"]), (&2.into(), &0.into()));
+    let again = json(&index(&server, folder.path(), "m"));
+    assert_eq!((&again["added"], &again["present"]), (&0.into(), &2.into()));
+    assert_eq!(server.get("/maps/m").await.expect(200)["frame"], "metric");
+    let image = server.get("/maps/m/images/north%2F%400110.50%400200.25%40.jpg").await.expect(200);
+    assert_eq!(image["pose"], serde_json::json!({"x": 110.5, "y": 200.25}));
+}
+
+#[tokio::test]
+async fn poses_come_from_a_csv_and_a_bad_file_fails_alone() {
+    let (_dir, server) = server();
+    let folder = TempDir::new().unwrap();
+    write_places(folder.path(), &["a.jpg", "b.jpg"]);
+    std::fs::write(folder.path().join("c.jpg"), "text").unwrap();
+    std::fs::write(folder.path().join("poses.csv"), "file,lat,lon\na.jpg,45.5,7.25\n").unwrap();
+    let output = index(&server, folder.path(), "m");
+    assert_eq!(output.status.code(), Some(1));
+    assert!(error(&output).contains("c.jpg"), "{}", error(&output));
+    let outcome = json(&output);
+    assert_eq!((&outcome["added"], &outcome["without_pose"]), (&2.into(), &1.into()));
+    let image = server.get("/maps/m/images/a.jpg").await.expect(200);
+    assert_eq!(image["pose"], serde_json::json!({"lat": 45.5, "lon": 7.25}));
+}
+
+#[tokio::test]
+async fn a_picture_is_localized_and_its_job_is_shown() {
+    let (dir, server) = server();
+    server.town("m", 6).await;
+    let file = dir.path().join("frame.jpg");
+    std::fs::write(&file, frame(2, 0)).unwrap();
+    let (file, url) = (file.to_str().unwrap(), server.url.as_str());
+    let args = ["localize", file, "--map", "m", "--refine", "--server", url];
+    let output = whereabouts(&args);
+    let text = String::from_utf8(output.stdout.clone()).unwrap();
+    assert!(text.contains("estimate: place-") && text.contains("succeeded"), "{text}");
+    let answer = json(&whereabouts(&[&args[..], &["--json"]].concat()));
+    let id = answer["job"]["id"].as_str().unwrap();
+    let listed = whereabouts(&["jobs", "--map", "m", "--server", url]);
+    assert!(String::from_utf8_lossy(&listed.stdout).contains(id));
+    let shown = whereabouts(&["jobs", id, "--wait", "10", "--server", url]);
+    assert!(String::from_utf8_lossy(&shown.stdout).contains("place-"), "{}", error(&shown));
+    assert_eq!(whereabouts(&["healthcheck", "--server", url]).status.code(), Some(0));
+}
+
+#[test]
+fn a_server_that_is_not_there_is_named_with_what_to_do() {
+    // Port 9 (discard) of this machine has no listener.
+    let url = "http://127.0.0.1:9";
+    for args in [&["healthcheck", "--server", url][..], &["jobs", "--server", url]] {
+        let output = whereabouts(args);
+        assert_eq!(output.status.code(), Some(1));
+        assert!(error(&output).contains("whereabouts serve"), "{}", error(&output));
+    }
+}
+
+#[test]
+fn wrong_usage_is_2_and_every_command_explains_itself() {
+    assert_eq!(whereabouts(&["serve", "--no-such-flag"]).status.code(), Some(2));
+    assert_eq!(whereabouts(&[]).status.code(), Some(2));
+    for command in
+        ["serve", "index", "localize", "jobs", "demo", "config", "openapi", "healthcheck"]
+    {
+        let output = whereabouts(&[command, "--help"]);
+        assert_eq!(output.status.code(), Some(0), "{command}");
+        assert!(output.stdout.len() > 80, "{command}");
+    }
+}
+
+#[test]
+fn what_is_missing_at_the_start_is_said_with_what_to_do() {
+    let dir = TempDir::new().unwrap();
+    let start = |name: &str, value: &str| {
+        let output = Command::new(BINARY)
+            .args(["serve", "--listen", "127.0.0.1:0", "--data"])
+            .arg(dir.path().join("data"))
+            .env(name, value)
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        error(&output)
+    };
+    let missing = start("ORT_DYLIB_PATH", "/no/such/libonnxruntime.so");
+    assert!(missing.contains("make build"), "{missing}");
+    let model = start("WHEREABOUTS_MODEL__NAME", "no-such-model");
+    assert!(model.contains("no-such-model") && model.contains("make build"), "{model}");
+    let bad = start("WHEREABOUTS_JOBS__LEASE_S", "1");
+    assert!(bad.contains("must outlast"), "{bad}");
+    let port = start("WHEREABOUTS_SERVER__LISTEN", "nonsense");
+    assert!(port.contains("listen"), "{port}");
+}
+
+#[test]
+fn the_demo_runs_and_refinement_helps() {
+    let dir = TempDir::new().unwrap();
+    let out = dir.path().join("out");
+    let args = ["demo", "--places", "24", "--out", out.to_str().unwrap(), "--json"];
+    let outcome = json(&whereabouts(&args));
+    assert_eq!(outcome["queries"], 24);
+    let recall = |when: &str| outcome["recall_at_1"][when].as_f64().unwrap();
+    assert!((10.0..=95.0).contains(&recall("before")), "{outcome}");
+    assert!(recall("after") >= recall("before"), "{outcome}");
+    let pictures = std::fs::read_dir(out.join("pictures")).unwrap().count();
+    assert_eq!(pictures, 24);
+    // What is not a demo's folder is left alone.
+    let other = dir.path().join("other");
+    std::fs::create_dir(&other).unwrap();
+    std::fs::write(other.join("thesis.tex"), "years of work").unwrap();
+    let refused = whereabouts(&["demo", "--out", other.to_str().unwrap()]);
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(other.join("thesis.tex").is_file());
+}

@@ -1,0 +1,132 @@
+//! `/jobs`.
+
+use serde_json::{Value, json};
+
+use super::support::{Server, frame, server};
+use tempfile::TempDir;
+
+async fn localize(server: &Server, place: usize) -> Value {
+    server.post_jpeg("/localize?map=m", frame(place, 0)).await.expect(200)
+}
+
+#[tokio::test]
+async fn a_job_describes_every_pair_and_ranks_every_candidate_once() {
+    let (_dir, server) = server();
+    server.town("m", 15).await;
+    let answer = localize(&server, 3).await;
+    let href = answer["job"]["href"].as_str().unwrap();
+    let job = server.get(&format!("{href}?wait=30")).await.expect(200);
+    assert_eq!(job["state"], "succeeded", "{job}");
+    assert_eq!(job["refiner"], "local");
+    assert_eq!(job["query_id"], answer["query_id"]);
+    assert_eq!(job["attempts"], 1);
+    assert_eq!(job["error"], json!(null));
+    let ids = |list: &Value| -> Vec<String> {
+        let of = |item: &Value| item["image_id"].as_str().unwrap().to_owned();
+        list.as_array().unwrap().iter().map(of).collect()
+    };
+    let candidates = ids(&answer["candidates"]);
+    assert_eq!(candidates.len(), 10);
+    assert_eq!(ids(&job["descriptions"]), candidates);
+    let mut ranked = ids(&job["ranking"]);
+    for (position, place) in job["ranking"].as_array().unwrap().iter().enumerate() {
+        assert_eq!(place["rank"], position + 1);
+        let coarse = place["coarse_rank"].as_u64().unwrap() as usize;
+        assert_eq!(place["image_id"], candidates[coarse - 1]);
+        assert!(place["pose"]["lat"].is_f64());
+    }
+    ranked.sort();
+    let mut all = candidates.clone();
+    all.sort();
+    assert_eq!(ranked, all);
+    for description in job["descriptions"].as_array().unwrap() {
+        assert!(description["text"].as_str().unwrap().len() > 40, "{description}");
+    }
+    assert!(job["reasoning"].is_string());
+    assert!(job["created_at"].as_str() <= job["finished_at"].as_str());
+}
+
+#[tokio::test]
+async fn jobs_are_listed_newest_first_by_map_and_state() {
+    let (_dir, server) = server();
+    server.town("m", 3).await;
+    server.town("other", 2).await;
+    let mut made = Vec::new();
+    for place in 0..3 {
+        let answer = localize(&server, place).await;
+        server.get(&format!("{}?wait=30", answer["job"]["href"].as_str().unwrap())).await.expect(200);
+        made.push(answer["job"]["id"].clone());
+    }
+    server.post_jpeg("/localize?map=other", frame(0, 0)).await.expect(200);
+    made.reverse();
+    let ids = |page: &Value| -> Vec<Value> {
+        page["jobs"].as_array().unwrap().iter().map(|job| job["id"].clone()).collect()
+    };
+    let page = server.get("/jobs?map=m&state=succeeded&limit=2").await.expect(200);
+    assert_eq!(ids(&page), made[..2]);
+    let cursor = page["next_cursor"].as_str().unwrap();
+    let rest = server.get(&format!("/jobs?map=m&limit=2&cursor={cursor}")).await.expect(200);
+    assert_eq!((ids(&rest), &rest["next_cursor"]), (made[2..].to_vec(), &json!(null)));
+    assert_eq!(ids(&server.get("/jobs?state=failed").await.expect(200)), [] as [Value; 0]);
+}
+
+#[tokio::test]
+async fn a_full_job_queue_answers_429_at_once_and_localizing_without_a_job_goes_on() {
+    let dir = TempDir::new().unwrap();
+    let server = Server::start(dir.path(), &[]);
+    server.town("m", 3).await;
+    assert!(server.terminate().success());
+    // No worker empties this queue: its jobs wait for a lease that outlasts the test.
+    let settings = [("WHEREABOUTS_JOBS__QUEUE", "1"), ("WHEREABOUTS_JOBS__WORKERS", "1")];
+    let server = Server::start(dir.path(), &settings);
+    let mut full = None;
+    for place in 0..50 {
+        let answer = server.post_jpeg("/localize?map=m", frame(place % 3, place as u32)).await;
+        if answer.status == 429 {
+            full = Some(answer);
+            break;
+        }
+    }
+    let full = full.expect("fifty frames in a row never met a queued job");
+    assert!(full.problem(429).contains("refine=off"));
+    assert!(full.headers.contains_key("retry-after"));
+    server.post_jpeg("/localize?map=m&refine=off", frame(0, 0)).await.expect(200);
+}
+
+#[tokio::test]
+async fn a_job_whose_map_was_removed_ends_with_the_reason() {
+    let (dir, server) = server();
+    server.town("m", 3).await;
+    let jobs: Vec<Value> = [localize(&server, 0).await, localize(&server, 1).await].into();
+    server.delete("/maps/m").await.expect(204);
+    for answer in jobs {
+        let href = answer["job"]["href"].as_str().unwrap();
+        let job = server.get(&format!("{href}?wait=30")).await.expect(200);
+        let state = job["state"].as_str().unwrap();
+        assert!(matches!(state, "succeeded" | "degraded" | "failed"), "{job}");
+        assert_eq!(state == "succeeded", job["error"].is_null(), "{job}");
+    }
+    drop(dir);
+}
+
+#[tokio::test]
+async fn an_ended_job_is_not_cancelled_and_a_success_is_not_retried() {
+    let (_dir, server) = server();
+    server.town("m", 2).await;
+    let answer = server.post_jpeg("/localize?map=m&refine=wait", frame(0, 0)).await.expect(200);
+    let href = answer["job"]["href"].as_str().unwrap();
+    let cancelled = server.post(&format!("{href}/cancel"), "text/plain", vec![]).await.expect(200);
+    assert_eq!(cancelled["state"], "succeeded");
+    server.post(&format!("{href}/retry"), "text/plain", vec![]).await.problem(409);
+}
+
+#[tokio::test]
+async fn what_is_no_job_says_so() {
+    let (_dir, server) = server();
+    server.get("/jobs/not-a-uuid").await.problem(400);
+    let unknown = "/jobs/01900000-0000-7000-8000-000000000000";
+    server.get(unknown).await.problem(404);
+    server.get(&format!("{unknown}?wait=5")).await.problem(404);
+    server.get(&format!("{unknown}?wait=1e9")).await.problem(422);
+    server.get(&format!("{unknown}?wait=-1")).await.problem(422);
+}

@@ -1,0 +1,65 @@
+//! `/localize`.
+
+use reqwest::Method;
+use reqwest::multipart::{Form, Part};
+use serde_json::json;
+
+use super::support::{Answer, frame, reference, server};
+
+#[tokio::test]
+async fn a_map_image_finds_itself_and_all_fields_are_there() {
+    let (_dir, server) = server();
+    server.town("m", 12).await;
+    let answer = server.post_jpeg("/localize?map=m&k=3", reference(4)).await.expect(200);
+    let candidates = answer["candidates"].as_array().unwrap();
+    assert_eq!(candidates.len(), 3);
+    assert_eq!(candidates[0]["image_id"], "place-4");
+    assert!(candidates[0]["similarity"].as_f64().unwrap() > 0.9999);
+    let ranks: Vec<_> = candidates.iter().map(|c| c["rank"].as_u64().unwrap()).collect();
+    assert_eq!(ranks, [1, 2, 3]);
+    let similarity = |i: usize| candidates[i]["similarity"].as_f64().unwrap();
+    assert!(similarity(0) >= similarity(1) && similarity(1) >= similarity(2));
+
+    assert_eq!(answer["estimate"]["image_id"], "place-4");
+    assert_eq!(answer["estimate"]["pose"], json!({"lat": 45.004, "lon": 7.0, "heading": 90.0}));
+    assert_eq!(answer["estimate"]["known"], true);
+    assert_eq!((&answer["map"], &answer["model"]), (&json!("m"), &json!("xfeat")));
+    let job = &answer["job"];
+    assert_eq!(job["href"], format!("/jobs/{}", job["id"].as_str().unwrap()));
+    for stage in ["decode", "extract", "search", "total"] {
+        assert!(answer["timing_ms"][stage].as_f64().unwrap() >= 0.0, "{stage}");
+    }
+}
+
+#[tokio::test]
+async fn png_webp_and_forms_are_taken_too() {
+    let (_dir, server) = server();
+    server.town("m", 4).await;
+    let pixels = image::load_from_memory(&reference(2)).unwrap();
+    for (format, media_type) in
+        [(image::ImageFormat::Png, "image/png"), (image::ImageFormat::WebP, "image/webp")]
+    {
+        let mut bytes = std::io::Cursor::new(Vec::new());
+        pixels.write_to(&mut bytes, format).unwrap();
+        let answer = server
+            .post("/localize?map=m&refine=off", media_type, bytes.into_inner())
+            .await
+            .expect(200);
+        assert_eq!(answer["candidates"][0]["image_id"], "place-2", "{media_type}");
+        assert!(answer["job"].is_null());
+    }
+    let form = Form::new().part("image", Part::bytes(reference(3)));
+    let request = server.request(Method::POST, "/localize?map=m").multipart(form);
+    let answer = Answer::of(request).await.expect(200);
+    assert_eq!(answer["candidates"][0]["image_id"], "place-3");
+}
+
+#[tokio::test]
+async fn waiting_for_the_refinement_returns_an_ended_job() {
+    let (_dir, server) = server();
+    server.town("m", 12).await;
+    let answer = server.post_jpeg("/localize?map=m&refine=wait", frame(5, 0)).await.expect(200);
+    assert_eq!(answer["job"]["state"], "succeeded");
+    let job = server.get(answer["job"]["href"].as_str().unwrap()).await.expect(200);
+    assert_eq!(answer["estimate"]["image_id"], job["ranking"][0]["image_id"]);
+}

@@ -1,0 +1,15 @@
+//! Black-box tests: they start the real binary and talk to it as its users do.
+//!
+//! Pictures come from the procedural town. `real_images` uses photographs where they are at hand.
+
+mod support;
+
+mod bad_input;
+mod cli;
+mod durability;
+mod images;
+mod jobs;
+mod localize;
+mod maps;
+mod real_images;
+mod service;
