@@ -73,7 +73,7 @@ pub struct Data {
 pub struct Model {
     /// The model's name.
     pub name: String,
-    /// The assets folder; empty for the usual places.
+    /// An assets folder to look in before the usual places; empty for none.
     pub assets: PathBuf,
     /// Sessions side by side.
     pub sessions: usize,
@@ -257,9 +257,8 @@ impl Config {
             layers = layers.merge(Toml::file_exact(file));
         }
         // A variable without "__" names no setting: WHEREABOUTS_DATA and the like are for others.
-        let environment = Env::prefixed("WHEREABOUTS_")
-            .filter(|key| key.as_str().contains("__"))
-            .split("__");
+        let environment =
+            Env::prefixed("WHEREABOUTS_").filter(|key| key.as_str().contains("__")).split("__");
         let config: Self = layers
             .merge(environment)
             .merge(Serialized::defaults(flags))

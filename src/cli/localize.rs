@@ -79,7 +79,11 @@ fn print_answer(answer: &Answer) {
 /// A job for people.
 pub(super) fn print_job(job: &Job) {
     println!("job {} ({}, {}): {} attempts", job.id, job.map, job.refiner, job.attempts);
-    println!("  {}{}", job.state, job.error.as_ref().map_or(String::new(), |why| format!(": {why}")));
+    println!(
+        "  {}{}",
+        job.state,
+        job.error.as_ref().map_or(String::new(), |why| format!(": {why}"))
+    );
     for place in job.ranking.iter().flat_map(|ranking| ranking.as_slice()) {
         println!(
             "{:3}  (was {:2})  {}  {}",

@@ -156,13 +156,13 @@ impl Rgb {
         self.zip(by, |level, factor| level * factor)
     }
 
-    /// Whether two shades differ too little to see a step between them.
+    /// The mean of two shades that differ too little to see a step between them.
     #[inline]
-    pub fn resembles(self, other: Rgb) -> bool {
+    pub fn between(self, other: Rgb) -> Option<Rgb> {
         const TOLERANCE: f32 = 0.04;
-        let far = self
+        let excess = self
             .zip(other, |one, another| (one - another).abs() - TOLERANCE * (one + another) - 0.001);
-        far.0.iter().all(|&excess| excess < 0.0)
+        excess.0.iter().all(|&excess| excess < 0.0).then(|| self.mix(other, 0.5))
     }
 
     #[inline]

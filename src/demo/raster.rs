@@ -3,8 +3,6 @@
 //! Visibility is found at two samples per pixel with a depth buffer, so that silhouettes are
 //! smooth; a pixel is then shaded once per surface in it, because paints filter themselves.
 
-use std::ops::RangeInclusive;
-
 use image::RgbImage;
 use rayon::prelude::*;
 
@@ -61,8 +59,9 @@ struct Visible<'a> {
     distance: f32,
     /// The normal on the side that is seen.
     facing: Vec3,
-    /// Nothing painted on it is thinner than two pixels, so every other pixel tells its shade.
-    is_coarse: bool,
+    /// Whether nothing painted on it is thinner than two pixels, so that every other pixel of a
+    /// row, and of a column, tells its shade.
+    is_coarse: (bool, bool),
 }
 
 impl<'a> Visible<'a> {
@@ -81,10 +80,12 @@ impl<'a> Visible<'a> {
         let sight = panel.point(panel.width / 2.0, panel.height / 2.0) - camera.eye;
         let normal = panel.normal();
         let behind = normal.dot(panel.corner - camera.eye) > 0.0;
-        let is_coarse = view
-            .outline
-            .iter()
-            .all(|&(x, y)| view.footprint(x, y).across * 2.0 < surface.paint.finest());
+        let (thin, flat) = surface.paint.finest();
+        let corners = || view.outline.iter().map(|&(x, y)| view.footprint(x, y));
+        let is_coarse = (
+            corners().all(|corner| corner.across * 2.0 < thin),
+            corners().all(|corner| corner.rise * 2.0 < flat),
+        );
         inside.then_some(Visible {
             is_coarse,
             facing: if behind { normal * -1.0 } else { normal },
@@ -117,6 +118,16 @@ struct Samples {
     surface: Vec<u32>,
 }
 
+impl Samples {
+    /// The surfaces seen by the samples of a band's pixel.
+    #[inline]
+    fn at(&self, pixel: usize, width: usize) -> [u32; SAMPLES.len()] {
+        // A row of pixels is stored as two lines of samples, one after the other.
+        let first = pixel + pixel / width * width;
+        [self.surface[first], self.surface[first + width]]
+    }
+}
+
 struct Canvas<'a> {
     scene: &'a Scene<'a>,
     camera: &'a Camera,
@@ -129,45 +140,75 @@ impl Canvas<'_> {
     fn draw_band(&self, top: usize, pixels: &mut [u8], stride: usize) {
         let rows = pixels.len() / stride;
         let samples = self.sample(top, rows);
-        let mut radiance = vec![Rgb::BLACK; self.width];
+        let radiance = self.shade(&samples, top, rows);
         for (row, line) in pixels.chunks_exact_mut(stride).enumerate() {
-            self.shade_line(&samples, row, top + row, &mut radiance);
-            for (column, pixel) in line.chunks_exact_mut(3).enumerate() {
-                pixel.copy_from_slice(&self.develop(radiance[column], column, top + row));
+            let colours = &radiance[row * self.width..];
+            for ((column, pixel), &colour) in line.chunks_exact_mut(3).enumerate().zip(colours) {
+                pixel.copy_from_slice(&self.develop(colour, column, top + row));
             }
         }
     }
 
-    /// Shades every other pixel, and of the rest those that differ from their neighbours in
-    /// surface or shade: smooth walls, ground and sky need half the work.
-    fn shade_line(&self, samples: &Samples, row: usize, y: usize, radiance: &mut [Rgb]) {
-        for column in (0..self.width).step_by(2) {
-            radiance[column] = self.pixel(samples, (column, row), y);
+    /// Shades every other pixel of every other row, and of the rest those whose neighbours differ
+    /// in surface or shade: smooth walls, ground and sky need no more.
+    fn shade(&self, samples: &Samples, top: usize, rows: usize) -> Vec<Rgb> {
+        let mut radiance = vec![Rgb::BLACK; self.width * rows];
+        for (first_row, first_column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+            for row in (first_row..rows).step_by(2) {
+                for column in (first_column..self.width).step_by(2) {
+                    let at = (column, row);
+                    let smooth = match (first_row, first_column) {
+                        (0, 0) => None,
+                        (0, _) => self.between_columns(samples, &radiance, at),
+                        _ => self.between_rows(samples, &radiance, at),
+                    };
+                    radiance[row * self.width + column] =
+                        smooth.unwrap_or_else(|| self.pixel(samples, at, top + row));
+                }
+            }
         }
-        for column in (1..self.width).step_by(2) {
-            let (left, right) = (column - 1, (column + 1).min(self.width - 1));
-            let smooth = right > column
-                && self.is_coarse(samples, row, left..=right)
-                && radiance[left].resembles(radiance[right]);
-            radiance[column] = if smooth {
-                radiance[left].mix(radiance[right], 0.5)
-            } else {
-                self.pixel(samples, (column, row), y)
-            };
-        }
+        radiance
     }
 
-    /// Whether some columns of a row show the same surface, one without fine lines.
-    fn is_coarse(&self, samples: &Samples, row: usize, columns: RangeInclusive<usize>) -> bool {
-        let first = samples.surface[row * SAMPLES.len() * self.width + columns.start()];
-        let is_coarse = self.surface(first).is_none_or(|visible| visible.is_coarse);
-        is_coarse
-            && (0..SAMPLES.len()).all(|sample| {
-                let start = (row * SAMPLES.len() + sample) * self.width;
-                samples.surface[start + columns.start()..=start + columns.end()]
-                    .iter()
-                    .all(|&surface| surface == first)
-            })
+    /// The mean of the pixels to the left and right, where that is as good as shading.
+    fn between_columns(
+        &self,
+        samples: &Samples,
+        radiance: &[Rgb],
+        (column, row): (usize, usize),
+    ) -> Option<Rgb> {
+        let here = row * self.width + column;
+        let is_coarse = |visible: &Visible<'_>| visible.is_coarse.0;
+        let smooth = column + 1 < self.width
+            && self.is_uniform(samples, [here - 1, here, here + 1], is_coarse);
+        smooth.then(|| radiance[here - 1].between(radiance[here + 1])).flatten()
+    }
+
+    /// The mean of the pixels above and below, where that is as good as shading.
+    fn between_rows(
+        &self,
+        samples: &Samples,
+        radiance: &[Rgb],
+        (column, row): (usize, usize),
+    ) -> Option<Rgb> {
+        let here = row * self.width + column;
+        let (above, below) = (here - self.width, here + self.width);
+        let is_coarse = |visible: &Visible<'_>| visible.is_coarse.1;
+        let smooth =
+            below < radiance.len() && self.is_uniform(samples, [above, here, below], is_coarse);
+        smooth.then(|| radiance[above].between(radiance[below])).flatten()
+    }
+
+    /// Whether pixels of a band show one and the same surface, and that is coarse.
+    fn is_uniform(
+        &self,
+        samples: &Samples,
+        pixels: [usize; 3],
+        is_coarse: impl Fn(&Visible<'_>) -> bool,
+    ) -> bool {
+        let [first, _] = samples.at(pixels[0], self.width);
+        self.surface(first).is_none_or(is_coarse)
+            && pixels.iter().all(|&pixel| samples.at(pixel, self.width) == [first; SAMPLES.len()])
     }
 
     fn sample(&self, top: usize, rows: usize) -> Samples {
@@ -193,10 +234,8 @@ impl Canvas<'_> {
 
     /// The mean radiance of a pixel, shading each surface in it where it is seen.
     fn pixel(&self, samples: &Samples, (column, row): (usize, usize), y: usize) -> Rgb {
-        let at =
-            |sample: usize| samples.surface[(row * SAMPLES.len() + sample) * self.width + column];
+        let [one, other] = samples.at(row * self.width + column, self.width);
         let (x, y) = (column as f32, y as f32);
-        let (one, other) = (at(0), at(1));
         if one == other {
             return self.radiance(one, x + 0.5, y + 0.5);
         }

@@ -59,14 +59,16 @@ pub(super) enum Paint<'a> {
 }
 
 impl Paint<'_> {
-    /// Width of the thinnest upright line that must stay visible, in metres.
-    pub fn finest(&self) -> f32 {
+    /// Thickness of the thinnest upright and level lines that must stay visible, in metres.
+    pub fn finest(&self) -> (f32, f32) {
         match self {
             // Strokes of the name over a shop.
-            Paint::Facade(_) => 0.09,
-            Paint::Sign { size, .. } => 0.17 * size,
-            Paint::VehicleSide(..) => 0.08,
-            _ => f32::INFINITY,
+            Paint::Facade(_) => (0.09, 0.09),
+            Paint::Sign { size, .. } => (0.17 * size, 0.17 * size),
+            Paint::VehicleSide(..) => (0.08, 0.06),
+            // The lines along the kerb.
+            Paint::Road => (f32::INFINITY, 0.09),
+            _ => (f32::INFINITY, f32::INFINITY),
         }
     }
 }

@@ -42,7 +42,8 @@ pub enum DenseFeaturesError {
 }
 
 impl DenseFeatures {
-    /// Takes row-major cells and normalises each one; a zero cell stays zero and matches nothing.
+    /// Takes row-major cells and normalises each one. A cell without a direction, because it is
+    /// zero or not finite, becomes zero and matches nothing.
     pub fn new(
         height: usize,
         width: usize,
@@ -62,8 +63,11 @@ impl DenseFeatures {
         }
         for cell in cells.chunks_exact_mut(channels) {
             let norm = cell.iter().map(|x| x * x).sum::<f32>().sqrt();
-            let scale = if norm > 1e-12 && norm.is_finite() { 1.0 / norm } else { 0.0 };
-            cell.iter_mut().for_each(|x| *x *= scale);
+            if norm > 1e-12 && norm.is_finite() {
+                cell.iter_mut().for_each(|x| *x /= norm);
+            } else {
+                cell.fill(0.0);
+            }
         }
         Ok(Self { height, width, channels, cells, reliability })
     }

@@ -12,11 +12,11 @@ mod job;
 mod map;
 mod pose;
 
+pub use self::image::{Image, ImageId, MediaType};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
 pub use dense::DenseFeatures;
 pub use descriptor::{Descriptor, DescriptorError};
 pub use digest::Digest;
-pub use self::image::{Image, ImageId, MediaType};
 pub use job::{Description, Job, JobState, RefinerKind, Usage};
 pub use map::{DescriptorKind, Frame, Map, MapName, Scene};
 pub use pose::{GeographicPose, MetricPose, Pose, PoseError};

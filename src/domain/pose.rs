@@ -221,9 +221,8 @@ mod tests {
 
     #[test]
     fn an_orientation_is_whole_and_of_unit_norm() {
-        let with = |q: [f64; 4]| {
-            json!({"x": 0, "y": 0, "qx": q[0], "qy": q[1], "qz": q[2], "qw": q[3]})
-        };
+        let with =
+            |q: [f64; 4]| json!({"x": 0, "y": 0, "qx": q[0], "qy": q[1], "qz": q[2], "qw": q[3]});
         assert!(Pose::from_json(Frame::Metric, with([0.0, 0.0, 0.6, 0.8])).is_ok());
         assert!(Pose::from_json(Frame::Metric, with([0.0, 0.0, 0.6, 0.6])).is_err());
         assert!(Pose::from_json(Frame::Metric, json!({"x": 0, "y": 0, "qw": 1})).is_err());
@@ -231,9 +230,8 @@ mod tests {
 
     #[test]
     fn a_degree_of_latitude_is_111_kilometres() {
-        let at = |lat| {
-            Pose::Geographic(GeographicPose { lat, lon: 139.7, alt: None, heading: None })
-        };
+        let at =
+            |lat| Pose::Geographic(GeographicPose { lat, lon: 139.7, alt: None, heading: None });
         let distance = at(35.0).distance_m(&at(36.0)).unwrap();
         assert!((distance - 111_195.0).abs() < 10.0, "{distance}");
     }

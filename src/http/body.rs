@@ -51,7 +51,10 @@ impl<T: DeserializeOwned> FromRequest<AppState> for JsonBody<T> {
         let bytes = whole(request, state).await?;
         let text: &[u8] = if bytes.is_empty() { b"{}" } else { &bytes };
         serde_json::from_slice(text).map(Self).map_err(|error| {
-            Problem::new(ErrorKind::Malformed, format!("the body is not the JSON expected: {error}"))
+            Problem::new(
+                ErrorKind::Malformed,
+                format!("the body is not the JSON expected: {error}"),
+            )
         })
     }
 }

@@ -32,11 +32,8 @@ pub(super) async fn observe(
     request.extensions_mut().insert(id.clone());
     let method = request.method().clone();
     // The pattern, not the path: a label for every image id would be a leak.
-    let route = request
-        .extensions()
-        .get::<MatchedPath>()
-        .map_or("none", |path| path.as_str())
-        .to_owned();
+    let route =
+        request.extensions().get::<MatchedPath>().map_or("none", |path| path.as_str()).to_owned();
     let path = request.uri().path().to_owned();
     let mut response = next.run(request).await;
     let (took, status) = (start.elapsed(), response.status().as_u16());
@@ -60,11 +57,7 @@ fn request_id(request: &Request) -> RequestId {
 }
 
 /// Bounds how many requests are in progress, how large they are and how long they take.
-pub(super) async fn bound(
-    State(state): State<AppState>,
-    request: Request,
-    next: Next,
-) -> Response {
+pub(super) async fn bound(State(state): State<AppState>, request: Request, next: Next) -> Response {
     // An operator looks here when the server is overloaded.
     if matches!(request.uri().path(), "/livez" | "/readyz" | "/metrics") {
         return next.run(request).await;
@@ -113,8 +106,9 @@ fn refuse(request: Request, kind: ErrorKind, detail: String) -> Response {
 async fn discard(body: Body) {
     const LONGEST: Duration = Duration::from_secs(5);
     let mut chunks = body.into_data_stream();
-    let _ = tokio::time::timeout(LONGEST, async move {
-        while let Some(Ok(_)) = chunks.next().await {}
-    })
+    let _ = tokio::time::timeout(
+        LONGEST,
+        async move { while let Some(Ok(_)) = chunks.next().await {} },
+    )
     .await;
 }

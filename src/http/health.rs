@@ -1,9 +1,9 @@
 //! Alive, ready, metrics, and the description of the API.
 
+use axum::Json;
 use axum::extract::State;
 use axum::http::header::{CONTENT_SECURITY_POLICY, CONTENT_TYPE};
 use axum::response::{Html, IntoResponse, Redirect, Response};
-use axum::Json;
 
 use super::problem::Problem;
 use super::state::{AppState, Ready};

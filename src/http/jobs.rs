@@ -38,10 +38,8 @@ pub(super) async fn list_jobs(
     Ready(service): Ready,
     Params(params): Params<ListParams>,
 ) -> Result<Json<JobPage>, Problem> {
-    let filter = JobFilter {
-        map: params.map.as_deref().map(map_name).transpose()?,
-        state: params.state,
-    };
+    let filter =
+        JobFilter { map: params.map.as_deref().map(map_name).transpose()?, state: params.state };
     let cursor = params.cursor.as_deref().map(job_id).transpose()?;
     Ok(Json(service.list_jobs(filter, cursor, params.limit).await?))
 }

@@ -72,8 +72,7 @@ impl From<ServiceError> for Problem {
 impl IntoResponse for Problem {
     /// Leaves the body to [`render`], which knows the request's id.
     fn into_response(self) -> Response {
-        let status =
-            StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+        let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
         let mut response = status.into_response();
         response.extensions_mut().insert(self);
         response

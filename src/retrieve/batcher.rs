@@ -103,6 +103,8 @@ fn load(
     builder
         .with_optimization_level(GraphOptimizationLevel::Level3)
         .and_then(|builder| builder.with_intra_threads(threads.max(1)))
+        // Threads that spin for work take the cores from decoding.
+        .and_then(|builder| builder.with_intra_op_spinning(false))
         .map_err(|error| failed(error.to_string()))?
         .commit_from_file(model)
         .map_err(|error| failed(error.to_string()))

@@ -69,10 +69,8 @@ pub fn decode(bytes: &[u8], limits: ImageLimits) -> Result<Picture, DecodeError>
         MediaType::Png => (image::ImageFormat::Png, "PNG"),
         MediaType::Webp => (image::ImageFormat::WebP, "WebP"),
     };
-    let damaged = |error: image::ImageError| DecodeError::Damaged {
-        format: name,
-        reason: error.to_string(),
-    };
+    let damaged =
+        |error: image::ImageError| DecodeError::Damaged { format: name, reason: error.to_string() };
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(allocation_limits(limits));
     let mut decoder = reader.into_decoder().map_err(damaged)?;
@@ -133,16 +131,13 @@ mod tests {
         let mut bytes = Vec::new();
         let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 95);
         encoder.set_exif_metadata(exif).unwrap();
-        encoder
-            .write_image(gradient(40, 20).as_raw(), 40, 20, ExtendedColorType::Rgb8)
-            .unwrap();
+        encoder.write_image(gradient(40, 20).as_raw(), 40, 20, ExtendedColorType::Rgb8).unwrap();
         bytes
     }
 
     #[test]
     fn the_three_formats_decode() {
-        for format in
-            [image::ImageFormat::Jpeg, image::ImageFormat::Png, image::ImageFormat::WebP]
+        for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png, image::ImageFormat::WebP]
         {
             let picture = decode(&encode(format), LIMITS).unwrap();
             assert_eq!(picture.pixels.dimensions(), (40, 20), "{format:?}");
@@ -159,8 +154,7 @@ mod tests {
 
     #[test]
     fn a_file_cut_anywhere_is_refused() {
-        for format in
-            [image::ImageFormat::Jpeg, image::ImageFormat::Png, image::ImageFormat::WebP]
+        for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png, image::ImageFormat::WebP]
         {
             let whole = encode(format);
             for keep in [12, whole.len() / 4, whole.len() / 2, whole.len() - 20] {

@@ -5,19 +5,19 @@
 //! [`Extractor`] strings the first four together. Where descriptors and records are kept is the
 //! business of [`crate::store`].
 
-pub mod decode;
 mod batcher;
+pub mod decode;
 mod extractor;
 pub mod index;
 mod jpeg;
 pub mod manifest;
-pub mod pooling;
 mod pool;
+pub mod pooling;
 pub mod preprocess;
 mod runtime;
 
 pub use decode::{DecodeError, ImageLimits, Picture};
-pub use extractor::{Extraction, ExtractError, Extractor, ExtractorSettings, StageTimes};
+pub use extractor::{ExtractError, Extraction, Extractor, ExtractorSettings, StageTimes};
 pub use manifest::{Manifest, ManifestError};
 pub use pool::{CpuPool, Overloaded, PoolError};
 pub use runtime::{Assets, RuntimeError};

@@ -180,8 +180,7 @@ mod tests {
     #[test]
     fn the_grid_pools_each_part_on_its_own() {
         let cells: Vec<f32> = (0..12).map(|i| i as f32).collect();
-        let features =
-            LocalFeatures::from_output(&map_output(1), (3, 4), &cells, None).unwrap();
+        let features = LocalFeatures::from_output(&map_output(1), (3, 4), &cells, None).unwrap();
         let numbers = features.gem(&pooling([3, 2], 1.0));
         assert_eq!(numbers, [0.5, 2.5, 4.5, 6.5, 8.5, 10.5]);
     }

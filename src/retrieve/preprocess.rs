@@ -1,6 +1,6 @@
 //! Pixels to the input tensor that a manifest asks for.
 
-use fast_image_resize::images::{ImageRef, Image as Canvas};
+use fast_image_resize::images::{Image as Canvas, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
 use image::RgbImage;
 
@@ -102,9 +102,8 @@ fn run_resize(
     height: u32,
     options: &ResizeOptions,
 ) -> Result<Vec<u8>, PreprocessError> {
-    let source =
-        ImageRef::new(pixels.width(), pixels.height(), pixels.as_raw(), PixelType::U8x3)
-            .map_err(|error| failure(pixels, &error.to_string()))?;
+    let source = ImageRef::new(pixels.width(), pixels.height(), pixels.as_raw(), PixelType::U8x3)
+        .map_err(|error| failure(pixels, &error.to_string()))?;
     let mut canvas = Canvas::new(width, height, PixelType::U8x3);
     Resizer::new()
         .resize(&source, &mut canvas, options)
@@ -113,11 +112,7 @@ fn run_resize(
 }
 
 fn failure(pixels: &RgbImage, reason: &str) -> PreprocessError {
-    PreprocessError {
-        width: pixels.width(),
-        height: pixels.height(),
-        reason: reason.to_owned(),
-    }
+    PreprocessError { width: pixels.width(), height: pixels.height(), reason: reason.to_owned() }
 }
 
 #[cfg(test)]
@@ -172,7 +167,8 @@ mod tests {
 
     #[test]
     fn downsizing_averages_instead_of_skipping() {
-        let stripes = RgbImage::from_fn(320, 160, |x, _| Rgb([if x % 2 == 0 { 0 } else { 255 }; 3]));
+        let stripes =
+            RgbImage::from_fn(320, 160, |x, _| Rgb([if x % 2 == 0 { 0 } else { 255 }; 3]));
         let tensor = preprocess(&stripes, &input(Resize::Squash)).unwrap();
         assert!(tensor.data[512..].iter().all(|&value| (value - 0.5).abs() < 0.05));
     }

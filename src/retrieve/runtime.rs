@@ -24,7 +24,9 @@ pub enum RuntimeError {
         looked: String,
     },
     /// The library does not load.
-    #[error("ONNX Runtime at {path} cannot be loaded: {reason}; `make build` installs one that can")]
+    #[error(
+        "ONNX Runtime at {path} cannot be loaded: {reason}; `make build` installs one that can"
+    )]
     Library {
         /// The library.
         path: PathBuf,
@@ -42,20 +44,14 @@ pub enum RuntimeError {
 }
 
 impl Assets {
-    /// The folder given, or else the usual places: `assets` beside the binary or two folders
-    /// above it (a checkout's `target/release`), then `/usr/lib/whereabouts`.
+    /// The folder given, if any, and then the usual places: `assets` beside the binary or up to
+    /// three folders above it (a checkout's `target/release`), and `/usr/lib/whereabouts`.
     pub fn locate(configured: Option<&Path>) -> Self {
-        let candidates = match configured {
-            Some(path) => vec![path.to_owned()],
-            None => std::env::current_exe()
-                .ok()
-                .iter()
-                .flat_map(|binary| binary.ancestors().skip(1).take(4))
-                .map(|folder| folder.join("assets"))
-                .chain([PathBuf::from("/usr/lib/whereabouts")])
-                .collect(),
-        };
-        Self { candidates }
+        let binary = std::env::current_exe().unwrap_or_default();
+        let beside = binary.ancestors().skip(1).take(4).map(|folder| folder.join("assets"));
+        let installed = PathBuf::from("/usr/lib/whereabouts");
+        let configured = configured.map(Path::to_owned);
+        Self { candidates: configured.into_iter().chain(beside).chain([installed]).collect() }
     }
 
     /// The folder of the model called `name`.
@@ -95,7 +91,8 @@ impl Assets {
     }
 
     fn looked(&self) -> String {
-        let places: Vec<_> = self.candidates.iter().map(|path| path.display().to_string()).collect();
+        let places: Vec<_> =
+            self.candidates.iter().map(|path| path.display().to_string()).collect();
         format!("looked in {}", places.join(", "))
     }
 }

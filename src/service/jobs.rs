@@ -26,12 +26,9 @@ impl Service {
     /// One job, at once or when it has ended, but after `wait` at the latest.
     pub async fn get_job(&self, id: Uuid, wait: Option<Duration>) -> Result<Job, ServiceError> {
         match wait {
-            Some(wait) if wait > self.settings.max_wait => {
-                Err(ServiceError::unprocessable(format!(
-                    "wait must be at most {} seconds",
-                    self.settings.max_wait.as_secs()
-                )))
-            }
+            Some(wait) if wait > self.settings.max_wait => Err(ServiceError::unprocessable(
+                format!("wait must be at most {} seconds", self.settings.max_wait.as_secs()),
+            )),
             Some(wait) => self.wait_for(id, wait).await,
             None => self.known_job(id).await,
         }

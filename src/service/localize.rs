@@ -203,8 +203,7 @@ impl Service {
             return Err(ServiceError::new(ErrorKind::Internal, "there is no refiner"));
         };
         let job = Job::queued(map.name.clone(), query.id, refiner.kind(), query.created_at);
-        let record =
-            JobRecord { job: job.clone(), map_uid: map.uid, query, candidates };
+        let record = JobRecord { job: job.clone(), map_uid: map.uid, query, candidates };
         let _pin = self.blobs.put_blob(record.query.digest, frame).await?;
         self.jobs.submit(record, self.settings.job_queue).await?;
         self.metrics.job_submitted();

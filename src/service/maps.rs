@@ -89,8 +89,7 @@ impl Service {
         }
         let known = self.maps.map(&name).await?;
         let known = known.as_ref();
-        let descriptor =
-            change.descriptor.or(known.map(|map| map.descriptor)).unwrap_or_default();
+        let descriptor = change.descriptor.or(known.map(|map| map.descriptor)).unwrap_or_default();
         let dim = manifest.dimension(descriptor).ok_or_else(|| {
             ServiceError::unprocessable(format!(
                 "the model {:?} has no [CLS] token; use \"descriptor\": \"gem\"",

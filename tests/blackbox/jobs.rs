@@ -54,7 +54,10 @@ async fn jobs_are_listed_newest_first_by_map_and_state() {
     let mut made = Vec::new();
     for place in 0..3 {
         let answer = localize(&server, place).await;
-        server.get(&format!("{}?wait=30", answer["job"]["href"].as_str().unwrap())).await.expect(200);
+        server
+            .get(&format!("{}?wait=30", answer["job"]["href"].as_str().unwrap()))
+            .await
+            .expect(200);
         made.push(answer["job"]["id"].clone());
     }
     server.post_jpeg("/localize?map=other", frame(0, 0)).await.expect(200);

@@ -11,5 +11,6 @@ mod images;
 mod jobs;
 mod localize;
 mod maps;
+mod models;
 mod real_images;
 mod service;

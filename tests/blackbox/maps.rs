@@ -7,13 +7,15 @@ use super::support::{frame, reference, server};
 #[tokio::test]
 async fn a_map_is_created_changed_listed_and_removed() {
     let (_dir, server) = server();
-    let made = server.put("/maps/yard", json!({"scene": "indoor", "frame": "metric"})).await.expect(201);
+    let made =
+        server.put("/maps/yard", json!({"scene": "indoor", "frame": "metric"})).await.expect(201);
     assert_eq!(made["scene"], "indoor");
     assert_eq!(made["model"], "xfeat");
     assert_eq!((&made["dim"], &made["images"]), (&json!(576), &json!(0)));
     assert_eq!(made["index"], "exact");
 
-    let changed = server.put("/maps/yard", json!({"description": "behind the house"})).await.expect(200);
+    let changed =
+        server.put("/maps/yard", json!({"description": "behind the house"})).await.expect(200);
     assert_eq!(changed["description"], "behind the house");
     assert_eq!((&changed["scene"], &changed["frame"]), (&json!("indoor"), &json!("metric")));
 

@@ -55,7 +55,10 @@ async fn a_request_keeps_the_id_it_came_with() {
     answer.problem(404);
     assert_eq!(answer.headers["x-request-id"], "robot-7/42");
     let request = server.request(Method::GET, "/livez").header("x-request-id", "a b\u{e9}");
-    assert_ne!(Answer::of(request).await.headers["x-request-id"].as_bytes(), "a b\u{e9}".as_bytes());
+    assert_ne!(
+        Answer::of(request).await.headers["x-request-id"].as_bytes(),
+        "a b\u{e9}".as_bytes()
+    );
 }
 
 #[tokio::test]

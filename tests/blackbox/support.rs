@@ -98,9 +98,8 @@ impl Server {
     pub async fn town(&self, map: &str, places: usize) {
         self.put(&format!("/maps/{map}"), json!({"scene": "outdoor"})).await.expect(201);
         for place in 0..places {
-            let path = format!(
-                "/maps/{map}/images?id=place-{place}&lat=45.{place:03}&lon=7&heading=90"
-            );
+            let path =
+                format!("/maps/{map}/images?id=place-{place}&lat=45.{place:03}&lon=7&heading=90");
             self.post_jpeg(&path, reference(place)).await.expect(201);
         }
     }

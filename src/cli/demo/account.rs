@@ -52,10 +52,7 @@ pub fn rendered(args: &Args, folders: &Folders, places: usize, took: Duration) {
 
 pub fn indexed(args: &Args, outcome: &index::Outcome, server: &str) {
     if !args.json {
-        println!(
-            "   indexed {} images at {server} in {:.1} s",
-            outcome.images, outcome.seconds
-        );
+        println!("   indexed {} images at {server} in {:.1} s", outcome.images, outcome.seconds);
     }
 }
 
@@ -145,8 +142,10 @@ fn summary(visits: &[Visit], verdicts: &[Verdict], folders: &Folders, took: Dura
         outcome.harmed
     );
     println!(
-        "   /localize median {:.1} ms; a job took {:.0} ms from submission on median",
-        outcome.localize_ms, outcome.job_ms
+        "   /localize median {:.1} ms; a job median {:.0} ms for {} pairs",
+        outcome.localize_ms,
+        outcome.job_ms,
+        visits.first().map_or(0, |visit| visit.job.descriptions.len())
     );
     println!("   pictures of every frame beside its candidates: {}", shown(&folders.pictures));
     println!("   all of it took {:.1} s", took.as_secs_f64());
@@ -175,8 +174,8 @@ impl Outcome {
         let count = |test: fn(&Verdict) -> bool| verdicts.iter().filter(|v| test(v)).count();
         let percent = |right: usize| 100.0 * right as f64 / verdicts.len().max(1) as f64;
         let job_ms = |visit: &Visit| {
-            let finished = visit.job.finished_at.unwrap_or(visit.job.created_at);
-            finished.duration_since(visit.job.created_at).as_secs_f64() * 1e3
+            let worked = visit.job.started_at.zip(visit.job.finished_at);
+            worked.map_or(0.0, |(start, end)| end.duration_since(start).as_secs_f64() * 1e3)
         };
         Self {
             before: percent(count(|v| v.before)),

@@ -57,7 +57,8 @@ pub(super) struct Visit {
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let start = Instant::now();
     let folders = Folders::fresh(&args.out)?;
-    let spec = TownSpec { seed: args.seed, places: usize::from(args.places), ..TownSpec::default() };
+    let spec =
+        TownSpec { seed: args.seed, places: usize::from(args.places), ..TownSpec::default() };
     account::heading(&args, "1. A town");
     let frames = town::render(spec, &folders)?;
     account::rendered(&args, &folders, frames.len(), start.elapsed());

@@ -59,12 +59,8 @@ fn paint(
     border: Rgb<u8>,
 ) -> anyhow::Result<()> {
     let picture = image::open(file).with_context(|| format!("cannot read {}", file.display()))?;
-    let small = imageops::resize(
-        &picture.into_rgb8(),
-        WIDTH,
-        HEIGHT,
-        imageops::FilterType::Triangle,
-    );
+    let small =
+        imageops::resize(&picture.into_rgb8(), WIDTH, HEIGHT, imageops::FilterType::Triangle);
     let frame = RgbImage::from_pixel(WIDTH + 2 * BORDER, HEIGHT + 2 * BORDER, border);
     imageops::replace(sheet, &frame, i64::from(left), 0);
     imageops::replace(sheet, &small, i64::from(left + BORDER), i64::from(BORDER));

@@ -41,10 +41,7 @@ impl Folders {
         if out.join(MARK).is_file() {
             std::fs::remove_dir_all(out).with_context(cannot)?;
         } else if out.exists() && out.read_dir().with_context(cannot)?.next().is_some() {
-            bail!(
-                "{} holds other things; name an empty or a new folder with --out",
-                out.display()
-            );
+            bail!("{} holds other things; name an empty or a new folder with --out", out.display());
         }
         let folders = Self {
             map: out.join("map"),

@@ -227,9 +227,9 @@ impl Progress {
         let target =
             if on_terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
         let bar = ProgressBar::with_draw_target(Some(total as u64), target);
-        if let Ok(style) = ProgressStyle::with_template(
-            "{bar:40} {pos}/{len} images, {per_sec}, {eta} left",
-        ) {
+        if let Ok(style) =
+            ProgressStyle::with_template("{bar:40} {pos}/{len} images, {per_sec}, {eta} left")
+        {
             bar.set_style(style);
         }
         Self { bar, on_terminal, last_line: std::cell::Cell::new(Instant::now()) }
@@ -240,11 +240,7 @@ impl Progress {
         self.bar.inc(1);
         if !self.on_terminal && self.last_line.get().elapsed() >= PAUSE {
             self.last_line.set(Instant::now());
-            eprintln!(
-                "{}/{} images",
-                self.bar.position(),
-                self.bar.length().unwrap_or_default()
-            );
+            eprintln!("{}/{} images", self.bar.position(), self.bar.length().unwrap_or_default());
         }
     }
 

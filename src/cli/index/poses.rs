@@ -169,7 +169,8 @@ mod tests {
 
     #[test]
     fn the_fields_file_names_hold_metres() {
-        let Some(Pose::Metric(pose)) = in_name("@0584522.50@4477231.25@17@T@40.4@-80.0@.jpg") else {
+        let Some(Pose::Metric(pose)) = in_name("@0584522.50@4477231.25@17@T@40.4@-80.0@.jpg")
+        else {
             panic!("no pose");
         };
         assert_eq!((pose.x, pose.y), (584522.5, 4477231.25));
@@ -180,7 +181,8 @@ mod tests {
 
     #[test]
     fn a_csv_names_files_by_path_or_by_name() {
-        let source = csv("file, lat, lon, heading\na/1.jpg, 35.5, 139.5, 90\n2.jpg,1,2,\n").unwrap();
+        let source =
+            csv("file, lat, lon, heading\na/1.jpg, 35.5, 139.5, 90\n2.jpg,1,2,\n").unwrap();
         assert_eq!(source.frame(), Some(Frame::Wgs84));
         assert!(source.pose("a/1.jpg", b"").unwrap().is_some());
         assert!(source.pose("b/2.jpg", b"").unwrap().is_some());
@@ -189,7 +191,8 @@ mod tests {
 
     #[test]
     fn a_bad_row_is_named_by_its_line() {
-        for text in ["file,lat,lon\na,1,2\nb,95,2", "file,x,y\na,1,2\nb,,2", "file,x,y\na,1,2\nb,q,2"]
+        for text in
+            ["file,lat,lon\na,1,2\nb,95,2", "file,x,y\na,1,2\nb,,2", "file,x,y\na,1,2\nb,q,2"]
         {
             let error = format!("{:#}", csv(text).unwrap_err());
             assert!(error.contains("line 3"), "{error}");

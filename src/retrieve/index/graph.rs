@@ -46,10 +46,7 @@ impl Graph {
         self.hnsw
             .search_filter(query, k, ef, Some(&filter as &dyn FilterT))
             .into_iter()
-            .map(|neighbour| Found {
-                slot: neighbour.d_id,
-                similarity: 1.0 - neighbour.distance,
-            })
+            .map(|neighbour| Found { slot: neighbour.d_id, similarity: 1.0 - neighbour.distance })
             .collect()
     }
 }

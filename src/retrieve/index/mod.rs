@@ -131,11 +131,12 @@ impl MapIndex {
             (SearchMode::Fast, Some(graph)) => {
                 let graphed = self.graphed();
                 let ef = self.settings.ef_search.max(k);
-                graph
-                    .search(query, k, ef, &|slot| slot < graphed && is_live(slot))
-                    .into_iter()
-                    .for_each(|found| best.offer(found));
-                graphed
+                let found = graph.search(query, k, ef, &|slot| slot < graphed && is_live(slot));
+                // Among many removed images a graph can lose its way to the rest.
+                let all = live.slots[..graphed].iter().filter(|live| **live).take(k).count();
+                let complete = found.len() >= all;
+                found.into_iter().filter(|_| complete).for_each(|found| best.offer(found));
+                if complete { graphed } else { 0 }
             }
             _ => 0,
         };
@@ -203,7 +204,8 @@ mod tests {
             state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
             (state >> 40) as f32 / (1_u64 << 24) as f32 - 0.5
         };
-        let centres: Vec<Vec<f32>> = (0..32).map(|_| (0..dim).map(|_| random()).collect()).collect();
+        let centres: Vec<Vec<f32>> =
+            (0..32).map(|_| (0..dim).map(|_| random()).collect()).collect();
         let rows = (0..count).map(|i| {
             let row: Vec<f32> = centres[i % 32].iter().map(|x| x + 0.6 * random()).collect();
             let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();

@@ -77,8 +77,7 @@ impl LiveMap {
         if entries.len() <= stored.slot {
             entries.resize_with(stored.slot + 1, || None);
         }
-        entries[stored.slot] =
-            Some(Entry { id: stored.image.id.clone(), pose: stored.image.pose });
+        entries[stored.slot] = Some(Entry { id: stored.image.id.clone(), pose: stored.image.pose });
         drop(entries);
         self.index.add(stored.slot);
     }

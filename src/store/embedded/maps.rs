@@ -322,6 +322,15 @@ pub(super) fn sweep_deleted(
             None => break,
         }
     }
+    // A map whose model changed while it was empty left a folder without images.
+    let named = |uid: &Uuid, folder: &std::fs::DirEntry| {
+        folder.file_name().to_str() == Some(uid.simple().to_string().as_str())
+    };
+    for folder in std::fs::read_dir(descriptors).into_iter().flatten().flatten() {
+        if !known.iter().any(|uid| named(uid, &folder)) {
+            remove_folder(&folder.path());
+        }
+    }
     trees.flush()
 }
 
@@ -338,11 +347,15 @@ fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs, descriptors: &Path) -> Result<
             blobs.remove_unreferenced(&stored.image.digest, trees);
         }
     }
-    let folder = descriptors.join(uid.simple().to_string());
-    if let Err(error) = std::fs::remove_dir_all(&folder)
+    remove_folder(&descriptors.join(uid.simple().to_string()));
+    Ok(())
+}
+
+/// What cannot be removed stays as rubbish, which harms nobody.
+fn remove_folder(folder: &Path) {
+    if let Err(error) = std::fs::remove_dir_all(folder)
         && error.kind() != std::io::ErrorKind::NotFound
     {
         tracing::warn!(folder = %folder.display(), %error, "cannot remove old descriptors");
     }
-    Ok(())
 }

@@ -121,12 +121,10 @@ fn make_folder(path: &Path) -> Result<(), StoreError> {
 
 fn lock(dir: &Path) -> Result<File, StoreError> {
     let path = dir.join("lock");
-    let file = File::options()
-        .create(true)
-        .truncate(false)
-        .write(true)
-        .open(&path)
-        .map_err(|error| StoreError::Failed(format!("cannot write {}: {error}", path.display())))?;
+    let file =
+        File::options().create(true).truncate(false).write(true).open(&path).map_err(|error| {
+            StoreError::Failed(format!("cannot write {}: {error}", path.display()))
+        })?;
     match file.try_lock() {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => Err(StoreError::Conflict(format!(

@@ -109,15 +109,13 @@ impl VectorFiles {
         let segment = self.open_segment(&path).map_err(|error| {
             StoreError::Failed(format!("cannot open the segment {}: {error}", path.display()))
         })?;
-        self.segments
-            .write()
-            .unwrap_or_else(PoisonError::into_inner)
-            .push(Arc::new(segment));
+        self.segments.write().unwrap_or_else(PoisonError::into_inner).push(Arc::new(segment));
         Ok(())
     }
 
     fn open_segment(&self, path: &std::path::Path) -> io::Result<Segment> {
-        let file = File::options().create(true).truncate(false).read(true).write(true).open(path)?;
+        let file =
+            File::options().create(true).truncate(false).read(true).write(true).open(path)?;
         let length = (HEADER_BYTES + ROWS * self.stride()) as u64;
         let header = self.header();
         if file.metadata()?.len() < HEADER_BYTES as u64 {

@@ -140,7 +140,11 @@ pub(super) fn get<T: DeserializeOwned>(
     tree.get(key).map_err(failed)?.map(|value| decode(&value)).transpose()
 }
 
-pub(super) fn put<T: Serialize>(tree: &sled::Tree, key: &[u8], value: &T) -> Result<(), StoreError> {
+pub(super) fn put<T: Serialize>(
+    tree: &sled::Tree,
+    key: &[u8],
+    value: &T,
+) -> Result<(), StoreError> {
     tree.insert(key, encode(value)?).map(drop).map_err(failed)
 }
 

@@ -1,0 +1,39 @@
+# Two targets are all a newcomer needs: `make demo` and `make test`.
+
+CARGO ?= cargo
+BINARY := target/release/whereabouts
+
+.PHONY: help demo build assets test lint format bench openapi clean
+
+help: ## Say what can be made
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
+
+demo: build ## Set up, build, index a town, localize in it, refine, print what happened
+	$(BINARY) demo --out demo-out
+
+build: assets ## Set up and build target/release/whereabouts
+	@command -v $(CARGO) >/dev/null || { echo "cargo is missing: install Rust 1.95 or later, then run make again" >&2; exit 1; }
+	$(CARGO) build --release --locked
+
+assets: ## Get ONNX Runtime and the built-in model, pinned by version and hash
+	deploy/setup/assets.sh assets
+
+test: build ## Set up, build and run every test
+	$(CARGO) test --release --locked
+
+lint: ## Check the format and the lints
+	$(CARGO) fmt --check
+	$(CARGO) clippy --release --locked --all-targets -- -D warnings
+
+format: ## Format the code
+	$(CARGO) fmt
+
+bench: build ## Measure localizing under load against bare inference
+	$(CARGO) bench --locked --bench localize
+
+openapi: build ## Write docs/openapi.json anew from the handlers
+	$(BINARY) openapi > docs/openapi.json
+
+clean: ## Remove what was built and downloaded
+	$(CARGO) clean
+	rm -rf assets demo-out

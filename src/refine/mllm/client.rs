@@ -1,0 +1,374 @@
+//! The client of one MLLM server: what to send, how long to wait, how often to try.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use bytes::{Bytes, BytesMut};
+use jiff::Timestamp;
+use reqwest::header::{
+    AUTHORIZATION, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, RETRY_AFTER,
+};
+use reqwest::{Response, StatusCode, Url, redirect};
+use tokio::sync::Semaphore;
+
+use super::breaker::Breaker;
+use super::rate::RateLimiter;
+use super::retry::{CallError, Failure, RetryPolicy, retry_after};
+use super::secret::Secret;
+use super::settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError};
+use super::wire::{ChatAnswer, ChatRequest, ErrorAnswer, Message, Reply, Schema};
+
+/// What is read of a refusal, in bytes, and what is told of it, in characters.
+const REFUSAL_BYTES: usize = 64 << 10;
+const REFUSAL_CHARS: usize = 300;
+
+/// One question to a model.
+#[derive(Debug)]
+pub struct Call<'a> {
+    /// The model.
+    pub model: &'a str,
+    /// The conversation so far.
+    pub messages: Vec<Message>,
+    /// The shape of the answer, where the server can be told.
+    pub schema: Option<Schema>,
+    /// What the conversation is expected to cost, in tokens.
+    pub prompt_tokens: u64,
+}
+
+/// What a model answered.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Answer {
+    /// Its words; may be empty.
+    pub text: String,
+    /// Why there are no more of them, where that is not the usual end.
+    pub cut: Option<String>,
+    /// Tokens sent.
+    pub prompt_tokens: u64,
+    /// Tokens received.
+    pub completion_tokens: u64,
+    /// Whether the tokens are a guess, because the server does not count them.
+    pub estimated: bool,
+}
+
+/// Talks to one server, within its limits.
+#[derive(Debug)]
+pub struct MllmClient {
+    http: reqwest::Client,
+    url: Url,
+    headers: HeaderMap,
+    key: Secret,
+    temperature: Option<f64>,
+    max_tokens: u32,
+    max_tokens_field: MaxTokensField,
+    timeout: Duration,
+    answer_max_bytes: usize,
+    /// Whether the server has not yet refused `response_format`.
+    structured: AtomicBool,
+    retry: RetryPolicy,
+    breaker: Breaker,
+    rate: RateLimiter,
+    turns: Semaphore,
+}
+
+impl MllmClient {
+    /// A client for the server of the settings. Nothing is sent yet.
+    pub fn new(settings: &MllmSettings) -> Result<Self, MllmSettingsError> {
+        // reqwest panics without one. Only the first call sets it; a library user may have chosen
+        // another.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let key = settings.key()?;
+        let http = reqwest::Client::builder()
+            // A redirect would carry the key to wherever it leads.
+            .redirect(redirect::Policy::none())
+            .connect_timeout(settings.timeout().min(Duration::from_secs(10)))
+            .build()
+            .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
+        Ok(Self {
+            http,
+            url: endpoint(settings)?,
+            headers: headers(&key, settings.key_header)?,
+            key,
+            temperature: (settings.temperature >= 0.0).then_some(settings.temperature),
+            max_tokens: settings.max_tokens,
+            max_tokens_field: settings.max_tokens_field,
+            timeout: settings.timeout(),
+            answer_max_bytes: settings.answer_max_bytes,
+            structured: AtomicBool::new(true),
+            retry: RetryPolicy {
+                attempts: settings.attempts,
+                backoff: Duration::from_millis(settings.backoff_ms),
+                longest_wait: Duration::from_secs(settings.retry_after_max_s),
+            },
+            breaker: Breaker::new(
+                settings.breaker_failures,
+                Duration::from_secs(settings.breaker_open_s),
+            ),
+            rate: RateLimiter::new(settings.requests_per_minute, settings.tokens_per_minute),
+            turns: Semaphore::new(settings.concurrency.max(1)),
+        })
+    }
+
+    /// Asks, as often as it takes and the settings allow. Dropping the call stops it.
+    pub async fn call(&self, call: &Call<'_>) -> Result<Answer, CallError> {
+        self.retry.run(|| self.attempt(call)).await
+    }
+
+    /// The longest answer, in tokens.
+    pub fn max_tokens(&self) -> u64 {
+        self.max_tokens.into()
+    }
+
+    /// Whether the breaker lets nothing pass at the moment.
+    pub fn is_suspended(&self) -> bool {
+        self.breaker.is_open()
+    }
+
+    async fn attempt(&self, call: &Call<'_>) -> Result<Answer, Failure> {
+        // The semaphore is never closed, so that there is a turn for everybody.
+        let _turn = self.turns.acquire().await;
+        let admission = self.breaker.admit().await.map_err(Failure::Open)?;
+        let most = call.prompt_tokens + self.max_tokens();
+        self.rate.take(most).await;
+        let outcome = self.exchange(call).await;
+        match &outcome {
+            Err(failure) if failure.is_the_servers() => admission.failed(),
+            _ => admission.succeeded(),
+        }
+        if let Ok(answer) = &outcome {
+            self.rate.settle(most, answer.prompt_tokens + answer.completion_tokens);
+        }
+        outcome
+    }
+
+    /// One request; two if the server turns out not to know `response_format`.
+    async fn exchange(&self, call: &Call<'_>) -> Result<Answer, Failure> {
+        let schema = call.schema.as_ref().filter(|_| self.structured.load(Ordering::Relaxed));
+        match self.send(call, schema).await {
+            Err(Failure::Unstructured(why)) => {
+                tracing::info!(why, "the MLLM server takes no response_format; asking in words");
+                self.structured.store(false, Ordering::Relaxed);
+                self.send(call, None).await
+            }
+            outcome => outcome,
+        }
+    }
+
+    async fn send(&self, call: &Call<'_>, schema: Option<&Schema>) -> Result<Answer, Failure> {
+        let body = self.body(call, schema)?;
+        let request =
+            self.http.post(self.url.clone()).headers(self.headers.clone()).body(body);
+        let exchange = async {
+            let response = request.send().await.map_err(|error| self.broken(error))?;
+            if response.status().is_success() {
+                self.read_answer(call, response).await
+            } else {
+                Err(self.read_refusal(response, schema.is_some()).await)
+            }
+        };
+        tokio::time::timeout(self.timeout, exchange).await.unwrap_or_else(|_| {
+            let why = format!("no answer within {} s (mllm.timeout_s)", self.timeout.as_secs());
+            Err(Failure::Broken { why, retry_after: None })
+        })
+    }
+
+    fn body(&self, call: &Call<'_>, schema: Option<&Schema>) -> Result<Vec<u8>, Failure> {
+        let bound = |field| (self.max_tokens_field == field).then_some(self.max_tokens);
+        serde_json::to_vec(&ChatRequest {
+            model: call.model,
+            messages: &call.messages,
+            temperature: self.temperature,
+            max_tokens: bound(MaxTokensField::MaxTokens),
+            max_completion_tokens: bound(MaxTokensField::MaxCompletionTokens),
+            response_format: schema.map(Into::into),
+        })
+        .map_err(|error| Failure::Refused(format!("the request cannot be written: {error}")))
+    }
+
+    async fn read_answer(&self, call: &Call<'_>, response: Response) -> Result<Answer, Failure> {
+        let broken = |why: String| Failure::Broken { why, retry_after: None };
+        let body = match self.read(response, self.answer_max_bytes).await? {
+            (body, false) => body,
+            // Buying it again would not make it shorter.
+            (_, true) => {
+                return Err(Failure::Refused(format!(
+                    "the answer is larger than {} bytes (mllm.answer_max_bytes)",
+                    self.answer_max_bytes
+                )));
+            }
+        };
+        let answer: ChatAnswer = serde_json::from_slice(&body)
+            .map_err(|error| broken(format!("the answer is not a chat completion: {error}")))?;
+        Ok(answered(answer.into(), call.prompt_tokens))
+    }
+
+    async fn read_refusal(&self, response: Response, structured: bool) -> Failure {
+        let status = response.status();
+        let wait = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok());
+        let retry_after = wait.and_then(|value| retry_after(value, Timestamp::now()));
+        let body = self.read(response, REFUSAL_BYTES).await.map(|(body, _)| body);
+        let said = self.told(&body.unwrap_or_default());
+        let why = format!("the MLLM server answered {status}: {said}");
+        match status {
+            StatusCode::TOO_MANY_REQUESTS => Failure::Busy { why, retry_after },
+            StatusCode::BAD_REQUEST | StatusCode::UNPROCESSABLE_ENTITY
+                if structured && names_structure(&said) =>
+            {
+                Failure::Unstructured(why)
+            }
+            StatusCode::REQUEST_TIMEOUT => Failure::Broken { why, retry_after },
+            status if status.is_server_error() => Failure::Broken { why, retry_after },
+            _ => Failure::Refused(why),
+        }
+    }
+
+    /// Reads at most `limit` bytes; says whether there were more.
+    async fn read(&self, mut response: Response, limit: usize) -> Result<(Bytes, bool), Failure> {
+        let mut body = BytesMut::new();
+        while let Some(chunk) = response.chunk().await.map_err(|error| self.broken(error))? {
+            let room = limit - body.len();
+            body.extend_from_slice(&chunk[..chunk.len().min(room)]);
+            if chunk.len() > room {
+                return Ok((body.freeze(), true));
+            }
+        }
+        Ok((body.freeze(), false))
+    }
+
+    /// What a server said, fit for a log: short, on one line, without the key.
+    fn told(&self, body: &[u8]) -> String {
+        let said = serde_json::from_slice(body)
+            .map(ErrorAnswer::message)
+            .unwrap_or_else(|_| String::from_utf8_lossy(body).into_owned());
+        let line: String =
+            said.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+        self.key.scrub(&line).chars().take(REFUSAL_CHARS).collect()
+    }
+
+    fn broken(&self, error: reqwest::Error) -> Failure {
+        // The URL may hold credentials, and the cause is a chain of which only the end is news.
+        let error = error.without_url();
+        let mut cause: &dyn std::error::Error = &error;
+        while let Some(deeper) = cause.source() {
+            cause = deeper;
+        }
+        let why = if cause.to_string() == error.to_string() {
+            error.to_string()
+        } else {
+            format!("{error}: {cause}")
+        };
+        let why = self.key.scrub(&format!("the MLLM server cannot be talked to: {why}"));
+        Failure::Broken { why, retry_after: None }
+    }
+}
+
+/// The tokens are those that the server counted, or else a guess.
+fn answered(reply: Reply, prompt_tokens: u64) -> Answer {
+    let Reply { text, cut, usage } = reply;
+    let guess = estimate_tokens(&text);
+    Answer {
+        prompt_tokens: usage.map_or(prompt_tokens, |usage| usage.prompt_tokens),
+        completion_tokens: usage.map_or(guess, |usage| usage.completion_tokens),
+        estimated: usage.is_none(),
+        text,
+        cut,
+    }
+}
+
+/// About four bytes of English make a token.
+pub fn estimate_tokens(text: &str) -> u64 {
+    text.len().div_ceil(4) as u64
+}
+
+fn names_structure(said: &str) -> bool {
+    let said = said.to_lowercase();
+    ["response_format", "json_schema", "structured output"].iter().any(|name| said.contains(name))
+}
+
+fn endpoint(settings: &MllmSettings) -> Result<Url, MllmSettingsError> {
+    let refused = |reason: String| MllmSettingsError::Url {
+        url: settings.base_url.clone(),
+        reason,
+    };
+    let text = format!("{}/chat/completions", settings.base_url.trim_end_matches('/'));
+    let mut url = Url::parse(&text).map_err(|error| refused(error.to_string()))?;
+    if !matches!(url.scheme(), "http" | "https") {
+        return Err(refused(format!("its scheme is {}", url.scheme())));
+    }
+    if !settings.api_version.is_empty() {
+        url.query_pairs_mut().append_pair("api-version", &settings.api_version);
+    }
+    Ok(url)
+}
+
+fn headers(key: &Secret, header: KeyHeader) -> Result<HeaderMap, MllmSettingsError> {
+    let mut headers = HeaderMap::new();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
+    if key.is_empty() {
+        return Ok(headers);
+    }
+    let (name, text) = match header {
+        KeyHeader::Authorization => (AUTHORIZATION, format!("Bearer {}", key.expose())),
+        KeyHeader::ApiKey => (HeaderName::from_static("api-key"), key.expose().to_owned()),
+    };
+    let mut value = HeaderValue::try_from(text).map_err(|_| MllmSettingsError::Key)?;
+    value.set_sensitive(true);
+    headers.insert(name, value);
+    Ok(headers)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::settings::tests::defaults;
+    use super::*;
+
+    #[test]
+    fn azure_takes_its_version_in_the_query_and_its_key_in_a_header_of_its_own() {
+        let settings = MllmSettings {
+            base_url: "https://x.openai.azure.com/openai/deployments/gpt/".into(),
+            api_version: "2024-10-21".into(),
+            key_header: KeyHeader::ApiKey,
+            api_key: Secret::new("azure-key"),
+            ..defaults()
+        };
+        let client = MllmClient::new(&settings).unwrap();
+        assert_eq!(
+            client.url.as_str(),
+            "https://x.openai.azure.com/openai/deployments/gpt/chat/completions\
+             ?api-version=2024-10-21"
+        );
+        assert_eq!(client.headers["api-key"], "azure-key");
+        assert!(!client.headers.contains_key(AUTHORIZATION));
+    }
+
+    #[test]
+    fn what_is_no_url_is_refused() {
+        for base_url in ["", "api.openai.com/v1", "ftp://host/v1"] {
+            let settings = MllmSettings { base_url: base_url.into(), ..defaults() };
+            assert!(matches!(MllmClient::new(&settings), Err(MllmSettingsError::Url { .. })));
+        }
+    }
+
+    #[test]
+    fn the_client_does_not_show_its_key() {
+        let settings = MllmSettings { api_key: Secret::new("sk-shown"), ..defaults() };
+        let client = MllmClient::new(&settings).unwrap();
+        assert!(!format!("{client:?}").contains("sk-shown"));
+        assert_eq!(client.told(b"{\"error\":{\"message\":\"no sk-shown\"}}"), "no [hidden]");
+        assert_eq!(client.told(b"{\"error\":\"model not found\"}"), "model not found");
+        assert_eq!(client.told("x\n".repeat(1000).as_bytes()).len(), REFUSAL_CHARS);
+    }
+
+    #[test]
+    fn a_key_that_no_header_can_carry_is_refused_without_showing_it() {
+        let settings = MllmSettings { api_key: Secret::new("bad\nkey"), ..defaults() };
+        let error = MllmClient::new(&settings).unwrap_err();
+        assert!(!format!("{error} {error:?}").contains("bad"));
+    }
+
+    #[test]
+    fn tokens_are_guessed_where_the_server_does_not_count() {
+        let answer = answered(Reply { text: "abcdefgh".into(), ..Reply::default() }, 50);
+        assert_eq!((answer.prompt_tokens, answer.completion_tokens), (50, 2));
+        assert!(answer.estimated);
+    }
+}

@@ -1,0 +1,121 @@
+//! Pictures as a model is sent them: scaled down, as JPEG, in a data URL.
+
+use std::sync::Arc;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use bytes::Bytes;
+use image::RgbImage;
+use tokio::sync::Semaphore;
+
+use crate::domain::Digest;
+use crate::retrieve::decode::{decode, encode_jpeg};
+use crate::retrieve::preprocess::shrink_to;
+use crate::retrieve::{CpuPool, ImageLimits};
+use crate::store::{BlobStore, StoreError};
+
+/// Threads that decode, scale and encode. A picture takes milliseconds, a call seconds.
+const THREADS: usize = 2;
+
+/// A picture ready to be sent.
+#[derive(Debug, Clone)]
+pub struct SentPicture {
+    /// The data URL.
+    pub url: Arc<str>,
+    /// What it is expected to cost, in tokens.
+    pub tokens: u64,
+}
+
+/// Why a picture cannot be sent.
+#[derive(Debug, thiserror::Error)]
+pub enum PictureError {
+    /// Its bytes are gone.
+    #[error("the bytes of the picture are missing from the store")]
+    Missing,
+    /// The store failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// It cannot be decoded, scaled or encoded.
+    #[error("the picture cannot be prepared: {0}")]
+    Unfit(String),
+    /// The work was not done.
+    #[error("the picture was not prepared: {0}")]
+    Undone(String),
+}
+
+/// Fetches pictures and makes them ready.
+pub struct Pictures {
+    blobs: Arc<dyn BlobStore>,
+    limits: ImageLimits,
+    max_edge: u32,
+    pool: CpuPool,
+    /// As many as the pool has room for, so that its queue is never full.
+    turns: Arc<Semaphore>,
+}
+
+impl Pictures {
+    /// Starts the threads.
+    pub fn new(
+        blobs: Arc<dyn BlobStore>,
+        limits: ImageLimits,
+        max_edge: u32,
+    ) -> std::io::Result<Self> {
+        let pool = CpuPool::new("mllm-pictures", THREADS, THREADS)?;
+        Ok(Self { blobs, limits, max_edge, pool, turns: Arc::new(Semaphore::new(THREADS)) })
+    }
+
+    /// The picture of that digest.
+    pub async fn picture(&self, digest: &Digest) -> Result<SentPicture, PictureError> {
+        let undone = |error: &dyn std::error::Error| PictureError::Undone(error.to_string());
+        let bytes = self.blobs.blob(digest).await?.ok_or(PictureError::Missing)?;
+        let turn = Arc::clone(&self.turns).acquire_owned().await.map_err(|error| undone(&error))?;
+        let (limits, max_edge) = (self.limits, self.max_edge);
+        let work = move || {
+            // Held by the work and not by its caller, who may leave before it is done.
+            let _turn = turn;
+            prepare(&bytes, limits, max_edge)
+        };
+        self.pool.run(work).await.map_err(|error| undone(&error))?
+    }
+}
+
+/// Blocks. Even a JPEG that is small enough is encoded anew: its EXIF may tell where it was taken,
+/// and that is nobody's business outside.
+fn prepare(bytes: &Bytes, limits: ImageLimits, max_edge: u32) -> Result<SentPicture, PictureError> {
+    let unfit = |error: &dyn std::error::Error| PictureError::Unfit(error.to_string());
+    let picture = decode(bytes, limits).map_err(|error| unfit(&error))?;
+    let pixels = shrink_to(&picture.pixels, max_edge).map_err(|error| unfit(&error))?;
+    let jpeg = encode_jpeg(&pixels).map_err(|error| unfit(&error))?;
+    let url = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
+    Ok(SentPicture { url: url.into(), tokens: estimate_tokens(&pixels) })
+}
+
+/// The rule of OpenAI's vision models: 85 tokens, and 170 for each tile of 512 pixels. Others count
+/// otherwise; this is for limits, and bills are settled by what the server counts.
+fn estimate_tokens(pixels: &RgbImage) -> u64 {
+    let tiles = u64::from(pixels.width().div_ceil(512)) * u64::from(pixels.height().div_ceil(512));
+    85 + 170 * tiles
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LIMITS: ImageLimits = ImageLimits { max_pixels: 1_000_000 };
+
+    #[test]
+    fn a_picture_is_sent_as_a_small_jpeg() {
+        let bytes = encode_jpeg(&RgbImage::new(800, 600)).unwrap();
+        let sent = prepare(&bytes.into(), LIMITS, 400).unwrap();
+        let data = sent.url.strip_prefix("data:image/jpeg;base64,").unwrap();
+        let pixels = decode(&STANDARD.decode(data).unwrap(), LIMITS).unwrap().pixels;
+        assert_eq!(pixels.dimensions(), (400, 300));
+        assert_eq!(sent.tokens, 85 + 170);
+    }
+
+    #[test]
+    fn what_is_no_picture_is_not_sent() {
+        let error = prepare(&Bytes::from_static(b"hello"), LIMITS, 400).unwrap_err();
+        assert!(matches!(error, PictureError::Unfit(_)));
+    }
+}

@@ -1,0 +1,224 @@
+//! From the words of the reasoning model to an order of the candidates.
+//!
+//! Whatever the model says, the outcome is a permutation: an answer can change the order of these
+//! candidates and nothing else.
+
+use serde::Deserialize;
+use serde_json::json;
+use uuid::Uuid;
+
+use super::wire::Schema;
+use crate::domain::Digest;
+
+/// The candidates under neutral names.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Labels {
+    /// Which candidate each label stands for, in the order in which they are shown.
+    shown: Vec<usize>,
+    labels: Vec<String>,
+}
+
+/// What was understood of an answer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Verdict {
+    /// Every candidate that has a label, best first.
+    pub order: Vec<usize>,
+    /// How many of them the answer left out; they are at the end, in coarse order.
+    pub left_out: usize,
+    /// Why, in the model's words.
+    pub reasoning: String,
+}
+
+/// Why an answer cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum AnswerError {
+    /// There is neither a JSON object with a ranking nor a line with one.
+    #[error("it holds no JSON object with a list \"ranking\"")]
+    NoRanking,
+    /// The ranking names no candidate.
+    #[error("its ranking holds none of the labels")]
+    NoLabel,
+}
+
+#[derive(Deserialize)]
+struct AnswerJson {
+    #[serde(default)]
+    reasoning: String,
+    ranking: Vec<String>,
+}
+
+impl Labels {
+    /// Names the candidates, which are given in coarse order: A, B, … With `shuffled_by`, they are
+    /// shown in an order that depends on the job alone, so that it is the same at the next try.
+    pub fn new(mut candidates: Vec<usize>, shuffled_by: Option<Uuid>) -> Self {
+        if let Some(job) = shuffled_by {
+            candidates.sort_by_cached_key(|index| {
+                Digest::of(format!("order {job} {index}").as_bytes())
+            });
+        }
+        let labels = (0..candidates.len()).map(label).collect();
+        Self { shown: candidates, labels }
+    }
+
+    /// Label and candidate, in the order in which they are shown.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, usize)> {
+        self.labels.iter().map(String::as_str).zip(self.shown.iter().copied())
+    }
+
+    /// The shape that an answer must have.
+    pub fn schema(&self) -> Schema {
+        let properties = json!({
+            "reasoning": { "type": "string" },
+            "ranking": { "type": "array", "items": { "type": "string", "enum": self.labels } },
+        });
+        Schema::object("ranking", properties)
+    }
+
+    /// Reads an answer. Labels that are unknown or come twice are passed over; candidates that are
+    /// missing follow in coarse order.
+    pub fn read(&self, answer: &str) -> Result<Verdict, AnswerError> {
+        let AnswerJson { reasoning, ranking } = find(answer).ok_or(AnswerError::NoRanking)?;
+        let mut order = Vec::with_capacity(self.shown.len());
+        for label in &ranking {
+            match self.candidate(label) {
+                Some(index) if !order.contains(&index) => order.push(index),
+                _ => {}
+            }
+        }
+        if order.is_empty() {
+            return Err(AnswerError::NoLabel);
+        }
+        let mut missing: Vec<usize> =
+            self.shown.iter().copied().filter(|index| !order.contains(index)).collect();
+        missing.sort_unstable();
+        let left_out = missing.len();
+        order.extend(missing);
+        Ok(Verdict { order, left_out, reasoning })
+    }
+
+    fn candidate(&self, label: &str) -> Option<usize> {
+        let label = label.trim();
+        let (_, index) = self.iter().find(|(known, _)| known.eq_ignore_ascii_case(label))?;
+        Some(index)
+    }
+}
+
+/// A … Z, AA, AB, …
+fn label(mut number: usize) -> String {
+    let mut letters = Vec::new();
+    loop {
+        letters.push(char::from(b'A' + (number % 26) as u8));
+        number = match (number / 26).checked_sub(1) {
+            Some(rest) => rest,
+            None => return letters.iter().rev().collect(),
+        };
+    }
+}
+
+/// The answer, wherever it is: the whole text, the inside of a fence, the last JSON object in the
+/// text, or a last line `RANKING: A, B, C`.
+fn find(answer: &str) -> Option<AnswerJson> {
+    let text = answer.trim();
+    let fenced = || {
+        let (_, after) = text.rsplit_once("```json")?;
+        Some(after.split_once("```").map_or(after, |(inside, _)| inside))
+    };
+    let object = || text.get(text.find('{')?..=text.rfind('}')?);
+    let parse = |text: &str| serde_json::from_str::<AnswerJson>(text.trim()).ok();
+    parse(text)
+        .or_else(|| fenced().and_then(parse))
+        .or_else(|| object().and_then(parse))
+        .or_else(|| last_line(text))
+}
+
+fn last_line(text: &str) -> Option<AnswerJson> {
+    let (before, line) = text.rsplit_once('\n').unwrap_or(("", text));
+    let (head, list) = line.split_once(':')?;
+    if !head.trim_matches(|c: char| !c.is_alphanumeric()).eq_ignore_ascii_case("ranking") {
+        return None;
+    }
+    let ranking = list
+        .split([',', '>'])
+        .map(|label| label.trim_matches(|c: char| !c.is_alphanumeric()).to_owned())
+        .collect();
+    Some(AnswerJson { reasoning: before.trim().to_owned(), ranking })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn labels(count: usize) -> Labels {
+        Labels::new((0..count).collect(), None)
+    }
+
+    fn order(answer: &str) -> Result<(Vec<usize>, usize), AnswerError> {
+        labels(4).read(answer).map(|verdict| (verdict.order, verdict.left_out))
+    }
+
+    #[test]
+    fn an_answer_is_found_in_each_of_its_guises() {
+        let json = r#"{"reasoning": "a sign", "ranking": ["C", "A", "D", "B"]}"#;
+        for answer in [
+            json.to_owned(),
+            format!("Here it is:\n```json\n{json}\n```\nDone."),
+            format!("I think {json} is right"),
+            "a sign\nRANKING: C, A, D, B".to_owned(),
+            "a sign\n**Ranking:** C > A > D > B.".to_owned(),
+        ] {
+            let verdict = labels(4).read(&answer).unwrap();
+            assert_eq!((verdict.order, verdict.left_out), (vec![2, 0, 3, 1], 0), "{answer}");
+        }
+    }
+
+    #[test]
+    fn unknown_and_repeated_labels_are_passed_over_and_missing_ones_follow_in_coarse_order() {
+        let ranking = |list: &str| order(&format!(r#"{{"reasoning": "", "ranking": {list}}}"#));
+        assert_eq!(ranking(r#"["D", "D", "X", "", "B", "d"]"#), Ok((vec![3, 1, 0, 2], 2)));
+        assert_eq!(ranking(r#"["A", "B", "C", "D", "E"]"#), Ok((vec![0, 1, 2, 3], 0)));
+        assert_eq!(ranking(r#"["X", "Y"]"#), Err(AnswerError::NoLabel));
+        assert_eq!(ranking("[]"), Err(AnswerError::NoLabel));
+    }
+
+    #[test]
+    fn what_holds_no_ranking_is_an_error() {
+        for answer in [
+            "",
+            "I cannot rank these.",
+            "{}",
+            "}{",
+            r#"{"ranking": "A"}"#,
+            r#"{"ranking": [1, 2]}"#,
+            "A, B",
+            "RANKING: A\nand so on",
+            &"{".repeat(100_000),
+        ] {
+            assert_eq!(order(answer), Err(AnswerError::NoRanking), "{answer:.40}");
+        }
+    }
+
+    #[test]
+    fn labels_do_not_leak_the_coarse_rank_and_are_the_same_at_the_next_try() {
+        let job = Uuid::from_u128(7);
+        let shuffled = |job| Labels::new((0..10).collect(), Some(job));
+        assert_eq!(shuffled(job), shuffled(job));
+        assert_ne!(shuffled(job).shown, (0..10).collect::<Vec<_>>());
+        let firsts: std::collections::HashSet<usize> =
+            (0..100).map(|job| shuffled(Uuid::from_u128(job)).shown[0]).collect();
+        assert_eq!(firsts.len(), 10);
+        let labels = shuffled(job);
+        let (first, candidate) = labels.iter().next().unwrap();
+        assert_eq!(first, "A");
+        let verdict = labels.read(r#"{"reasoning": "", "ranking": ["A"]}"#).unwrap();
+        assert_eq!(verdict.order[0], candidate);
+        assert!(verdict.order[1..].is_sorted());
+    }
+
+    #[test]
+    fn a_hundred_candidates_have_a_hundred_labels() {
+        let labels = labels(100);
+        let unique: std::collections::HashSet<&str> = labels.iter().map(|(label, _)| label).collect();
+        assert_eq!(unique.len(), 100);
+        assert_eq!((label(25), label(26), label(99)), ("Z".into(), "AA".into(), "CV".into()));
+    }
+}

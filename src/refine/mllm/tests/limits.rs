@@ -1,0 +1,116 @@
+//! Breaker and budget: what a job does while no call may be made.
+
+use async_trait::async_trait;
+
+use super::*;
+use crate::domain::{Ranking, RefinerKind, Usage};
+
+/// Stands in for the local refiner: turns the coarse order round.
+struct Reverse;
+
+#[async_trait]
+impl Refiner for Reverse {
+    fn kind(&self) -> RefinerKind {
+        RefinerKind::Local
+    }
+
+    async fn refine(&self, record: &JobRecord) -> Result<Refinement, RefineError> {
+        let order: Vec<usize> = (0..record.candidates.len()).rev().collect();
+        Ok(Refinement {
+            descriptions: vec![],
+            ranking: Ranking::new(&record.candidates, &order).unwrap(),
+            reasoning: None,
+            usage: Usage::default(),
+            degraded: None,
+        })
+    }
+}
+
+/// Fails the first describe calls.
+fn failing(first: usize) -> Script {
+    Script {
+        describe: Box::new(move |call| match call.number {
+            number if number <= first => Reply::Status(500, "down".into()),
+            _ => Reply::Text("notes".into()),
+        }),
+        ..Script::default()
+    }
+}
+
+/// One call at a time, each tried once; three failures open the breaker.
+fn brittle(settings: &mut MllmSettings) {
+    settings.concurrency = 1;
+    settings.attempts = 1;
+    settings.breaker_failures = 3;
+}
+
+#[tokio::test]
+async fn an_open_breaker_hands_the_job_to_the_other_refiner() {
+    let mut bench = Bench::with(failing(1000), brittle).await;
+    bench.fallback = Some(Arc::new(Reverse));
+    bench.rebuild(|settings| settings.breaker_open_s = 3600);
+    for _ in 0..2 {
+        let refinement = bench.refine(5).await.unwrap();
+        assert_eq!(ranks(&refinement), [5, 4, 3, 2, 1]);
+        let why = refinement.degraded.unwrap();
+        assert!(why.contains("`local` instead of `mllm`") && why.contains("suspended"), "{why}");
+    }
+    assert_eq!(bench.mock.describe_calls(), 3);
+    assert!(bench.refiner.levels().suspended);
+}
+
+#[tokio::test]
+async fn without_another_refiner_the_job_is_tried_again_later() {
+    let bench = Bench::with(failing(1000), brittle).await;
+    let error = bench.refine(5).await.unwrap_err();
+    assert!(matches!(error, RefineError::Passing(_)), "{error}");
+}
+
+#[tokio::test]
+async fn a_job_that_waits_goes_on_when_the_breaker_lets_it() {
+    let bench = Bench::with(failing(3), |settings| {
+        brittle(settings);
+        settings.breaker_open_s = 0;
+        settings.on_unavailable = OnUnavailable::Wait;
+    })
+    .await;
+    let refinement = bench.refine(6).await.unwrap();
+    assert_eq!(bench.mock.describe_calls(), 6);
+    assert!(refinement.degraded.unwrap().starts_with("3 of 6 pairs"));
+    assert!(!bench.refiner.levels().suspended);
+}
+
+#[tokio::test]
+async fn a_job_never_passes_its_budget() {
+    let mut bench = Bench::with(Script::default(), |settings| {
+        settings.concurrency = 1;
+        settings.tokens_per_job = 8000;
+    })
+    .await;
+    let refinement = bench.refine(20).await.unwrap();
+    let usage = refinement.usage;
+    assert!(usage.prompt_tokens + usage.completion_tokens <= 8000);
+    assert!(refinement.degraded.unwrap().contains("the budget of the job is spent"));
+    bench.fallback = Some(Arc::new(Reverse));
+    bench.rebuild(|settings| settings.tokens_per_job = 10);
+    let refinement = bench.refine(2).await.unwrap();
+    assert_eq!(ranks(&refinement), [2, 1]);
+    assert!(refinement.degraded.unwrap().contains("tokens_per_job"));
+}
+
+#[tokio::test]
+async fn a_day_never_passes_its_budget() {
+    let bench = Bench::with(Script::default(), |settings| {
+        settings.price_prompt = 1.0;
+        settings.price_completion = 2.0;
+        settings.money_per_day = 1.0;
+    })
+    .await;
+    bench.refiner.seed_spent_today(Spent { tokens: 5, money: 0.999 });
+    let error = bench.refine(2).await.unwrap_err();
+    assert!(matches!(&error, RefineError::Passing(why) if why.contains("money_per_day")));
+    assert_eq!(bench.mock.describe_calls(), 0);
+    bench.refiner.seed_spent_today(Spent { tokens: 5, money: 0.5 });
+    assert_eq!(bench.refine(2).await.unwrap().degraded, None);
+    assert!(bench.refiner.levels().spent_today.money > 0.5);
+}

@@ -1,0 +1,217 @@
+//! A map of a few plain pictures in memory, and a refiner that looks at them through the mock.
+
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use image::{Rgb, RgbImage};
+use jiff::Timestamp;
+use uuid::Uuid;
+
+use super::super::cache::MemoryCache;
+use super::super::mock_mllm::{MockMllm, Script};
+use super::super::settings::tests::defaults;
+use super::*;
+use crate::domain::{
+    Candidate, Descriptor, DescriptorKind, Digest, Frame, Image, ImageId, Job, Map, MapName,
+    MediaType, RefinerKind,
+};
+use crate::retrieve::decode::encode_jpeg;
+use crate::retrieve::index::SearchMode;
+use crate::store::{Added, BlobPin, IndexState, Query, StoreError};
+
+/// The key that every call must carry.
+pub const KEY: &str = "sk-test-5c1f";
+
+/// A map whose images `image-0`, `image-1`, … are pictures of one colour each.
+#[derive(Clone)]
+pub struct Shelf {
+    pub map: Map,
+}
+
+/// The mock, and a refiner that is set up to call it.
+pub struct Bench {
+    pub mock: MockMllm,
+    pub shelf: Shelf,
+    pub cache: Arc<MemoryCache>,
+    pub fallback: Option<Arc<dyn Refiner>>,
+    pub settings: MllmSettings,
+    pub refiner: MllmRefiner,
+}
+
+impl Bench {
+    pub async fn new(script: Script) -> Self {
+        Self::with(script, |_| {}).await
+    }
+
+    pub async fn with(script: Script, change: impl FnOnce(&mut MllmSettings)) -> Self {
+        let mock = MockMllm::start(Script { key: Some(KEY.into()), ..script }).await;
+        let mut settings = MllmSettings {
+            base_url: mock.url(),
+            api_key: Secret::new(KEY),
+            backoff_ms: 1,
+            ..defaults()
+        };
+        change(&mut settings);
+        let (shelf, cache) = (Shelf::new(), Arc::new(MemoryCache::default()));
+        let refiner = refiner(&shelf, &cache, None, &settings);
+        Self { mock, shelf, cache, fallback: None, settings, refiner }
+    }
+
+    /// The refiner as after a restart with other settings; the cache stays.
+    pub fn rebuild(&mut self, change: impl FnOnce(&mut MllmSettings)) {
+        change(&mut self.settings);
+        self.refiner = refiner(&self.shelf, &self.cache, self.fallback.clone(), &self.settings);
+    }
+
+    pub fn record(&self, candidates: usize) -> JobRecord {
+        self.shelf.record(candidates)
+    }
+
+    pub async fn refine(&self, candidates: usize) -> Result<Refinement, RefineError> {
+        self.refiner.refine(&self.record(candidates)).await
+    }
+}
+
+fn refiner(
+    shelf: &Shelf,
+    cache: &Arc<MemoryCache>,
+    fallback: Option<Arc<dyn Refiner>>,
+    settings: &MllmSettings,
+) -> MllmRefiner {
+    let parts = MllmParts {
+        maps: Arc::new(shelf.clone()),
+        blobs: Arc::new(shelf.clone()),
+        cache: cache.clone(),
+        limits: ImageLimits { max_pixels: 1_000_000 },
+        fallback,
+    };
+    MllmRefiner::new(parts, settings.clone()).unwrap()
+}
+
+/// The picture of a number; the frame is number 200.
+fn picture(number: u8) -> Bytes {
+    encode_jpeg(&RgbImage::from_pixel(64, 48, Rgb([number, 90, 255 - number]))).unwrap().into()
+}
+
+const FRAME: u8 = 200;
+
+impl Shelf {
+    fn new() -> Self {
+        let map = Map {
+            uid: Uuid::from_u128(1),
+            name: "m".parse().unwrap(),
+            scene: Scene::Outdoor,
+            descriptor: DescriptorKind::Gem,
+            frame: Frame::Metric,
+            model: "none".into(),
+            model_digest: Digest::of(b"none"),
+            dim: 1,
+            description: None,
+            created_at: Timestamp::UNIX_EPOCH,
+        };
+        Self { map }
+    }
+
+    fn record(&self, candidates: usize) -> JobRecord {
+        let now = Timestamp::now();
+        let query = Query {
+            id: Uuid::now_v7(),
+            digest: Digest::of(&picture(FRAME)),
+            media_type: MediaType::Jpeg,
+            created_at: now,
+        };
+        let candidate = |index: usize| Candidate {
+            rank: index + 1,
+            image_id: format!("image-{index}").parse().unwrap(),
+            similarity: 0.9,
+            pose: None,
+        };
+        JobRecord {
+            job: Job::queued(self.map.name.clone(), query.id, RefinerKind::Mllm, now),
+            map_uid: self.map.uid,
+            query,
+            candidates: (0..candidates).map(candidate).collect(),
+        }
+    }
+}
+
+fn not_here<T>() -> Result<T, StoreError> {
+    Err(StoreError::Failed("the refiner has no business here".into()))
+}
+
+#[async_trait]
+impl MapStore for Shelf {
+    async fn map(&self, _: &MapName) -> Result<Option<Map>, StoreError> {
+        Ok(Some(self.map.clone()))
+    }
+
+    async fn image(&self, _: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
+        let number = id.as_str().strip_prefix("image-").and_then(|number| number.parse().ok());
+        Ok(number.map(|number| Image {
+            id: id.clone(),
+            digest: Digest::of(&picture(number)),
+            media_type: MediaType::Jpeg,
+            width: 64,
+            height: 48,
+            pose: None,
+            captured_at: None,
+            tags: vec![],
+            created_at: Timestamp::UNIX_EPOCH,
+        }))
+    }
+
+    async fn put_map(&self, _: Map) -> Result<(Map, bool), StoreError> {
+        not_here()
+    }
+
+    async fn maps(&self) -> Result<Vec<Map>, StoreError> {
+        not_here()
+    }
+
+    async fn delete_map(&self, _: &MapName) -> Result<bool, StoreError> {
+        not_here()
+    }
+
+    async fn index_state(&self, _: &Map) -> Result<IndexState, StoreError> {
+        not_here()
+    }
+
+    async fn add_image(&self, _: &Map, _: Image, _: Descriptor) -> Result<Added, StoreError> {
+        not_here()
+    }
+
+    async fn images(
+        &self,
+        _: &Map,
+        _: Option<&ImageId>,
+        _: usize,
+    ) -> Result<Vec<Image>, StoreError> {
+        not_here()
+    }
+
+    async fn delete_image(&self, _: &Map, _: &ImageId) -> Result<bool, StoreError> {
+        not_here()
+    }
+
+    async fn search(
+        &self,
+        _: &Map,
+        _: Descriptor,
+        _: usize,
+        _: SearchMode,
+    ) -> Result<Vec<Candidate>, StoreError> {
+        not_here()
+    }
+}
+
+#[async_trait]
+impl BlobStore for Shelf {
+    async fn put_blob(&self, _: Digest, _: Bytes) -> Result<BlobPin, StoreError> {
+        not_here()
+    }
+
+    async fn blob(&self, digest: &Digest) -> Result<Option<Bytes>, StoreError> {
+        Ok((0..=FRAME).map(picture).find(|bytes| Digest::of(bytes) == *digest))
+    }
+}

@@ -1,0 +1,98 @@
+//! Models of both layouts, from the bytes of a picture to the descriptor.
+
+use std::path::Path;
+
+use serde_json::Value;
+use whereabouts::domain::DescriptorKind;
+use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits};
+
+use super::support::reference;
+
+fn load(model: &str, max_batch: usize) -> Extractor {
+    // The fixtures first, then what `make build` installed.
+    let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures");
+    let settings = ExtractorSettings {
+        model: model.into(),
+        sessions: 1,
+        threads: 1,
+        max_batch,
+        limits: ImageLimits { max_pixels: 10_000_000 },
+    };
+    Extractor::load(&Assets::locate(Some(&fixtures)), &settings).unwrap()
+}
+
+/// The picture that the fixture's script describes, as a PNG.
+fn pattern() -> Vec<u8> {
+    let pixels = image::RgbImage::from_fn(56, 42, |x, y| {
+        let byte = |value: u32| (value % 256) as u8;
+        let (r, g, b) = (7 * x + 13 * y, 11 * x + 3 * y + 50, 5 * x + 17 * y + 101);
+        image::Rgb([byte(r), byte(g), byte(b)])
+    });
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    pixels.write_to(&mut bytes, image::ImageFormat::Png).unwrap();
+    bytes.into_inner()
+}
+
+fn cosine(a: &[f32], b: &[f32]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+}
+
+#[test]
+fn a_token_model_gives_the_descriptors_that_numpy_worked_out() {
+    let extractor = load("tiny-tokens", 1);
+    let file =
+        concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/models/tiny-tokens/expected.json");
+    let expected: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
+    for (kind, name) in [(DescriptorKind::Cls, "cls"), (DescriptorKind::Gem, "gem")] {
+        let expected: Vec<f32> = serde_json::from_value(expected[name].clone()).unwrap();
+        let extraction = extractor.extract(&pattern(), kind).unwrap();
+        for (got, expected) in extraction.descriptor.as_slice().iter().zip(&expected) {
+            assert!((got - expected).abs() < 1e-5, "{name}: {got} is not {expected}");
+        }
+        let dense = &extraction.dense;
+        assert_eq!((dense.height(), dense.width(), dense.channels()), (3, 4, 8));
+    }
+}
+
+#[test]
+fn a_batch_gives_what_single_runs_give() {
+    let (single, batched) = (load("xfeat", 1), load("xfeat", 8));
+    let alone: Vec<_> = (0..8)
+        .map(|place| single.extract(&reference(place), DescriptorKind::Gem).unwrap().descriptor)
+        .collect();
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = (0..8)
+            .map(|place| {
+                let batched = &batched;
+                scope
+                    .spawn(move || batched.extract(&reference(place), DescriptorKind::Gem).unwrap())
+            })
+            .collect();
+        for (thread, alone) in threads.into_iter().zip(&alone) {
+            let together = thread.join().unwrap().descriptor;
+            assert!(cosine(together.as_slice(), alone.as_slice()) > 0.999_99);
+        }
+    });
+}
+
+#[test]
+fn a_damaged_model_is_refused_by_its_digest() {
+    let root = tempfile::tempdir().unwrap();
+    let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/models/tiny-tokens");
+    let to = root.path().join("models/tiny-tokens");
+    std::fs::create_dir_all(&to).unwrap();
+    std::fs::copy(from.join("manifest.toml"), to.join("manifest.toml")).unwrap();
+    let mut bytes = std::fs::read(from.join("model.onnx")).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(to.join("model.onnx"), bytes).unwrap();
+    let settings = ExtractorSettings {
+        model: "tiny-tokens".into(),
+        sessions: 1,
+        threads: 1,
+        max_batch: 1,
+        limits: ImageLimits { max_pixels: 1 },
+    };
+    let error = Extractor::load(&Assets::locate(Some(root.path())), &settings).unwrap_err();
+    assert!(error.to_string().contains("pins"), "{error}");
+}
