@@ -18,7 +18,7 @@ build: assets ## Set up and build target/release/whereabouts
 assets: ## Get ONNX Runtime and the built-in model, pinned by version and hash
 	deploy/setup/assets.sh assets
 
-test: build ## Set up, build and run every test
+test: assets ## Set up, build and run every test
 	$(CARGO) test --release --locked
 
 lint: ## Check the format and the lints

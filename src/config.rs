@@ -11,6 +11,7 @@ use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
 use crate::domain::RefinerKind;
+use crate::refine::mllm::MllmSettings;
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
@@ -35,6 +36,8 @@ pub struct Config {
     pub jobs: Jobs,
     /// The refiner.
     pub refine: Refine,
+    /// The multimodal LLM.
+    pub mllm: MllmSettings,
     /// Logs.
     pub log: Log,
 }
@@ -65,6 +68,10 @@ pub struct Data {
     pub db_cache_bytes: u64,
     /// The most changes in one commit.
     pub commit_batch: usize,
+    /// Descriptions that were paid for, in bytes.
+    pub description_cache_bytes: u64,
+    /// How long they are used, in days.
+    pub description_cache_days: u64,
 }
 
 /// `[model]`
@@ -157,6 +164,8 @@ pub struct Refine {
 pub enum Refiner {
     /// Geometric matching of dense features.
     Local,
+    /// A multimodal LLM ([mllm] says which).
+    Mllm,
     /// Nobody.
     Off,
 }
@@ -166,6 +175,7 @@ impl Refiner {
     pub fn kind(self) -> Option<RefinerKind> {
         match self {
             Self::Local => Some(RefinerKind::Local),
+            Self::Mllm => Some(RefinerKind::Mllm),
             Self::Off => None,
         }
     }
@@ -204,6 +214,8 @@ pub struct Overrides {
     model: Option<serde_json::Value>,
     #[serde(skip_serializing_if = "Option::is_none")]
     refine: Option<serde_json::Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mllm: Option<serde_json::Value>,
 }
 
 impl Overrides {
@@ -228,6 +240,12 @@ impl Overrides {
     /// Sets `[refine] refiner`.
     pub fn refiner(mut self, refiner: Option<Refiner>) -> Self {
         self.refine = refiner.map(|refiner| serde_json::json!({ "refiner": refiner }));
+        self
+    }
+
+    /// Sets `[mllm] base_url`.
+    pub fn mllm_base_url(mut self, url: Option<String>) -> Self {
+        self.mllm = url.map(|url| serde_json::json!({ "base_url": url }));
         self
     }
 }
@@ -298,6 +316,11 @@ impl Config {
         }
         if self.index.m > 256 {
             return Some("index.m must not exceed 256".into());
+        }
+        if self.refine.refiner == Refiner::Mllm
+            && let Some(why) = self.mllm.contradiction(self.jobs.timeout_s)
+        {
+            return Some(why);
         }
         if self.jobs.lease_s <= self.jobs.timeout_s {
             return Some(format!(

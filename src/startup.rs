@@ -13,12 +13,13 @@ use tokio_util::sync::CancellationToken;
 use crate::config::{Config, Refiner as ConfiguredRefiner};
 use crate::http::{AppState, HttpSettings, router};
 use crate::refine::local::{LocalMatcher, LocalSettings};
+use crate::refine::mllm::{MllmParts, MllmRefiner};
 use crate::refine::{DenseCache, LocalRefiner, Refiner, Worker, WorkerSettings};
 use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Assets, CpuPool, Extractor, ExtractorSettings, ImageLimits};
 use crate::service::{Service, ServiceSettings};
 use crate::store::JobStore;
-use crate::store::embedded::{EmbeddedSettings, EmbeddedStore};
+use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
 use crate::telemetry::Metrics;
 
 /// Serves on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200.
@@ -89,20 +90,35 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
         },
         db_cache_bytes: config.data.db_cache_bytes,
         commit_batch: config.data.commit_batch,
+        descriptions: DescriptionBounds {
+            max_bytes: config.data.description_cache_bytes,
+            max_age: Duration::from_secs(config.data.description_cache_days * 24 * 3600),
+        },
     })?);
     let extractor = Arc::new(load_model(config)?);
     let pool = CpuPool::new("frames", threads_or(config.image.threads, 2), config.image.queue)?;
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
+    let local = Arc::new(LocalRefiner {
+        maps: store.clone(),
+        blobs: store.clone(),
+        extractor: Arc::clone(&extractor),
+        dense: Arc::clone(&dense),
+        pool: CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?,
+        matcher: LocalMatcher::new(LocalSettings::default()),
+    });
     let refiner: Option<Arc<dyn Refiner>> = match config.refine.refiner {
         ConfiguredRefiner::Off => None,
-        ConfiguredRefiner::Local => Some(Arc::new(LocalRefiner {
-            maps: store.clone(),
-            blobs: store.clone(),
-            extractor: Arc::clone(&extractor),
-            dense: Arc::clone(&dense),
-            pool: CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?,
-            matcher: LocalMatcher::new(LocalSettings::default()),
-        })),
+        ConfiguredRefiner::Local => Some(local),
+        ConfiguredRefiner::Mllm => {
+            let parts = MllmParts {
+                maps: store.clone(),
+                blobs: store.clone(),
+                cache: store.clone(),
+                limits: extractor.limits(),
+                fallback: Some(local),
+            };
+            Some(Arc::new(MllmRefiner::new(parts, config.mllm.clone())?))
+        }
     };
     let jobs: Arc<dyn JobStore> = store.clone();
     let workers = refiner.iter().flat_map(|refiner| {

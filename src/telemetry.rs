@@ -44,6 +44,9 @@ pub struct Metrics {
     job_seconds: Family<RefinerLabels, Histogram, fn() -> Histogram>,
     queued_jobs: Gauge,
     submitted_jobs: Counter,
+    model_calls: Family<RefinerLabels, Counter>,
+    cached_descriptions: Family<RefinerLabels, Counter>,
+    tokens: Family<TokenLabels, Counter>,
     map_images: Family<MapLabels, Gauge>,
     dense_cache_bytes: Gauge<f64, AtomicU64>,
 }
@@ -77,6 +80,12 @@ struct RefinerLabels {
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct TokenLabels {
+    refiner: &'static str,
+    direction: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct MapLabels {
     map: String,
 }
@@ -104,6 +113,9 @@ impl Metrics {
             job_seconds: Family::new_with_constructor(latency),
             queued_jobs: Gauge::default(),
             submitted_jobs: Counter::default(),
+            model_calls: Family::default(),
+            cached_descriptions: Family::default(),
+            tokens: Family::default(),
             map_images: Family::default(),
             dense_cache_bytes: Gauge::default(),
         };
@@ -132,6 +144,21 @@ impl Metrics {
             self.job_seconds.clone(),
         );
         registry.register("jobs_queued", "Jobs that wait or run", self.queued_jobs.clone());
+        registry.register(
+            "model_calls",
+            "Calls to a model outside, by jobs that ended",
+            self.model_calls.clone(),
+        );
+        registry.register(
+            "cached_descriptions",
+            "Descriptions that were known from an earlier job",
+            self.cached_descriptions.clone(),
+        );
+        registry.register(
+            "tokens",
+            "Tokens sent to a model outside (prompt) and received (completion)",
+            self.tokens.clone(),
+        );
         registry.register("map_images", "Images in a map", self.map_images.clone());
         registry.register(
             "dense_cache_bytes",
@@ -171,6 +198,14 @@ impl Metrics {
     pub fn job_ended(&self, job: &Job) {
         let refiner = job.refiner.as_str();
         self.jobs.get_or_create(&JobLabels { refiner, state: job.state.as_str() }).inc();
+        let (of, usage) = (RefinerLabels { refiner }, job.usage);
+        self.model_calls.get_or_create(&of).inc_by(usage.calls.into());
+        self.cached_descriptions.get_or_create(&of).inc_by(usage.cached.into());
+        for (direction, tokens) in
+            [("prompt", usage.prompt_tokens), ("completion", usage.completion_tokens)]
+        {
+            self.tokens.get_or_create(&TokenLabels { refiner, direction }).inc_by(tokens);
+        }
         if let Some(finished) = job.finished_at {
             let took = finished.duration_since(job.created_at).as_secs_f64();
             self.job_seconds.get_or_create(&RefinerLabels { refiner }).observe(took.max(0.0));

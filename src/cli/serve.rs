@@ -32,6 +32,10 @@ pub struct Args {
     /// Who refines the candidates
     #[arg(long)]
     refiner: Option<Refiner>,
+    /// A server that speaks the OpenAI chat-completions format, for --refiner mllm; its key comes
+    /// from WHEREABOUTS_MLLM__API_KEY
+    #[arg(long, value_name = "URL")]
+    mllm_base_url: Option<String>,
 }
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
@@ -39,7 +43,8 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         .listen(args.listen)
         .data(args.data)
         .model(args.model)
-        .refiner(args.refiner);
+        .refiner(args.refiner)
+        .mllm_base_url(args.mllm_base_url);
     let config = Config::load(args.config.as_deref(), &flags)?;
     telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
     let listener = TcpListener::bind(config.server.listen).await.with_context(|| {

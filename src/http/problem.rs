@@ -84,7 +84,7 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
     let id = request.extensions().get::<RequestId>().cloned().unwrap_or_default();
     let mut response = next.run(request).await;
     let Some(mut problem) = response.extensions_mut().remove::<Problem>() else { return response };
-    if problem.status >= 500 {
+    if problem.status == StatusCode::INTERNAL_SERVER_ERROR {
         tracing::error!(request_id = %id.0, status = problem.status, detail = problem.detail);
     }
     problem.request_id = id.0;

@@ -2,11 +2,13 @@
 //! what differs into words, and orders the candidates anew.
 //!
 //! A [`Refiner`] does this for one job; the [`Worker`] takes jobs from the queue and hands them to
-//! it. [`LocalRefiner`] compares dense features on this machine.
+//! it. [`LocalRefiner`] compares dense features on this machine, [`mllm::MllmRefiner`] asks a
+//! multimodal LLM.
 
 mod dense_cache;
 pub mod local;
 mod local_refiner;
+pub mod mllm;
 mod worker;
 
 use async_trait::async_trait;

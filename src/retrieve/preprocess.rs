@@ -1,7 +1,8 @@
 //! Pixels to the input tensor that a manifest asks for.
 
-use fast_image_resize::images::{Image as Canvas, ImageRef};
-use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
+use fast_image_resize::images::{TypedImage, TypedImageRef};
+use fast_image_resize::pixels::U8x3;
+use fast_image_resize::{FilterType, ResizeAlg, ResizeOptions, Resizer};
 use image::RgbImage;
 
 use super::manifest::{Input, Interpolation, Resize};
@@ -102,13 +103,17 @@ fn run_resize(
     height: u32,
     options: &ResizeOptions,
 ) -> Result<Vec<u8>, PreprocessError> {
-    let source = ImageRef::new(pixels.width(), pixels.height(), pixels.as_raw(), PixelType::U8x3)
+    // One pixel type, known here: the untyped call would compile the filters for every type.
+    let source =
+        TypedImageRef::<U8x3>::from_buffer(pixels.width(), pixels.height(), pixels.as_raw())
+            .map_err(|error| failure(pixels, &error.to_string()))?;
+    let mut buffer = vec![0; width as usize * height as usize * 3];
+    let mut canvas = TypedImage::<U8x3>::from_buffer(width, height, &mut buffer)
         .map_err(|error| failure(pixels, &error.to_string()))?;
-    let mut canvas = Canvas::new(width, height, PixelType::U8x3);
     Resizer::new()
-        .resize(&source, &mut canvas, options)
+        .resize_typed(&source, &mut canvas, options)
         .map_err(|error| failure(pixels, &error.to_string()))?;
-    Ok(canvas.into_vec())
+    Ok(buffer)
 }
 
 fn failure(pixels: &RgbImage, reason: &str) -> PreprocessError {

@@ -11,6 +11,8 @@ mod images;
 mod jobs;
 mod localize;
 mod maps;
+mod mllm;
+mod mock_mllm;
 mod models;
 mod real_images;
 mod service;

@@ -111,7 +111,9 @@ impl Default for Script {
     /// Names the pair in each description, and ranks in the order of the prompt.
     fn default() -> Self {
         Self {
-            describe: Box::new(|call| Reply::Text(format!("notes on {} {}", call.pair.0, call.pair.1))),
+            describe: Box::new(|call| {
+                Reply::Text(format!("notes on {} {}", call.pair.0, call.pair.1))
+            }),
             reason: Box::new(|call| ranking(&call.labels())),
             structured: true,
             counts_tokens: true,

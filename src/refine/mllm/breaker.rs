@@ -98,9 +98,7 @@ impl Breaker {
                 (State::Closed { failed }, _, Ended::Badly) if failed + 1 >= self.failures => {
                     opened
                 }
-                (State::Closed { failed }, _, Ended::Badly) => {
-                    State::Closed { failed: failed + 1 }
-                }
+                (State::Closed { failed }, _, Ended::Badly) => State::Closed { failed: failed + 1 },
                 // What was sent before the breaker opened says nothing about the server now.
                 (unchanged, _, _) => unchanged,
             };

@@ -31,27 +31,3 @@ pub struct CachedDescription {
     /// When it was made.
     pub created_at: Timestamp,
 }
-
-/// Keeps descriptions in memory.
-#[cfg(test)]
-#[derive(Default)]
-pub(super) struct MemoryCache(
-    std::sync::Mutex<std::collections::HashMap<Digest, CachedDescription>>,
-);
-
-#[cfg(test)]
-#[async_trait]
-impl DescriptionCache for MemoryCache {
-    async fn description(&self, key: &Digest) -> Result<Option<CachedDescription>, StoreError> {
-        Ok(self.0.lock().unwrap().get(key).cloned())
-    }
-
-    async fn keep_description(
-        &self,
-        key: Digest,
-        value: CachedDescription,
-    ) -> Result<(), StoreError> {
-        self.0.lock().unwrap().insert(key, value);
-        Ok(())
-    }
-}

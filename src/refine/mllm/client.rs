@@ -155,8 +155,7 @@ impl MllmClient {
 
     async fn send(&self, call: &Call<'_>, schema: Option<&Schema>) -> Result<Answer, Failure> {
         let body = self.body(call, schema)?;
-        let request =
-            self.http.post(self.url.clone()).headers(self.headers.clone()).body(body);
+        let request = self.http.post(self.url.clone()).headers(self.headers.clone()).body(body);
         let exchange = async {
             let response = request.send().await.map_err(|error| self.broken(error))?;
             if response.status().is_success() {
@@ -239,8 +238,7 @@ impl MllmClient {
         let said = serde_json::from_slice(body)
             .map(ErrorAnswer::message)
             .unwrap_or_else(|_| String::from_utf8_lossy(body).into_owned());
-        let line: String =
-            said.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+        let line: String = said.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
         self.key.scrub(&line).chars().take(REFUSAL_CHARS).collect()
     }
 
@@ -285,10 +283,8 @@ fn names_structure(said: &str) -> bool {
 }
 
 fn endpoint(settings: &MllmSettings) -> Result<Url, MllmSettingsError> {
-    let refused = |reason: String| MllmSettingsError::Url {
-        url: settings.base_url.clone(),
-        reason,
-    };
+    let refused =
+        |reason: String| MllmSettingsError::Url { url: settings.base_url.clone(), reason };
     let text = format!("{}/chat/completions", settings.base_url.trim_end_matches('/'));
     let mut url = Url::parse(&text).map_err(|error| refused(error.to_string()))?;
     if !matches!(url.scheme(), "http" | "https") {

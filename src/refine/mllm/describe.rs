@@ -68,6 +68,16 @@ impl<'a> Work<'a> {
         *self.usage.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Takes a description into the account; what was bought is charged when it is answered.
+    fn take(&self, index: usize, description: CachedDescription, cached: bool) -> Described {
+        let CachedDescription { text, usage, .. } = description;
+        let known = Usage { cached: 1, ..Usage::default() };
+        if cached {
+            self.charge(known);
+        }
+        Described { index, text, cached, usage: if cached { known } else { usage } }
+    }
+
     fn charge(&self, cost: Usage) {
         let mut usage = self.usage.lock().unwrap_or_else(PoisonError::into_inner);
         *usage = sum(*usage, cost);
@@ -112,11 +122,10 @@ impl MllmRefiner {
 
     /// Describes all pairs, several at once.
     pub(super) async fn describe_all(&self, work: &Work<'_>, pairs: &[Pair]) -> Findings {
-        let mut outcomes: Vec<_> = stream::iter(pairs)
-            .map(|pair| async move { (pair.index, self.describe(work, pair).await) })
-            .buffer_unordered(self.settings.concurrency)
-            .collect()
-            .await;
+        // Collected first: the compiler cannot see through a closure over borrowed pairs here.
+        let calls: Vec<_> = pairs.iter().map(|pair| self.describe(work, pair)).collect();
+        let mut outcomes: Vec<_> =
+            stream::iter(calls).buffer_unordered(self.settings.concurrency).collect().await;
         outcomes.sort_by_key(|(index, _)| *index);
         let mut findings = Findings::default();
         for (index, outcome) in outcomes {
@@ -132,25 +141,31 @@ impl MllmRefiner {
         findings
     }
 
-    async fn describe(&self, work: &Work<'_>, pair: &Pair) -> Result<Described, CallError> {
+    async fn describe(
+        &self,
+        work: &Work<'_>,
+        pair: &Pair,
+    ) -> (usize, Result<Described, CallError>) {
         let bought = AtomicBool::new(false);
-        // The cache is looked at inside the flight: a flight that has just landed has filled it.
-        let make = || async {
-            if let Some(known) = self.cache.description(&pair.key).await.map_err(passing)? {
-                return Ok(known);
-            }
-            let description = self.buy(work, pair).await?;
-            bought.store(true, Ordering::Relaxed);
-            Ok(description)
-        };
-        let description = self.flights.join(pair.key, make).await?;
+        let find = || self.find(work, pair, &bought);
+        let found = self.flights.join(pair.key, find).await;
         let cached = !bought.load(Ordering::Relaxed);
-        let known = Usage { cached: 1, ..Usage::default() };
-        if cached {
-            work.charge(known);
+        (pair.index, found.map(|description| work.take(pair.index, description, cached)))
+    }
+
+    /// The cache is looked at inside the flight: a flight that has just landed has filled it.
+    async fn find(
+        &self,
+        work: &Work<'_>,
+        pair: &Pair,
+        bought: &AtomicBool,
+    ) -> Result<CachedDescription, CallError> {
+        if let Some(known) = self.cache.description(&pair.key).await.map_err(passing)? {
+            return Ok(known);
         }
-        let usage = if cached { known } else { description.usage };
-        Ok(Described { index: pair.index, text: description.text, cached, usage })
+        let description = self.buy(work, pair).await?;
+        bought.store(true, Ordering::Relaxed);
+        Ok(description)
     }
 
     async fn buy(&self, work: &Work<'_>, pair: &Pair) -> Result<CachedDescription, CallError> {
@@ -180,8 +195,7 @@ impl MllmRefiner {
     /// not take the description with it.
     async fn keep(&self, key: Digest, description: CachedDescription) {
         let cache = Arc::clone(&self.cache);
-        let keeping =
-            tokio::spawn(async move { cache.keep_description(key, description).await });
+        let keeping = tokio::spawn(async move { cache.keep_description(key, description).await });
         let outcome = keeping.await.map_err(|error| StoreError::Failed(error.to_string()));
         if let Err(error) = outcome.and_then(|kept| kept) {
             // The job has its text; only the next one will have to pay again.
@@ -190,11 +204,7 @@ impl MllmRefiner {
     }
 
     /// Asks within the budget. Where so configured, waits while calls are suspended.
-    pub(super) async fn call(
-        &self,
-        work: &Work<'_>,
-        call: &Call<'_>,
-    ) -> Result<Answer, CallError> {
+    pub(super) async fn call(&self, work: &Work<'_>, call: &Call<'_>) -> Result<Answer, CallError> {
         loop {
             let reserved = work
                 .budget

@@ -176,9 +176,7 @@ impl Refiner for MllmRefiner {
             (Some(Err(why)), Some(fallback)) if conclude::is_unavailable(&why) && !self.waits() => {
                 self.fall_back(fallback.as_ref(), &work, &why).await
             }
-            (Some(Err(why)), _) if findings.described.is_empty() => {
-                Err(conclude::given_up(&why))
-            }
+            (Some(Err(why)), _) if findings.described.is_empty() => Err(conclude::given_up(&why)),
             (Some(Err(CallError::DaySpent)), _) if self.waits() => {
                 Err(conclude::given_up(&CallError::DaySpent))
             }

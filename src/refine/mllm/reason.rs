@@ -52,9 +52,8 @@ impl Labels {
     /// shown in an order that depends on the job alone, so that it is the same at the next try.
     pub fn new(mut candidates: Vec<usize>, shuffled_by: Option<Uuid>) -> Self {
         if let Some(job) = shuffled_by {
-            candidates.sort_by_cached_key(|index| {
-                Digest::of(format!("order {job} {index}").as_bytes())
-            });
+            candidates
+                .sort_by_cached_key(|index| Digest::of(format!("order {job} {index}").as_bytes()));
         }
         let labels = (0..candidates.len()).map(label).collect();
         Self { shown: candidates, labels }
@@ -134,7 +133,8 @@ fn find(answer: &str) -> Option<AnswerJson> {
 fn last_line(text: &str) -> Option<AnswerJson> {
     let (before, line) = text.rsplit_once('\n').unwrap_or(("", text));
     let (head, list) = line.split_once(':')?;
-    if !head.trim_matches(|c: char| !c.is_alphanumeric()).eq_ignore_ascii_case("ranking") {
+    // Models like to set it in bold or make it a heading.
+    if !head.trim_matches([' ', '*', '#']).eq_ignore_ascii_case("ranking") {
         return None;
     }
     let ranking = list
@@ -217,7 +217,8 @@ mod tests {
     #[test]
     fn a_hundred_candidates_have_a_hundred_labels() {
         let labels = labels(100);
-        let unique: std::collections::HashSet<&str> = labels.iter().map(|(label, _)| label).collect();
+        let unique: std::collections::HashSet<&str> =
+            labels.iter().map(|(label, _)| label).collect();
         assert_eq!(unique.len(), 100);
         assert_eq!((label(25), label(26), label(99)), ("Z".into(), "AA".into(), "CV".into()));
     }

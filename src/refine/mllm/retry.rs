@@ -94,9 +94,9 @@ impl RetryPolicy {
                 Err(Failure::Refused(why) | Failure::Unstructured(why)) => {
                     return Err(CallError::Hopeless(why));
                 }
-                Err(
-                    Failure::Busy { why, retry_after } | Failure::Broken { why, retry_after },
-                ) => (why, retry_after),
+                Err(Failure::Busy { why, retry_after } | Failure::Broken { why, retry_after }) => {
+                    (why, retry_after)
+                }
             };
             tried += 1;
             if tried >= self.attempts {

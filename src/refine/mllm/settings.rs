@@ -223,7 +223,7 @@ pub(super) mod tests {
 
     /// The defaults as the configuration file has them.
     pub fn defaults() -> MllmSettings {
-        toml::from_str::<File>(include_str!("defaults.toml")).unwrap().mllm
+        toml::from_str::<File>(include_str!("../../../deploy/whereabouts.toml")).unwrap().mllm
     }
 
     #[test]

@@ -112,8 +112,7 @@ async fn an_answer_without_a_ranking_is_repaired_once() {
 
 #[tokio::test]
 async fn a_second_answer_without_a_ranking_leaves_the_coarse_order() {
-    let script =
-        Script { reason: Box::new(|_| Reply::Text(String::new())), ..Script::default() };
+    let script = Script { reason: Box::new(|_| Reply::Text(String::new())), ..Script::default() };
     let bench = Bench::new(script).await;
     let refinement = bench.refine(3).await.unwrap();
     assert_eq!(bench.mock.reason_calls(), 2);
@@ -149,10 +148,8 @@ async fn a_description_that_gives_orders_is_text_like_any_other() {
 
 #[tokio::test]
 async fn the_scene_and_the_switches_shape_the_prompt_and_the_key() {
-    let script = Script {
-        describe: Box::new(|call| Reply::Text(call.prompt.clone())),
-        ..Script::default()
-    };
+    let script =
+        Script { describe: Box::new(|call| Reply::Text(call.prompt.clone())), ..Script::default() };
     let mut bench = Bench::with(script, |settings| settings.object_matching = false).await;
     bench.shelf.map.scene = Scene::Indoor;
     bench.rebuild(|_| {});

@@ -87,11 +87,6 @@ impl DescriptionUse {
         Ok(Self { bounds, order: Mutex::new(order) })
     }
 
-    /// Bytes of all records.
-    pub fn bytes(&self) -> u64 {
-        self.order.lock().unwrap_or_else(PoisonError::into_inner).bytes
-    }
-
     fn used(&self, key: Digest, bytes: u64) -> Vec<Digest> {
         let mut order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
         order.touch(key, bytes);
@@ -149,3 +144,30 @@ impl DescriptionCache for EmbeddedStore {
     }
 }
 
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn key(number: u8) -> Digest {
+        Digest::of(&[number])
+    }
+
+    #[test]
+    fn the_least_recently_used_make_room() {
+        let mut order = Order::default();
+        (0..4).for_each(|number| order.touch(key(number), 10));
+        order.touch(key(0), 10);
+        assert_eq!(order.over(25), [key(1), key(2)]);
+        assert_eq!((order.bytes, order.known.len(), order.by_use.len()), (20, 2, 2));
+    }
+
+    #[test]
+    fn a_description_that_grew_is_counted_once() {
+        let mut order = Order::default();
+        order.touch(key(0), 10);
+        order.touch(key(0), 30);
+        assert_eq!((order.bytes, order.by_use.len()), (30, 1));
+        assert_eq!(order.over(29), [key(0)]);
+        assert_eq!(order.over(0), []);
+    }
+}

@@ -11,6 +11,7 @@
 //! The graph of a map is derived from its segments and is built in the background.
 
 mod blobs;
+mod descriptions;
 mod indexer;
 mod jobs;
 mod live_map;
@@ -29,6 +30,8 @@ use tokio::sync::broadcast;
 use uuid::Uuid;
 
 use self::blobs::Blobs;
+pub use self::descriptions::DescriptionBounds;
+use self::descriptions::DescriptionUse;
 use self::indexer::Indexer;
 use self::live_map::LiveMap;
 use self::trees::Trees;
@@ -48,6 +51,8 @@ pub struct EmbeddedSettings {
     pub db_cache_bytes: u64,
     /// The most changes that are made durable together.
     pub commit_batch: usize,
+    /// Bounds of the cache of descriptions.
+    pub descriptions: DescriptionBounds,
 }
 
 /// The embedded store; clones share it.
@@ -65,6 +70,7 @@ struct Inner {
     index: IndexSettings,
     descriptors: PathBuf,
     queued: AtomicUsize,
+    descriptions: DescriptionUse,
     changes: broadcast::Sender<Uuid>,
     /// Held, never read: the lock ends with the file handle.
     _lock: File,
@@ -94,6 +100,7 @@ impl EmbeddedStore {
         let inner = Inner {
             writer: Writer::start(trees.clone(), settings.commit_batch)?,
             indexer: Indexer::start()?,
+            descriptions: DescriptionUse::load(&trees, settings.descriptions)?,
             trees,
             blobs,
             maps: RwLock::new(loaded),

@@ -23,6 +23,8 @@ pub(super) struct Trees {
     pub jobs: sled::Tree,
     /// Job id → when its lease ends ([`Lease`]), for jobs that have not ended.
     pub queue: sled::Tree,
+    /// Cache key → description of a pair.
+    pub descriptions: sled::Tree,
 }
 
 /// An image and where its descriptor is.
@@ -57,6 +59,7 @@ impl Trees {
             blob_refs: tree("blob_refs")?,
             jobs: tree("jobs")?,
             queue: tree("queue")?,
+            descriptions: tree("descriptions")?,
             db,
         })
     }

@@ -37,7 +37,11 @@ pub fn check_envelope(uri: &Uri, headers: &HeaderMap, script: &Script) -> Result
 
 pub fn check_request(request: &Value, max_edge: u32) -> Result<Asked, String> {
     const KNOWN: [&str; 6] = [
-        "model", "messages", "temperature", "max_tokens", "max_completion_tokens",
+        "model",
+        "messages",
+        "temperature",
+        "max_tokens",
+        "max_completion_tokens",
         "response_format",
     ];
     let fields = request.as_object().ok_or("the body is no object")?;
@@ -49,8 +53,10 @@ pub fn check_request(request: &Value, max_edge: u32) -> Result<Asked, String> {
         let right = temperature.as_f64().is_some_and(|t| (0.0..=2.0).contains(&t));
         ensure(right, "temperature is not 0 to 2")?;
     }
-    let bounds: Vec<_> =
-        ["max_tokens", "max_completion_tokens"].iter().filter_map(|name| fields.get(*name)).collect();
+    let bounds: Vec<_> = ["max_tokens", "max_completion_tokens"]
+        .iter()
+        .filter_map(|name| fields.get(*name))
+        .collect();
     let bounded = matches!(bounds.as_slice(), [bound] if bound.as_u64().is_some_and(|n| n > 0));
     ensure(bounded, "the answer's length must be bounded once, by a positive integer")?;
     let structured = fields.get("response_format").map(check_format).transpose()?.is_some();

@@ -89,10 +89,8 @@ async fn a_pair_that_fails_for_good_is_ranked_behind_the_others() {
 
 #[tokio::test]
 async fn when_no_pair_can_be_described_the_job_has_no_ranking() {
-    let always = |reply: Reply| Script {
-        describe: Box::new(move |_| reply.clone()),
-        ..Script::default()
-    };
+    let always =
+        |reply: Reply| Script { describe: Box::new(move |_| reply.clone()), ..Script::default() };
     let bench = Bench::new(always(status(404))).await;
     assert!(matches!(bench.refine(2).await.unwrap_err(), RefineError::Hopeless(_)));
     assert_eq!(bench.mock.describe_calls(), 2);

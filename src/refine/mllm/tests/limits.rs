@@ -84,12 +84,12 @@ async fn a_job_that_waits_goes_on_when_the_breaker_lets_it() {
 async fn a_job_never_passes_its_budget() {
     let mut bench = Bench::with(Script::default(), |settings| {
         settings.concurrency = 1;
-        settings.tokens_per_job = 8000;
+        settings.tokens_per_job = 6000;
     })
     .await;
     let refinement = bench.refine(20).await.unwrap();
     let usage = refinement.usage;
-    assert!(usage.prompt_tokens + usage.completion_tokens <= 8000);
+    assert!(usage.prompt_tokens + usage.completion_tokens <= 6000);
     assert!(refinement.degraded.unwrap().contains("the budget of the job is spent"));
     bench.fallback = Some(Arc::new(Reverse));
     bench.rebuild(|settings| settings.tokens_per_job = 10);

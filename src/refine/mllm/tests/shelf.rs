@@ -1,6 +1,7 @@
 //! A map of a few plain pictures in memory, and a refiner that looks at them through the mock.
 
-use std::sync::Arc;
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
 
 use async_trait::async_trait;
 use bytes::Bytes;
@@ -8,7 +9,6 @@ use image::{Rgb, RgbImage};
 use jiff::Timestamp;
 use uuid::Uuid;
 
-use super::super::cache::MemoryCache;
 use super::super::mock_mllm::{MockMllm, Script};
 use super::super::settings::tests::defaults;
 use super::*;
@@ -23,10 +23,12 @@ use crate::store::{Added, BlobPin, IndexState, Query, StoreError};
 /// The key that every call must carry.
 pub const KEY: &str = "sk-test-5c1f";
 
-/// A map whose images `image-0`, `image-1`, … are pictures of one colour each.
+/// A map with the images `image-0`, `image-1`, …
 #[derive(Clone)]
 pub struct Shelf {
     pub map: Map,
+    /// Their bytes; the last is the frame.
+    pictures: Arc<Vec<Bytes>>,
 }
 
 /// The mock, and a refiner that is set up to call it.
@@ -89,12 +91,11 @@ fn refiner(
     MllmRefiner::new(parts, settings.clone()).unwrap()
 }
 
-/// The picture of a number; the frame is number 200.
-fn picture(number: u8) -> Bytes {
-    encode_jpeg(&RgbImage::from_pixel(64, 48, Rgb([number, 90, 255 - number]))).unwrap().into()
+/// The picture of a number: so many white columns, as no compression mistakes for others.
+fn picture(number: u32) -> Bytes {
+    let column = |x| Rgb([if x < 2 * number { 255 } else { 0 }; 3]);
+    encode_jpeg(&RgbImage::from_fn(64, 48, |x, _| column(x))).unwrap().into()
 }
-
-const FRAME: u8 = 200;
 
 impl Shelf {
     fn new() -> Self {
@@ -110,14 +111,14 @@ impl Shelf {
             description: None,
             created_at: Timestamp::UNIX_EPOCH,
         };
-        Self { map }
+        Self { map, pictures: Arc::new((0..24).map(picture).collect()) }
     }
 
     fn record(&self, candidates: usize) -> JobRecord {
         let now = Timestamp::now();
         let query = Query {
             id: Uuid::now_v7(),
-            digest: Digest::of(&picture(FRAME)),
+            digest: Digest::of(&self.pictures[self.pictures.len() - 1]),
             media_type: MediaType::Jpeg,
             created_at: now,
         };
@@ -148,9 +149,9 @@ impl MapStore for Shelf {
 
     async fn image(&self, _: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
         let number = id.as_str().strip_prefix("image-").and_then(|number| number.parse().ok());
-        Ok(number.map(|number| Image {
+        Ok(number.map(|number: usize| Image {
             id: id.clone(),
-            digest: Digest::of(&picture(number)),
+            digest: Digest::of(&self.pictures[number]),
             media_type: MediaType::Jpeg,
             width: 64,
             height: 48,
@@ -212,6 +213,26 @@ impl BlobStore for Shelf {
     }
 
     async fn blob(&self, digest: &Digest) -> Result<Option<Bytes>, StoreError> {
-        Ok((0..=FRAME).map(picture).find(|bytes| Digest::of(bytes) == *digest))
+        Ok(self.pictures.iter().find(|bytes| Digest::of(bytes) == *digest).cloned())
+    }
+}
+
+/// Keeps descriptions in memory.
+#[derive(Default)]
+pub struct MemoryCache(Mutex<HashMap<Digest, CachedDescription>>);
+
+#[async_trait]
+impl DescriptionCache for MemoryCache {
+    async fn description(&self, key: &Digest) -> Result<Option<CachedDescription>, StoreError> {
+        Ok(self.0.lock().unwrap().get(key).cloned())
+    }
+
+    async fn keep_description(
+        &self,
+        key: Digest,
+        value: CachedDescription,
+    ) -> Result<(), StoreError> {
+        self.0.lock().unwrap().insert(key, value);
+        Ok(())
     }
 }
