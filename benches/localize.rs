@@ -22,6 +22,7 @@ const FRAMES: usize = 50;
 const REQUESTS: usize = 400;
 
 fn main() -> anyhow::Result<()> {
+    let _ = rustls::crypto::ring::default_provider().install_default();
     let spec = TownSpec { places: PLACES, ..TownSpec::default() };
     let town = Town::new(spec);
     let frames: Vec<bytes::Bytes> = (0..FRAMES)

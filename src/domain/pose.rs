@@ -168,7 +168,8 @@ impl MetricPose {
             [None, None, None, None] => {}
             [Some(x), Some(y), Some(z), Some(w)] => {
                 let norm = (x * x + y * y + z * z + w * w).sqrt();
-                if !((norm - 1.0).abs() < 1e-3) {
+                let is_unit = (norm - 1.0).abs() < 1e-3;
+                if !is_unit {
                     return Err(PoseError::Quaternion(
                         "qx, qy, qz, qw must be a unit quaternion (norm 1 to within 0.001)",
                     ));

@@ -1,14 +1,14 @@
 //! Reading requests: queries, JSON, pictures raw or in a form.
 
-use axum::extract::rejection::BytesRejection;
 use axum::extract::{FromRequest, FromRequestParts, Multipart, Path, Query, Request};
 use axum::http::header::CONTENT_TYPE;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, StatusCode};
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
+use futures_util::StreamExt;
 use serde::de::DeserializeOwned;
 
-use super::guard::too_large;
+use super::guard::{discard, too_large};
 use super::problem::Problem;
 use super::state::AppState;
 use crate::service::ErrorKind;
@@ -128,16 +128,21 @@ async fn from_form(request: Request, state: &AppState) -> Result<PictureBody, Pr
     Ok(PictureBody { picture, meta })
 }
 
+/// The whole body. What exceeds the bound is thrown away for a while, or the client, which is still
+/// sending, would see a reset connection instead of the answer.
 async fn whole(request: Request, state: &AppState) -> Result<Bytes, Problem> {
-    Bytes::from_request(request, state).await.map_err(|rejection: BytesRejection| {
-        match rejection.status() {
-            StatusCode::PAYLOAD_TOO_LARGE => {
-                Problem::new(ErrorKind::TooLarge, too_large(state.settings.body_limit_bytes))
-            }
-            _ => Problem::new(
-                ErrorKind::Malformed,
-                format!("the body cannot be read: {}", rejection.body_text()),
-            ),
+    let limit = state.settings.body_limit_bytes;
+    let mut chunks = request.into_body().into_data_stream();
+    let mut body = BytesMut::new();
+    while let Some(chunk) = chunks.next().await {
+        let chunk = chunk.map_err(|error| {
+            Problem::new(ErrorKind::Malformed, format!("the body cannot be read: {error}"))
+        })?;
+        if body.len() + chunk.len() > limit {
+            tokio::spawn(discard(chunks));
+            return Err(Problem::new(ErrorKind::TooLarge, too_large(limit)));
         }
-    })
+        body.extend_from_slice(&chunk);
+    }
+    Ok(body.freeze())
 }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use axum::body::Body;
+use axum::body::BodyDataStream;
 use axum::extract::{MatchedPath, Request, State};
 use axum::http::header::{CONNECTION, CONTENT_LENGTH};
 use axum::http::{HeaderName, HeaderValue};
@@ -97,15 +97,14 @@ fn time_allowed(state: &AppState, request: &Request) -> Duration {
 /// Answers without reading the body. What the client is still sending is thrown away for a while,
 /// or it would see a reset connection instead of the answer.
 fn refuse(request: Request, kind: ErrorKind, detail: String) -> Response {
-    tokio::spawn(discard(request.into_body()));
+    tokio::spawn(discard(request.into_body().into_data_stream()));
     let mut response = Problem::new(kind, detail).into_response();
     response.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
     response
 }
 
-async fn discard(body: Body) {
+pub(super) async fn discard(mut chunks: BodyDataStream) {
     const LONGEST: Duration = Duration::from_secs(5);
-    let mut chunks = body.into_data_stream();
     let _ = tokio::time::timeout(
         LONGEST,
         async move { while let Some(Ok(_)) = chunks.next().await {} },

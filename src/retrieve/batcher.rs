@@ -100,14 +100,15 @@ fn load(
 ) -> Result<Session, InferenceError> {
     let failed = |error: String| InferenceError::Load(format!("{}: {error}", model.display()));
     let builder = Session::builder(environment).map_err(|error| failed(error.to_string()))?;
-    builder
+    let builder = builder
         .with_optimization_level(GraphOptimizationLevel::Level3)
-        .and_then(|builder| builder.with_intra_threads(threads.max(1)))
-        // Threads that spin for work take the cores from decoding.
-        .and_then(|builder| builder.with_intra_op_spinning(false))
-        .map_err(|error| failed(error.to_string()))?
-        .commit_from_file(model)
-        .map_err(|error| failed(error.to_string()))
+        .map_err(|error| failed(error.to_string()))?;
+    let builder =
+        builder.with_intra_threads(threads.max(1)).map_err(|error| failed(error.to_string()))?;
+    // Threads that spin for work take the cores from decoding.
+    let mut builder =
+        builder.with_intra_op_spinning(false).map_err(|error| failed(error.to_string()))?;
+    builder.commit_from_file(model).map_err(|error| failed(error.to_string()))
 }
 
 struct Worker {

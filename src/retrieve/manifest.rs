@@ -212,10 +212,12 @@ impl Manifest {
                 output.channels * rows * columns
             ));
         }
-        if !(pooling.gem_p > 0.0 && pooling.gem_p.is_finite()) {
+        let usable = pooling.gem_p > 0.0 && pooling.gem_p.is_finite();
+        if !usable {
             return Some("pooling.gem_p must be above 0".into());
         }
-        if input.std.iter().any(|&s| !(s > 0.0)) {
+        let positive = input.std.iter().all(|&s| s > 0.0);
+        if !positive {
             return Some("input.std must be above 0".into());
         }
         if output.layout == Layout::Map && (output.cls || output.registers > 0) {

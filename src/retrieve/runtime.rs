@@ -1,7 +1,7 @@
 //! Where ONNX Runtime and the installed models are found.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use ort::environment::Environment;
 
@@ -66,6 +66,12 @@ impl Assets {
 
     /// Loads ONNX Runtime: `ORT_DYLIB_PATH` if set, else the library among the assets.
     pub fn load_onnxruntime(&self) -> Result<Arc<Environment>, RuntimeError> {
+        // ONNX Runtime allows one environment in a process, whoever asks.
+        static LOADED: Mutex<Weak<Environment>> = Mutex::new(Weak::new());
+        let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(environment) = loaded.upgrade() {
+            return Ok(environment);
+        }
         let path = self.onnxruntime()?;
         let failed = |reason: String| RuntimeError::Library { path: path.clone(), reason };
         let environment = ort::init_from(&path)
@@ -74,7 +80,9 @@ impl Assets {
             .with_telemetry(false)
             .build()
             .map_err(|error| failed(error.to_string()))?;
-        Ok(Arc::new(environment))
+        let environment = Arc::new(environment);
+        *loaded = Arc::downgrade(&environment);
+        Ok(environment)
     }
 
     fn onnxruntime(&self) -> Result<PathBuf, RuntimeError> {

@@ -54,11 +54,8 @@ async fn a_request_keeps_the_id_it_came_with() {
     let answer = Answer::of(request).await;
     answer.problem(404);
     assert_eq!(answer.headers["x-request-id"], "robot-7/42");
-    let request = server.request(Method::GET, "/livez").header("x-request-id", "a b\u{e9}");
-    assert_ne!(
-        Answer::of(request).await.headers["x-request-id"].as_bytes(),
-        "a b\u{e9}".as_bytes()
-    );
+    let request = server.request(Method::GET, "/livez").header("x-request-id", "a b");
+    assert_ne!(Answer::of(request).await.headers["x-request-id"], "a b");
 }
 
 #[tokio::test]

@@ -34,6 +34,10 @@ impl Server {
     /// Starts a server and waits until it says that it is ready. `settings` are environment
     /// variables, such as `("WHEREABOUTS_JOBS__QUEUE", "1")`.
     pub fn start(data: &Path, settings: &[(&str, &str)]) -> Self {
+        // reqwest has no cryptography of its own; the binary chooses the same.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        // Connections are not kept, so that a drain never waits for an idle one.
+        let http = reqwest::Client::builder().pool_max_idle_per_host(0).build().unwrap();
         let address_file = data.with_extension("address");
         let mut child = Command::new(BINARY)
             .args(["serve", "--listen", "127.0.0.1:0", "--data"])
@@ -63,8 +67,6 @@ impl Server {
             lines.map_while(Result::ok).for_each(|line| kept.lock().unwrap().push(line));
         });
         let address = std::fs::read_to_string(&address_file).unwrap();
-        // Connections are not kept, so that a drain never waits for an idle one.
-        let http = reqwest::Client::builder().pool_max_idle_per_host(0).build().unwrap();
         Self { child, url: format!("http://{}", address.trim()), log, http }
     }
 
@@ -114,10 +116,6 @@ impl Server {
     pub fn kill(mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
-    }
-
-    pub fn send_signal(&self, name: &str) {
-        signal(&self.child, name);
     }
 
     pub fn log(&self) -> String {
