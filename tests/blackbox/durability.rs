@@ -1,6 +1,6 @@
 //! What was acknowledged is there after a restart, whether the server was asked to end or not.
 
-use serde_json::json;
+use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::support::{BINARY, Server, frame, reference};
@@ -19,13 +19,25 @@ async fn everything_is_there_after_kill_9() {
     assert_eq!(server.get("/maps/m/images").await.expect(200), list);
     assert_eq!(server.get("/maps/m").await.expect(200)["images"], 7);
     let after = server.post_jpeg("/localize?map=m&refine=off", frame(2, 0)).await.expect(200);
-    assert_eq!(after["candidates"], before["candidates"]);
+    same_candidates(&after["candidates"], &before["candidates"]);
     // The job was acknowledged, so it ends, by whichever of the two processes.
     let href = before["job"]["href"].as_str().unwrap();
     let job = server.get(&format!("{href}?wait=30")).await.expect(200);
     assert_eq!(job["state"], "succeeded", "{job}");
     let content = server.get("/maps/m/images/place-3/content").await;
     assert_eq!(content.bytes, reference(3));
+}
+
+/// The same images in the same order. Two runs of a model may differ in the last bit.
+#[track_caller]
+fn same_candidates(a: &Value, b: &Value) {
+    let (a, b) = (a.as_array().unwrap(), b.as_array().unwrap());
+    assert_eq!(a.len(), b.len());
+    for (a, b) in a.iter().zip(b) {
+        assert_eq!((&a["image_id"], &a["pose"]), (&b["image_id"], &b["pose"]));
+        let similarity = |c: &Value| c["similarity"].as_f64().unwrap();
+        assert!((similarity(a) - similarity(b)).abs() < 1e-5, "{a} {b}");
+    }
 }
 
 #[tokio::test]

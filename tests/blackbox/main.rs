@@ -2,6 +2,13 @@
 //!
 //! Pictures come from the procedural town. `real_images` uses photographs where they are at hand.
 
+#![allow(
+    clippy::expect_used,
+    clippy::panic,
+    clippy::unwrap_used,
+    reason = "clippy lets tests do this, but not what tests call"
+)]
+
 mod support;
 
 mod bad_input;
