@@ -1,7 +1,7 @@
 //! `/localize` of the real server, against bare extraction in one process.
 //!
 //! The peer is what no server can undercut: the same frames decoded and run through the same model
-//! on one thread of this process, without HTTP, search or store. Both run in turn, in the same
+//! in this process, one at a time, without HTTP, search or store. Both run in turn, in the same
 //! run, and the last lines are ratios.
 
 use std::io::{BufRead, BufReader};
@@ -29,7 +29,7 @@ fn main() -> anyhow::Result<()> {
         .map(|place| Ok(encode_jpeg(&town.query(place, 0).image)?.into()))
         .collect::<anyhow::Result<_>>()?;
     let bare = bare_extraction(&frames)?;
-    println!("bare extraction, 1 thread       {bare}");
+    println!("bare extraction, one at a time   {bare}");
 
     let data = tempfile::tempdir()?;
     let server = Server::start(data.path())?;
