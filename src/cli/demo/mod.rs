@@ -34,7 +34,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR", default_value = "demo-out")]
     out: PathBuf,
     /// Places in the town; each gives one map image and one frame
-    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u16).range(2..=5000))]
+    #[arg(long, default_value_t = 40, value_parser = clap::value_parser!(u16).range(2..=5000))]
     places: u16,
     /// Which town
     #[arg(long, default_value_t = 7)]
