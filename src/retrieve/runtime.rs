@@ -1,7 +1,7 @@
 //! Where ONNX Runtime and the installed models are found.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use ort::environment::Environment;
 
@@ -66,11 +66,11 @@ impl Assets {
 
     /// Loads ONNX Runtime: `ORT_DYLIB_PATH` if set, else the library among the assets.
     pub fn load_onnxruntime(&self) -> Result<Arc<Environment>, RuntimeError> {
-        // ONNX Runtime allows one environment in a process, whoever asks.
-        static LOADED: Mutex<Weak<Environment>> = Mutex::new(Weak::new());
+        // ONNX Runtime allows one environment in a process, whoever asks; once made, it stays.
+        static LOADED: Mutex<Option<Arc<Environment>>> = Mutex::new(None);
         let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(environment) = loaded.upgrade() {
-            return Ok(environment);
+        if let Some(environment) = loaded.as_ref() {
+            return Ok(Arc::clone(environment));
         }
         let path = self.onnxruntime()?;
         let failed = |reason: String| RuntimeError::Library { path: path.clone(), reason };
@@ -81,7 +81,7 @@ impl Assets {
             .build()
             .map_err(|error| failed(error.to_string()))?;
         let environment = Arc::new(environment);
-        *loaded = Arc::downgrade(&environment);
+        *loaded = Some(Arc::clone(&environment));
         Ok(environment)
     }
 
