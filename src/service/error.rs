@@ -1,7 +1,7 @@
 //! What can go wrong in a use case, and of which kind it is.
 
 use crate::domain::{InvalidName, PoseError};
-use crate::retrieve::{DecodeError, ExtractError, Overloaded};
+use crate::retrieve::{ExtractError, Overloaded};
 use crate::store::StoreError;
 
 /// The kinds that a caller can tell apart; HTTP maps each to one status.
@@ -84,7 +84,6 @@ impl From<Overloaded> for ServiceError {
 impl From<ExtractError> for ServiceError {
     fn from(error: ExtractError) -> Self {
         let kind = match &error {
-            ExtractError::Decode(DecodeError::UnknownFormat) => ErrorKind::Unprocessable,
             ExtractError::Decode(_) | ExtractError::Preprocess(_) | ExtractError::Pooling(_) => {
                 ErrorKind::Unprocessable
             }
