@@ -30,6 +30,8 @@ pub(super) struct Camera {
     up: Vec3,
     pub forward: Vec3,
     focal: f32,
+    /// One over the focal length.
+    per_pixel: f32,
     centre: (f32, f32),
 }
 
@@ -41,12 +43,14 @@ impl Camera {
         let level = vec3(sin_yaw, -cos_yaw, 0.0);
         let steep = level.cross(forward);
         let (sin_roll, cos_roll) = pose.roll.sin_cos();
+        let focal = width as f32 / 2.0 / (FIELD_OF_VIEW / 2.0).tan();
         Camera {
             eye: pose.eye,
             right: level * cos_roll - steep * sin_roll,
             up: steep * cos_roll + level * sin_roll,
             forward,
-            focal: width as f32 / 2.0 / (FIELD_OF_VIEW / 2.0).tan(),
+            focal,
+            per_pixel: 1.0 / focal,
             centre: (width as f32 / 2.0, height as f32 / 2.0),
         }
     }
@@ -55,8 +59,8 @@ impl Camera {
     #[inline]
     pub fn ray(&self, x: f32, y: f32) -> Vec3 {
         self.forward
-            + self.right * ((x - self.centre.0) / self.focal)
-            + self.up * ((self.centre.1 - y) / self.focal)
+            + self.right * ((x - self.centre.0) * self.per_pixel)
+            + self.up * ((self.centre.1 - y) * self.per_pixel)
     }
 
     /// Pixel position of a point in front of the camera, and its depth in metres.
@@ -95,6 +99,8 @@ impl Camera {
         let over_depth =
             |axis: Vec3| self.along_rays(axis).plus(inverse_depth.times(axis.dot(offset)));
         Some(View {
+            foot: (panel.along.dot(offset), panel.up.dot(offset)),
+            per_reach: 1.0 / reach.abs(),
             inverse_depth,
             u_over_depth: over_depth(panel.along),
             v_over_depth: over_depth(panel.up),
@@ -172,6 +178,10 @@ pub(super) struct View {
     pub inverse_depth: Linear,
     u_over_depth: Linear,
     v_over_depth: Linear,
+    /// The point of the panel's plane nearest to the camera, in metres.
+    foot: (f32, f32),
+    /// One over the camera's distance from the plane.
+    per_reach: f32,
     /// Convex polygon in pixels.
     pub outline: Vec<(f32, f32)>,
 }
@@ -184,6 +194,8 @@ pub(super) struct Footprint {
     /// Extent of the pixel along `u` and `v`, for filtering textures.
     pub across: f32,
     pub rise: f32,
+    /// How far the line of sight moves along `u` and `v` per metre *behind* the panel.
+    pub slant: (f32, f32),
     pub depth: f32,
 }
 
@@ -193,6 +205,27 @@ impl View {
     pub fn uv(&self, x: f32, y: f32) -> (f32, f32) {
         let depth = 1.0 / self.inverse_depth.at(x, y);
         (self.u_over_depth.at(x, y) * depth, self.v_over_depth.at(x, y) * depth)
+    }
+
+    /// Whether a pixel covers less than `limit` metres along `u`.
+    #[inline]
+    pub fn is_finer_across(&self, x: f32, y: f32, limit: f32) -> bool {
+        self.is_finer(&self.u_over_depth, x, y, limit)
+    }
+
+    /// Whether a pixel covers less than `limit` metres along `v`.
+    #[inline]
+    pub fn is_finer_upwards(&self, x: f32, y: f32, limit: f32) -> bool {
+        self.is_finer(&self.v_over_depth, x, y, limit)
+    }
+
+    /// The quotient rule on `form / inverse_depth`, multiplied out.
+    #[inline]
+    fn is_finer(&self, form: &Linear, x: f32, y: f32, limit: f32) -> bool {
+        let (value, inverse_depth) = (form.at(x, y), self.inverse_depth.at(x, y));
+        let dx = form.dx * inverse_depth - value * self.inverse_depth.dx;
+        let dy = form.dy * inverse_depth - value * self.inverse_depth.dy;
+        dx.abs() + dy.abs() < limit * inverse_depth * inverse_depth
     }
 
     #[inline]
@@ -210,6 +243,7 @@ impl View {
             v,
             across: extent(u, &self.u_over_depth).max(1e-4),
             rise: extent(v, &self.v_over_depth).max(1e-4),
+            slant: ((u - self.foot.0) * self.per_reach, (v - self.foot.1) * self.per_reach),
             depth,
         }
     }

@@ -4,6 +4,8 @@
 //! textures are made of. Neither keeps state outside the value, so a place can be built without
 //! building the places before it.
 
+use super::geometry::Rgb;
+
 /// A stream of draws. Copies continue independently from the same point.
 #[derive(Clone, Copy)]
 pub(super) struct Dice(u64);
@@ -68,9 +70,10 @@ pub(super) fn speckle(x: i32, y: i32, seed: u32) -> f32 {
 
 /// Three draws, uniform in `-0.5..0.5`.
 #[inline]
-pub(super) fn grain(x: i32, y: i32, seed: u32) -> [f32; 3] {
+pub(super) fn grain(x: i32, y: i32, seed: u32) -> Rgb {
     let bits = hash(x, y, seed);
-    [0, 10, 20].map(|shift| (bits >> shift & 1023) as f32 * (1.0 / 1023.0) - 0.5)
+    let draw = |shift: u32| (bits >> shift & 1023) as f32 * (1.0 / 1023.0) - 0.5;
+    Rgb::new(draw(0), draw(10), draw(20))
 }
 
 #[inline]
@@ -129,4 +132,6 @@ pub(super) fn whole(x: f32) -> f32 {
     (x - 0.5 + ROUNDER) - ROUNDER
 }
 
-const ROUNDER: f32 = 12_582_912.0;
+/// The float nearest to a whole number `n` of magnitude below 2²², plus this, has `n` in its low
+/// bits.
+pub(super) const ROUNDER: f32 = 12_582_912.0;

@@ -75,10 +75,13 @@ fn trimmed(building: &Building, mut material: Material, at: &Glance) -> Material
     let ground = building.ground_height();
     let eaves = building.eaves();
     let cornice = eaves - style.cornice;
-    material = material.paint(style.trim * 0.9, at.band(cornice, eaves));
-    material = material.paint(style.trim * 0.35, at.band(cornice - 0.07, cornice));
-    material = material.paint(style.trim * 0.45, at.band(eaves - 0.16, eaves - 0.12));
-    material = material.paint(style.trim * 0.85, at.band(ground - 0.02, ground + 0.14));
+    if at.band(ground + 0.14, cornice - 0.07) < 1.0 {
+        material = material
+            .paint(style.trim * 0.9, at.band(cornice, eaves))
+            .paint(style.trim * 0.35, at.band(cornice - 0.07, cornice))
+            .paint(style.trim * 0.45, at.band(eaves - 0.16, eaves - 0.12))
+            .paint(style.trim * 0.85, at.band(ground - 0.02, ground + 0.14));
+    }
     let pipe = if building.mirrored { 0.18 } else { building.at.width - 0.18 };
     material.paint(Rgb::hex(0x3b3b3d), at.within((pipe - 0.05, pipe + 0.05), (0.0, cornice)) * 0.9)
 }
@@ -149,6 +152,9 @@ fn shutters(opening: &Opening, colour: Rgb, mut material: Material, at: &Glance)
 fn surround(opening: &Opening, trim: Rgb, material: Material, at: &Glance) -> Material {
     let wide = (opening.left - 0.12, opening.right + 0.12);
     let (bottom, top) = opening.levels();
+    if at.within(wide, (bottom - 0.16, top + 0.2)) <= 0.0 {
+        return material;
+    }
     material
         .paint(trim * 0.82, at.within(wide, (top, top + 0.2)))
         .paint(trim * 0.95, at.within(wide, (bottom - 0.1, bottom)))

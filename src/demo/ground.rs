@@ -12,7 +12,7 @@ const YELLOW: Rgb = Rgb::hex(0xc9a13a);
 pub(super) fn road(crossings: &[f32], at: &Glance) -> Material {
     let (x, y) = (at.point.x, at.point.y);
     let grain = (1.0 - at.across.max(at.rise) / 0.12).clamp(0.0, 1.0);
-    let gravel = (speckle(floor(x * 25.0), floor(y * 25.0), 1) - 0.5) * 0.3 * grain;
+    let gravel = (speckle(floor(x * 25.0), floor(y * 25.0), 1) - 0.5) * 0.18 * grain;
     let wear = 0.85 + 0.3 * drift(x * 0.35, y * 0.9, 2);
     let mut road = Material::matt(Rgb::hex(0x55575a) * (wear + gravel));
     road = road.paint(Rgb::hex(0x3d3f42), patch(x, y));

@@ -46,10 +46,22 @@ impl Indoors {
     }
 }
 
+/// How a surface lies to the light: all of its illumination that is the same at each of its points.
+pub(super) struct Turned {
+    normal: Vec3,
+    /// Arriving from the sky under which nothing stands.
+    ambient: Rgb,
+    /// Arriving from the sun where nothing casts a shadow.
+    sun: Rgb,
+    is_sunny: bool,
+}
+
 /// The illumination of one street at one moment.
 pub(super) struct Lighting {
     /// Towards the sun.
     pub sun_direction: Vec3,
+    /// Whether the sun casts shadows.
+    pub has_sun: bool,
     sun: Rgb,
     ambient: Rgb,
     zenith: Rgb,
@@ -72,8 +84,10 @@ impl Lighting {
         let azimuth = f64::from(dice.between(100.0, 260.0).to_radians());
         let elevation = dice.between(0.6, 0.95);
         let balance = Rgb::new(1.0 + dice.around(0.08), 1.0, 1.0 + dice.around(0.08));
+        let sun_direction = street.towards(azimuth, elevation);
         Lighting {
-            sun_direction: street.towards(azimuth, elevation),
+            sun_direction,
+            has_sun: mood.sun != Rgb::BLACK,
             sun: mood.sun,
             ambient: mood.ambient,
             zenith: mood.zenith,
@@ -92,27 +106,31 @@ impl Lighting {
             },
             exposure: balance * (mood.exposure * (1.0 + dice.around(0.2))),
             noise: mood.noise,
-            roofline: Roofline::new(street),
+            roofline: Roofline::new(street, sun_direction),
         }
     }
 
-    pub fn has_sun(&self) -> bool {
-        self.sun != Rgb::BLACK
+    /// How a surface with the given normal lies to the light.
+    pub fn turned(&self, normal: Vec3) -> Turned {
+        let facing = normal.dot(self.sun_direction).max(0.0);
+        Turned {
+            normal,
+            ambient: self.ambient * (0.62 + 0.38 * normal.z),
+            sun: self.sun * facing,
+            is_sunny: self.has_sun && facing > 0.0,
+        }
     }
 
-    /// Light arriving at a point with the given normal.
+    /// Light arriving at a point of a surface.
     #[inline]
-    pub fn irradiance(&self, point: Vec3, normal: Vec3) -> Rgb {
-        let open_sky = 0.62 + 0.38 * normal.z;
-        let canyon = 0.72 + 0.28 * (point.z / 9.0).clamp(0.0, 1.0);
-        let mut light = self.ambient * (open_sky * canyon);
-        let facing = normal.dot(self.sun_direction);
-        if self.has_sun() && facing > 0.0 {
-            let shade = self.roofline.shade(point, self.sun_direction);
-            light = light + self.sun * (facing * (1.0 - shade));
+    pub fn irradiance(&self, point: Vec3, turned: &Turned) -> Rgb {
+        let canyon = 0.72 + 0.28 * (point.z * (1.0 / 9.0)).clamp(0.0, 1.0);
+        let mut light = turned.ambient * canyon;
+        if turned.is_sunny {
+            light = light + turned.sun * (1.0 - self.roofline.shade(point));
         }
         if self.lamp_power > 0.0 {
-            light = light + self.lamplight(point, normal);
+            light = light + self.lamplight(point, turned.normal);
         }
         light
     }
@@ -126,9 +144,11 @@ impl Lighting {
             .map(|&lamp| {
                 let towards = lamp - point;
                 let squared = towards.dot(towards);
-                // Half Lambert: bounced light wraps around what the lamp does not reach.
-                let facing = 0.35 + 0.65 * (towards.dot(normal) / squared.sqrt()).max(0.0);
-                facing / (squared + 6.0)
+                let distance = squared.sqrt();
+                // Half Lambert: bounced light wraps around what the lamp does not reach. Both
+                // terms are over the distance, which takes one division instead of two.
+                let facing = 0.35 * distance + 0.65 * towards.dot(normal).max(0.0);
+                facing / (distance * (squared + 6.0))
             })
             .sum();
         SODIUM * (received * self.lamp_power)
@@ -250,50 +270,53 @@ fn lamp_heads(street: &Street, camera: &Camera) -> Vec<Vec3> {
         .collect()
 }
 
-/// Heights of the buildings on both sides, for the shadows they cast across the street.
+/// Heights of the buildings on the sun's side, for the shadows they cast across the street.
 struct Roofline {
-    left: Vec<f32>,
-    right: Vec<f32>,
+    heights: Vec<f32>,
+    /// Where the buildings stand: y in metres.
+    line: f32,
+    sun: Vec3,
+    /// Metres along the sun's direction per metre of y.
+    per_y: f32,
 }
 
 impl Roofline {
     const STEP: f32 = 0.5;
 
-    fn new(street: &Street) -> Roofline {
+    fn new(street: &Street, sun: Vec3) -> Roofline {
         let samples = ((STREET_END - STREET_START) / Self::STEP) as usize + 1;
-        let mut left = vec![0.0; samples];
-        let mut right = left.clone();
+        let mut heights = vec![0.0; samples];
         for lot in &street.lots {
             let Lot::Built(building) = lot else { continue };
-            let side = if building.at.away.y > 0.0 { &mut left } else { &mut right };
+            if building.at.away.y * sun.y <= 0.0 {
+                continue;
+            }
             let index = |x: f32| (((x - STREET_START) / Self::STEP).max(0.0) as usize).min(samples);
             let (start, end) = building.at.x_range();
-            side[index(start)..index(end)].fill(building.eaves());
+            heights[index(start)..index(end)].fill(building.eaves());
         }
-        Roofline { left, right }
+        // A sun straight along the street meets no roof.
+        let per_y = if sun.y.abs() < 1e-3 { f32::INFINITY } else { 1.0 / sun.y };
+        Roofline { heights, line: FRONT * sun.y.signum(), sun, per_y }
     }
 
-    /// How much of the sun the buildings opposite take from a point, in `0.0..=1.0`.
+    /// How much of the sun the buildings take from a point, in `0.0..=1.0`.
     #[inline]
-    fn shade(&self, point: Vec3, sun: Vec3) -> f32 {
-        let (side, line) = if sun.y > 0.0 { (&self.left, FRONT) } else { (&self.right, -FRONT) };
-        let distance = (line - point.y) / sun.y;
-        if !distance.is_finite() || distance < 0.0 {
+    fn shade(&self, point: Vec3) -> f32 {
+        let distance = (self.line - point.y) * self.per_y;
+        if !(0.0..1e4).contains(&distance) {
             return 0.0;
         }
-        let crossing = point + sun * distance;
-        let roof = Self::height(side, crossing.x);
-        ((roof - crossing.z) / 0.25 + 0.5).clamp(0.0, 1.0)
+        let roof = self.height(point.x + self.sun.x * distance);
+        ((roof - (point.z + self.sun.z * distance)) * 4.0 + 0.5).clamp(0.0, 1.0)
     }
 
     #[inline]
-    fn height(side: &[f32], x: f32) -> f32 {
-        let position = (x - STREET_START) / Self::STEP;
+    fn height(&self, x: f32) -> f32 {
+        let position = (x - STREET_START) * (1.0 / Self::STEP);
         let index = floor(position);
-        let at = |index: i32| {
-            usize::try_from(index).ok().and_then(|index| side.get(index)).copied().unwrap_or(0.0)
-        };
+        let at = |index: i32| self.heights.get(index as usize).copied().unwrap_or(0.0);
         let low = at(index);
-        low + (at(index.saturating_add(1)) - low) * (position - index as f32)
+        low + (at(index.wrapping_add(1)) - low) * (position - index as f32)
     }
 }

@@ -8,7 +8,8 @@ use rayon::prelude::*;
 
 use super::camera::{Camera, View};
 use super::dice::{Dice, grain};
-use super::geometry::{Rgb, Vec3};
+use super::geometry::Rgb;
+use super::light::Turned;
 use super::scene::Scene;
 use super::surface::{Outline, Surface};
 
@@ -17,6 +18,11 @@ const BAND: usize = 16;
 /// Where in a pixel visibility is sampled: on a diagonal, which softens upright and level edges
 /// alike.
 const SAMPLES: [(f32, f32); 2] = [(0.25, 0.25), (0.75, 0.75)];
+/// How many pixels' width a line must have to be told from the two pixels beside the one it
+/// covers.
+const MARGIN: f32 = 1.2;
+/// Marks a pixel that shows several surfaces.
+const MIXED: u32 = u32::MAX;
 /// The surface number of the sky.
 const SKY: u32 = 0;
 
@@ -29,7 +35,7 @@ pub(super) fn render(
     let mut visible: Vec<Visible<'_>> = scene
         .surfaces
         .iter()
-        .filter_map(|surface| Visible::new(surface, camera, width, height))
+        .filter_map(|surface| Visible::new(surface, scene, camera, (width, height)))
         .collect();
     // Near surfaces first, so that most of what they hide is never entered.
     visible.sort_by(|one, other| one.distance.total_cmp(&other.distance));
@@ -57,15 +63,19 @@ struct Visible<'a> {
     rows: (f32, f32),
     /// To its middle, in metres.
     distance: f32,
-    /// The normal on the side that is seen.
-    facing: Vec3,
-    /// Whether nothing painted on it is thinner than two pixels, so that every other pixel of a
-    /// row, and of a column, tells its shade.
-    is_coarse: (bool, bool),
+    turned: Turned,
+    /// The most that a pixel may cover of it, along and up, for nothing painted on it to hide
+    /// between two pixels with one between them; in metres.
+    widest: (f32, f32),
 }
 
 impl<'a> Visible<'a> {
-    fn new(surface: &'a Surface<'a>, camera: &Camera, width: u32, height: u32) -> Option<Self> {
+    fn new(
+        surface: &'a Surface<'a>,
+        scene: &Scene<'_>,
+        camera: &Camera,
+        (width, height): (u32, u32),
+    ) -> Option<Self> {
         let view = camera.view(&surface.panel)?;
         let range = |values: &mut dyn Iterator<Item = f32>| {
             values.fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), value| {
@@ -81,19 +91,27 @@ impl<'a> Visible<'a> {
         let normal = panel.normal();
         let behind = normal.dot(panel.corner - camera.eye) > 0.0;
         let (thin, flat) = surface.paint.finest();
-        let corners = || view.outline.iter().map(|&(x, y)| view.footprint(x, y));
-        let is_coarse = (
-            corners().all(|corner| corner.across * 2.0 < thin),
-            corners().all(|corner| corner.rise * 2.0 < flat),
-        );
+        let facing = if behind { normal * -1.0 } else { normal };
         inside.then_some(Visible {
-            is_coarse,
-            facing: if behind { normal * -1.0 } else { normal },
+            widest: (thin / MARGIN, flat / MARGIN),
+            turned: scene.lighting.turned(surface.lit_normal(facing)),
             surface,
             view,
             rows,
             distance: sight.dot(sight).sqrt(),
         })
+    }
+
+    /// Whether nothing painted here could hide between two pixels, side by side or one above the
+    /// other, with one between them.
+    #[inline]
+    fn is_coarse(&self, x: f32, y: f32, is_level: bool) -> bool {
+        let (across, rise) = self.widest;
+        if is_level {
+            across == f32::INFINITY || self.view.is_finer_across(x, y, across)
+        } else {
+            rise == f32::INFINITY || self.view.is_finer_upwards(x, y, rise)
+        }
     }
 
     /// Where the outline crosses a horizontal line, in pixels.
@@ -112,19 +130,21 @@ impl<'a> Visible<'a> {
     }
 }
 
-/// The nearest surface at every sample of a band.
+/// The nearest surface at every sample of a band; each row of pixels is one line of samples for
+/// each of [`SAMPLES`].
 struct Samples {
-    inverse_depth: Vec<f32>,
+    width: usize,
     surface: Vec<u32>,
+    /// The surface of each pixel that shows only one, else [`MIXED`].
+    only: Vec<u32>,
 }
 
 impl Samples {
     /// The surfaces seen by the samples of a band's pixel.
     #[inline]
-    fn at(&self, pixel: usize, width: usize) -> [u32; SAMPLES.len()] {
-        // A row of pixels is stored as two lines of samples, one after the other.
-        let first = pixel + pixel / width * width;
-        [self.surface[first], self.surface[first + width]]
+    fn at(&self, (column, row): (usize, usize)) -> (u32, u32) {
+        let first = SAMPLES.len() * row * self.width + column;
+        (self.surface[first], self.surface[first + self.width])
     }
 }
 
@@ -143,8 +163,9 @@ impl Canvas<'_> {
         let radiance = self.shade(&samples, top, rows);
         for (row, line) in pixels.chunks_exact_mut(stride).enumerate() {
             let colours = &radiance[row * self.width..];
-            for ((column, pixel), &colour) in line.chunks_exact_mut(3).enumerate().zip(colours) {
-                pixel.copy_from_slice(&self.develop(colour, column, top + row));
+            let (line, _) = line.as_chunks_mut::<3>();
+            for ((column, pixel), &colour) in line.iter_mut().enumerate().zip(colours) {
+                *pixel = self.develop(colour, column, top + row);
             }
         }
     }
@@ -152,71 +173,60 @@ impl Canvas<'_> {
     /// Shades every other pixel of every other row, and of the rest those whose neighbours differ
     /// in surface or shade: smooth walls, ground and sky need no more.
     fn shade(&self, samples: &Samples, top: usize, rows: usize) -> Vec<Rgb> {
-        let mut radiance = vec![Rgb::BLACK; self.width * rows];
-        for (first_row, first_column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
-            for row in (first_row..rows).step_by(2) {
-                for column in (first_column..self.width).step_by(2) {
-                    let at = (column, row);
-                    let smooth = match (first_row, first_column) {
-                        (0, 0) => None,
-                        (0, _) => self.between_columns(samples, &radiance, at),
-                        _ => self.between_rows(samples, &radiance, at),
-                    };
-                    radiance[row * self.width + column] =
-                        smooth.unwrap_or_else(|| self.pixel(samples, at, top + row));
-                }
+        let width = self.width;
+        let mut radiance = vec![Rgb::BLACK; width * rows];
+        for row in (0..rows).step_by(2) {
+            for column in (0..width).step_by(2) {
+                radiance[row * width + column] = self.pixel(samples, (column, row), top);
+            }
+            for column in (1..width).step_by(2) {
+                let beside = (column + 1 < width).then_some(1);
+                self.fill(samples, &mut radiance, (column, row), top, beside);
+            }
+        }
+        for row in (1..rows).step_by(2) {
+            let beside = (row + 1 < rows).then_some(width);
+            for column in 0..width {
+                self.fill(samples, &mut radiance, (column, row), top, beside);
             }
         }
         radiance
     }
 
-    /// The mean of the pixels to the left and right, where that is as good as shading.
-    fn between_columns(
+    /// Gives a pixel the mean of the two that lie `beside` it in memory, or shades it where that
+    /// is not as good: where not all three show one and the same surface, the two differ much, or
+    /// something painted on the surface could hide between them.
+    #[inline]
+    fn fill(
         &self,
         samples: &Samples,
-        radiance: &[Rgb],
+        radiance: &mut [Rgb],
         (column, row): (usize, usize),
-    ) -> Option<Rgb> {
+        top: usize,
+        beside: Option<usize>,
+    ) {
         let here = row * self.width + column;
-        let is_coarse = |visible: &Visible<'_>| visible.is_coarse.0;
-        let smooth = column + 1 < self.width
-            && self.is_uniform(samples, [here - 1, here, here + 1], is_coarse);
-        smooth.then(|| radiance[here - 1].between(radiance[here + 1])).flatten()
-    }
-
-    /// The mean of the pixels above and below, where that is as good as shading.
-    fn between_rows(
-        &self,
-        samples: &Samples,
-        radiance: &[Rgb],
-        (column, row): (usize, usize),
-    ) -> Option<Rgb> {
-        let here = row * self.width + column;
-        let (above, below) = (here - self.width, here + self.width);
-        let is_coarse = |visible: &Visible<'_>| visible.is_coarse.1;
-        let smooth =
-            below < radiance.len() && self.is_uniform(samples, [above, here, below], is_coarse);
-        smooth.then(|| radiance[above].between(radiance[below])).flatten()
-    }
-
-    /// Whether pixels of a band show one and the same surface, and that is coarse.
-    fn is_uniform(
-        &self,
-        samples: &Samples,
-        pixels: [usize; 3],
-        is_coarse: impl Fn(&Visible<'_>) -> bool,
-    ) -> bool {
-        let [first, _] = samples.at(pixels[0], self.width);
-        self.surface(first).is_none_or(is_coarse)
-            && pixels.iter().all(|&pixel| samples.at(pixel, self.width) == [first; SAMPLES.len()])
+        if let Some(step) = beside {
+            let (before, after) = (here - step, here + step);
+            let (one, surface, other) =
+                (samples.only[before], samples.only[here], samples.only[after]);
+            let is_uniform = (surface != MIXED) & (one == surface) & (other == surface);
+            if is_uniform && radiance[before].is_close(radiance[after]) {
+                let (x, y) = (column as u32 as f32 + 0.5, (top + row) as u32 as f32 + 0.5);
+                let is_level = step == 1;
+                if self.surface(surface).is_none_or(|visible| visible.is_coarse(x, y, is_level)) {
+                    radiance[here] = radiance[before].mix(radiance[after], 0.5);
+                    return;
+                }
+            }
+        }
+        radiance[here] = self.pixel(samples, (column, row), top);
     }
 
     fn sample(&self, top: usize, rows: usize) -> Samples {
         let lines = rows * SAMPLES.len();
-        let mut samples = Samples {
-            inverse_depth: vec![0.0; self.width * lines],
-            surface: vec![SKY; self.width * lines],
-        };
+        let mut nearness = vec![0.0; self.width * lines];
+        let mut surface = vec![SKY; self.width * lines];
         for (number, visible) in (SKY + 1..).zip(self.visible) {
             let (first, last) = visible.rows;
             let start = ((first - top as f32).max(0.0) as usize).min(rows);
@@ -225,25 +235,29 @@ impl Canvas<'_> {
                 let (right, down) = SAMPLES[line % SAMPLES.len()];
                 let y = (top + line / SAMPLES.len()) as f32 + down;
                 let at = line * self.width..(line + 1) * self.width;
-                let depths = &mut samples.inverse_depth[at.clone()];
-                scan(visible, number, (right, y), depths, &mut samples.surface[at]);
+                let depths = &mut nearness[at.clone()];
+                scan(visible, number, (right, y), depths, &mut surface[at]);
             }
         }
-        samples
+        let mut only = Vec::with_capacity(self.width * rows);
+        for row in surface.chunks_exact(SAMPLES.len() * self.width) {
+            let (above, below) = row.split_at(self.width);
+            let whole = |(&one, &other): (&u32, &u32)| if one == other { one } else { MIXED };
+            only.extend(above.iter().zip(below).map(whole));
+        }
+        Samples { width: self.width, surface, only }
     }
 
     /// The mean radiance of a pixel, shading each surface in it where it is seen.
-    fn pixel(&self, samples: &Samples, (column, row): (usize, usize), y: usize) -> Rgb {
-        let [one, other] = samples.at(row * self.width + column, self.width);
-        let (x, y) = (column as f32, y as f32);
+    fn pixel(&self, samples: &Samples, pixel: (usize, usize), top: usize) -> Rgb {
+        let (one, other) = samples.at(pixel);
+        let (x, y) = (pixel.0 as u32 as f32, (top + pixel.1) as u32 as f32);
         if one == other {
             return self.radiance(one, x + 0.5, y + 0.5);
         }
-        let seen = |number: u32, sample: usize| {
-            let (right, down) = SAMPLES[sample];
-            self.radiance(number, x + right, y + down)
-        };
-        (seen(one, 0) + seen(other, 1)) * 0.5
+        let seen =
+            |number: u32, (right, down): (f32, f32)| self.radiance(number, x + right, y + down);
+        (seen(one, SAMPLES[0]) + seen(other, SAMPLES[1])) * 0.5
     }
 
     /// A surface by its number, or `None` for the sky.
@@ -252,33 +266,26 @@ impl Canvas<'_> {
     }
 
     fn radiance(&self, number: u32, x: f32, y: f32) -> Rgb {
-        let ray = self.camera.ray(x, y);
         match self.surface(number) {
-            None => self.scene.lighting.sky(ray),
+            None => self.scene.lighting.sky(self.camera.ray(x, y)),
             Some(visible) => {
-                let seen = visible.view.footprint(x, y);
-                let facing = visible.facing;
-                self.scene.shade(visible.surface, &seen, facing, ray)
+                self.scene.shade(visible.surface, &visible.view.footprint(x, y), &visible.turned)
             }
         }
     }
 
     /// Exposure, a film-like shoulder, display gamma and sensor noise.
+    #[inline]
     fn develop(&self, radiance: Rgb, column: usize, row: usize) -> [u8; 3] {
         let lighting = &self.scene.lighting;
         // The grain's standard deviation is 1/√12.
         let spread = lighting.noise * 3.46;
-        let noise = grain(column as i32, row as i32, self.grain);
+        let noise = grain(column as i32, row as i32, self.grain) * spread;
         let levels = radiance.tint(lighting.exposure).map(|light| {
             let shoulder = light * (1.0 + 0.18 * light) / (1.0 + 0.55 * light);
-            255.0 * shoulder.max(0.0).sqrt() + 0.5
+            255.0 * shoulder.max(0.0).sqrt()
         });
-        let [red, green, blue] = levels.channels();
-        [
-            (red + noise[0] * spread) as u8,
-            (green + noise[1] * spread) as u8,
-            (blue + noise[2] * spread) as u8,
-        ]
+        (levels + noise).bytes()
     }
 }
 
@@ -297,20 +304,25 @@ fn scan(
     let sample = |x: f32| (x - right + 1.0).clamp(0.0, depths.len() as f32) as usize;
     let (start, end) = (sample(from), sample(to));
     let form = visible.view.inverse_depth;
-    let first = form.at(right, y);
+    let nearness = |index: usize| form.at(index as i32 as f32 + right, y);
     let line = depths[start..end].iter_mut().zip(&mut surfaces[start..end]);
-    for (index, (depth, surface)) in (start..end).zip(line) {
-        let inverse_depth = first + form.dx * index as f32;
-        if inverse_depth <= *depth {
-            continue;
+    if matches!(visible.surface.outline, Outline::Full) {
+        // Without branches, so that it compiles to vector instructions.
+        for (index, (depth, surface)) in (start..end).zip(line) {
+            let inverse_depth = nearness(index);
+            let is_nearer = inverse_depth > *depth;
+            *depth = if is_nearer { inverse_depth } else { *depth };
+            *surface = if is_nearer { number } else { *surface };
         }
-        if !matches!(visible.surface.outline, Outline::Full) {
+        return;
+    }
+    for (index, (depth, surface)) in (start..end).zip(line) {
+        let inverse_depth = nearness(index);
+        if inverse_depth > *depth {
             let (u, v) = visible.view.uv(index as f32 + right, y);
-            if !Scene::covers(visible.surface, u, v) {
-                continue;
+            if Scene::covers(visible.surface, u, v) {
+                (*depth, *surface) = (inverse_depth, number);
             }
         }
-        *depth = inverse_depth;
-        *surface = number;
     }
 }

@@ -5,7 +5,7 @@ use super::facade::facade;
 use super::geometry::{Panel, Rgb, Vec3, vec3};
 use super::ground;
 use super::layout::{KERB, Lot, PAVEMENT_HEIGHT, STREET_END, STREET_START, Street};
-use super::light::Lighting;
+use super::light::{Lighting, Turned};
 use super::massing;
 use super::props;
 use super::surface::{Glance, Material, Outline, Paint, Surface, stripes, wall};
@@ -21,10 +21,11 @@ pub(super) struct Scene<'a> {
     pub surfaces: Vec<Surface<'a>>,
     pub lighting: Lighting,
     street: &'a Street,
-    shadows: Vec<Shadow>,
+    shadows: Shadows,
 }
 
 /// A soft dark patch on the ground.
+#[derive(Clone, Copy)]
 struct Shadow {
     centre: Vec3,
     /// One over its half length and half width, per metre.
@@ -35,6 +36,47 @@ struct Shadow {
 impl Shadow {
     fn new(centre: Vec3, half: (f32, f32), strength: f32) -> Shadow {
         Shadow { centre, sharpness: (1.0 / half.0, 1.0 / half.1), strength }
+    }
+}
+
+/// The shadows on a street, by where along it they lie.
+struct Shadows(Vec<Vec<Shadow>>);
+
+impl Shadows {
+    /// Length of street that is looked up together, in metres.
+    const CELL: f32 = 2.0;
+
+    fn new(shadows: &[Shadow]) -> Shadows {
+        let mut cells = vec![Vec::new(); Self::cell(STREET_END) + 1];
+        for &shadow in shadows {
+            let half = 1.0 / shadow.sharpness.0;
+            let (first, last) =
+                (Self::cell(shadow.centre.x - half), Self::cell(shadow.centre.x + half));
+            for cell in cells.iter_mut().take(last + 1).skip(first) {
+                cell.push(shadow);
+            }
+        }
+        Shadows(cells)
+    }
+
+    #[inline]
+    fn cell(x: f32) -> usize {
+        ((x - STREET_START) * (1.0 / Self::CELL)) as usize
+    }
+
+    /// Share of the light that patches of shadow leave to a point on the ground.
+    #[inline]
+    fn unshaded(&self, point: Vec3) -> f32 {
+        let mut share = 1.0;
+        for shadow in self.0.get(Self::cell(point.x)).into_iter().flatten() {
+            let x = (point.x - shadow.centre.x) * shadow.sharpness.0;
+            let y = (point.y - shadow.centre.y) * shadow.sharpness.1;
+            if x.abs() < 1.0 && y.abs() < 1.0 {
+                let (x, y) = (x * x, y * y);
+                share *= 1.0 - shadow.strength * (1.5 - 1.5 * (x * x + y * y)).clamp(0.0, 1.0);
+            }
+        }
+        share
     }
 }
 
@@ -55,9 +97,8 @@ impl<'a> Scene<'a> {
         for (foot, dice) in &traffic.walkers {
             props::walker(*foot, camera.rightwards(), &mut dice.fork(0), &mut surfaces);
         }
-        let mut shadows = cast_shadows(street, traffic, &lighting);
-        shadows.retain(|shadow| camera.may_see(shadow.centre, 6.0));
-        Scene { surfaces, shadows, lighting, street }
+        let shadows = cast_shadows(street, traffic, &lighting);
+        Scene { surfaces, shadows: Shadows::new(&shadows), lighting, street }
     }
 
     /// Whether a surface covers a point of its panel.
@@ -78,11 +119,11 @@ impl<'a> Scene<'a> {
         }
     }
 
-    /// Radiance of the point of `surface` seen along `ray`; `normal` is the one on that side.
+    /// Radiance of the point of `surface` seen by a pixel; `turned` is how the surface lies to the
+    /// light on that side.
     #[inline]
-    pub fn shade(&self, surface: &Surface<'a>, seen: &Footprint, normal: Vec3, ray: Vec3) -> Rgb {
+    pub fn shade(&self, surface: &Surface<'a>, seen: &Footprint, turned: &Turned) -> Rgb {
         let panel = &surface.panel;
-        let depth = (-normal.dot(ray)).max(1e-3);
         let glance = Glance {
             u: seen.u,
             v: seen.v,
@@ -90,17 +131,13 @@ impl<'a> Scene<'a> {
             height: panel.height,
             across: seen.across,
             rise: seen.rise,
-            slant: (panel.along.dot(ray) / depth, panel.up.dot(ray) / depth),
+            slant: seen.slant,
             point: panel.point(seen.u, seen.v),
         };
         let material = self.material(surface, &glance);
-        let facing = match surface.paint {
-            Paint::Leaves(_) | Paint::Walker { .. } => (normal + Vec3::UP).unit(),
-            _ => normal,
-        };
-        let mut light = self.lighting.irradiance(glance.point, facing);
+        let mut light = self.lighting.irradiance(glance.point, turned);
         if matches!(surface.paint, Paint::Road | Paint::Pavement) {
-            light = light * self.unshaded(glance.point);
+            light = light * self.shadows.unshaded(glance.point);
         }
         let haze = seen.depth / (seen.depth + 700.0);
         (material.albedo.tint(light) + material.glow).mix(self.lighting.horizon, haze)
@@ -134,23 +171,6 @@ impl<'a> Scene<'a> {
             Paint::Road => ground::road(&self.street.crossings, at),
             Paint::Pavement => ground::pavement(at),
         }
-    }
-
-    /// Share of the light that patches of shadow leave to a point on the ground.
-    #[inline]
-    fn unshaded(&self, point: Vec3) -> f32 {
-        self.shadows
-            .iter()
-            .map(|shadow| {
-                let x = (point.x - shadow.centre.x) * shadow.sharpness.0;
-                let y = (point.y - shadow.centre.y) * shadow.sharpness.1;
-                if x.abs() > 1.0 || y.abs() > 1.0 {
-                    return 1.0;
-                }
-                let (x, y) = (x * x, y * y);
-                1.0 - shadow.strength * (1.5 - 1.5 * (x * x + y * y)).clamp(0.0, 1.0)
-            })
-            .product()
     }
 }
 
@@ -251,7 +271,7 @@ fn cast_shadows(street: &Street, traffic: &Traffic, lighting: &Lighting) -> Vec<
     });
     let under_people = traffic.walkers.iter().map(|&(foot, _)| Shadow::new(foot, (0.35, 0.3), 0.5));
     let mut shadows: Vec<Shadow> = under_vehicles.chain(under_people).collect();
-    if lighting.has_sun() {
+    if lighting.has_sun {
         let drop = lighting.sun_direction * (1.0 / lighting.sun_direction.z);
         shadows.extend(street.trees.iter().map(|tree| {
             let spread = tree.height * 0.3;

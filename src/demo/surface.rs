@@ -13,6 +13,17 @@ pub(super) struct Surface<'a> {
     pub paint: Paint<'a>,
 }
 
+impl Surface<'_> {
+    /// The normal that light meets, `facing` being the panel's own on the side that is seen: leaves
+    /// and people are round, and catch light from above.
+    pub fn lit_normal(&self, facing: Vec3) -> Vec3 {
+        match self.paint {
+            Paint::Leaves(_) | Paint::Walker { .. } => (facing + Vec3::UP).unit(),
+            _ => facing,
+        }
+    }
+}
+
 /// The part of a panel that exists.
 #[derive(Clone, Copy)]
 pub(super) enum Outline {
