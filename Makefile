@@ -28,8 +28,8 @@ lint: ## Check the format and the lints
 format: ## Format the code
 	$(CARGO) fmt
 
-bench: build ## Measure localizing against bare extraction, and how fast the town is drawn
-	$(CARGO) bench --locked --bench localize --bench town
+bench: build ## Measure localizing, refining by an MLLM (a mock), and drawing the town
+	$(CARGO) bench --locked --bench localize --bench mllm --bench town
 
 openapi: build ## Write docs/openapi.json anew from the handlers
 	$(BINARY) openapi > docs/openapi.json

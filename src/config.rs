@@ -54,6 +54,8 @@ pub struct Server {
     pub request_timeout_s: u64,
     /// The most requests in progress.
     pub max_requests: usize,
+    /// The most event streams that are open.
+    pub max_streams: usize,
     /// The longest drain, in seconds.
     pub drain_timeout_s: u64,
 }
@@ -72,6 +74,8 @@ pub struct Data {
     pub description_cache_bytes: u64,
     /// How long they are used, in days.
     pub description_cache_days: u64,
+    /// For how many days it is known what was spent.
+    pub usage_days: u32,
 }
 
 /// `[model]`
@@ -142,6 +146,8 @@ pub struct Jobs {
     pub timeout_s: u64,
     /// How often a job is tried.
     pub attempts: u32,
+    /// The pause before the second try, in seconds; it doubles each time.
+    pub retry_pause_s: u64,
     /// The longest wait of a caller, in seconds.
     pub max_wait_s: u64,
 }
@@ -292,6 +298,8 @@ impl Config {
         let at_least_one = [
             ("server.body_limit_bytes", self.server.body_limit_bytes),
             ("server.max_requests", self.server.max_requests),
+            ("server.max_streams", self.server.max_streams),
+            ("data.usage_days", self.data.usage_days as usize),
             ("data.commit_batch", self.data.commit_batch),
             ("model.sessions", self.model.sessions),
             ("model.max_batch", self.model.max_batch),

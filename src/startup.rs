@@ -6,7 +6,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
+use jiff::Timestamp;
+use jiff::tz::TimeZone;
 use tokio::net::TcpListener;
+use tokio::runtime::Handle;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
@@ -18,8 +21,8 @@ use crate::refine::{DenseCache, LocalRefiner, Refiner, Worker, WorkerSettings};
 use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Assets, CpuPool, Extractor, ExtractorSettings, ImageLimits};
 use crate::service::{Service, ServiceSettings};
-use crate::store::JobStore;
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
+use crate::store::{JobStore, UsageStore};
 use crate::telemetry::Metrics;
 
 /// Serves on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200.
@@ -75,6 +78,7 @@ fn http_settings(config: &Config) -> HttpSettings {
         request_timeout: config.server.request_timeout(),
         max_wait: Duration::from_secs(config.jobs.max_wait_s),
         max_requests: config.server.max_requests,
+        max_streams: config.server.max_streams,
     }
 }
 
@@ -94,6 +98,7 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
             max_bytes: config.data.description_cache_bytes,
             max_age: Duration::from_secs(config.data.description_cache_days * 24 * 3600),
         },
+        usage_days: config.data.usage_days,
     })?);
     let extractor = Arc::new(load_model(config)?);
     let pool = CpuPool::new("frames", threads_or(config.image.threads, 2), config.image.queue)?;
@@ -114,10 +119,16 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
                 maps: store.clone(),
                 blobs: store.clone(),
                 cache: store.clone(),
+                usage: store.clone(),
+                metrics: Arc::clone(&metrics),
                 limits: extractor.limits(),
                 fallback: Some(local),
             };
-            Some(Arc::new(MllmRefiner::new(parts, config.mllm.clone())?))
+            let refiner = MllmRefiner::new(parts, config.mllm.clone())?;
+            // Nobody else spends before the workers start.
+            let today = Timestamp::now().to_zoned(TimeZone::UTC).date();
+            refiner.seed_spent_today(&Handle::current().block_on(store.usage(today))?);
+            Some(Arc::new(refiner))
         }
     };
     let jobs: Arc<dyn JobStore> = store.clone();
@@ -130,6 +141,7 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
                 lease: Duration::from_secs(config.jobs.lease_s),
                 timeout: Duration::from_secs(config.jobs.timeout_s),
                 attempts: config.jobs.attempts,
+                retry_pause: Duration::from_secs(config.jobs.retry_pause_s),
             },
         })
     });
@@ -138,6 +150,7 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
         maps: store.clone(),
         blobs: store.clone(),
         jobs,
+        accounts: store.clone(),
         extractor,
         pool,
         refiner,
@@ -150,6 +163,7 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
             candidates: config.refine.candidates,
             job_queue: config.jobs.queue,
             max_wait: Duration::from_secs(config.jobs.max_wait_s),
+            usage_days: config.data.usage_days,
         },
     };
     Ok((service, workers))

@@ -14,6 +14,7 @@ use tracing_subscriber::EnvFilter;
 
 use crate::config::{Log, LogFormat};
 use crate::domain::Job;
+use crate::refine::mllm::MllmLevels;
 use crate::retrieve::StageTimes;
 
 /// Starts logging to standard error. A second call changes nothing.
@@ -47,8 +48,38 @@ pub struct Metrics {
     model_calls: Family<RefinerLabels, Counter>,
     cached_descriptions: Family<RefinerLabels, Counter>,
     tokens: Family<TokenLabels, Counter>,
+    description_lookups: Family<LookupLabels, Counter>,
+    description_cache_entries: Gauge,
+    description_cache_bytes: Gauge,
+    mllm_suspended: Gauge,
+    mllm_tokens_today: Gauge,
+    mllm_money_today: Gauge<f64, AtomicU64>,
     map_images: Family<MapLabels, Gauge>,
     dense_cache_bytes: Gauge<f64, AtomicU64>,
+}
+
+/// What came of looking for a pair's description.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum CacheLookup {
+    /// It was there.
+    Hit,
+    /// That of a similar frame was there.
+    Similar,
+    /// It had to be bought.
+    Miss,
+}
+
+/// What is measured when it is asked for.
+#[derive(Debug, Clone)]
+pub struct Levels {
+    /// Images of each map.
+    pub maps: Vec<(String, usize)>,
+    /// Jobs that wait or run.
+    pub queued: usize,
+    /// Bytes of cached dense features.
+    pub dense_cache_bytes: usize,
+    /// How the refiner stands, if it asks models outside.
+    pub mllm: Option<MllmLevels>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
@@ -86,6 +117,11 @@ struct TokenLabels {
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct LookupLabels {
+    result: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct MapLabels {
     map: String,
 }
@@ -116,6 +152,12 @@ impl Metrics {
             model_calls: Family::default(),
             cached_descriptions: Family::default(),
             tokens: Family::default(),
+            description_lookups: Family::default(),
+            description_cache_entries: Gauge::default(),
+            description_cache_bytes: Gauge::default(),
+            mllm_suspended: Gauge::default(),
+            mllm_tokens_today: Gauge::default(),
+            mllm_money_today: Gauge::default(),
             map_images: Family::default(),
             dense_cache_bytes: Gauge::default(),
         };
@@ -158,6 +200,37 @@ impl Metrics {
             "tokens",
             "Tokens sent to a model outside (prompt) and received (completion)",
             self.tokens.clone(),
+        );
+        registry.register(
+            "description_lookups",
+            "Pairs whose description was looked for: known (hit), known of a nearly equal frame \
+             (similar), or bought (miss)",
+            self.description_lookups.clone(),
+        );
+        registry.register(
+            "description_cache_entries",
+            "Descriptions that are kept",
+            self.description_cache_entries.clone(),
+        );
+        registry.register(
+            "description_cache_bytes",
+            "Bytes of the descriptions that are kept",
+            self.description_cache_bytes.clone(),
+        );
+        registry.register(
+            "mllm_suspended",
+            "Whether calls to the MLLM are suspended because the last ones failed",
+            self.mllm_suspended.clone(),
+        );
+        registry.register(
+            "mllm_tokens_today",
+            "Tokens spent since midnight UTC, calls in progress included",
+            self.mllm_tokens_today.clone(),
+        );
+        registry.register(
+            "mllm_money_today",
+            "Money spent since midnight UTC, calls in progress included",
+            self.mllm_money_today.clone(),
         );
         registry.register("map_images", "Images in a map", self.map_images.clone());
         registry.register(
@@ -212,15 +285,32 @@ impl Metrics {
         }
     }
 
-    /// Sets what is measured when it is asked for: images of each map, jobs that wait, bytes cached.
-    pub fn set_levels(&self, maps: &[(String, usize)], queued: usize, dense_cache_bytes: usize) {
+    /// Counts a search for a pair's description.
+    pub fn description_lookup(&self, found: CacheLookup) {
+        let result = match found {
+            CacheLookup::Hit => "hit",
+            CacheLookup::Similar => "similar",
+            CacheLookup::Miss => "miss",
+        };
+        self.description_lookups.get_or_create(&LookupLabels { result }).inc();
+    }
+
+    /// Sets what is measured when it is asked for.
+    pub fn set_levels(&self, levels: &Levels) {
         self.map_images.clear();
-        for (map, images) in maps {
+        for (map, images) in &levels.maps {
             let labels = MapLabels { map: map.clone() };
             self.map_images.get_or_create(&labels).set(*images as i64);
         }
-        self.queued_jobs.set(queued as i64);
-        self.dense_cache_bytes.set(dense_cache_bytes as f64);
+        self.queued_jobs.set(levels.queued as i64);
+        self.dense_cache_bytes.set(levels.dense_cache_bytes as f64);
+        if let Some(mllm) = levels.mllm {
+            self.mllm_suspended.set(mllm.suspended.into());
+            self.mllm_tokens_today.set(mllm.spent_today.tokens as i64);
+            self.mllm_money_today.set(mllm.spent_today.money);
+            self.description_cache_entries.set(mllm.cache.entries as i64);
+            self.description_cache_bytes.set(mllm.cache.bytes as i64);
+        }
     }
 
     /// All metrics in the OpenMetrics text format.

@@ -1,9 +1,16 @@
 //! Global descriptors: one unit vector for one picture.
 
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use serde::{Deserialize, Serialize};
+
 /// The global descriptor of one picture: finite numbers of unit Euclidean norm.
 ///
 /// The dot product of two descriptors is their cosine similarity, −1 to 1.
-#[derive(Debug, Clone, PartialEq)]
+///
+/// Serialized as base64 of its numbers in little-endian order.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
 pub struct Descriptor(Vec<f32>);
 
 /// Why numbers could not become a [`Descriptor`].
@@ -15,6 +22,9 @@ pub enum DescriptorError {
     /// A number is infinite or not a number.
     #[error("the descriptor holds a number that is not finite")]
     NotFinite,
+    /// A text is not base64 of 32-bit floats.
+    #[error("the text is not base64 of 32-bit floats")]
+    Unreadable,
 }
 
 impl Descriptor {
@@ -33,6 +43,11 @@ impl Descriptor {
         Ok(Self(numbers))
     }
 
+    /// Cosine similarity to another of the same dimension, −1 to 1.
+    pub fn similarity(&self, other: &Self) -> f32 {
+        self.0.iter().zip(&other.0).map(|(a, b)| a * b).sum()
+    }
+
     /// How many numbers it has.
     pub fn dim(&self) -> usize {
         self.0.len()
@@ -44,6 +59,26 @@ impl Descriptor {
     }
 }
 
+impl From<Descriptor> for String {
+    fn from(descriptor: Descriptor) -> Self {
+        let bytes: Vec<u8> = descriptor.0.iter().flat_map(|number| number.to_le_bytes()).collect();
+        STANDARD.encode(bytes)
+    }
+}
+
+impl TryFrom<String> for Descriptor {
+    type Error = DescriptorError;
+
+    fn try_from(text: String) -> Result<Self, DescriptorError> {
+        let bytes = STANDARD.decode(text).map_err(|_| DescriptorError::Unreadable)?;
+        let (numbers, rest) = bytes.as_chunks::<4>();
+        if !rest.is_empty() {
+            return Err(DescriptorError::Unreadable);
+        }
+        Self::normalised(numbers.iter().copied().map(f32::from_le_bytes).collect())
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -52,6 +87,17 @@ mod tests {
     fn a_descriptor_has_unit_norm() {
         let descriptor = Descriptor::normalised(vec![3.0, 4.0]).unwrap();
         assert_eq!(descriptor.as_slice(), [0.6, 0.8]);
+    }
+
+    #[test]
+    fn a_descriptor_survives_being_written_down() {
+        let descriptor = Descriptor::normalised(vec![3.0, -4.0, 12.0]).unwrap();
+        let read: Descriptor =
+            serde_json::from_str(&serde_json::to_string(&descriptor).unwrap()).unwrap();
+        assert!((read.similarity(&descriptor) - 1.0).abs() < 1e-6);
+        for text in ["\"AAAA\"", "\"not base64\"", "\"\""] {
+            assert!(serde_json::from_str::<Descriptor>(text).is_err(), "{text}");
+        }
     }
 
     #[test]

@@ -1,9 +1,11 @@
 //! Jobs: one refinement of the candidates of one query.
 
 use std::fmt;
+use std::ops::{Add, AddAssign};
 use std::str::FromStr;
 
 use jiff::Timestamp;
+use jiff::civil::Date;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
@@ -40,6 +42,22 @@ pub enum JobState {
     Cancelled,
 }
 
+/// Which jobs are refined first: those of higher priority, and among equals the oldest.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize, ToSchema,
+)]
+#[serde(rename_all = "lowercase")]
+pub enum Priority {
+    /// When nothing else waits.
+    Low,
+    /// In its turn.
+    #[default]
+    Normal,
+    /// Before all others.
+    High,
+}
+
+display_as_written!(Priority { Low => "low", Normal => "normal", High => "high" });
 display_as_written!(RefinerKind { Local => "local", Mllm => "mllm" });
 display_as_written!(JobState {
     Queued => "queued",
@@ -66,8 +84,22 @@ pub struct Description {
     pub text: String,
     /// Whether the text was known from an earlier job.
     pub cached: bool,
+    /// The earlier frame that the text is about, where it stands in for this one because the two
+    /// are nearly the same.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub stands_in: Option<StandIn>,
     /// What it cost.
     pub usage: Usage,
+}
+
+/// An earlier frame that is nearly the same.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct StandIn {
+    /// Its query.
+    pub query_id: Uuid,
+    /// Cosine similarity of the two frames' descriptors, −1 to 1.
+    pub similarity: f32,
 }
 
 /// What a refinement cost.
@@ -81,6 +113,42 @@ pub struct Usage {
     pub prompt_tokens: u64,
     /// Tokens received.
     pub completion_tokens: u64,
+    /// Of the calls, those whose tokens are a guess because the model's server did not count them.
+    #[serde(default)]
+    pub estimated: u32,
+}
+
+impl Add for Usage {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            calls: self.calls + other.calls,
+            cached: self.cached + other.cached,
+            prompt_tokens: self.prompt_tokens + other.prompt_tokens,
+            completion_tokens: self.completion_tokens + other.completion_tokens,
+            estimated: self.estimated + other.estimated,
+        }
+    }
+}
+
+impl AddAssign for Usage {
+    fn add_assign(&mut self, other: Self) {
+        *self = *self + other;
+    }
+}
+
+/// What refining in one map cost on one day.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct DayUsage {
+    /// The day, in UTC.
+    pub date: Date,
+    /// The map.
+    pub map: MapName,
+    /// The calls and their tokens.
+    pub usage: Usage,
+    /// Money, in the currency of the configured prices, at the prices of the time.
+    pub money: f64,
 }
 
 /// One refinement.
@@ -94,6 +162,9 @@ pub struct Job {
     pub query_id: Uuid,
     /// Who refines.
     pub refiner: RefinerKind,
+    /// Its place among the jobs that wait.
+    #[serde(default)]
+    pub priority: Priority,
     /// How far it has come.
     pub state: JobState,
     /// When it was queued.
@@ -111,9 +182,9 @@ pub struct Job {
     pub ranking: Option<Ranking>,
     /// Why the ranking is as it is.
     pub reasoning: Option<String>,
-    /// What it cost so far.
+    /// What it cost so far, in all attempts since it was queued or last retried.
     pub usage: Usage,
-    /// What went wrong, if anything did.
+    /// What went wrong, or what a job that is queued again waits for.
     pub error: Option<String>,
 }
 
@@ -125,6 +196,7 @@ impl Job {
             map,
             query_id,
             refiner,
+            priority: Priority::default(),
             state: JobState::Queued,
             created_at: now,
             started_at: None,

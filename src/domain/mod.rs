@@ -17,7 +17,7 @@ pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
 pub use dense::DenseFeatures;
 pub use descriptor::{Descriptor, DescriptorError};
 pub use digest::Digest;
-pub use job::{Description, Job, JobState, RefinerKind, Usage};
+pub use job::{DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage};
 pub use map::{DescriptorKind, Frame, Map, MapName, Scene};
 pub use pose::{GeographicPose, MetricPose, Pose, PoseError};
 

@@ -8,6 +8,7 @@ use axum::response::{Html, IntoResponse, Redirect, Response};
 use super::problem::Problem;
 use super::state::{AppState, Ready};
 use crate::service::{ErrorKind, ServiceError};
+use crate::telemetry::Levels;
 
 /// Whether the process runs
 #[utoipa::path(get, path = "/livez", tag = "service", responses((status = 200, body = String)))]
@@ -62,7 +63,12 @@ impl crate::service::Service {
             .into_iter()
             .map(|map| (map.name.to_string(), map.images))
             .collect();
-        self.metrics.set_levels(&maps, self.jobs.queued().await?, self.dense.bytes());
+        self.metrics.set_levels(&Levels {
+            maps,
+            queued: self.jobs.queued().await?,
+            dense_cache_bytes: self.dense.bytes(),
+            mllm: self.refiner.as_ref().and_then(|refiner| refiner.levels()),
+        });
         self.metrics
             .encode()
             .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))

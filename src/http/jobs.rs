@@ -95,7 +95,7 @@ pub(super) async fn retry_job(
     Ok(Json(service.retry_job(job_id(&id)?).await?))
 }
 
-fn job_id(text: &str) -> Result<Uuid, Problem> {
+pub(super) fn job_id(text: &str) -> Result<Uuid, Problem> {
     text.parse().map_err(|_| {
         let shown: String = text.chars().take(80).collect();
         Problem::new(ErrorKind::Malformed, format!("a job id is a UUID; got {shown:?}"))

@@ -8,6 +8,7 @@ use super::body::{Params, PictureBody};
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::Ready;
+use crate::domain::Priority;
 use crate::service::{Answer, LocalizeRequest, RefineMode};
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -22,6 +23,10 @@ pub(super) struct LocalizeParams {
     /// no job.
     #[serde(default)]
     refine: RefineMode,
+    /// How soon the job is taken: before all others (`high`), in its turn (`normal`, default), or
+    /// when nothing else waits (`low`).
+    #[serde(default)]
+    priority: Priority,
 }
 
 /// The form of a frame.
@@ -61,6 +66,7 @@ pub(super) async fn localize(
         map: map_name(&params.map)?,
         k: params.k,
         refine: params.refine,
+        priority: params.priority,
         frame: body.picture,
     };
     Ok(Json(service.localize(request).await?))

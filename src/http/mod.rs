@@ -1,6 +1,7 @@
 //! HTTP: extract, call the service, convert. No decision about maps or frames is taken here.
 
 mod body;
+mod events;
 mod guard;
 mod health;
 mod images;
@@ -9,6 +10,7 @@ mod localize;
 mod maps;
 mod problem;
 mod state;
+mod usage;
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
@@ -29,7 +31,11 @@ pub use state::{AppState, HttpSettings};
                        candidate and orders them anew. Errors are RFC 9457 problems.",
         license(name = "Apache-2.0", identifier = "Apache-2.0")
     ),
-    components(schemas(problem::Problem)),
+    components(schemas(
+        problem::Problem,
+        crate::service::JobStatus,
+        crate::service::PairDescribed
+    )),
     tags(
         (name = "maps", description = "Named sets of reference images"),
         (name = "images", description = "Reference images with their poses"),
@@ -52,6 +58,8 @@ fn described() -> OpenApiRouter<AppState> {
         .routes(routes!(jobs::get_job))
         .routes(routes!(jobs::cancel_job))
         .routes(routes!(jobs::retry_job))
+        .routes(routes!(events::follow_job))
+        .routes(routes!(usage::usage))
         .routes(routes!(health::livez))
         .routes(routes!(health::readyz))
         .routes(routes!(health::metrics))

@@ -1,12 +1,12 @@
 //! What handlers share, and how a handler gets a service that is ready.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
 use tokio::sync::Semaphore;
+use tokio_util::sync::CancellationToken;
 
 use super::problem::Problem;
 use crate::service::{ErrorKind, Service, ServiceError};
@@ -23,6 +23,8 @@ pub struct HttpSettings {
     pub max_wait: Duration,
     /// The most requests in progress.
     pub max_requests: usize,
+    /// The most event streams that are open.
+    pub max_streams: usize,
 }
 
 /// Shared by all handlers; clones share it.
@@ -31,8 +33,9 @@ pub struct AppState {
     pub(super) settings: Arc<HttpSettings>,
     pub(super) metrics: Arc<Metrics>,
     pub(super) permits: Arc<Semaphore>,
+    pub(super) streams: Arc<Semaphore>,
     service: Arc<OnceLock<Arc<Service>>>,
-    draining: Arc<AtomicBool>,
+    draining: CancellationToken,
 }
 
 impl AppState {
@@ -40,10 +43,11 @@ impl AppState {
     pub fn new(settings: HttpSettings, metrics: Arc<Metrics>) -> Self {
         Self {
             permits: Arc::new(Semaphore::new(settings.max_requests)),
+            streams: Arc::new(Semaphore::new(settings.max_streams)),
             settings: Arc::new(settings),
             metrics,
             service: Arc::default(),
-            draining: Arc::default(),
+            draining: CancellationToken::new(),
         }
     }
 
@@ -52,13 +56,18 @@ impl AppState {
         let _ = self.service.set(service);
     }
 
-    /// Says from now on that the server is not ready, while it answers what it has begun.
+    /// Says from now on that the server is not ready, while it answers what it has begun. Event
+    /// streams end.
     pub fn set_draining(&self) {
-        self.draining.store(true, Ordering::Relaxed);
+        self.draining.cancel();
     }
 
     pub(super) fn is_draining(&self) -> bool {
-        self.draining.load(Ordering::Relaxed)
+        self.draining.is_cancelled()
+    }
+
+    pub(super) fn draining(&self) -> CancellationToken {
+        self.draining.clone()
     }
 
     pub(super) fn service(&self) -> Result<Arc<Service>, ServiceError> {

@@ -6,7 +6,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 
 use super::local::{LocalMatcher, PairMatch, describe, rank};
-use super::{DenseCache, RefineError, Refinement, Refiner};
+use super::{DenseCache, Progress, RefineError, Refinement, Refiner};
 use crate::domain::{
     Candidate, DenseFeatures, Description, DescriptorKind, Digest, Map, Ranking, RefinerKind, Usage,
 };
@@ -41,7 +41,11 @@ impl Refiner for LocalRefiner {
         RefinerKind::Local
     }
 
-    async fn refine(&self, record: &JobRecord) -> Result<Refinement, RefineError> {
+    async fn refine(
+        &self,
+        record: &JobRecord,
+        _: &dyn Progress,
+    ) -> Result<Refinement, RefineError> {
         let map = match self.maps.map(&record.job.map).await? {
             Some(map) if map.uid == record.map_uid => map,
             _ => return Err(RefineError::Hopeless("the map was removed".into())),
@@ -138,6 +142,7 @@ fn conclude(
                 image_id: candidates[index].image_id.clone(),
                 text: describe(pair),
                 cached: false,
+                stands_in: None,
                 usage: Usage::default(),
             })
             .collect(),

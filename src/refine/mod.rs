@@ -11,6 +11,8 @@ mod local_refiner;
 pub mod mllm;
 mod worker;
 
+use std::time::Duration;
+
 use async_trait::async_trait;
 
 pub use dense_cache::DenseCache;
@@ -18,15 +20,34 @@ pub use local_refiner::LocalRefiner;
 pub use worker::{Worker, WorkerSettings};
 
 use crate::domain::{Description, Ranking, RefinerKind, Usage};
-use crate::store::{JobRecord, StoreError};
+use crate::store::{JobRecord, Step, StoreError};
 
 /// Compares and orders the candidates of one job.
 #[async_trait]
 pub trait Refiner: Send + Sync {
     /// Which refiner this is.
     fn kind(&self) -> RefinerKind;
-    /// Refines one job. Dropping the call stops it.
-    async fn refine(&self, record: &JobRecord) -> Result<Refinement, RefineError>;
+    /// Whether it looks at the descriptor of a query's frame.
+    fn wants_descriptor(&self) -> bool {
+        false
+    }
+    /// How it stands, if it asks models outside.
+    fn levels(&self) -> Option<mllm::MllmLevels> {
+        None
+    }
+    /// Refines one job, and tells each step as it is done. Dropping the call stops it.
+    async fn refine(
+        &self,
+        record: &JobRecord,
+        progress: &dyn Progress,
+    ) -> Result<Refinement, RefineError>;
+}
+
+/// Hears of the steps of a refinement.
+#[async_trait]
+pub trait Progress: Send + Sync {
+    /// A step is done. What it cost is part of the refinement's usage too.
+    async fn step(&self, step: Step);
 }
 
 /// What a refiner found.
@@ -38,7 +59,7 @@ pub struct Refinement {
     pub ranking: Ranking,
     /// Why it is so.
     pub reasoning: Option<String>,
-    /// What it cost.
+    /// What this attempt cost.
     pub usage: Usage,
     /// Why part of the order is the coarse one, if it is.
     pub degraded: Option<String>,
@@ -53,6 +74,14 @@ pub enum RefineError {
     /// It may work the next time.
     #[error("{0}")]
     Passing(String),
+    /// Nothing is wrong with the job, but now is not the time.
+    #[error("{why}")]
+    Later {
+        /// What it waits for.
+        why: String,
+        /// How long to wait.
+        after: Duration,
+    },
 }
 
 impl From<StoreError> for RefineError {

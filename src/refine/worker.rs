@@ -3,14 +3,15 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast::error::RecvError;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::{RefineError, Refinement, Refiner};
+use super::{Progress, RefineError, Refinement, Refiner};
 use crate::domain::{Job, JobState};
-use crate::store::{JobRecord, JobStore, StoreError};
+use crate::store::{JobRecord, JobStore, Release, Step, StoreError};
 use crate::telemetry::Metrics;
 
 /// Bounds on a worker's patience.
@@ -22,6 +23,8 @@ pub struct WorkerSettings {
     pub timeout: Duration,
     /// How often a job is tried.
     pub attempts: u32,
+    /// The pause before the second try; it doubles each time.
+    pub retry_pause: Duration,
 }
 
 /// Refines one job after another.
@@ -53,8 +56,8 @@ impl Worker {
                 Ok(false) => {}
                 Err(error) => tracing::error!(%error, "the job queue cannot be worked on"),
             }
-            // A notice wakes the worker at once; the pause finds jobs whose lease ran out.
-            let pause = tokio::time::sleep(self.settings.lease.min(Duration::from_secs(5)));
+            // A notice wakes the worker at once; the pause finds jobs whose time has come.
+            let pause = tokio::time::sleep(self.settings.lease.min(Duration::from_secs(1)));
             tokio::select! {
                 () = shutdown.cancelled() => {}
                 () = pause => {}
@@ -65,26 +68,45 @@ impl Worker {
 
     /// Takes one job and sees it through; `false` if none waits.
     pub async fn step(&self, shutdown: &CancellationToken) -> Result<bool, StoreError> {
-        let now = Timestamp::now();
-        let lease = SignedDuration::try_from(self.settings.lease).unwrap_or(SignedDuration::MAX);
-        let until = now.saturating_add(lease).unwrap_or(Timestamp::MAX);
-        let Some(record) = self.jobs.claim(now, until).await? else { return Ok(false) };
+        let until = after(self.settings.lease);
+        let Some(record) = self.jobs.claim(Timestamp::now(), until).await? else {
+            return Ok(false);
+        };
         let job = record.job.clone();
         match self.refine(&record, shutdown).await {
             Ok(refinement) => self.end(succeeded(job, refinement)).await?,
             Err(Stopped::Cancelled) => {}
             Err(Stopped::ShuttingDown) => {
-                self.jobs.release(job.id, "the server was stopped".into()).await?;
+                let why = "the server was stopped".to_owned();
+                let release = Release { why, not_before: None, counts: false };
+                self.jobs.release(job.id, release).await?;
+            }
+            Err(Stopped::Failed(RefineError::Later { why, after: pause })) => {
+                tracing::info!(job = %job.id, why, seconds = pause.as_secs(), "a job waits");
+                let release = Release { why, not_before: Some(after(pause)), counts: false };
+                self.jobs.release(job.id, release).await?;
             }
             Err(Stopped::Failed(RefineError::Passing(why)))
                 if job.attempts < self.settings.attempts =>
             {
                 tracing::warn!(job = %job.id, attempt = job.attempts, why, "a job is tried again");
-                self.jobs.release(job.id, why).await?;
+                let doubled = 2_u32.saturating_pow(job.attempts.saturating_sub(1));
+                let pause = self.settings.retry_pause.saturating_mul(doubled);
+                let release = Release { why, not_before: Some(after(pause)), counts: true };
+                self.jobs.release(job.id, release).await?;
             }
-            Err(Stopped::Failed(error)) => self.end(failed(job, &error)).await?,
+            Err(Stopped::Failed(error)) => self.fail(job, &error).await?,
         }
         Ok(true)
+    }
+
+    /// Ends a job with what it has so far.
+    async fn fail(&self, job: Job, error: &RefineError) -> Result<(), StoreError> {
+        let job = match self.jobs.job(job.id).await? {
+            Some(record) => record.job,
+            None => job,
+        };
+        self.end(failed(job, error)).await
     }
 
     async fn refine(
@@ -93,10 +115,11 @@ impl Worker {
         shutdown: &CancellationToken,
     ) -> Result<Refinement, Stopped> {
         let timeout = self.settings.timeout;
+        let progress = JobProgress { jobs: self.jobs.as_ref(), job: record.job.id };
         tokio::select! {
             () = shutdown.cancelled() => Err(Stopped::ShuttingDown),
             () = self.cancelled(record.job.id) => Err(Stopped::Cancelled),
-            outcome = tokio::time::timeout(timeout, self.refiner.refine(record)) => match outcome {
+            outcome = tokio::time::timeout(timeout, self.refiner.refine(record, &progress)) => match outcome {
                 Ok(refined) => refined.map_err(Stopped::Failed),
                 Err(_) => Err(Stopped::Failed(RefineError::Passing(format!(
                     "it took longer than {} s (jobs.timeout_s)",
@@ -130,6 +153,28 @@ impl Worker {
     }
 }
 
+/// Writes the steps of a refinement into its job.
+struct JobProgress<'a> {
+    jobs: &'a dyn JobStore,
+    job: Uuid,
+}
+
+#[async_trait]
+impl Progress for JobProgress<'_> {
+    async fn step(&self, step: Step) {
+        if let Err(error) = self.jobs.progress(self.job, step).await {
+            // The refinement says it all again at its end.
+            tracing::error!(job = %self.job, %error, "a step of a job could not be written down");
+        }
+    }
+}
+
+/// So long from now.
+fn after(pause: Duration) -> Timestamp {
+    let pause = SignedDuration::try_from(pause).unwrap_or(SignedDuration::MAX);
+    Timestamp::now().saturating_add(pause).unwrap_or(Timestamp::MAX)
+}
+
 fn succeeded(job: Job, refinement: Refinement) -> Job {
     let Refinement { descriptions, ranking, reasoning, usage, degraded } = refinement;
     Job {
@@ -138,7 +183,7 @@ fn succeeded(job: Job, refinement: Refinement) -> Job {
         descriptions,
         ranking: Some(ranking),
         reasoning,
-        usage,
+        usage: job.usage + usage,
         error: degraded,
         ..job
     }

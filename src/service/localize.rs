@@ -11,7 +11,7 @@ use uuid::Uuid;
 
 use super::images::empty_body;
 use super::{ErrorKind, Service, ServiceError};
-use crate::domain::{Candidate, Digest, ImageId, Job, JobState, Map, MapName, Pose};
+use crate::domain::{Candidate, Digest, ImageId, Job, JobState, Map, MapName, Pose, Priority};
 use crate::retrieve::index::SearchMode;
 use crate::store::{JobRecord, Query, StoreError};
 
@@ -37,6 +37,8 @@ pub struct LocalizeRequest {
     pub k: Option<usize>,
     /// What becomes of them.
     pub refine: RefineMode,
+    /// How soon a job refines them.
+    pub priority: Priority,
     /// The bytes of the frame: JPEG, PNG or WebP.
     pub frame: Bytes,
 }
@@ -117,6 +119,8 @@ impl Service {
         let extraction = self.extract(request.frame.clone(), map.descriptor).await?;
         let searching = Instant::now();
         let wanted = if refined { k.max(self.settings.candidates) } else { k };
+        let kept = self.refiner.as_ref().filter(|refiner| refiner.wants_descriptor());
+        let descriptor = kept.map(|_| extraction.descriptor.clone());
         let mut candidates =
             self.maps.search(&map, extraction.descriptor, wanted, SearchMode::Fast).await?;
         let searched = searching.elapsed();
@@ -130,10 +134,11 @@ impl Service {
                 digest: Digest::of(&request.frame),
                 media_type: extraction.media_type,
                 created_at: Timestamp::now(),
+                descriptor,
             };
             self.dense.insert(query.digest, Arc::new(extraction.dense));
             let compared = candidates.iter().take(self.settings.candidates).cloned().collect();
-            job = Some(self.submit(&map, query, compared, request.frame).await?);
+            job = Some(self.submit(&map, query, compared, request.frame, request.priority).await?);
         }
         candidates.truncate(k);
         let mut estimate = candidates.first().map(|best| self.estimate(best));
@@ -198,11 +203,15 @@ impl Service {
         query: Query,
         candidates: Vec<Candidate>,
         frame: Bytes,
+        priority: Priority,
     ) -> Result<Job, ServiceError> {
         let Some(refiner) = &self.refiner else {
             return Err(ServiceError::new(ErrorKind::Internal, "there is no refiner"));
         };
-        let job = Job::queued(map.name.clone(), query.id, refiner.kind(), query.created_at);
+        let job = Job {
+            priority,
+            ..Job::queued(map.name.clone(), query.id, refiner.kind(), query.created_at)
+        };
         let record = JobRecord { job: job.clone(), map_uid: map.uid, query, candidates };
         let _pin = self.blobs.put_blob(record.query.digest, frame).await?;
         self.jobs.submit(record, self.settings.job_queue).await?;

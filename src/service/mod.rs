@@ -4,22 +4,26 @@
 //! knows the stores by their traits alone.
 
 mod error;
+mod events;
 mod images;
 mod jobs;
 mod localize;
 mod maps;
+mod usage;
 
 use std::sync::Arc;
 
 pub use self::error::{ErrorKind, ServiceError};
+pub use self::events::{JobEvent, JobStatus, PairDescribed};
 pub use self::images::{ImageMeta, ImagePage, NewImage};
 pub use self::jobs::JobPage;
 pub use self::localize::{Answer, Estimate, JobLink, LocalizeRequest, RefineMode, TimingMs};
 pub use self::maps::{MapChange, MapState};
+pub use self::usage::{Today, Total, UsageReport};
 use crate::refine::DenseCache;
 use crate::refine::Refiner;
 use crate::retrieve::{CpuPool, Extractor};
-use crate::store::{BlobStore, JobStore, MapStore};
+use crate::store::{BlobStore, JobStore, MapStore, UsageStore};
 use crate::telemetry::Metrics;
 
 /// Bounds and defaults of the use cases.
@@ -37,6 +41,8 @@ pub struct ServiceSettings {
     pub job_queue: usize,
     /// The longest wait for a job.
     pub max_wait: std::time::Duration,
+    /// For how many days it is known what was spent.
+    pub usage_days: u32,
 }
 
 /// Everything a use case needs.
@@ -47,6 +53,8 @@ pub struct Service {
     pub blobs: Arc<dyn BlobStore>,
     /// Jobs.
     pub jobs: Arc<dyn JobStore>,
+    /// What calls to models outside have cost.
+    pub accounts: Arc<dyn UsageStore>,
     /// The model.
     pub extractor: Arc<Extractor>,
     /// Where decoding and inference run.

@@ -8,12 +8,14 @@ pub mod embedded;
 use async_trait::async_trait;
 use bytes::Bytes;
 use jiff::Timestamp;
+use jiff::civil::Date;
 use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
 use crate::domain::{
-    Candidate, Descriptor, Digest, Image, ImageId, Job, JobState, Map, MapName, MediaType,
+    Candidate, DayUsage, Description, Descriptor, Digest, Image, ImageId, Job, JobState, Map,
+    MapName, MediaType, Usage,
 };
 use crate::retrieve::index::SearchMode;
 
@@ -130,6 +132,9 @@ pub struct Query {
     pub media_type: MediaType,
     /// When it came.
     pub created_at: Timestamp,
+    /// The frame's descriptor, where the refiner wants it.
+    #[serde(default)]
+    pub descriptor: Option<Descriptor>,
 }
 
 /// A job with what its worker needs.
@@ -145,6 +150,21 @@ pub struct JobRecord {
     pub candidates: Vec<Candidate>,
 }
 
+impl JobRecord {
+    /// Adds a step: its cost, and its description in the place of one of the same image.
+    pub fn add(&mut self, step: Step) {
+        let Self { job, candidates, .. } = self;
+        job.usage += step.usage;
+        if let Some(description) = step.description {
+            job.descriptions.retain(|known| known.image_id != description.image_id);
+            job.descriptions.push(description);
+            job.descriptions.sort_by_key(|description| {
+                candidates.iter().position(|candidate| candidate.image_id == description.image_id)
+            });
+        }
+    }
+}
+
 /// Which jobs to list.
 #[derive(Debug, Clone, Default)]
 pub struct JobFilter {
@@ -152,6 +172,26 @@ pub struct JobFilter {
     pub map: Option<MapName>,
     /// Only those in this state.
     pub state: Option<JobState>,
+}
+
+/// A step of a job that runs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Step {
+    /// What the step cost.
+    pub usage: Usage,
+    /// The pair that is described now, if the step was that.
+    pub description: Option<Description>,
+}
+
+/// How a claimed job goes back to the queue.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Release {
+    /// Why.
+    pub why: String,
+    /// Nobody takes it before then.
+    pub not_before: Option<Timestamp>,
+    /// Whether the attempt counts.
+    pub counts: bool,
 }
 
 /// Jobs and their queue.
@@ -170,20 +210,33 @@ pub trait JobStore: Send + Sync {
         before: Option<Uuid>,
         limit: usize,
     ) -> Result<Vec<Job>, StoreError>;
-    /// Takes the oldest waiting job, or one whose lease ran out, until `lease_until`.
+    /// Takes, until `lease_until`, a job that waits or whose lease ran out: one of the highest
+    /// priority, and of those the oldest.
     async fn claim(
         &self,
         now: Timestamp,
         lease_until: Timestamp,
     ) -> Result<Option<JobRecord>, StoreError>;
+    /// Adds a step to a claimed job: its cost, and its description in the place of one of the same
+    /// image.
+    async fn progress(&self, id: Uuid, step: Step) -> Result<(), StoreError>;
     /// Gives a claimed job back to the queue.
-    async fn release(&self, id: Uuid, why: String) -> Result<(), StoreError>;
+    async fn release(&self, id: Uuid, release: Release) -> Result<(), StoreError>;
     /// Ends a claimed job with what its worker found. A job that was cancelled meanwhile stays so.
     async fn finish(&self, job: Job) -> Result<(), StoreError>;
     /// Cancels a job that has not ended; returns it as it then is.
     async fn cancel(&self, id: Uuid) -> Result<Job, StoreError>;
-    /// Queues a job again that ended without success.
+    /// Queues a job again that ended without success. Its attempts and its cost begin anew.
     async fn retry(&self, id: Uuid) -> Result<Job, StoreError>;
     /// The ids of jobs that changed, as they change. A slow listener loses the oldest.
     fn changes(&self) -> broadcast::Receiver<Uuid>;
+}
+
+/// What calls to models outside have cost.
+#[async_trait]
+pub trait UsageStore: Send + Sync {
+    /// Adds to what was spent on that day in that map.
+    async fn add_usage(&self, spent: DayUsage) -> Result<(), StoreError>;
+    /// What was spent from that day on, by day and map, oldest first.
+    async fn usage(&self, from: Date) -> Result<Vec<DayUsage>, StoreError>;
 }

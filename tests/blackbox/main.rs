@@ -14,6 +14,7 @@ mod support;
 mod bad_input;
 mod cli;
 mod durability;
+mod events;
 mod images;
 mod jobs;
 mod localize;

@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::mock_mllm::{MockMllm, Reply, Script, ranking};
+use super::mock_mllm::{DescribeCall, MockMllm, Reply, Script, ranking};
 use super::support::{Server, frame};
 
-fn start(dir: &TempDir, mock: &MockMllm, more: &[(&str, &str)]) -> Server {
+pub fn start(dir: &TempDir, mock: &MockMllm, more: &[(&str, &str)]) -> Server {
     let url = mock.url();
     let settings = [
         ("WHEREABOUTS_REFINE__REFINER", "mllm"),
@@ -167,4 +167,211 @@ async fn a_job_is_cancelled_while_its_calls_hang_and_can_be_retried() {
     assert_eq!(job["state"], "queued");
     let job = server.get(&format!("{href}?wait=30")).await.expect(200);
     assert_eq!((&job["state"], &job["error"]), (&json!("succeeded"), &json!(null)), "{job}");
+}
+
+#[tokio::test]
+async fn what_is_spent_is_known_by_day_and_map_and_outlives_kill_9() {
+    let dir = TempDir::new().unwrap();
+    let mock = MockMllm::start(Script::default()).await;
+    let prices =
+        [("WHEREABOUTS_MLLM__PRICE_PROMPT", "2.5"), ("WHEREABOUTS_MLLM__MONEY_PER_DAY", "9")];
+    let server = start(&dir, &mock, &prices);
+    server.town("m", 4).await;
+    let job = refine(&server, 0).await;
+    let before = server.get("/usage").await.expect(200);
+    let [day] = before["days"].as_array().unwrap().as_slice() else { panic!("{before}") };
+    assert_eq!((&day["map"], &day["usage"]), (&json!("m"), &job["usage"]));
+    let money = day["money"].as_f64().unwrap();
+    let tokens = job["usage"]["prompt_tokens"].as_f64().unwrap();
+    assert!((money - tokens * 2.5 / 1e6).abs() < 1e-9 && money > 0.0, "{before}");
+    assert_eq!(before["total"]["usage"], job["usage"]);
+    assert_eq!(before["today"]["money_limit"], 9.0);
+    server.kill();
+
+    let server = start(&dir, &mock, &prices);
+    let after = server.get("/usage?days=1&map=m").await.expect(200);
+    assert_eq!(after, before);
+    assert_eq!(server.get("/usage?map=other").await.expect(200)["days"], json!([]));
+    assert!(server.get("/usage?days=0").await.problem(422).contains("usage_days"));
+    refine(&server, 0).await;
+    let usage = server.get("/usage").await.expect(200)["total"]["usage"].clone();
+    assert_eq!((&usage["calls"], &usage["cached"]), (&json!(6), &json!(4)));
+    let metrics = String::from_utf8(server.get("/metrics").await.bytes).unwrap();
+    for line in [
+        "whereabouts_description_lookups_total{result=\"hit\"} 4",
+        "whereabouts_description_cache_entries 4",
+        "whereabouts_mllm_suspended 0",
+    ] {
+        assert!(metrics.contains(line), "{line} is missing in {metrics}");
+    }
+}
+
+#[tokio::test]
+async fn jobs_of_higher_priority_go_first() {
+    let dir = TempDir::new().unwrap();
+    let mock =
+        MockMllm::start(Script { latency: Duration::from_millis(300), ..Script::default() }).await;
+    let server = start(&dir, &mock, &[]);
+    server.town("m", 2).await;
+    let mut jobs = Vec::new();
+    // The first occupies the only worker while the others queue up.
+    for (variant, priority) in ["normal", "low", "normal", "high"].into_iter().enumerate() {
+        let path = format!("/localize?map=m&priority={priority}");
+        let answer = server.post_jpeg(&path, frame(0, variant as u32)).await.expect(200);
+        jobs.push(answer["job"]["href"].as_str().unwrap().to_owned());
+        if variant == 0 {
+            until(|| mock.describe_calls() > 0).await;
+        }
+    }
+    let mut started = Vec::new();
+    for href in &jobs {
+        let job = server.get(&format!("{href}?wait=30")).await.expect(200);
+        assert_eq!(job["state"], "succeeded", "{job}");
+        started.push((job["started_at"].as_str().unwrap().to_owned(), job["priority"].clone()));
+    }
+    started.sort_by(|one, other| one.0.cmp(&other.0));
+    let order: Vec<&Value> = started.iter().map(|(_, priority)| priority).collect();
+    assert_eq!(order, ["normal", "high", "normal", "low"]);
+    server.post_jpeg("/localize?map=m&priority=urgent", frame(0, 0)).await.problem(400);
+}
+
+#[tokio::test]
+async fn a_job_waits_out_a_pause_without_losing_an_attempt_or_the_worker() {
+    let dir = TempDir::new().unwrap();
+    let mock = MockMllm::start(Script {
+        describe: Box::new(|call| match call.number {
+            1..=2 => Reply::Status(500, "out of order".into()),
+            _ => Reply::Text("notes".into()),
+        }),
+        ..Script::default()
+    })
+    .await;
+    let server = start(
+        &dir,
+        &mock,
+        &[
+            ("WHEREABOUTS_MLLM__ON_UNAVAILABLE", "wait"),
+            ("WHEREABOUTS_MLLM__CONCURRENCY", "1"),
+            ("WHEREABOUTS_MLLM__ATTEMPTS", "1"),
+            ("WHEREABOUTS_MLLM__BREAKER_FAILURES", "2"),
+            ("WHEREABOUTS_MLLM__BREAKER_OPEN_S", "2"),
+        ],
+    );
+    server.town("m", 3).await;
+    let answer = server.post_jpeg("/localize?map=m", frame(0, 0)).await.expect(200);
+    until(|| mock.describe_calls() >= 2).await;
+    let href = answer["job"]["href"].as_str().unwrap();
+    let waiting = async {
+        loop {
+            let job = server.get(href).await.expect(200);
+            if job["state"] == "queued" && !job["error"].is_null() {
+                return job;
+            }
+        }
+    };
+    let job = tokio::time::timeout(Duration::from_secs(5), waiting).await.unwrap();
+    assert!(job["error"].as_str().unwrap().contains("suspended"), "{job}");
+    assert_eq!(job["attempts"], 0);
+    let job = server.get(&format!("{href}?wait=30")).await.expect(200);
+    assert_eq!((&job["state"], &job["attempts"]), (&json!("succeeded"), &json!(1)), "{job}");
+    assert_eq!(job["error"], json!(null));
+}
+
+#[tokio::test]
+async fn the_descriptions_of_an_almost_equal_frame_stand_in_and_the_job_says_so() {
+    let dir = TempDir::new().unwrap();
+    let mock = MockMllm::start(Script::default()).await;
+    let server = start(&dir, &mock, &[("WHEREABOUTS_MLLM__SIMILAR_FRAME_MIN", "0.98")]);
+    server.town("m", 4).await;
+    let first = refine(&server, 0).await;
+    assert_eq!(mock.describe_calls(), 4);
+    // The same view once more, compressed harder.
+    let pixels = image::load_from_memory(&frame(0, 0)).unwrap().into_rgb8();
+    let mut again = Vec::new();
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut again, 60)
+        .encode_image(&pixels)
+        .unwrap();
+    let answer = server.post_jpeg("/localize?map=m&refine=wait", again).await.expect(200);
+    let job = server.get(answer["job"]["href"].as_str().unwrap()).await.expect(200);
+    assert_eq!((mock.describe_calls(), mock.reason_calls()), (4, 2));
+    for description in job["descriptions"].as_array().unwrap() {
+        assert_eq!(description["stands_in"]["query_id"], first["query_id"]);
+        assert!(description["stands_in"]["similarity"].as_f64().unwrap() >= 0.98);
+    }
+    // Another place is another frame.
+    let other = refine(&server, 2).await;
+    assert!(other["descriptions"].as_array().unwrap().iter().all(|d| d["stands_in"].is_null()));
+    assert_eq!(mock.describe_calls(), 8);
+}
+
+/// Every fifth call meets a fault, each kind in its turn.
+fn faulty(call: &DescribeCall) -> Reply {
+    match call.number {
+        number if number % 5 > 0 => Reply::Text(format!("notes number {number}.")),
+        number => match number / 5 % 16 {
+            0 => Reply::Hang,
+            kind if kind % 5 == 0 => Reply::Busy("0".into()),
+            kind if kind % 5 == 1 => Reply::Status(503, "overloaded".into()),
+            kind if kind % 5 == 2 => Reply::Cut,
+            kind if kind % 5 == 3 => Reply::HalfBody,
+            _ => Reply::NotJson,
+        },
+    }
+}
+
+#[tokio::test]
+async fn two_hundred_jobs_with_a_fifth_of_the_calls_failing_and_kill_9_in_the_middle() {
+    const JOBS: usize = 200;
+    const CONCURRENCY: usize = 20;
+    let dir = TempDir::new().unwrap();
+    let mock = MockMllm::start(Script { describe: Box::new(faulty), ..Script::default() }).await;
+    let concurrency = CONCURRENCY.to_string();
+    let settings = [
+        ("WHEREABOUTS_JOBS__WORKERS", "4"),
+        ("WHEREABOUTS_MLLM__CONCURRENCY", concurrency.as_str()),
+        ("WHEREABOUTS_MLLM__REQUESTS_PER_MINUTE", "0"),
+        ("WHEREABOUTS_MLLM__TIMEOUT_S", "1"),
+        ("WHEREABOUTS_MLLM__BREAKER_FAILURES", "1000"),
+    ];
+    let server = start(&dir, &mock, &settings);
+    server.town("m", 10).await;
+    let mut ids = Vec::new();
+    for number in 0..JOBS {
+        let answer = server.post_jpeg("/localize?map=m", frame(number, 0)).await.expect(200);
+        ids.push(answer["job"]["id"].clone());
+    }
+    until(|| mock.describe_calls() >= 5 * JOBS).await;
+    assert_eq!(mock.asked_again(), 0);
+    server.kill();
+
+    let server = start(&dir, &mock, &settings);
+    let done = |state: &'static str| {
+        let server = &server;
+        async move {
+            let path = format!("/jobs?state={state}&limit=1000");
+            server.get(&path).await.expect(200)["jobs"].as_array().unwrap().clone()
+        }
+    };
+    let began = Instant::now();
+    let ended = loop {
+        let ended = [done("succeeded").await, done("degraded").await].concat();
+        if ended.len() == JOBS {
+            break ended;
+        }
+        assert_eq!(done("failed").await, [json!(null); 0]);
+        assert!(began.elapsed() < Duration::from_secs(240), "only {} jobs ended", ended.len());
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    };
+    assert!(ids.iter().all(|id| ended.iter().any(|job| job["id"] == *id)), "a job was lost");
+    // What was answered in the instant of the kill may not have reached the disk.
+    let again = mock.asked_again();
+    assert!(again <= CONCURRENCY, "{again} answered pairs were asked again");
+    let degraded = ended.iter().filter(|job| job["state"] == "degraded").count();
+    eprintln!(
+        "{JOBS} jobs, {} describe calls; {degraded} jobs degraded; {again} answered pairs asked \
+         again, all in flight at the kill",
+        mock.describe_calls()
+    );
+    assert!(degraded < JOBS / 10);
+    assert_eq!(mock.violations(), [""; 0]);
 }

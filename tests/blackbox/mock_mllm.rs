@@ -138,6 +138,8 @@ struct Seen {
     structure_refused: usize,
     violations: Vec<String>,
     reason_prompts: Vec<String>,
+    /// Bytes of describe requests and of reason requests.
+    request_bytes: (usize, usize),
 }
 
 struct Shared {
@@ -216,6 +218,11 @@ impl MockMllm {
         self.seen(|seen| seen.reason_prompts.clone())
     }
 
+    /// Bytes of the describe requests and of the reason requests so far.
+    pub fn request_bytes(&self) -> (usize, usize) {
+        self.seen(|seen| seen.request_bytes)
+    }
+
     fn seen<T>(&self, look: impl FnOnce(&Seen) -> T) -> T {
         look(&self.shared.seen.lock().unwrap())
     }
@@ -266,6 +273,11 @@ async fn answer(
     }
     if !script.latency.is_zero() {
         tokio::time::sleep(script.latency).await;
+    }
+    {
+        let mut seen = shared.seen.lock().unwrap();
+        let (describe, reason) = &mut seen.request_bytes;
+        *if asked.pictures.is_empty() { reason } else { describe } += body.len();
     }
     let prompt_tokens = body.len() / 100;
     let reply = shared.reply(asked);

@@ -9,6 +9,8 @@ use jiff::Timestamp;
 use jiff::civil::Date;
 use jiff::tz::TimeZone;
 
+use crate::domain::DayUsage;
+
 /// The bounds; 0 stands for none.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Limits {
@@ -66,8 +68,16 @@ impl Limits {
     }
 }
 
+impl From<&DayUsage> for Spent {
+    fn from(day: &DayUsage) -> Self {
+        let tokens = day.usage.prompt_tokens + day.usage.completion_tokens;
+        Self { tokens, money: day.money }
+    }
+}
+
 impl Spent {
-    fn plus(self, other: Self) -> Self {
+    /// The sum.
+    pub fn plus(self, other: Self) -> Self {
         Self { tokens: self.tokens + other.tokens, money: self.money + other.money }
     }
 
@@ -99,9 +109,15 @@ impl Budget {
         self.today(now).spent
     }
 
-    /// The budget of one job.
-    pub fn for_job(self: &Arc<Self>) -> JobBudget {
-        JobBudget { budget: Arc::clone(self), spent: Mutex::default() }
+    /// What so many tokens cost.
+    pub fn cost(&self, prompt_tokens: u64, completion_tokens: u64) -> Spent {
+        self.limits.cost(prompt_tokens, completion_tokens)
+    }
+
+    /// The budget of one job, of which so many tokens are spent.
+    pub fn for_job(self: &Arc<Self>, prompt_tokens: u64, completion_tokens: u64) -> JobBudget {
+        let spent = Mutex::new(self.cost(prompt_tokens, completion_tokens));
+        JobBudget { budget: Arc::clone(self), spent }
     }
 
     /// Today's account; a new day starts an empty one.
@@ -203,14 +219,21 @@ mod tests {
     #[test]
     fn a_call_that_might_pass_the_limit_of_its_job_is_not_made() {
         let budget = budget(Limits { tokens_per_job: 1000, ..Limits::default() });
-        let job = budget.for_job();
+        let job = budget.for_job(0, 0);
         let first = job.reserve(200, 400, noon()).unwrap();
         assert_eq!(job.reserve(200, 400, noon()).unwrap_err(), Exceeded::Job);
         first.settle(200, 100);
         let second = job.reserve(200, 400, noon()).unwrap();
         drop(second);
         assert_eq!(budget.spent(noon()).tokens, 300);
-        assert!(budget.for_job().reserve(500, 500, noon()).is_ok());
+        assert!(budget.for_job(0, 0).reserve(500, 500, noon()).is_ok());
+    }
+
+    #[test]
+    fn what_an_earlier_attempt_spent_is_spent() {
+        let budget = budget(Limits { tokens_per_job: 1000, ..Limits::default() });
+        assert_eq!(budget.for_job(500, 100).reserve(300, 101, noon()).unwrap_err(), Exceeded::Job);
+        assert!(budget.for_job(500, 100).reserve(300, 100, noon()).is_ok());
     }
 
     #[test]
@@ -222,7 +245,7 @@ mod tests {
             ..Limits::default()
         };
         let budget = budget(limits);
-        let job = budget.for_job();
+        let job = budget.for_job(0, 0);
         job.reserve(2000, 1000, noon()).unwrap().settle(2000, 1000);
         assert!((budget.spent(noon()).money - 0.015).abs() < 1e-12);
         assert_eq!(job.reserve(2000, 1000, noon()).unwrap_err(), Exceeded::Day);
@@ -232,10 +255,10 @@ mod tests {
     fn a_new_day_starts_with_nothing_spent() {
         let budget = budget(Limits { tokens_per_day: 100, ..Limits::default() });
         budget.seed(noon(), Spent { tokens: 90, money: 0.0 });
-        let job = budget.for_job();
+        let job = budget.for_job(0, 0);
         assert_eq!(job.reserve(20, 0, noon()).unwrap_err(), Exceeded::Day);
         let tomorrow = noon() + SignedDuration::from_hours(12);
-        let over_midnight = budget.for_job();
+        let over_midnight = budget.for_job(0, 0);
         let held = over_midnight.reserve(10, 0, noon()).unwrap();
         let next = job.reserve(20, 0, tomorrow).unwrap();
         held.settle(10, 0);

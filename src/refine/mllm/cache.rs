@@ -1,10 +1,11 @@
-//! Descriptions that were paid for, kept so that none is bought twice.
+//! Descriptions that were paid for, kept so that none is bought twice; and the frames they are of.
 
 use async_trait::async_trait;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use uuid::Uuid;
 
-use crate::domain::{Digest, Usage};
+use crate::domain::{Descriptor, Digest, StandIn, Usage};
 use crate::store::StoreError;
 
 /// Descriptions by key. A key covers all that shapes the text: both pictures, the prompt, the model
@@ -19,6 +20,55 @@ pub trait DescriptionCache: Send + Sync {
         key: Digest,
         value: CachedDescription,
     ) -> Result<(), StoreError>;
+
+    /// Earlier frames of the map that are as similar as `at_least` (cosine), the most similar
+    /// first; no more than a few.
+    async fn similar_frames(
+        &self,
+        map: Uuid,
+        to: &Descriptor,
+        at_least: f32,
+    ) -> Result<Vec<SimilarFrame>, StoreError>;
+    /// Remembers a frame of the map whose pairs were described; the oldest beyond `most` are
+    /// forgotten.
+    async fn keep_frame(
+        &self,
+        map: Uuid,
+        frame: DescribedFrame,
+        most: usize,
+    ) -> Result<(), StoreError>;
+
+    /// How full it is.
+    fn levels(&self) -> CacheLevels;
+}
+
+/// A frame whose pairs were described.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DescribedFrame {
+    /// Its query.
+    pub query_id: Uuid,
+    /// Its bytes.
+    pub digest: Digest,
+    /// Its descriptor.
+    pub descriptor: Descriptor,
+}
+
+/// An earlier frame that resembles another.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SimilarFrame {
+    /// Its bytes.
+    pub digest: Digest,
+    /// What a job says of it.
+    pub stand_in: StandIn,
+}
+
+/// How full a cache of descriptions is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct CacheLevels {
+    /// Descriptions.
+    pub entries: usize,
+    /// Their bytes, keys included.
+    pub bytes: u64,
 }
 
 /// A description as it was bought.

@@ -1,10 +1,10 @@
 //! From what was found to a refinement: whatever failed, every candidate has its place.
 
-use super::describe::{Described, Findings, Work};
+use super::describe::{Findings, Work};
 use super::reason::Verdict;
 use super::retry::CallError;
 use super::{RefineError, Refinement};
-use crate::domain::{Description, Ranking};
+use crate::domain::Ranking;
 
 /// Orders the candidates: those that could be compared as the model says, the others behind them in
 /// coarse order. Without a verdict, all are in coarse order. `ranked` is `None` if there was nothing
@@ -22,14 +22,8 @@ pub(super) fn conclude(
     order.extend(behind);
     let ranking = Ranking::new(candidates, &order)
         .map_err(|error| RefineError::Hopeless(error.to_string()))?;
-    let text = |described: Described| Description {
-        image_id: candidates[described.index].image_id.clone(),
-        text: described.text,
-        cached: described.cached,
-        usage: described.usage,
-    };
     Ok(Refinement {
-        descriptions: findings.described.into_iter().map(text).collect(),
+        descriptions: findings.described.iter().map(|pair| pair.of(candidates)).collect(),
         ranking,
         reasoning: verdict.map(|verdict| verdict.reasoning),
         usage: work.usage(),

@@ -8,21 +8,25 @@ use jiff::Timestamp;
 use tokio::sync::OnceCell;
 
 use super::budget::{Exceeded, JobBudget};
-use super::cache::CachedDescription;
+use super::cache::{CachedDescription, DescribedFrame, SimilarFrame};
 use super::client::{Answer, Call, estimate_tokens};
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Switches, clean};
 use super::retry::CallError;
 use super::wire::{Content, ImageUrl, Message, Part, Role};
-use super::{MllmRefiner, RefineError};
-use crate::domain::{Digest, Map, Scene, Usage};
-use crate::store::{JobRecord, StoreError};
+use super::{MllmRefiner, Progress, RefineError};
+use crate::domain::{Candidate, Description, Digest, Map, Scene, StandIn, Usage};
+use crate::store::{JobRecord, Step, StoreError};
+use crate::telemetry::CacheLookup;
 
 /// What one refinement goes along with.
 pub(super) struct Work<'a> {
     pub record: &'a JobRecord,
     pub scene: Scene,
     pub budget: JobBudget,
+    pub progress: &'a dyn Progress,
+    /// Earlier frames that are nearly the same, whose descriptions may stand in.
+    pub similar: Vec<SimilarFrame>,
     /// What was bought so far.
     usage: Mutex<Usage>,
     /// The frame, made ready when it is first needed: a job whose pairs are all known needs none.
@@ -39,6 +43,13 @@ pub(super) struct Pair {
     pub key: Digest,
 }
 
+/// A description, and of which frame it is if not of the job's own.
+#[derive(Debug, Clone)]
+pub(super) struct Found {
+    description: CachedDescription,
+    stands_in: Option<StandIn>,
+}
+
 /// A pair in words.
 pub(super) struct Described {
     /// The candidate's place among the candidates.
@@ -47,8 +58,23 @@ pub(super) struct Described {
     pub text: String,
     /// Whether no call was needed.
     pub cached: bool,
+    /// The frame it is of, if that is an earlier one.
+    pub stands_in: Option<StandIn>,
     /// What it cost this job.
     pub usage: Usage,
+}
+
+impl Described {
+    /// As the job tells it.
+    pub fn of(&self, candidates: &[Candidate]) -> Description {
+        Description {
+            image_id: candidates[self.index].image_id.clone(),
+            text: self.text.clone(),
+            cached: self.cached,
+            stands_in: self.stands_in,
+            usage: self.usage,
+        }
+    }
 }
 
 /// All pairs in words, as far as that went; both lists in coarse order.
@@ -59,8 +85,21 @@ pub(super) struct Findings {
 }
 
 impl<'a> Work<'a> {
-    pub fn new(record: &'a JobRecord, scene: Scene, budget: JobBudget) -> Self {
-        Self { record, scene, budget, usage: Mutex::default(), frame: OnceCell::new() }
+    pub fn new(
+        record: &'a JobRecord,
+        scene: Scene,
+        budget: JobBudget,
+        progress: &'a dyn Progress,
+    ) -> Self {
+        Self {
+            record,
+            scene,
+            budget,
+            progress,
+            similar: Vec::new(),
+            usage: Mutex::default(),
+            frame: OnceCell::new(),
+        }
     }
 
     /// What was bought so far.
@@ -69,37 +108,28 @@ impl<'a> Work<'a> {
     }
 
     /// Takes a description into the account; what was bought is charged when it is answered.
-    fn take(&self, index: usize, description: CachedDescription, cached: bool) -> Described {
-        let CachedDescription { text, usage, .. } = description;
+    fn take(&self, index: usize, found: Found, cached: bool) -> Described {
+        let Found { description: CachedDescription { text, usage, .. }, stands_in } = found;
         let known = Usage { cached: 1, ..Usage::default() };
         if cached {
             self.charge(known);
         }
-        Described { index, text, cached, usage: if cached { known } else { usage } }
+        let usage = if cached { known } else { usage };
+        Described { index, text, cached, stands_in, usage }
     }
 
     fn charge(&self, cost: Usage) {
-        let mut usage = self.usage.lock().unwrap_or_else(PoisonError::into_inner);
-        *usage = sum(*usage, cost);
+        *self.usage.lock().unwrap_or_else(PoisonError::into_inner) += cost;
     }
 }
 
-/// Two costs together.
-pub(super) fn sum(a: Usage, b: Usage) -> Usage {
-    Usage {
-        calls: a.calls + b.calls,
-        cached: a.cached + b.cached,
-        prompt_tokens: a.prompt_tokens + b.prompt_tokens,
-        completion_tokens: a.completion_tokens + b.completion_tokens,
-    }
-}
-
-fn cost_of(answer: &Answer) -> Usage {
+pub(super) fn cost_of(answer: &Answer) -> Usage {
     Usage {
         calls: 1,
         cached: 0,
         prompt_tokens: answer.prompt_tokens,
         completion_tokens: answer.completion_tokens,
+        estimated: answer.estimated.into(),
     }
 }
 
@@ -120,6 +150,20 @@ impl MllmRefiner {
         Ok(pairs)
     }
 
+    /// Earlier frames whose descriptions may stand in for those of this job.
+    pub(super) async fn similar_frames(
+        &self,
+        record: &JobRecord,
+    ) -> Result<Vec<SimilarFrame>, RefineError> {
+        let at_least = self.settings.similar_frame_min;
+        match &record.query.descriptor {
+            Some(descriptor) if at_least > 0.0 => {
+                Ok(self.cache.similar_frames(record.map_uid, descriptor, at_least).await?)
+            }
+            _ => Ok(Vec::new()),
+        }
+    }
+
     /// Describes all pairs, several at once.
     pub(super) async fn describe_all(&self, work: &Work<'_>, pairs: &[Pair]) -> Findings {
         // Collected first: the compiler cannot see through a closure over borrowed pairs here.
@@ -138,7 +182,27 @@ impl MllmRefiner {
                 }
             }
         }
+        let known = findings.described.iter().filter(|described| described.cached).count();
+        if known > 0 {
+            let usage = Usage { cached: known as u32, ..Usage::default() };
+            self.keep(work, usage, None).await;
+        }
+        if known < findings.described.len() {
+            self.keep_frame(work.record).await;
+        }
         findings
+    }
+
+    /// Remembers a frame some of whose descriptions are new.
+    async fn keep_frame(&self, record: &JobRecord) {
+        let Some(descriptor) = record.query.descriptor.clone() else { return };
+        let frame =
+            DescribedFrame { query_id: record.query.id, digest: record.query.digest, descriptor };
+        let most = self.settings.similar_frames_kept;
+        if let Err(error) = self.cache.keep_frame(record.map_uid, frame, most).await {
+            // The next frame like it will have to be described.
+            tracing::error!(%error, "a described frame could not be remembered");
+        }
     }
 
     async fn describe(
@@ -150,7 +214,12 @@ impl MllmRefiner {
         let find = || self.find(work, pair, &bought);
         let found = self.flights.join(pair.key, find).await;
         let cached = !bought.load(Ordering::Relaxed);
-        (pair.index, found.map(|description| work.take(pair.index, description, cached)))
+        let described = found.map(|found| work.take(pair.index, found, cached));
+        if let Ok(described) = &described {
+            let description = Some(described.of(&work.record.candidates));
+            work.progress.step(Step { usage: described.usage, description }).await;
+        }
+        (pair.index, described)
     }
 
     /// The cache is looked at inside the flight: a flight that has just landed has filled it.
@@ -159,13 +228,22 @@ impl MllmRefiner {
         work: &Work<'_>,
         pair: &Pair,
         bought: &AtomicBool,
-    ) -> Result<CachedDescription, CallError> {
-        if let Some(known) = self.cache.description(&pair.key).await.map_err(passing)? {
-            return Ok(known);
+    ) -> Result<Found, CallError> {
+        if let Some(description) = self.cache.description(&pair.key).await.map_err(passing)? {
+            self.metrics.description_lookup(CacheLookup::Hit);
+            return Ok(Found { description, stands_in: None });
         }
+        for frame in &work.similar {
+            let key = self.key(&frame.digest, &pair.digest, work.scene);
+            if let Some(description) = self.cache.description(&key).await.map_err(passing)? {
+                self.metrics.description_lookup(CacheLookup::Similar);
+                return Ok(Found { description, stands_in: Some(frame.stand_in) });
+            }
+        }
+        self.metrics.description_lookup(CacheLookup::Miss);
         let description = self.buy(work, pair).await?;
         bought.store(true, Ordering::Relaxed);
-        Ok(description)
+        Ok(Found { description, stands_in: None })
     }
 
     async fn buy(&self, work: &Work<'_>, pair: &Pair) -> Result<CachedDescription, CallError> {
@@ -181,51 +259,63 @@ impl MllmRefiner {
         };
         let answer = self.call(work, &call).await?;
         let text = clean(&answer.text, self.settings.description_max_chars);
+        let usage = cost_of(&answer);
         if text.is_empty() {
+            self.keep(work, usage, None).await;
+            work.progress.step(Step { usage, description: None }).await;
             let why = answer.cut.as_deref().unwrap_or("the model said nothing");
             return Err(CallError::Hopeless(format!("the description is empty: {why}")));
         }
-        let usage = cost_of(&answer);
         let description = CachedDescription { text, usage, created_at: Timestamp::now() };
-        self.keep(pair.key, description.clone()).await;
+        self.keep(work, usage, Some((pair.key, description.clone()))).await;
         Ok(description)
     }
 
-    /// Stores what was paid for, on a task of its own: a job that is cancelled in this moment must
-    /// not take the description with it.
-    async fn keep(&self, key: Digest, description: CachedDescription) {
-        let cache = Arc::clone(&self.cache);
-        let keeping = tokio::spawn(async move { cache.keep_description(key, description).await });
-        let outcome = keeping.await.map_err(|error| StoreError::Failed(error.to_string()));
-        if let Err(error) = outcome.and_then(|kept| kept) {
+    /// Writes down what was paid, and what for, on a task of its own: a job that is cancelled in this
+    /// moment must not take it along.
+    pub(super) async fn keep(
+        &self,
+        work: &Work<'_>,
+        usage: Usage,
+        bought: Option<(Digest, CachedDescription)>,
+    ) {
+        let (cache, accounts) = (Arc::clone(&self.cache), Arc::clone(&self.usage));
+        let spent = self.spent_now(work.record, usage);
+        let keeping = tokio::spawn(async move {
+            let describing = async {
+                match bought {
+                    Some((key, description)) => cache.keep_description(key, description).await,
+                    None => Ok(()),
+                }
+            };
+            tokio::join!(describing, accounts.add_usage(spent))
+        });
+        let (described, accounted) = keeping.await.unwrap_or_else(|error| {
+            let broken = || Err(StoreError::Failed(error.to_string()));
+            (broken(), broken())
+        });
+        if let Err(error) = described {
             // The job has its text; only the next one will have to pay again.
             tracing::error!(%error, "a description could not be stored");
         }
+        if let Err(error) = accounted {
+            tracing::error!(%error, "what was spent could not be written down");
+        }
     }
 
-    /// Asks within the budget. Where so configured, waits while calls are suspended.
+    /// Asks within the budget.
     pub(super) async fn call(&self, work: &Work<'_>, call: &Call<'_>) -> Result<Answer, CallError> {
-        loop {
-            let reserved = work
-                .budget
-                .reserve(call.prompt_tokens, self.client.max_tokens(), Timestamp::now())
-                .map_err(|exceeded| match exceeded {
-                    Exceeded::Job => CallError::JobSpent,
-                    Exceeded::Day => CallError::DaySpent,
-                })?;
-            match self.client.call(call).await {
-                Ok(answer) => {
-                    reserved.settle(answer.prompt_tokens, answer.completion_tokens);
-                    work.charge(cost_of(&answer));
-                    return Ok(answer);
-                }
-                Err(CallError::Suspended { wait }) if self.waits() => {
-                    drop(reserved);
-                    tokio::time::sleep(wait).await;
-                }
-                Err(error) => return Err(error),
-            }
-        }
+        let reserved = work
+            .budget
+            .reserve(call.prompt_tokens, self.client.max_tokens(), Timestamp::now())
+            .map_err(|exceeded| match exceeded {
+                Exceeded::Job => CallError::JobSpent,
+                Exceeded::Day => CallError::DaySpent,
+            })?;
+        let answer = self.client.call(call).await?;
+        reserved.settle(answer.prompt_tokens, answer.completion_tokens);
+        work.charge(cost_of(&answer));
+        Ok(answer)
     }
 
     fn switches(&self) -> Switches {

@@ -36,26 +36,29 @@ mod mock_mllm;
 mod tests;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use async_trait::async_trait;
 use jiff::Timestamp;
+use jiff::tz::TimeZone;
 
 pub use budget::Spent;
-pub use cache::{CachedDescription, DescriptionCache};
+pub use cache::{CacheLevels, CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame};
 pub use prompts::PROMPT_VERSION;
 pub use secret::Secret;
 pub use settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError, OnUnavailable};
 
 use self::budget::Budget;
 use self::client::MllmClient;
-use self::describe::{Work, sum};
+use self::describe::{Found, Work};
 use self::flight::Flights;
 use self::pictures::Pictures;
 use self::retry::CallError;
-use super::{RefineError, Refinement, Refiner};
-use crate::domain::{Map, RefinerKind};
+use super::{Progress, RefineError, Refinement, Refiner};
+use crate::domain::{DayUsage, Map, RefinerKind, Usage};
 use crate::retrieve::ImageLimits;
-use crate::store::{BlobStore, JobRecord, MapStore};
+use crate::store::{BlobStore, JobRecord, MapStore, UsageStore};
+use crate::telemetry::Metrics;
 
 /// What an [`MllmRefiner`] works with.
 pub struct MllmParts {
@@ -65,6 +68,10 @@ pub struct MllmParts {
     pub blobs: Arc<dyn BlobStore>,
     /// Descriptions that were paid for.
     pub cache: Arc<dyn DescriptionCache>,
+    /// What was paid.
+    pub usage: Arc<dyn UsageStore>,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
     /// Bounds on the pictures that are decoded.
     pub limits: ImageLimits,
     /// Who takes a job while no call may be made, if `on_unavailable` is `local`.
@@ -77,21 +84,27 @@ pub struct MllmParts {
 pub struct MllmRefiner {
     maps: Arc<dyn MapStore>,
     cache: Arc<dyn DescriptionCache>,
+    usage: Arc<dyn UsageStore>,
+    metrics: Arc<Metrics>,
     fallback: Option<Arc<dyn Refiner>>,
     pictures: Pictures,
     client: MllmClient,
     budget: Arc<Budget>,
-    flights: Flights<CachedDescription>,
+    flights: Flights<Found>,
     settings: MllmSettings,
 }
 
-/// How an [`MllmRefiner`] stands, for metrics.
+/// How an [`MllmRefiner`] stands.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MllmLevels {
     /// Whether calls are suspended because the last ones failed.
     pub suspended: bool,
     /// What is spent today (UTC), calls in progress included.
     pub spent_today: Spent,
+    /// What may be spent a day; 0 stands for no limit.
+    pub limit: Spent,
+    /// How full the cache of descriptions is.
+    pub cache: CacheLevels,
 }
 
 impl MllmRefiner {
@@ -103,6 +116,8 @@ impl MllmRefiner {
         Ok(Self {
             maps: parts.maps,
             cache: parts.cache,
+            usage: parts.usage,
+            metrics: parts.metrics,
             fallback: parts.fallback,
             pictures,
             client,
@@ -113,16 +128,18 @@ impl MllmRefiner {
     }
 
     /// Says what was spent today (UTC) before this process began.
-    pub fn seed_spent_today(&self, spent: Spent) {
-        self.budget.seed(Timestamp::now(), spent);
+    pub fn seed_spent_today(&self, spent: &[DayUsage]) {
+        let now = Timestamp::now();
+        let today = now.to_zoned(TimeZone::UTC).date();
+        let spent = spent.iter().filter(|spent| spent.date == today);
+        self.budget.seed(now, spent.map(Spent::from).fold(Spent::default(), Spent::plus));
     }
 
-    /// How it stands.
-    pub fn levels(&self) -> MllmLevels {
-        MllmLevels {
-            suspended: self.client.is_suspended(),
-            spent_today: self.budget.spent(Timestamp::now()),
-        }
+    /// What a job spends at this moment.
+    fn spent_now(&self, record: &JobRecord, usage: Usage) -> DayUsage {
+        let money = self.budget.cost(usage.prompt_tokens, usage.completion_tokens).money;
+        let date = Timestamp::now().to_zoned(TimeZone::UTC).date();
+        DayUsage { date, map: record.job.map.clone(), usage, money }
     }
 
     fn waits(&self) -> bool {
@@ -143,10 +160,10 @@ impl MllmRefiner {
         work: &Work<'_>,
         why: &CallError,
     ) -> Result<Refinement, RefineError> {
-        let refinement = fallback.refine(work.record).await?;
+        let refinement = fallback.refine(work.record, work.progress).await?;
         let said = format!("refined by `{}` instead of `mllm`: {why}", fallback.kind());
         Ok(Refinement {
-            usage: sum(work.usage(), refinement.usage),
+            usage: work.usage() + refinement.usage,
             degraded: Some(match refinement.degraded {
                 Some(also) => format!("{said}; {also}"),
                 None => said,
@@ -162,9 +179,33 @@ impl Refiner for MllmRefiner {
         RefinerKind::Mllm
     }
 
-    async fn refine(&self, record: &JobRecord) -> Result<Refinement, RefineError> {
+    fn wants_descriptor(&self) -> bool {
+        self.settings.similar_frame_min > 0.0
+    }
+
+    fn levels(&self) -> Option<MllmLevels> {
+        Some(MllmLevels {
+            suspended: self.client.is_suspended(),
+            spent_today: self.budget.spent(Timestamp::now()),
+            limit: Spent {
+                tokens: self.settings.tokens_per_day,
+                money: self.settings.money_per_day,
+            },
+            cache: self.cache.levels(),
+        })
+    }
+
+    async fn refine(
+        &self,
+        record: &JobRecord,
+        progress: &dyn Progress,
+    ) -> Result<Refinement, RefineError> {
         let map = self.map(record).await?;
-        let work = Work::new(record, map.scene, self.budget.for_job());
+        // What earlier attempts spent is spent.
+        let spent = record.job.usage;
+        let budget = self.budget.for_job(spent.prompt_tokens, spent.completion_tokens);
+        let mut work = Work::new(record, map.scene, budget, progress);
+        work.similar = self.similar_frames(record).await?;
         let pairs = self.pairs(&map, record).await?;
         let findings = self.describe_all(&work, &pairs).await;
         let ranked = match (findings.described.as_slice(), conclude::gravest(&findings.failed)) {
@@ -173,14 +214,31 @@ impl Refiner for MllmRefiner {
             (described, _) => Some(self.rank(&work, described).await),
         };
         match (ranked, &self.fallback) {
-            (Some(Err(why)), Some(fallback)) if conclude::is_unavailable(&why) && !self.waits() => {
+            (Some(Err(why)), _)
+                if self.waits()
+                    && let Some(after) = pause(&why) =>
+            {
+                Err(RefineError::Later { why: why.to_string(), after })
+            }
+            (Some(Err(why)), Some(fallback)) if conclude::is_unavailable(&why) => {
                 self.fall_back(fallback.as_ref(), &work, &why).await
             }
             (Some(Err(why)), _) if findings.described.is_empty() => Err(conclude::given_up(&why)),
-            (Some(Err(CallError::DaySpent)), _) if self.waits() => {
-                Err(conclude::given_up(&CallError::DaySpent))
-            }
             (ranked, _) => conclude::conclude(&work, findings, ranked),
         }
+    }
+}
+
+/// How long it is until calls may be made again, where that is known.
+fn pause(why: &CallError) -> Option<Duration> {
+    match why {
+        // At least a little: the breaker may have opened for no time at all.
+        CallError::Suspended { wait } => Some((*wait).max(Duration::from_millis(100))),
+        CallError::DaySpent => {
+            let now = Timestamp::now().to_zoned(TimeZone::UTC);
+            let midnight = now.date().tomorrow().ok()?.to_zoned(TimeZone::UTC).ok()?;
+            now.duration_until(&midnight).try_into().ok()
+        }
+        CallError::Hopeless(_) | CallError::Passing(_) | CallError::JobSpent => None,
     }
 }

@@ -2,12 +2,13 @@
 
 use super::MllmRefiner;
 use super::client::{Answer, Call, estimate_tokens};
-use super::describe::{Described, Work};
+use super::describe::{Described, Work, cost_of};
 use super::prompts::{self, Notes, clean};
 use super::reason::{AnswerError, Labels, Verdict};
 use super::retry::CallError;
 use super::wire::Message;
 use crate::domain::Digest;
+use crate::store::Step;
 
 impl MllmRefiner {
     /// Orders the described candidates by what was written about them.
@@ -73,7 +74,11 @@ impl MllmRefiner {
             messages: talk.to_vec(),
             schema: Some(labels.schema()),
         };
-        self.call(work, &call).await
+        let answer = self.call(work, &call).await?;
+        let usage = cost_of(&answer);
+        self.keep(work, usage, None).await;
+        work.progress.step(Step { usage, description: None }).await;
+        Ok(answer)
     }
 
     /// An unusable answer as it is shown to the model again. Servers refuse an empty message.

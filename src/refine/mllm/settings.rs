@@ -76,6 +76,11 @@ pub struct MllmSettings {
     pub answer_max_bytes: usize,
     /// What is kept of one description, in characters.
     pub description_max_chars: usize,
+    /// The cosine similarity from which the descriptions of an earlier frame stand in for those of
+    /// a new one; 0 for never.
+    pub similar_frame_min: f32,
+    /// Described frames that are remembered for that, in each map.
+    pub similar_frames_kept: usize,
 }
 
 /// The header that carries the key.
@@ -157,6 +162,9 @@ impl MllmSettings {
         }
         if self.temperature.is_nan() || self.temperature > 2.0 {
             return Some("mllm.temperature must be 0 to 2, or negative to send none".into());
+        }
+        if !(0.0..=1.0).contains(&self.similar_frame_min) {
+            return Some("mllm.similar_frame_min must be 0 (never) to 1".into());
         }
         let money =
             [self.money_per_job, self.money_per_day, self.price_prompt, self.price_completion];

@@ -4,11 +4,11 @@ mod faults;
 mod limits;
 mod shelf;
 
-use shelf::Bench;
+use shelf::{Bench, Steps};
 
 use super::mock_mllm::{Reply, Script, ranking};
 use super::*;
-use crate::domain::Scene;
+use crate::domain::{Descriptor, Scene};
 use crate::store::JobRecord;
 
 /// Names each description after the number of its call; at concurrency 1, that is the coarse rank.
@@ -52,6 +52,55 @@ async fn a_repeat_asks_for_no_description() {
     assert_eq!((bench.mock.describe_calls(), bench.mock.reason_calls()), (5, 2));
     assert!(again.descriptions.iter().all(|description| description.cached));
     assert_eq!((again.usage.calls, again.usage.cached), (1, 5));
+}
+
+#[tokio::test]
+async fn each_step_is_told_with_its_cost() {
+    let bench = Bench::new(Script::default()).await;
+    for known in [0, 4] {
+        let steps = Steps::default();
+        let refinement = bench.refiner.refine(&bench.record(4), &steps).await.unwrap();
+        let steps = steps.0.into_inner().unwrap();
+        assert_eq!(steps.len(), 5);
+        let told: Vec<_> = steps.iter().filter_map(|step| step.description.as_ref()).collect();
+        assert_eq!(told.len(), 4);
+        assert!(refinement.descriptions.iter().all(|description| told.contains(&description)));
+        let sum = steps.iter().fold(Usage::default(), |sum, step| sum + step.usage);
+        assert_eq!((sum, sum.cached), (refinement.usage, known));
+    }
+    let accounted = bench.cache.spent.lock().unwrap();
+    let sum = accounted.iter().fold(Usage::default(), |sum, spent| sum + spent.usage);
+    assert_eq!((sum.calls, sum.cached), (6, 4));
+}
+
+#[tokio::test]
+async fn the_descriptions_of_a_similar_frame_stand_in() {
+    let bench = Bench::with(Script::default(), |settings| settings.similar_frame_min = 0.9).await;
+    let record = |frame: usize, numbers: Vec<f32>, candidates| {
+        let mut record = bench.record(candidates);
+        record.query.digest = bench.shelf.digest(frame);
+        record.query.descriptor = Some(Descriptor::normalised(numbers).unwrap());
+        record
+    };
+    let first = record(20, vec![1.0, 0.0], 3);
+    bench.refiner.refine(&first, &Steps::default()).await.unwrap();
+    assert_eq!(bench.mock.describe_calls(), 3);
+
+    let near = record(21, vec![1.0, 0.1], 4);
+    let refinement = bench.refiner.refine(&near, &Steps::default()).await.unwrap();
+    assert_eq!(bench.mock.describe_calls(), 4, "the fourth pair is new");
+    assert_eq!((refinement.usage.calls, refinement.usage.cached), (2, 3));
+    let [known @ .., bought] = refinement.descriptions.as_slice() else { panic!() };
+    for description in known {
+        let of = description.stands_in.unwrap();
+        assert!(of.query_id == first.query.id && of.similarity > 0.99, "{of:?}");
+    }
+    assert_eq!((bought.stands_in, bought.cached), (None, false));
+
+    let far = record(22, vec![0.0, 1.0], 3);
+    let refinement = bench.refiner.refine(&far, &Steps::default()).await.unwrap();
+    assert!(refinement.descriptions.iter().all(|description| description.stands_in.is_none()));
+    assert_eq!(bench.mock.describe_calls(), 7);
 }
 
 #[tokio::test]
@@ -169,7 +218,7 @@ async fn candidates_that_are_gone_stay_behind_the_others() {
     let bench = Bench::new(Script::default()).await;
     let mut record = bench.record(3);
     record.candidates[0].image_id = "gone".parse().unwrap();
-    let refinement = bench.refiner.refine(&record).await.unwrap();
+    let refinement = bench.refiner.refine(&record, &Steps::default()).await.unwrap();
     assert_eq!(refinement.ranking.as_slice()[2].coarse_rank, 1);
     assert_eq!(bench.mock.describe_calls(), 2);
     let why = refinement.degraded.unwrap();
@@ -180,7 +229,7 @@ async fn candidates_that_are_gone_stay_behind_the_others() {
 async fn a_job_whose_map_is_gone_ends_at_once() {
     let bench = Bench::new(Script::default()).await;
     let record = JobRecord { map_uid: uuid::Uuid::from_u128(99), ..bench.record(2) };
-    let error = bench.refiner.refine(&record).await.unwrap_err();
+    let error = bench.refiner.refine(&record, &Steps::default()).await.unwrap_err();
     assert!(matches!(error, RefineError::Hopeless(_)));
     assert_eq!(bench.mock.describe_calls(), 0);
 }

@@ -1,20 +1,27 @@
-//! The cache of descriptions that were paid for: records in sled, their order of use in memory.
+//! The cache of descriptions that were paid for: records in sled, their order of use in memory; and
+//! the frames they are of.
 //!
 //! Bounded in bytes and in age. The least recently used goes first; after a restart, when uses are
 //! forgotten, the oldest.
 
 use std::collections::{BTreeMap, HashMap};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
+use uuid::Uuid;
 
 use super::super::StoreError;
-use super::trees::{Trees, decode, encode, failed};
+use super::trees::{Trees, decode, encode, failed, put};
 use super::{EmbeddedStore, blocking};
-use crate::domain::Digest;
-use crate::refine::mllm::{CachedDescription, DescriptionCache};
+use crate::domain::{Descriptor, Digest, StandIn};
+use crate::refine::mllm::{
+    CacheLevels, CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame,
+};
+
+/// As many similar frames are looked at, at the most: a pair that none of them has is bought.
+const SIMILAR_FRAMES: usize = 4;
 
 /// Bounds of the cache.
 #[derive(Debug, Clone, Copy)]
@@ -57,6 +64,13 @@ impl Order {
         }
     }
 
+    /// Counts a use of a description, unless it has gone meanwhile.
+    fn used(&mut self, key: Digest) {
+        if let Some(&(_, bytes)) = self.known.get(&key) {
+            self.touch(key, bytes);
+        }
+    }
+
     /// Those that must go for the rest to fit.
     fn over(&mut self, max_bytes: u64) -> Vec<Digest> {
         let mut gone = Vec::new();
@@ -87,8 +101,13 @@ impl DescriptionUse {
         Ok(Self { bounds, order: Mutex::new(order) })
     }
 
-    fn used(&self, key: Digest, bytes: u64) -> Vec<Digest> {
-        let mut order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
+    fn order(&self) -> MutexGuard<'_, Order> {
+        self.order.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Counts a new description; returns those that must go for it.
+    fn make_room(&self, key: Digest, bytes: u64) -> Vec<Digest> {
+        let mut order = self.order();
         order.touch(key, bytes);
         order.over(self.bounds.max_bytes)
     }
@@ -116,7 +135,7 @@ impl DescriptionCache for EmbeddedStore {
             if !inner.descriptions.is_fresh(&record) {
                 return Ok(None);
             }
-            inner.descriptions.used(key, size(&value));
+            inner.descriptions.order().used(key);
             Ok(Some(record))
         })
         .await
@@ -133,7 +152,7 @@ impl DescriptionCache for EmbeddedStore {
             .writer
             .commit(
                 move |trees, _| {
-                    for gone in inner.descriptions.used(key, size(&value)) {
+                    for gone in inner.descriptions.make_room(key, size(&value)) {
                         trees.descriptions.remove(gone.hex()).map_err(failed)?;
                     }
                     trees.descriptions.insert(key.hex(), value).map(drop).map_err(failed)
@@ -141,6 +160,59 @@ impl DescriptionCache for EmbeddedStore {
                 |()| {},
             )
             .await
+    }
+
+    async fn similar_frames(
+        &self,
+        map: Uuid,
+        to: &Descriptor,
+        at_least: f32,
+    ) -> Result<Vec<SimilarFrame>, StoreError> {
+        let (inner, to) = (Arc::clone(&self.inner), to.clone());
+        blocking(move || {
+            let mut similar = Vec::new();
+            for value in inner.trees.frames.scan_prefix(map.as_bytes()).values() {
+                let frame: DescribedFrame = decode(&value.map_err(failed)?)?;
+                let similarity = frame.descriptor.similarity(&to);
+                // A map that changed its model while it was empty keeps frames of the old one.
+                if frame.descriptor.dim() == to.dim() && similarity >= at_least {
+                    let stand_in = StandIn { query_id: frame.query_id, similarity };
+                    similar.push(SimilarFrame { digest: frame.digest, stand_in });
+                }
+            }
+            similar.sort_by(|a, b| b.stand_in.similarity.total_cmp(&a.stand_in.similarity));
+            similar.truncate(SIMILAR_FRAMES);
+            Ok(similar)
+        })
+        .await
+    }
+
+    async fn keep_frame(
+        &self,
+        map: Uuid,
+        frame: DescribedFrame,
+        most: usize,
+    ) -> Result<(), StoreError> {
+        let key = [map.as_bytes().as_slice(), frame.query_id.as_bytes()].concat();
+        self.inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    put(&trees.frames, &key, &frame)?;
+                    let of_map = || trees.frames.scan_prefix(map.as_bytes()).keys();
+                    for oldest in of_map().take(of_map().count().saturating_sub(most)) {
+                        trees.frames.remove(oldest.map_err(failed)?).map_err(failed)?;
+                    }
+                    Ok(())
+                },
+                |()| {},
+            )
+            .await
+    }
+
+    fn levels(&self) -> CacheLevels {
+        let order = self.inner.descriptions.order();
+        CacheLevels { entries: order.known.len(), bytes: order.bytes }
     }
 }
 
@@ -159,6 +231,14 @@ mod tests {
         order.touch(key(0), 10);
         assert_eq!(order.over(25), [key(1), key(2)]);
         assert_eq!((order.bytes, order.known.len(), order.by_use.len()), (20, 2, 2));
+    }
+
+    #[test]
+    fn a_use_of_what_has_gone_is_not_counted() {
+        let mut order = Order::default();
+        order.touch(key(0), 10);
+        order.used(key(1));
+        assert_eq!((order.bytes, order.known.len()), (10, 1));
     }
 
     #[test]

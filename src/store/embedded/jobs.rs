@@ -1,7 +1,7 @@
 //! Jobs and their queue.
 //!
-//! A job that has not ended has an entry in the `queue` tree, whose value says until when a worker
-//! holds it. Ids are UUIDs of version 7, so that key order is the order of submission.
+//! A job that has not ended has an entry in the `queue` tree, whose value says until when nobody may
+//! take it. Ids are UUIDs of version 7, so that key order is the order of submission.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -12,12 +12,13 @@ use sled::Transactional;
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
-use super::super::{JobFilter, JobRecord, JobStore, StoreError};
+use super::super::{JobFilter, JobRecord, JobStore, Release, Step, StoreError};
 use super::trees::{
-    BlobOwner, Lease, Trees, blob_ref_key, decode, encode, failed, put, transaction_failed,
+    BlobOwner, Lease, Trees, blob_ref_key, decode, encode, failed, put, queue_key, queued_job,
+    transaction_failed,
 };
 use super::{EmbeddedStore, blocking};
-use crate::domain::{Job, JobState};
+use crate::domain::{Job, JobState, Usage};
 
 impl EmbeddedStore {
     /// Applies a change to one job and tells the listeners.
@@ -121,6 +122,7 @@ impl JobStore for EmbeddedStore {
                 move |trees, _| {
                     let Some(mut record) = next_waiting(trees, now)? else { return Ok(None) };
                     record.job.state = JobState::Running;
+                    record.job.error = None;
                     record.job.started_at.get_or_insert(now);
                     record.job.attempts += 1;
                     write_job(trees, &record, Some(Some(lease_until)))?;
@@ -135,12 +137,27 @@ impl JobStore for EmbeddedStore {
             .await
     }
 
-    async fn release(&self, id: Uuid, why: String) -> Result<(), StoreError> {
+    async fn progress(&self, id: Uuid, step: Step) -> Result<(), StoreError> {
+        self.change(id, move |trees, mut record| {
+            if record.job.state == JobState::Running {
+                record.add(step);
+                put(&trees.jobs, id.as_bytes(), &record)?;
+            }
+            Ok(record)
+        })
+        .await
+        .map(drop)
+    }
+
+    async fn release(&self, id: Uuid, release: Release) -> Result<(), StoreError> {
         self.change(id, move |trees, mut record| {
             if record.job.state == JobState::Running {
                 record.job.state = JobState::Queued;
-                record.job.error = Some(why);
-                write_job(trees, &record, Some(None))?;
+                record.job.error = Some(release.why);
+                if !release.counts {
+                    record.job.attempts = record.job.attempts.saturating_sub(1);
+                }
+                write_job(trees, &record, Some(release.not_before))?;
             }
             Ok(record)
         })
@@ -184,7 +201,8 @@ impl JobStore for EmbeddedStore {
                 }
             }
             job.state = JobState::Queued;
-            (job.attempts, job.finished_at, job.error) = (0, None, None);
+            (job.attempts, job.usage, job.finished_at, job.error) =
+                (0, Usage::default(), None, None);
             write_job(trees, &record, Some(None))?;
             Ok(record)
         })
@@ -200,7 +218,7 @@ fn no_job(id: Uuid) -> StoreError {
     StoreError::NotFound(format!("there is no job {id}"))
 }
 
-/// The oldest job that nobody holds.
+/// The first job in the queue that may be taken.
 fn next_waiting(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, StoreError> {
     for entry in trees.queue.iter() {
         let (key, lease) = entry.map_err(failed)?;
@@ -208,7 +226,7 @@ fn next_waiting(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, Stor
         if held {
             continue;
         }
-        match Uuid::from_slice(&key).ok().map(|id| trees.job(id)).transpose()?.flatten() {
+        match queued_job(&key).map(|id| trees.job(id)).transpose()?.flatten() {
             Some(record) => return Ok(Some(record)),
             None => {
                 trees.queue.remove(key).map_err(failed)?;
@@ -226,15 +244,15 @@ fn insert_job(trees: &Trees, record: &JobRecord) -> Result<(), StoreError> {
 
 /// Writes a job and its place in the queue: a lease, or `None` to take it out.
 fn write_job(trees: &Trees, record: &JobRecord, queue: Option<Lease>) -> Result<(), StoreError> {
-    let key = record.job.id.as_bytes();
+    let (key, place) = (record.job.id.as_bytes(), queue_key(&record.job));
     let value = encode(record)?;
     let lease = queue.map(|lease| encode(&lease)).transpose()?;
     (&trees.jobs, &trees.queue)
         .transaction(|(jobs, queue)| {
             jobs.insert(key, value.as_slice())?;
             match &lease {
-                Some(lease) => queue.insert(key, lease.as_slice())?,
-                None => queue.remove(key)?,
+                Some(lease) => queue.insert(&place, lease.as_slice())?,
+                None => queue.remove(&place)?,
             };
             Ok(())
         })

@@ -334,8 +334,11 @@ pub(super) fn sweep_deleted(
     trees.flush()
 }
 
-/// Clears away the images, references, bytes and descriptors of a map that is gone.
+/// Clears away the frames, images, references, bytes and descriptors of a map that is gone.
 fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs, descriptors: &Path) -> Result<(), StoreError> {
+    for key in trees.frames.scan_prefix(uid.as_bytes()).keys() {
+        trees.frames.remove(key.map_err(failed)?).map_err(failed)?;
+    }
     loop {
         let some: Vec<StoredImage> = trees.images_of(uid).take(SWEEP).collect::<Result<_, _>>()?;
         if some.is_empty() {

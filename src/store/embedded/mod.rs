@@ -18,6 +18,7 @@ mod live_map;
 mod maps;
 mod segments;
 mod trees;
+mod usage;
 mod writer;
 
 use std::collections::BTreeMap;
@@ -26,6 +27,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, PoisonError, RwLock};
 
+use jiff::tz::TimeZone;
+use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
@@ -53,6 +56,8 @@ pub struct EmbeddedSettings {
     pub commit_batch: usize,
     /// Bounds of the cache of descriptions.
     pub descriptions: DescriptionBounds,
+    /// For how many days it is known what was spent.
+    pub usage_days: u32,
 }
 
 /// The embedded store; clones share it.
@@ -96,6 +101,9 @@ impl EmbeddedStore {
             let live = LiveMap::load(map, &descriptors, settings.index, &trees)?;
             loaded.insert(name, Arc::new(live));
         }
+        let kept = SignedDuration::from_hours(24 * i64::from(settings.usage_days));
+        let today = Timestamp::now().to_zoned(TimeZone::UTC).date();
+        usage::forget_before(&trees, today.saturating_sub(kept))?;
         let queued = trees.requeue_claimed()?;
         let inner = Inner {
             writer: Writer::start(trees.clone(), settings.commit_batch)?,

@@ -7,7 +7,7 @@ use serde::de::DeserializeOwned;
 use uuid::Uuid;
 
 use super::super::{JobRecord, StoreError};
-use crate::domain::{Digest, Image, ImageId, JobState, Map};
+use crate::domain::{Digest, Image, ImageId, Job, JobState, Map, Priority};
 
 /// The sled trees. Clones share them.
 #[derive(Clone)]
@@ -21,10 +21,14 @@ pub(super) struct Trees {
     pub blob_refs: sled::Tree,
     /// Job id → [`JobRecord`].
     pub jobs: sled::Tree,
-    /// Job id → when its lease ends ([`Lease`]), for jobs that have not ended.
+    /// Place in the queue → when its lease ends ([`Lease`]), for jobs that have not ended.
     pub queue: sled::Tree,
     /// Cache key → description of a pair.
     pub descriptions: sled::Tree,
+    /// Map uid, query id → a frame whose pairs were described.
+    pub frames: sled::Tree,
+    /// Day, map → what was spent.
+    pub usage: sled::Tree,
 }
 
 /// An image and where its descriptor is.
@@ -34,7 +38,8 @@ pub(super) struct StoredImage {
     pub slot: usize,
 }
 
-/// Until when a worker holds a job; `None` while it waits.
+/// Until when nobody may take a job: it is held, or is not to be tried before. `None` while it
+/// waits.
 pub(super) type Lease = Option<jiff::Timestamp>;
 
 /// Who needs the bytes of a blob.
@@ -60,6 +65,8 @@ impl Trees {
             jobs: tree("jobs")?,
             queue: tree("queue")?,
             descriptions: tree("descriptions")?,
+            frames: tree("frames")?,
+            usage: tree("usage")?,
             db,
         })
     }
@@ -104,17 +111,35 @@ impl Trees {
         for key in self.queue.iter().keys() {
             let key = key.map_err(failed)?;
             waiting += 1;
-            put(&self.queue, &key, &Lease::None)?;
-            if let Some(mut record) = get::<JobRecord>(&self.jobs, &key)?
+            let job = queued_job(&key);
+            if let Some(mut record) = job.map(|id| self.job(id)).transpose()?.flatten()
                 && record.job.state == JobState::Running
             {
                 record.job.state = JobState::Queued;
-                put(&self.jobs, &key, &record)?;
+                put(&self.jobs, record.job.id.as_bytes(), &record)?;
+                put(&self.queue, &key, &Lease::None)?;
             }
         }
         self.flush()?;
         Ok(waiting)
     }
+}
+
+/// A job's place in the queue: sorted by priority, then by age.
+pub(super) fn queue_key(job: &Job) -> [u8; 17] {
+    let mut key = [0; 17];
+    key[0] = match job.priority {
+        Priority::High => 0,
+        Priority::Normal => 1,
+        Priority::Low => 2,
+    };
+    key[1..].copy_from_slice(job.id.as_bytes());
+    key
+}
+
+/// The job at a place in the queue.
+pub(super) fn queued_job(key: &[u8]) -> Option<Uuid> {
+    Uuid::from_slice(key.get(1..)?).ok()
 }
 
 pub(super) fn image_key(map_uid: Uuid, id: &ImageId) -> Vec<u8> {

@@ -14,7 +14,11 @@ impl Refiner for Reverse {
         RefinerKind::Local
     }
 
-    async fn refine(&self, record: &JobRecord) -> Result<Refinement, RefineError> {
+    async fn refine(
+        &self,
+        record: &JobRecord,
+        _: &dyn Progress,
+    ) -> Result<Refinement, RefineError> {
         let order: Vec<usize> = (0..record.candidates.len()).rev().collect();
         Ok(Refinement {
             descriptions: vec![],
@@ -56,7 +60,7 @@ async fn an_open_breaker_hands_the_job_to_the_other_refiner() {
         assert!(why.contains("`local` instead of `mllm`") && why.contains("suspended"), "{why}");
     }
     assert_eq!(bench.mock.describe_calls(), 3);
-    assert!(bench.refiner.levels().suspended);
+    assert!(bench.refiner.levels().unwrap().suspended);
 }
 
 #[tokio::test]
@@ -77,7 +81,31 @@ async fn a_job_that_waits_goes_on_when_the_breaker_lets_it() {
     let refinement = bench.refine(6).await.unwrap();
     assert_eq!(bench.mock.describe_calls(), 6);
     assert!(refinement.degraded.unwrap().starts_with("3 of 6 pairs"));
-    assert!(!bench.refiner.levels().suspended);
+    assert!(!bench.refiner.levels().unwrap().suspended);
+}
+
+#[tokio::test]
+async fn a_job_that_waits_says_for_how_long() {
+    let bench = Bench::with(failing(1000), |settings| {
+        brittle(settings);
+        settings.breaker_open_s = 3600;
+        settings.on_unavailable = OnUnavailable::Wait;
+    })
+    .await;
+    let error = bench.refine(5).await.unwrap_err();
+    let RefineError::Later { why, after } = error else { panic!("{error}") };
+    assert!(why.contains("suspended"), "{why}");
+    assert!((3590..=3600).contains(&after.as_secs()), "{after:?}");
+}
+
+#[tokio::test]
+async fn what_earlier_attempts_spent_counts_against_the_budget_of_the_job() {
+    let bench = Bench::with(Script::default(), |settings| settings.tokens_per_job = 20_000).await;
+    let mut record = bench.record(2);
+    record.job.usage.prompt_tokens = 19_990;
+    let error = bench.refiner.refine(&record, &Steps::default()).await.unwrap_err();
+    assert!(matches!(&error, RefineError::Hopeless(why) if why.contains("tokens_per_job")));
+    assert_eq!(bench.mock.describe_calls(), 0);
 }
 
 #[tokio::test]
@@ -106,11 +134,18 @@ async fn a_day_never_passes_its_budget() {
         settings.money_per_day = 1.0;
     })
     .await;
-    bench.refiner.seed_spent_today(Spent { tokens: 5, money: 0.999 });
+    let date = Timestamp::now().to_zoned(TimeZone::UTC).date();
+    let spent = |money| {
+        let map = bench.shelf.map.name.clone();
+        [DayUsage { date, map, usage: Usage::default(), money }]
+    };
+    bench.refiner.seed_spent_today(&spent(0.999));
     let error = bench.refine(2).await.unwrap_err();
     assert!(matches!(&error, RefineError::Passing(why) if why.contains("money_per_day")));
     assert_eq!(bench.mock.describe_calls(), 0);
-    bench.refiner.seed_spent_today(Spent { tokens: 5, money: 0.5 });
+    bench.refiner.seed_spent_today(&spent(0.5));
     assert_eq!(bench.refine(2).await.unwrap().degraded, None);
-    assert!(bench.refiner.levels().spent_today.money > 0.5);
+    assert!(bench.refiner.levels().unwrap().spent_today.money > 0.5);
+    let spent: f64 = bench.cache.spent.lock().unwrap().iter().map(|spent| spent.money).sum();
+    assert!((bench.refiner.levels().unwrap().spent_today.money - 0.5 - spent).abs() < 1e-9);
 }

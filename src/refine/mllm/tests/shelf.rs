@@ -7,18 +7,19 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use image::{Rgb, RgbImage};
 use jiff::Timestamp;
+use jiff::civil::Date;
 use uuid::Uuid;
 
 use super::super::mock_mllm::{MockMllm, Script};
 use super::super::settings::tests::defaults;
 use super::*;
 use crate::domain::{
-    Candidate, Descriptor, DescriptorKind, Digest, Frame, Image, ImageId, Job, Map, MapName,
-    MediaType, RefinerKind,
+    Candidate, DayUsage, Descriptor, DescriptorKind, Digest, Frame, Image, ImageId, Job, Map,
+    MapName, MediaType, RefinerKind, StandIn,
 };
 use crate::retrieve::decode::encode_jpeg;
 use crate::retrieve::index::SearchMode;
-use crate::store::{Added, BlobPin, IndexState, Query, StoreError};
+use crate::store::{Added, BlobPin, IndexState, Query, Step, StoreError};
 
 /// The key that every call must carry.
 pub const KEY: &str = "sk-test-5c1f";
@@ -71,7 +72,7 @@ impl Bench {
     }
 
     pub async fn refine(&self, candidates: usize) -> Result<Refinement, RefineError> {
-        self.refiner.refine(&self.record(candidates)).await
+        self.refiner.refine(&self.record(candidates), &Steps::default()).await
     }
 }
 
@@ -85,6 +86,8 @@ fn refiner(
         maps: Arc::new(shelf.clone()),
         blobs: Arc::new(shelf.clone()),
         cache: cache.clone(),
+        usage: cache.clone(),
+        metrics: Arc::new(Metrics::new()),
         limits: ImageLimits { max_pixels: 1_000_000 },
         fallback,
     };
@@ -114,6 +117,11 @@ impl Shelf {
         Self { map, pictures: Arc::new((0..24).map(picture).collect()) }
     }
 
+    /// The digest of a picture.
+    pub fn digest(&self, number: usize) -> Digest {
+        Digest::of(&self.pictures[number])
+    }
+
     fn record(&self, candidates: usize) -> JobRecord {
         let now = Timestamp::now();
         let query = Query {
@@ -121,6 +129,7 @@ impl Shelf {
             digest: Digest::of(&self.pictures[self.pictures.len() - 1]),
             media_type: MediaType::Jpeg,
             created_at: now,
+            descriptor: None,
         };
         let candidate = |index: usize| Candidate {
             rank: index + 1,
@@ -217,14 +226,41 @@ impl BlobStore for Shelf {
     }
 }
 
-/// Keeps descriptions in memory.
+/// Remembers the steps of a refinement.
 #[derive(Default)]
-pub struct MemoryCache(Mutex<HashMap<Digest, CachedDescription>>);
+pub struct Steps(pub Mutex<Vec<Step>>);
+
+#[async_trait]
+impl Progress for Steps {
+    async fn step(&self, step: Step) {
+        self.0.lock().unwrap().push(step);
+    }
+}
+
+/// Keeps descriptions, frames and accounts in memory.
+#[derive(Default)]
+pub struct MemoryCache {
+    descriptions: Mutex<HashMap<Digest, CachedDescription>>,
+    frames: Mutex<Vec<DescribedFrame>>,
+    pub spent: Mutex<Vec<DayUsage>>,
+}
+
+#[async_trait]
+impl UsageStore for MemoryCache {
+    async fn add_usage(&self, spent: DayUsage) -> Result<(), StoreError> {
+        self.spent.lock().unwrap().push(spent);
+        Ok(())
+    }
+
+    async fn usage(&self, _: Date) -> Result<Vec<DayUsage>, StoreError> {
+        not_here()
+    }
+}
 
 #[async_trait]
 impl DescriptionCache for MemoryCache {
     async fn description(&self, key: &Digest) -> Result<Option<CachedDescription>, StoreError> {
-        Ok(self.0.lock().unwrap().get(key).cloned())
+        Ok(self.descriptions.lock().unwrap().get(key).cloned())
     }
 
     async fn keep_description(
@@ -232,7 +268,33 @@ impl DescriptionCache for MemoryCache {
         key: Digest,
         value: CachedDescription,
     ) -> Result<(), StoreError> {
-        self.0.lock().unwrap().insert(key, value);
+        self.descriptions.lock().unwrap().insert(key, value);
         Ok(())
+    }
+
+    async fn similar_frames(
+        &self,
+        _: Uuid,
+        to: &Descriptor,
+        at_least: f32,
+    ) -> Result<Vec<SimilarFrame>, StoreError> {
+        let frames = self.frames.lock().unwrap();
+        let similar = frames.iter().map(|frame| SimilarFrame {
+            digest: frame.digest,
+            stand_in: StandIn {
+                query_id: frame.query_id,
+                similarity: frame.descriptor.similarity(to),
+            },
+        });
+        Ok(similar.filter(|frame| frame.stand_in.similarity >= at_least).collect())
+    }
+
+    async fn keep_frame(&self, _: Uuid, frame: DescribedFrame, _: usize) -> Result<(), StoreError> {
+        self.frames.lock().unwrap().push(frame);
+        Ok(())
+    }
+
+    fn levels(&self) -> CacheLevels {
+        CacheLevels::default()
     }
 }

@@ -1,0 +1,55 @@
+//! `/jobs/{id}/events`: a job as it goes on, as server-sent events.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::response::sse::{Event, KeepAlive, Sse};
+use futures_util::{Stream, StreamExt};
+
+use super::body::Segments;
+use super::jobs::job_id;
+use super::problem::Problem;
+use super::state::{AppState, Ready};
+use crate::service::{ErrorKind, JobEvent};
+
+/// A comment is sent after so long without an event, so that nothing on the way hangs up.
+const KEEP_ALIVE: Duration = Duration::from_secs(15);
+
+/// Follow a job
+///
+/// Server-sent events until the job has ended: `state` with a `JobStatus` when its state or attempt
+/// changes, `description` with a `PairDescribed` for each pair, and at last `end` with the `Job`.
+/// What happened before is told first, so that a client that lost the connection just asks again.
+#[utoipa::path(get, path = "/jobs/{id}/events", tag = "jobs",
+    params(("id" = uuid::Uuid, Path)), responses(
+    (status = 200, body = String, content_type = "text/event-stream"),
+    (status = 404, body = Problem, description = "No such job", content_type = "application/problem+json"),
+    (status = 429, body = Problem, description = "Too many streams are open", content_type = "application/problem+json"),
+))]
+pub(super) async fn follow_job(
+    State(state): State<AppState>,
+    Ready(service): Ready,
+    Segments(id): Segments<String>,
+) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
+    let Ok(permit) = Arc::clone(&state.streams).try_acquire_owned() else {
+        let detail = format!(
+            "{} event streams are open, the bound (server.max_streams); ask with \
+             GET /jobs/{{id}}?wait= instead",
+            state.settings.max_streams
+        );
+        return Err(Problem::new(ErrorKind::Overloaded, detail));
+    };
+    let events = service.follow_job(job_id(&id)?).await?.map(move |event| {
+        // Given back when the stream ends or the client has gone.
+        let _permit = &permit;
+        match event {
+            JobEvent::State(status) => Event::default().event("state").json_data(status),
+            JobEvent::Described(pair) => Event::default().event("description").json_data(pair),
+            JobEvent::Ended(job) => Event::default().event("end").json_data(job),
+        }
+    });
+    // A drain does not wait for jobs that nobody may finish before the next start.
+    let events = events.take_until(state.draining().cancelled_owned());
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
+}

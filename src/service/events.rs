@@ -1,0 +1,134 @@
+//! A job as it goes on: every change of its state, every pair as it is described, and its end.
+
+use std::collections::{HashSet, VecDeque};
+use std::sync::Arc;
+
+use futures_util::{Stream, stream};
+use serde::Serialize;
+use tokio::sync::broadcast::Receiver;
+use tokio::sync::broadcast::error::RecvError;
+use utoipa::ToSchema;
+use uuid::Uuid;
+
+use super::{Service, ServiceError};
+use crate::domain::{Description, ImageId, Job, JobState};
+use crate::store::{JobRecord, JobStore};
+
+/// Something that happened to a job.
+#[derive(Debug, Clone, PartialEq)]
+pub enum JobEvent {
+    /// It is in another state, or in another attempt.
+    State(JobStatus),
+    /// One more pair is described.
+    Described(PairDescribed),
+    /// It has ended; no event follows.
+    Ended(Box<Job>),
+}
+
+/// How far a job has come.
+#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
+pub struct JobStatus {
+    /// Its state.
+    pub state: JobState,
+    /// How often a worker has taken it.
+    pub attempts: u32,
+    /// What went wrong, or what it waits for.
+    pub error: Option<String>,
+}
+
+/// One more pair of a job is described.
+#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
+pub struct PairDescribed {
+    /// Pairs described so far.
+    pub described: usize,
+    /// Pairs of the job.
+    pub of: usize,
+    /// The pair.
+    pub description: Description,
+}
+
+impl Service {
+    /// What has happened to a job, and then what happens to it until it has ended.
+    pub async fn follow_job(
+        &self,
+        id: Uuid,
+    ) -> Result<impl Stream<Item = JobEvent> + Send + use<>, ServiceError> {
+        let mut follower = Follower {
+            changes: self.jobs.changes(),
+            jobs: Arc::clone(&self.jobs),
+            id,
+            status: None,
+            told: HashSet::new(),
+            waiting: VecDeque::new(),
+            ended: false,
+        };
+        match self.jobs.job(id).await? {
+            Some(record) => follower.look_at(record),
+            None => return Err(ServiceError::not_found(format!("there is no job {id}"))),
+        }
+        Ok(stream::unfold(follower, |mut follower| async {
+            follower.next().await.map(|event| (event, follower))
+        }))
+    }
+}
+
+/// Tells apart what it has told from what is new.
+struct Follower {
+    jobs: Arc<dyn JobStore>,
+    changes: Receiver<Uuid>,
+    id: Uuid,
+    status: Option<JobStatus>,
+    told: HashSet<ImageId>,
+    waiting: VecDeque<JobEvent>,
+    ended: bool,
+}
+
+impl Follower {
+    async fn next(&mut self) -> Option<JobEvent> {
+        loop {
+            if let Some(event) = self.waiting.pop_front() {
+                return Some(event);
+            }
+            if self.ended {
+                return None;
+            }
+            match self.changes.recv().await {
+                Ok(changed) if changed != self.id => continue,
+                // After lost notices, any of which may have been the one, it is looked at too.
+                Ok(_) | Err(RecvError::Lagged(_)) => {}
+                Err(RecvError::Closed) => return None,
+            }
+            match self.jobs.job(self.id).await {
+                Ok(Some(record)) => self.look_at(record),
+                Ok(None) => return None,
+                Err(error) => {
+                    tracing::error!(job = %self.id, %error, "a job that is followed cannot be read");
+                    return None;
+                }
+            }
+        }
+    }
+
+    fn look_at(&mut self, record: JobRecord) {
+        let JobRecord { job, candidates, .. } = record;
+        let status =
+            JobStatus { state: job.state, attempts: job.attempts, error: job.error.clone() };
+        if !job.state.is_final() && self.status.as_ref() != Some(&status) {
+            self.waiting.push_back(JobEvent::State(status.clone()));
+            self.status = Some(status);
+        }
+        for description in &job.descriptions {
+            if self.told.insert(description.image_id.clone()) {
+                self.waiting.push_back(JobEvent::Described(PairDescribed {
+                    described: self.told.len(),
+                    of: candidates.len(),
+                    description: description.clone(),
+                }));
+            }
+        }
+        if job.state.is_final() {
+            self.ended = true;
+            self.waiting.push_back(JobEvent::Ended(Box::new(job)));
+        }
+    }
+}

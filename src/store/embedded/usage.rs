@@ -1,0 +1,57 @@
+//! What was spent, by day and map: one small record each, kept for a configured number of days.
+
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use jiff::civil::Date;
+
+use super::super::{StoreError, UsageStore};
+use super::trees::{Trees, decode, failed, get, put};
+use super::{EmbeddedStore, blocking};
+use crate::domain::DayUsage;
+
+/// Removes what is older than `first`.
+pub(super) fn forget_before(trees: &Trees, first: Date) -> Result<(), StoreError> {
+    for key in trees.usage.range(..first.to_string().into_bytes()).keys() {
+        trees.usage.remove(key.map_err(failed)?).map_err(failed)?;
+    }
+    Ok(())
+}
+
+/// Sorted by day: dates are written with four, two and two digits.
+fn key(of: &DayUsage) -> Vec<u8> {
+    format!("{}/{}", of.date, of.map.as_str()).into_bytes()
+}
+
+#[async_trait]
+impl UsageStore for EmbeddedStore {
+    async fn add_usage(&self, spent: DayUsage) -> Result<(), StoreError> {
+        self.inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    let key = key(&spent);
+                    let sum = match get::<DayUsage>(&trees.usage, &key)? {
+                        Some(known) => DayUsage {
+                            usage: known.usage + spent.usage,
+                            money: known.money + spent.money,
+                            ..spent
+                        },
+                        None => spent,
+                    };
+                    put(&trees.usage, &key, &sum)
+                },
+                |()| {},
+            )
+            .await
+    }
+
+    async fn usage(&self, from: Date) -> Result<Vec<DayUsage>, StoreError> {
+        let inner = Arc::clone(&self.inner);
+        blocking(move || {
+            let values = inner.trees.usage.range(from.to_string().into_bytes()..).values();
+            values.map(|value| decode(&value.map_err(failed)?)).collect()
+        })
+        .await
+    }
+}

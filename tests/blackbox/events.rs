@@ -1,0 +1,92 @@
+//! A job as it goes on, as server-sent events.
+
+use std::time::{Duration, Instant};
+
+use futures_util::StreamExt;
+use reqwest::Method;
+use serde_json::Value;
+use tempfile::TempDir;
+
+use super::mllm::start;
+use super::mock_mllm::{MockMllm, Reply, Script};
+use super::support::{Server, frame};
+
+/// Event names and data of a stream that has ended.
+fn events(stream: &[u8]) -> Vec<(String, Value)> {
+    let text = String::from_utf8(stream.to_vec()).unwrap();
+    let field = |event: &str, name: &str| {
+        let line = event.lines().find_map(|line| line.strip_prefix(name)).unwrap_or_default();
+        line.trim().to_owned()
+    };
+    text.split("\n\n")
+        .filter(|event| event.contains("event:"))
+        .map(|event| {
+            (field(event, "event:"), serde_json::from_str(&field(event, "data:")).unwrap())
+        })
+        .collect()
+}
+
+async fn queue(server: &Server) -> String {
+    let answer = server.post_jpeg("/localize?map=m", frame(0, 0)).await.expect(200);
+    format!("{}/events", answer["job"]["href"].as_str().unwrap())
+}
+
+#[tokio::test]
+async fn a_job_is_followed_pair_by_pair_and_can_be_followed_again() {
+    let dir = TempDir::new().unwrap();
+    let mock =
+        MockMllm::start(Script { latency: Duration::from_millis(40), ..Script::default() }).await;
+    let server = start(&dir, &mock, &[("WHEREABOUTS_MLLM__CONCURRENCY", "1")]);
+    server.town("m", 5).await;
+    let path = queue(&server).await;
+    let stream = server.get(&path).await;
+    assert_eq!(stream.headers["content-type"], "text/event-stream");
+    let live = events(&stream.bytes);
+    let names: Vec<&str> = live.iter().map(|(name, _)| name.as_str()).collect();
+    let described: Vec<&Value> =
+        live.iter().filter(|(name, _)| name == "description").map(|(_, data)| data).collect();
+    assert_eq!(names.last(), Some(&"end"), "{names:?}");
+    assert!(live.iter().any(|(name, data)| name == "state" && data["state"] == "running"));
+    let counts: Vec<_> = described.iter().map(|pair| pair["described"].as_u64().unwrap()).collect();
+    assert_eq!(counts, [1, 2, 3, 4, 5]);
+    assert_eq!(described[0]["of"], 5);
+    assert!(!described[0]["description"]["text"].as_str().unwrap().is_empty());
+    assert_eq!(live.last().unwrap().1["state"], "succeeded");
+
+    // Afterwards it is all told at once.
+    let again = events(&server.get(&path).await.bytes);
+    assert_eq!(again.len(), 6);
+    assert_eq!(again[5], *live.last().unwrap());
+}
+
+#[tokio::test]
+async fn streams_are_bounded_and_end_with_the_server() {
+    let dir = TempDir::new().unwrap();
+    let mock =
+        MockMllm::start(Script { describe: Box::new(|_| Reply::Hang), ..Script::default() }).await;
+    let server = start(&dir, &mock, &[("WHEREABOUTS_SERVER__MAX_STREAMS", "1")]);
+    server.town("m", 3).await;
+    let path = queue(&server).await;
+    server.get("/jobs/018f0000-0000-7000-8000-000000000000/events").await.problem(404);
+    let stream = server.request(Method::GET, &path).send().await.unwrap();
+    let mut chunks = stream.bytes_stream();
+    let first = chunks.next().await.unwrap().unwrap();
+    assert!(first.starts_with(b"event: state"), "{first:?}");
+    assert!(server.get(&path).await.problem(429).contains("max_streams"));
+    drop(chunks);
+    // The place is free again once the server has noticed.
+    let deadline = Instant::now() + Duration::from_secs(20);
+    let stream = loop {
+        let stream = server.request(Method::GET, &path).send().await.unwrap();
+        if stream.status() == 200 {
+            break stream;
+        }
+        assert!(Instant::now() < deadline, "the place was not given back");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    };
+    let began = Instant::now();
+    let rest = tokio::spawn(async move { stream.bytes().await.unwrap() });
+    assert!(server.terminate().success());
+    assert!(began.elapsed() < Duration::from_secs(10), "the drain waited for the stream");
+    assert!(events(&rest.await.unwrap()).iter().all(|(name, _)| name != "end"));
+}
