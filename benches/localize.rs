@@ -15,7 +15,7 @@ use serde_json::Value;
 use whereabouts::demo::{Town, TownSpec};
 use whereabouts::domain::DescriptorKind;
 use whereabouts::retrieve::decode::encode_jpeg;
-use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits};
+use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits, Wanted};
 
 const PLACES: usize = 200;
 const FRAMES: usize = 50;
@@ -55,12 +55,14 @@ fn main() -> anyhow::Result<()> {
 
 /// Decode, resize, inference and pooling, one frame after another.
 fn bare_extraction(frames: &[bytes::Bytes]) -> anyhow::Result<Times> {
+    // By whoever is fastest on this machine, as the server does.
     let settings = ExtractorSettings {
-        model: "xfeat".into(),
-        sessions: 1,
-        threads: std::thread::available_parallelism()?.get(),
-        max_batch: 1,
-        limits: ImageLimits { max_pixels: 50_000_000 },
+        wanted: Wanted::default(),
+        ..ExtractorSettings::plain(
+            "xfeat",
+            std::thread::available_parallelism()?.get(),
+            ImageLimits { max_pixels: 50_000_000 },
+        )
     };
     let extractor = Extractor::load(&Assets::locate(None), &settings)?;
     let start = Instant::now();

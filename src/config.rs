@@ -10,8 +10,9 @@ use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
-use crate::domain::RefinerKind;
+use crate::domain::{Precision, RefinerKind};
 use crate::refine::mllm::MllmSettings;
+use crate::retrieve::{Provider, Wanted};
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
@@ -84,6 +85,10 @@ pub struct Data {
 pub struct Model {
     /// The model's name.
     pub name: String,
+    /// Who runs it.
+    pub provider: ProviderWish,
+    /// At which precision.
+    pub precision: PrecisionWish,
     /// An assets folder to look in before the usual places; empty for none.
     pub assets: PathBuf,
     /// Sessions side by side.
@@ -92,6 +97,57 @@ pub struct Model {
     pub threads: usize,
     /// The most pictures in one run.
     pub max_batch: usize,
+}
+
+/// Who is to run the model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ProviderWish {
+    /// The fastest that there is.
+    Auto,
+    /// ONNX Runtime itself.
+    Cpu,
+    /// Intel's OpenVINO.
+    OpenVino,
+    /// NVIDIA's CUDA.
+    Cuda,
+    /// NVIDIA's TensorRT.
+    TensorRt,
+    /// Apple's Core ML.
+    CoreMl,
+}
+
+/// At which precision the model is to run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PrecisionWish {
+    /// That of the maps there are, else the fastest that gives the same descriptors.
+    Auto,
+    /// 32-bit floats.
+    Full,
+    /// 16-bit floats with 8 bits of exponent.
+    Bf16,
+}
+
+impl Model {
+    /// What may be chosen from.
+    pub fn wanted(&self) -> Wanted {
+        Wanted {
+            provider: match self.provider {
+                ProviderWish::Auto => None,
+                ProviderWish::Cpu => Some(Provider::Cpu),
+                ProviderWish::OpenVino => Some(Provider::OpenVino),
+                ProviderWish::Cuda => Some(Provider::Cuda),
+                ProviderWish::TensorRt => Some(Provider::TensorRt),
+                ProviderWish::CoreMl => Some(Provider::CoreMl),
+            },
+            precision: match self.precision {
+                PrecisionWish::Auto => None,
+                PrecisionWish::Full => Some(Precision::Full),
+                PrecisionWish::Bf16 => Some(Precision::Bf16),
+            },
+        }
+    }
 }
 
 /// `[image]`

@@ -14,6 +14,7 @@ use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::{Config, Refiner as ConfiguredRefiner};
+use crate::domain::Map;
 use crate::http::{AppState, HttpSettings, router};
 use crate::refine::local::{LocalMatcher, LocalSettings};
 use crate::refine::mllm::{MllmParts, MllmRefiner};
@@ -22,7 +23,7 @@ use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Assets, CpuPool, Extractor, ExtractorSettings, ImageLimits};
 use crate::service::{Service, ServiceSettings};
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
-use crate::store::{JobStore, UsageStore};
+use crate::store::{JobStore, MapStore, UsageStore};
 use crate::telemetry::Metrics;
 
 /// Serves on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200.
@@ -100,7 +101,8 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
         },
         usage_days: config.data.usage_days,
     })?);
-    let extractor = Arc::new(load_model(config)?);
+    let maps = Handle::current().block_on(store.maps())?;
+    let extractor = Arc::new(load_model(config, &maps)?);
     let pool = CpuPool::new("frames", threads_or(config.image.threads, 2), config.image.queue)?;
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
     let local = Arc::new(LocalRefiner {
@@ -169,17 +171,27 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
     Ok((service, workers))
 }
 
-fn load_model(config: &Config) -> anyhow::Result<Extractor> {
+/// Loads the model, at the precision of `maps` if nothing else is asked for.
+fn load_model(config: &Config, maps: &[Map]) -> anyhow::Result<Extractor> {
     let configured = Some(config.model.assets.as_path()).filter(|path| *path != Path::new(""));
+    let mut wanted = config.model.wanted();
+    wanted.precision = wanted.precision.or(maps.first().map(|map| map.precision));
     let settings = ExtractorSettings {
         model: config.model.name.clone(),
+        wanted,
+        remember: Some(config.data.dir.join("inference.toml")),
         sessions: config.model.sessions,
         threads: threads_or(config.model.threads, 1),
         max_batch: config.model.max_batch,
         limits: ImageLimits { max_pixels: config.image.max_pixels },
     };
     let extractor = Extractor::load(&Assets::locate(configured), &settings)?;
-    tracing::info!(model = extractor.manifest().name, digest = %extractor.digest(), "model loaded");
+    tracing::info!(
+        model = extractor.manifest().name,
+        digest = %extractor.digest(),
+        execution = %extractor.execution(),
+        "model loaded"
+    );
     Ok(extractor)
 }
 

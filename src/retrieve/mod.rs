@@ -14,10 +14,12 @@ pub mod manifest;
 mod pool;
 pub mod pooling;
 pub mod preprocess;
+mod provider;
 mod runtime;
 
 pub use decode::{DecodeError, ImageLimits, Picture};
 pub use extractor::{ExtractError, Extraction, Extractor, ExtractorSettings, StageTimes};
 pub use manifest::{Manifest, ManifestError};
 pub use pool::{CpuPool, Overloaded, PoolError};
+pub use provider::{Execution, LEAST_SIMILARITY, Measured, Provider, Trial, Wanted};
 pub use runtime::{Assets, RuntimeError};

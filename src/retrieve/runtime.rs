@@ -5,6 +5,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use ort::environment::Environment;
 
+use super::provider::Provider;
+
 /// The folder that `make build` fills: `onnxruntime/` and `models/`.
 #[derive(Debug, Clone)]
 pub struct Assets {
@@ -64,15 +66,19 @@ impl Assets {
             .ok_or_else(|| RuntimeError::NoModel { name: name.to_owned(), looked: self.looked() })
     }
 
-    /// Loads ONNX Runtime: `ORT_DYLIB_PATH` if set, else the library among the assets.
-    pub fn load_onnxruntime(&self) -> Result<Arc<Environment>, RuntimeError> {
+    /// Loads ONNX Runtime: `ORT_DYLIB_PATH` if set, else the library among the assets; the one with
+    /// OpenVINO, if it is there and may be wanted.
+    pub fn load_onnxruntime(
+        &self,
+        provider: Option<Provider>,
+    ) -> Result<Arc<Environment>, RuntimeError> {
         // ONNX Runtime allows one environment in a process, whoever asks; once made, it stays.
         static LOADED: Mutex<Option<Arc<Environment>>> = Mutex::new(None);
         let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(environment) = loaded.as_ref() {
             return Ok(Arc::clone(environment));
         }
-        let path = self.onnxruntime()?;
+        let path = self.onnxruntime(provider)?;
         let failed = |reason: String| RuntimeError::Library { path: path.clone(), reason };
         let environment = ort::init_from(&path)
             .map_err(|error| failed(error.to_string()))?
@@ -85,15 +91,20 @@ impl Assets {
         Ok(environment)
     }
 
-    fn onnxruntime(&self) -> Result<PathBuf, RuntimeError> {
+    fn onnxruntime(&self, provider: Option<Provider>) -> Result<PathBuf, RuntimeError> {
         if let Some(path) = std::env::var_os("ORT_DYLIB_PATH").filter(|path| !path.is_empty()) {
             return Ok(path.into());
         }
         let name =
             format!("{}onnxruntime{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
-        self.candidates
+        let folders: &[&str] = match provider {
+            None | Some(Provider::OpenVino) => &["onnxruntime-openvino", "onnxruntime"],
+            Some(_) => &["onnxruntime"],
+        };
+        folders
             .iter()
-            .map(|folder| folder.join("onnxruntime").join(&name))
+            .flat_map(|folder| self.candidates.iter().map(move |assets| assets.join(folder)))
+            .map(|folder| folder.join(&name))
             .find(|path| path.is_file())
             .ok_or_else(|| RuntimeError::NoLibrary { looked: self.looked() })
     }

@@ -6,7 +6,7 @@ use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::{ErrorKind, Service, ServiceError};
-use crate::domain::{DescriptorKind, Frame, Map, MapName, Scene};
+use crate::domain::{DescriptorKind, Digest, Frame, Map, MapName, Precision, Scene};
 use crate::store::IndexState;
 
 /// What to set on a map. What is left out keeps its value, or its default in a new map.
@@ -43,6 +43,11 @@ pub struct MapState {
     pub frame: Frame,
     /// The model that makes its descriptors.
     pub model: String,
+    /// The digest of that model's ONNX file.
+    #[schema(value_type = String)]
+    pub model_digest: Digest,
+    /// The arithmetic that the model runs in; descriptors of another are refused.
+    pub precision: Precision,
     /// Numbers in a descriptor.
     pub dim: usize,
     /// Images in the map.
@@ -104,6 +109,7 @@ impl Service {
             frame: change.frame.or(known.map(|map| map.frame)).unwrap_or_default(),
             model: manifest.name.clone(),
             model_digest: self.extractor.digest(),
+            precision: self.extractor.execution().precision,
             dim,
             description: change
                 .description
@@ -148,8 +154,18 @@ impl Service {
     /// The map, if its descriptors are of the model that is loaded.
     pub(super) async fn searchable_map(&self, name: &MapName) -> Result<Map, ServiceError> {
         let map = self.known_map(name).await?;
+        let precision = self.extractor.execution().precision;
         if map.model_digest == self.extractor.digest() {
-            return Ok(map);
+            if map.precision == precision {
+                return Ok(map);
+            }
+            let detail = format!(
+                "the map {name} was indexed at {} precision, but the server runs the model at \
+                 {precision} precision; start it with model.precision = \"{}\", or index the images \
+                 into a new map",
+                map.precision, map.precision
+            );
+            return Err(ServiceError::new(ErrorKind::Conflict, detail));
         }
         Err(ServiceError::new(
             ErrorKind::Conflict,
@@ -178,6 +194,8 @@ impl Service {
             descriptor: map.descriptor,
             frame: map.frame,
             model: map.model,
+            model_digest: map.model_digest,
+            precision: map.precision,
             dim: map.dim,
             images,
             index,

@@ -3,21 +3,17 @@
 use std::path::Path;
 
 use serde_json::Value;
+use tempfile::TempDir;
 use whereabouts::domain::DescriptorKind;
 use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits};
 
-use super::support::reference;
+use super::support::{BINARY, Server, frame, reference};
 
 fn load(model: &str, max_batch: usize) -> Extractor {
     // The fixtures first, then what `make build` installed.
     let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures");
-    let settings = ExtractorSettings {
-        model: model.into(),
-        sessions: 1,
-        threads: 1,
-        max_batch,
-        limits: ImageLimits { max_pixels: 10_000_000 },
-    };
+    let limits = ImageLimits { max_pixels: 10_000_000 };
+    let settings = ExtractorSettings { max_batch, ..ExtractorSettings::plain(model, 1, limits) };
     Extractor::load(&Assets::locate(Some(&fixtures)), &settings).unwrap()
 }
 
@@ -86,13 +82,65 @@ fn a_damaged_model_is_refused_by_its_digest() {
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
     std::fs::write(to.join("model.onnx"), bytes).unwrap();
-    let settings = ExtractorSettings {
-        model: "tiny-tokens".into(),
-        sessions: 1,
-        threads: 1,
-        max_batch: 1,
-        limits: ImageLimits { max_pixels: 1 },
-    };
+    let settings = ExtractorSettings::plain("tiny-tokens", 1, ImageLimits { max_pixels: 1 });
     let error = Extractor::load(&Assets::locate(Some(root.path())), &settings).unwrap_err();
     assert!(error.to_string().contains("pins"), "{error}");
+}
+
+/// Whether `make openvino` has been run.
+fn has_openvino() -> bool {
+    let library = "assets/onnxruntime-openvino/libonnxruntime.so";
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(library).is_file()
+}
+
+#[tokio::test]
+async fn another_provider_gives_the_same_descriptors_and_another_precision_is_refused() {
+    if !has_openvino() {
+        eprintln!("not run: `make openvino` gets the library that this needs");
+        return;
+    }
+    let dir = TempDir::new().unwrap();
+    let start = |provider, precision| {
+        let settings = [
+            ("WHEREABOUTS_MODEL__PROVIDER", provider),
+            ("WHEREABOUTS_MODEL__PRECISION", precision),
+        ];
+        Server::start(dir.path(), &settings)
+    };
+    let localize = async |server: &Server| {
+        let answer = server.post_jpeg("/localize?map=m&refine=off", frame(1, 0)).await.expect(200);
+        let candidates = answer["candidates"].as_array().unwrap().clone();
+        candidates.iter().map(|one| one["similarity"].as_f64().unwrap()).collect::<Vec<_>>()
+    };
+    let server = start("cpu", "auto");
+    server.town("m", 4).await;
+    assert_eq!(server.get("/maps/m").await.expect(200)["precision"], "full");
+    let by_cpu = localize(&server).await;
+    server.terminate();
+    // auto keeps to the precision of the maps.
+    let server = start("openvino", "auto");
+    assert!(server.log().contains("openvino at full precision"), "{}", server.log());
+    for (one, other) in localize(&server).await.iter().zip(&by_cpu) {
+        assert!((one - other).abs() < 1e-4, "{one} is not {other}");
+    }
+    server.terminate();
+    let server = start("openvino", "bf16");
+    let refused = server.post_jpeg("/localize?map=m&refine=off", frame(1, 0)).await.problem(409);
+    assert!(refused.contains("model.precision"), "{refused}");
+    server.town("b", 2).await;
+    assert_eq!(server.get("/maps/b").await.expect(200)["precision"], "bf16");
+}
+
+#[test]
+fn a_provider_that_is_not_there_is_named_at_the_start() {
+    let dir = TempDir::new().unwrap();
+    let output = std::process::Command::new(BINARY)
+        .args(["serve", "--listen", "127.0.0.1:0", "--data"])
+        .arg(dir.path())
+        .env("WHEREABOUTS_MODEL__PROVIDER", "tensorrt")
+        .output()
+        .unwrap();
+    assert!(!output.status.success());
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("tensorrt") && said.contains("model.provider"), "{said}");
 }

@@ -38,6 +38,7 @@ impl Inner {
             None => (wanted, true),
             Some(stored) => {
                 let same = stored.model_digest == wanted.model_digest
+                    && stored.precision == wanted.precision
                     && stored.descriptor == wanted.descriptor
                     && stored.frame == wanted.frame;
                 let has_images = trees.images.scan_prefix(stored.uid.as_bytes()).next().is_some();

@@ -15,7 +15,7 @@ use super::super::settings::tests::defaults;
 use super::*;
 use crate::domain::{
     Candidate, DayUsage, Descriptor, DescriptorKind, Digest, Frame, Image, ImageId, Job, Map,
-    MapName, MediaType, RefinerKind, StandIn,
+    MapName, MediaType, Precision, RefinerKind, StandIn,
 };
 use crate::retrieve::decode::encode_jpeg;
 use crate::retrieve::index::SearchMode;
@@ -110,6 +110,7 @@ impl Shelf {
             frame: Frame::Metric,
             model: "none".into(),
             model_digest: Digest::of(b"none"),
+            precision: Precision::Full,
             dim: 1,
             description: None,
             created_at: Timestamp::UNIX_EPOCH,
