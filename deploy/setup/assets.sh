@@ -3,6 +3,8 @@
 #
 #   DEST/onnxruntime/libonnxruntime.so    ONNX Runtime (.dylib on macOS), with its licences
 #   DEST/models/xfeat/model.onnx          the built-in model, with its manifest and licence
+#   DEST/.python                          the Python and the folder of numpy and onnx that made it,
+#                                         for the tests
 #   DEST/onnxruntime-openvino/            ONNX Runtime with OpenVINO, only with --openvino
 #
 # usage: deploy/setup/assets.sh [--openvino] [DEST]
@@ -88,6 +90,7 @@ up_to_date() {
     [ -f "$dest/onnxruntime/$library" ] &&
         [ -f "$dest/models/xfeat/model.onnx" ] &&
         [ -f "$dest/models/xfeat/manifest.toml" ] &&
+        [ -f "$dest/.python" ] && [ -d "$(tail -n 1 "$dest/.python")" ] &&
         [ -f "$dest/.stamp" ] &&
         [ "$(cat "$dest/.stamp")" = "$(inputs)" ]
 }
@@ -219,6 +222,7 @@ put_in_place() {
     mkdir -p "$dest/onnxruntime" "$dest/models/xfeat"
     mv -f "$new"/onnxruntime/* "$dest/onnxruntime/"
     mv -f "$new"/models/xfeat/* "$dest/models/xfeat/"
+    printf '%s\n' "$(command -v "$python")" "$packages" >"$dest/.python"
     inputs >"$new/.stamp"
     mv -f "$new/.stamp" "$dest/.stamp"
 }

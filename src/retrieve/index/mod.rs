@@ -5,17 +5,20 @@
 //!
 //! Small maps are searched exactly. For larger ones an HNSW graph covers the slots below
 //! [`MapIndex::graphed`], and the rest, which arrived since, is searched exactly: adding an image
-//! never waits for the graph, and a map answers while its graph is still being built.
+//! never waits for the graph, and a map answers while its graph is still being built. A graph that
+//! has caught up is sealed ([`SealedGraph`]), which makes it smaller and its search faster, and lets
+//! it be written to a file.
 
 mod exact;
 mod graph;
+mod sealed;
 
 use std::ops::Range;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{OnceLock, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use self::exact::Best;
 use self::graph::Graph;
+pub use self::sealed::{DamagedGraph, SealedGraph};
 
 /// Stored descriptors, by slot.
 pub trait Vectors: Send + Sync {
@@ -57,12 +60,16 @@ pub enum SearchMode {
 }
 
 /// The index of one map.
+///
+/// Slots below [`SealedGraph::end`] are in the sealed graph, those from there to
+/// [`MapIndex::graphed`] in the growing one, and the rest in none.
 pub struct MapIndex {
     settings: IndexSettings,
     /// Whether the image in each slot is still part of the map.
     live: RwLock<Live>,
-    graph: OnceLock<Graph>,
-    graphed: AtomicUsize,
+    graphs: RwLock<Graphs>,
+    /// A graph over everything, on its way to replace those there are. Only the indexer touches it.
+    merging: Mutex<Option<Merging>>,
 }
 
 #[derive(Default)]
@@ -71,15 +78,45 @@ struct Live {
     count: usize,
 }
 
+#[derive(Default, Clone)]
+struct Graphs {
+    sealed: Option<Arc<SealedGraph>>,
+    growing: Option<Arc<Graph>>,
+    /// Slots below this one are in one of the two, unless they were removed before they got there.
+    graphed: usize,
+}
+
+struct Merging {
+    graph: Graph,
+    /// Slots below this one are in it.
+    done: usize,
+    /// Slots below this one will be.
+    end: usize,
+}
+
+impl Graphs {
+    /// Where the growing graph begins.
+    fn sealed_end(&self) -> usize {
+        self.sealed.as_ref().map_or(0, |sealed| sealed.end())
+    }
+}
+
 impl MapIndex {
     /// An empty index.
     pub fn new(settings: IndexSettings) -> Self {
         Self {
             settings,
             live: RwLock::default(),
-            graph: OnceLock::new(),
-            graphed: AtomicUsize::new(0),
+            graphs: RwLock::default(),
+            merging: Mutex::default(),
         }
+    }
+
+    /// Searches with a graph that was sealed by an earlier process.
+    pub fn restore(&self, sealed: SealedGraph) {
+        let graphed = sealed.end();
+        let sealed = Some(Arc::new(sealed));
+        *self.graphs_mut() = Graphs { sealed, growing: None, graphed };
     }
 
     /// Makes the image in `slot` part of every later answer.
@@ -103,7 +140,7 @@ impl MapIndex {
 
     /// How many images are part of the map.
     pub fn len(&self) -> usize {
-        self.live.read().unwrap_or_else(PoisonError::into_inner).count
+        self.live().count
     }
 
     /// Whether no image is part of the map.
@@ -111,9 +148,9 @@ impl MapIndex {
         self.len() == 0
     }
 
-    /// Slots below this one are in the graph, unless they were removed before they got there.
+    /// Slots below this one are in a graph, unless they were removed before they got there.
     pub fn graphed(&self) -> usize {
-        self.graphed.load(Ordering::Acquire)
+        self.graphs().graphed
     }
 
     /// The `k` most similar images, best first; equal similarities keep the order of the slots.
@@ -124,56 +161,148 @@ impl MapIndex {
         k: usize,
         mode: SearchMode,
     ) -> Vec<Found> {
-        let live = self.live.read().unwrap_or_else(PoisonError::into_inner);
-        let mut best = Best::new(k);
+        let live = self.live();
         let is_live = |slot: usize| live.slots.get(slot).copied().unwrap_or(false);
-        let graphed = match (mode, self.graph.get()) {
-            (SearchMode::Fast, Some(graph)) => {
-                let graphed = self.graphed();
-                let ef = self.settings.ef_search.max(k);
-                let found = graph.search(query, k, ef, &|slot| slot < graphed && is_live(slot));
-                // Among many removed images a graph can lose its way to the rest.
-                let all = live.slots[..graphed].iter().filter(|live| **live).take(k).count();
-                let complete = found.len() >= all;
-                found.into_iter().filter(|_| complete).for_each(|found| best.offer(found));
-                if complete { graphed } else { 0 }
-            }
-            _ => 0,
+        let graphs = match mode {
+            SearchMode::Fast => self.graphs().clone(),
+            SearchMode::Exact => Graphs::default(),
         };
-        vectors.scan(graphed..live.slots.len(), &mut |slot, vector| {
-            if is_live(slot) {
-                best.offer(Found { slot, similarity: exact::dot(query, vector) });
+        let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
+        let mut best = Best::new(k);
+        let mut found_in = |slots: Range<usize>, found: Vec<Found>| {
+            // Among many removed images a graph can lose its way to the rest.
+            let end = slots.end.min(live.slots.len());
+            let all = live.slots[slots.start.min(end)..end].iter().filter(|live| **live).take(k);
+            if found.len() >= all.count() {
+                found.into_iter().for_each(|found| best.offer(found));
+            } else {
+                exactly(vectors, query, slots, &is_live, &mut best);
             }
-        });
+        };
+        let ef = self.settings.ef_search.max(k);
+        if let Some(sealed) = &graphs.sealed {
+            found_in(0..sealed_end, sealed.search(vectors, query, (k, ef), is_live));
+        }
+        if let Some(growing) = &graphs.growing {
+            // It may hold more than `graphed` says by now.
+            let kept = |slot: usize| slot < graphed && is_live(slot);
+            found_in(sealed_end..graphed, growing.search(query, k, ef, &kept));
+        }
+        exactly(vectors, query, graphed..live.slots.len(), &is_live, &mut best);
         best.into_sorted()
     }
 
-    /// Whether slots wait to be put into the graph.
+    /// Whether slots wait to be put into a graph.
     pub fn is_behind(&self) -> bool {
-        let live = self.live.read().unwrap_or_else(PoisonError::into_inner);
-        live.count > self.settings.exact_up_to && self.graphed() < live.slots.len()
+        let graphed = self.graphed();
+        let live = self.live();
+        live.count > self.settings.exact_up_to && graphed < live.slots.len()
     }
 
-    /// Puts up to `most` waiting slots into the graph. Call from one thread at a time; searches
-    /// go on meanwhile.
-    pub fn catch_up(&self, vectors: &dyn Vectors, most: usize) {
-        if !self.is_behind() {
-            return;
+    /// Whether [`MapIndex::catch_up`] has anything to do.
+    pub fn has_work(&self) -> bool {
+        self.is_behind() || self.merging().is_some() || self.wants_sealing()
+    }
+
+    /// Whether the growing graph has become as large as the sealed one.
+    fn wants_sealing(&self) -> bool {
+        let graphs = self.graphs();
+        let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
+        graphs.growing.is_some() && graphed - sealed_end >= sealed_end.max(1)
+    }
+
+    /// Does a piece of the work that waits, over at most `most` slots; returns the graph that was
+    /// sealed by it, if one was. Call from one thread at a time; searches go on meanwhile.
+    ///
+    /// New slots go into the growing graph. When none waits and that graph has become as large as
+    /// the sealed one, the two are made one, which is then sealed: each slot is put into a graph
+    /// twice on average, whatever the size of the map.
+    pub fn catch_up(&self, vectors: &dyn Vectors, most: usize) -> Option<Arc<SealedGraph>> {
+        let mut merging = self.merging();
+        if let Some(merge) = merging.as_mut() {
+            let end = merge.end.min(merge.done + most);
+            self.insert(&merge.graph, vectors, merge.done..end);
+            merge.done = end;
+            if merge.done < merge.end {
+                return None;
+            }
+            let Merging { graph, end, .. } = merging.take()?;
+            return Some(self.seal(&graph, end, vectors));
         }
-        let start = self.graphed();
-        let waiting: Vec<bool> = {
-            let live = self.live.read().unwrap_or_else(PoisonError::into_inner);
-            live.slots[start..].iter().take(most).copied().collect()
+        if self.is_behind() {
+            let graphs = self.graphs().clone();
+            let growing = graphs.growing.unwrap_or_else(|| Arc::new(Graph::new(&self.settings)));
+            let end = self.live().slots.len().min(graphs.graphed + most);
+            self.insert(&growing, vectors, graphs.graphed..end);
+            let mut graphs = self.graphs_mut();
+            graphs.growing = Some(growing);
+            graphs.graphed = end;
+            return None;
+        }
+        if !self.wants_sealing() {
+            return None;
+        }
+        let Graphs { sealed, growing, graphed } = self.graphs().clone();
+        match (sealed, growing) {
+            (None, Some(growing)) => Some(self.seal(&growing, graphed, vectors)),
+            _ => {
+                let graph = Graph::new(&self.settings);
+                *merging = Some(Merging { graph, done: 0, end: graphed });
+                None
+            }
+        }
+    }
+
+    fn insert(&self, graph: &Graph, vectors: &dyn Vectors, slots: Range<usize>) {
+        let live: Vec<bool> = {
+            let live = self.live();
+            slots.clone().map(|slot| live.slots.get(slot).copied().unwrap_or(false)).collect()
         };
-        let graph = self.graph.get_or_init(|| Graph::new(&self.settings));
-        let end = start + waiting.len();
-        vectors.scan(start..end, &mut |slot, vector| {
-            if waiting[slot - start] {
+        vectors.scan(slots.clone(), &mut |slot, vector| {
+            if live[slot - slots.start] {
                 graph.insert(slot, vector);
             }
         });
-        self.graphed.store(end, Ordering::Release);
     }
+
+    /// Replaces the graphs there are by a finished one.
+    fn seal(&self, graph: &Graph, end: usize, vectors: &dyn Vectors) -> Arc<SealedGraph> {
+        let sealed = Arc::new(SealedGraph::new(&graph.linked(), end, vectors, &self.settings));
+        *self.graphs_mut() =
+            Graphs { sealed: Some(Arc::clone(&sealed)), growing: None, graphed: end };
+        sealed
+    }
+
+    fn live(&self) -> RwLockReadGuard<'_, Live> {
+        self.live.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn graphs(&self) -> RwLockReadGuard<'_, Graphs> {
+        self.graphs.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn graphs_mut(&self) -> RwLockWriteGuard<'_, Graphs> {
+        self.graphs.write().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn merging(&self) -> MutexGuard<'_, Option<Merging>> {
+        self.merging.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Offers every live slot of a range.
+fn exactly(
+    vectors: &dyn Vectors,
+    query: &[f32],
+    slots: Range<usize>,
+    is_live: &dyn Fn(usize) -> bool,
+    best: &mut Best,
+) {
+    vectors.scan(slots, &mut |slot, vector| {
+        if is_live(slot) {
+            best.offer(Found { slot, similarity: exact::dot(query, vector) });
+        }
+    });
 }
 
 #[cfg(test)]
@@ -224,10 +353,13 @@ mod tests {
     fn the_graph_finds_what_exact_search_finds() {
         let rows = clustered(1500, 48);
         let index = filled(&rows);
-        while index.is_behind() {
-            index.catch_up(&rows, 200);
+        let mut sealed = None;
+        while index.has_work() {
+            sealed = index.catch_up(&rows, 200).or(sealed);
         }
         assert_eq!(index.graphed(), 1500);
+        let sealed = sealed.unwrap();
+        assert_eq!((sealed.len(), sealed.end(), sealed.dim()), (1500, 1500, 48));
         let (mut same, mut all) = (0, 0);
         for query in rows.0.iter().step_by(15) {
             let exact = index.search(&rows, query, 10, SearchMode::Exact);
@@ -237,6 +369,57 @@ mod tests {
             all += exact.len();
         }
         assert!(same * 100 >= all * 99, "recall@10 is {same}/{all}");
+    }
+
+    #[test]
+    fn a_sealed_graph_survives_a_file_and_notices_damage() {
+        let rows = clustered(400, 20);
+        let index = filled(&rows);
+        let mut sealed = None;
+        while index.has_work() {
+            sealed = index.catch_up(&rows, 100).or(sealed);
+        }
+        let mut bytes = sealed.unwrap().to_bytes();
+        let again = filled(&rows);
+        again.restore(SealedGraph::from_bytes(&bytes).unwrap());
+        assert_eq!((again.graphed(), again.has_work()), (400, false));
+        for query in rows.0.iter().step_by(37) {
+            let search = |index: &MapIndex| index.search(&rows, query, 5, SearchMode::Fast);
+            assert_eq!(search(&again), search(&index));
+        }
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        assert!(SealedGraph::from_bytes(&bytes).is_err());
+        bytes[middle] ^= 1;
+        assert!(SealedGraph::from_bytes(&bytes[..bytes.len() - 1]).is_err());
+        assert!(SealedGraph::from_bytes(&[]).is_err());
+    }
+
+    #[test]
+    fn graphs_are_made_one_as_a_map_grows_and_every_image_is_found_meanwhile() {
+        let rows = clustered(1000, 24);
+        let index = MapIndex::new(SETTINGS);
+        let mut seals = Vec::new();
+        for slot in 0..1000 {
+            index.add(slot);
+            // Images come in bursts; between them there is time to seal what has grown.
+            if slot % 100 > 70 {
+                seals.extend(index.catch_up(&rows, 16).map(|sealed| sealed.end()));
+            }
+            if slot % 50 == 0 {
+                let found = index.search(&rows, &rows.0[slot], 1, SearchMode::Fast);
+                assert_eq!(found[0].slot, slot);
+            }
+        }
+        while index.has_work() {
+            seals.extend(index.catch_up(&rows, 16).map(|sealed| sealed.end()));
+        }
+        assert!(seals.len() > 1 && seals.is_sorted(), "{seals:?}");
+        assert_eq!(index.graphed(), 1000);
+        for slot in (0..1000).step_by(13) {
+            let found = index.search(&rows, &rows.0[slot], 1, SearchMode::Fast);
+            assert_eq!(found[0].slot, slot);
+        }
     }
 
     #[test]
@@ -253,7 +436,7 @@ mod tests {
     fn a_removed_image_is_never_found() {
         let rows = clustered(300, 16);
         let index = filled(&rows);
-        while index.is_behind() {
+        while index.has_work() {
             index.catch_up(&rows, 64);
         }
         for slot in (0..300).step_by(2) {

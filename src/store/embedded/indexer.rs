@@ -27,7 +27,7 @@ impl Indexer {
 
     /// Asks for a map to be brought up to date.
     pub fn look_at(&self, map: &Arc<LiveMap>) {
-        if !map.index.is_behind() {
+        if !map.index.has_work() {
             return;
         }
         match self.wake.try_send(Arc::downgrade(map)) {
@@ -52,8 +52,10 @@ fn run(wake: &Receiver<Weak<LiveMap>>) {
         }
         behind.retain(|map| {
             map.upgrade().is_some_and(|map| {
-                map.index.catch_up(map.vectors.as_ref(), TURN);
-                map.index.is_behind()
+                if let Some(sealed) = map.index.catch_up(map.vectors.as_ref(), TURN) {
+                    map.keep(&sealed);
+                }
+                map.index.has_work()
             })
         });
     }

@@ -1,6 +1,7 @@
 //! One map in memory: which slot is which image, and its index.
 
-use std::path::Path;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
@@ -8,13 +9,15 @@ use super::super::StoreError;
 use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
 use crate::domain::{Candidate, ImageId, Map, Pose};
-use crate::retrieve::index::{IndexSettings, MapIndex, SearchMode};
+use crate::retrieve::index::{IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
 
 pub(super) struct LiveMap {
     /// The map as stored; scene and description may change.
     map: RwLock<Map>,
     pub vectors: Arc<VectorFiles>,
     pub index: MapIndex,
+    /// The sealed graph, so that a start need not build it again.
+    graph_file: PathBuf,
     entries: RwLock<Vec<Option<Entry>>>,
     /// The slot of the next image. Only the writer thread moves it.
     next_slot: AtomicUsize,
@@ -35,14 +38,17 @@ impl LiveMap {
         trees: &Trees,
     ) -> Result<Self, StoreError> {
         let uid = map.uid;
-        let vectors = VectorFiles::open(descriptors.join(uid.simple().to_string()), map.dim)?;
+        let folder = descriptors.join(uid.simple().to_string());
+        let vectors = VectorFiles::open(folder.clone(), map.dim)?;
         let live = Self {
             map: RwLock::new(map),
             vectors: Arc::new(vectors),
             index: MapIndex::new(index),
+            graph_file: folder.join("graph"),
             entries: RwLock::default(),
             next_slot: AtomicUsize::new(0),
         };
+        live.restore_graph(index);
         for stored in trees.images_of(uid) {
             let stored = stored?;
             live.next_slot.fetch_max(stored.slot + 1, Ordering::Relaxed);
@@ -56,6 +62,48 @@ impl LiveMap {
             }
         }
         Ok(live)
+    }
+
+    /// Takes up the graph of an earlier process. One that is damaged or missing is built again in
+    /// the background, while the map is searched exactly.
+    fn restore_graph(&self, settings: IndexSettings) {
+        let bytes = match std::fs::read(&self.graph_file) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return,
+            Err(error) => {
+                tracing::warn!(file = %self.graph_file.display(), %error, "the graph cannot be read");
+                return;
+            }
+        };
+        match SealedGraph::from_bytes(&bytes) {
+            Ok(sealed) if sealed.dim() == self.vectors.dim() && sealed.fits(&settings) => {
+                // Its slots are never given to other images.
+                self.next_slot.fetch_max(sealed.end(), Ordering::Relaxed);
+                self.index.restore(sealed);
+            }
+            Ok(_) => tracing::info!(
+                file = %self.graph_file.display(),
+                "the graph was made with other settings; it is built again"
+            ),
+            Err(error) => {
+                tracing::warn!(file = %self.graph_file.display(), %error, "the graph is built again");
+            }
+        }
+    }
+
+    /// Writes a sealed graph where the next start finds it.
+    pub fn keep(&self, sealed: &SealedGraph) {
+        let beside = self.graph_file.with_extension("tmp");
+        let written = std::fs::File::create(&beside).and_then(|mut file| {
+            file.write_all(&sealed.to_bytes())?;
+            file.sync_all()?;
+            std::fs::rename(&beside, &self.graph_file)
+        });
+        if let Err(error) = written {
+            let _ = std::fs::remove_file(&beside);
+            // The next start builds it again.
+            tracing::warn!(file = %self.graph_file.display(), %error, "the graph cannot be kept");
+        }
     }
 
     pub fn map(&self) -> Map {

@@ -1,0 +1,140 @@
+//! DINOv2 from the bytes of a JPEG to the descriptor, against PyTorch, torchvision and transformers.
+//!
+//! The weights are seeded random numbers, made anew for each run: the real ones are hundreds of
+//! megabytes and prove nothing more about the arithmetic. `deploy/models/reference_dinov2.py` made
+//! the expected descriptors, in Python, from the same weights and the same pictures.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use serde::Deserialize;
+use tempfile::TempDir;
+use whereabouts::domain::DescriptorKind;
+use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits};
+
+/// The least cosine similarity to the descriptor of the original.
+const LEAST: f64 = 0.9999;
+
+#[derive(Deserialize)]
+struct Expected {
+    model: String,
+    seed: u32,
+    width: u32,
+    height: u32,
+    resize: String,
+    kind: DescriptorKind,
+    picture: String,
+    vector: Vec<f32>,
+}
+
+fn repository() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Makes the ONNX file and manifest of a model of random weights.
+fn export(model: &str, seed: u32, folder: &Path) {
+    let packages = std::fs::read_to_string(repository().join("assets/.python"))
+        .expect("run `make assets` first: it gets the Python packages that this needs");
+    let (python, packages) = packages.trim().split_once('\n').unwrap();
+    let output = Command::new(python)
+        .env("PYTHONPATH", packages)
+        .env("PYTHONDONTWRITEBYTECODE", "1")
+        .arg(repository().join("deploy/models/export_dinov2.py"))
+        .args([model, folder.to_str().unwrap(), "--position", "hub", "--random"])
+        .arg(seed.to_string())
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// The model with another input, as a folder of its own beside the shared ONNX file.
+fn with_input(root: &Path, exported: &Path, expected: &Expected) -> PathBuf {
+    let name = format!("{}-{}-{}", expected.width, expected.height, expected.resize);
+    let folder = root.join("models").join(&name);
+    if !folder.exists() {
+        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::hard_link(exported.join("model.onnx"), folder.join("model.onnx")).unwrap();
+        let text = std::fs::read_to_string(exported.join("manifest.toml")).unwrap();
+        let mut manifest: toml::Table = text.parse().unwrap();
+        let input = manifest["input"].as_table_mut().unwrap();
+        input.insert("width".into(), i64::from(expected.width).into());
+        input.insert("height".into(), i64::from(expected.height).into());
+        input.insert("resize".into(), expected.resize.clone().into());
+        std::fs::write(folder.join("manifest.toml"), manifest.to_string()).unwrap();
+    }
+    folder
+}
+
+/// Compares all that is expected of one model.
+fn check(model: &str) {
+    let fixtures = repository().join("tests/fixtures/dinov2");
+    let text = std::fs::read_to_string(fixtures.join("expected.json")).unwrap();
+    let mut expected: Vec<Expected> = serde_json::from_str(&text).unwrap();
+    expected.retain(|expected| expected.model == model);
+    assert!(!expected.is_empty());
+    let root = TempDir::new().unwrap();
+    let exported = root.path().join("exported");
+    export(model, expected[0].seed, &exported);
+    let mut by_input: BTreeMap<PathBuf, Vec<Expected>> = BTreeMap::new();
+    for expected in expected {
+        by_input.entry(with_input(root.path(), &exported, &expected)).or_default().push(expected);
+    }
+    let mut least = 1.0_f64;
+    for (folder, expected) in by_input {
+        let name = folder.file_name().unwrap().to_str().unwrap();
+        let limits = ImageLimits { max_pixels: 10_000_000 };
+        let settings =
+            ExtractorSettings { max_batch: 8, ..ExtractorSettings::plain(name, 2, limits) };
+        let extractor = Extractor::load(&Assets::locate(Some(root.path())), &settings).unwrap();
+        // Each twice at once: what shares a batch must not depend on it.
+        std::thread::scope(|scope| {
+            let running: Vec<_> = expected
+                .iter()
+                .flat_map(|expected| [expected, expected])
+                .map(|expected| {
+                    let (extractor, fixtures) = (&extractor, &fixtures);
+                    scope.spawn(move || {
+                        let picture = std::fs::read(fixtures.join(&expected.picture)).unwrap();
+                        let extraction = extractor.extract(&picture, expected.kind).unwrap();
+                        (cosine(extraction.descriptor.as_slice(), &expected.vector), expected)
+                    })
+                })
+                .collect();
+            for running in running {
+                let (similarity, expected) = running.join().unwrap();
+                assert!(
+                    similarity >= LEAST,
+                    "{model} {name} {} {}: cosine {similarity:.7}",
+                    expected.kind,
+                    expected.picture
+                );
+                least = least.min(similarity);
+            }
+        });
+    }
+    eprintln!("{model}: the least cosine to transformers is {least:.7}");
+}
+
+fn cosine(a: &[f32], b: &[f32]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    let dot = |a: &[f32], b: &[f32]| -> f64 {
+        a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+    };
+    dot(a, b) / (dot(a, a) * dot(b, b)).sqrt()
+}
+
+#[test]
+fn the_small_model_is_the_original() {
+    check("dinov2-small");
+}
+
+#[test]
+fn the_base_model_is_the_original() {
+    check("dinov2-base");
+}
+
+#[test]
+fn the_small_model_with_registers_is_the_original() {
+    check("dinov2-with-registers-small");
+}
