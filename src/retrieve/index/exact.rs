@@ -3,6 +3,8 @@
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
+use multiversion::multiversion;
+
 use super::Found;
 
 /// The `k` best of all that was offered.
@@ -60,6 +62,7 @@ impl PartialEq for WorstFirst {
 impl Eq for WorstFirst {}
 
 /// The dot product, in 16 running sums so that the compiler can keep them in vector registers.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
     const LANES: usize = 16;
     let mut sums = [0.0_f32; LANES];

@@ -12,6 +12,8 @@
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
+use multiversion::multiversion;
+
 use super::exact::Best;
 use super::graph::Linked;
 use super::{Found, IndexSettings, Vectors, exact};
@@ -81,6 +83,7 @@ fn code(vector: &[f32], into: &mut Vec<i8>) -> f32 {
     scale
 }
 
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2", "aarch64+neon"))]
 fn coded_dot(a: &[i8], b: &[i8]) -> i32 {
     a.iter().zip(b).map(|(&x, &y)| i32::from(x) * i32::from(y)).sum()
 }

@@ -1,0 +1,175 @@
+#!/usr/bin/env python3
+"""Write the descriptors that the tests expect of DINOv2, made with PyTorch. For developers.
+
+    pip install torch torchvision transformers numpy onnx
+    reference_dinov2.py tests/fixtures/dinov2
+
+Reads the pictures `*.jpg` in the folder and writes `expected.json` beside them. The weights are
+those of `export_dinov2.py --random`, put into transformers' own DINOv2; nothing of our graph, our
+decoder or our resizing is used. So a test is to export with `--position hub`, as that is how
+transformers treats the position embedding, and to read the same pictures.
+
+A picture is decoded by Pillow and scaled as 8-bit RGB with an antialiased bicubic filter, then
+normalised by ImageNet's mean and deviation:
+
+    squash        to width × height, whatever its shape (torchvision's `resize`)
+    centre_crop   the largest centred part of the shape width : height, whose edges need not fall
+                  on whole pixels, scaled to width × height (Pillow's `ImageOps.fit`). This is not
+                  torchvision's usual resize of the shorter edge followed by a crop, which rounds
+                  in between
+
+The descriptors, brought to unit length and rounded to six significant digits:
+
+    cls   the CLS token after the last normalisation
+    gem   for each channel, m = mean of x³ over the patch tokens, then sign(m) · |m|^(1/3)
+
+The committed file was made with torch 2.15.0, torchvision 0.29.2, transformers 5.23.0 and Pillow
+13.0.0, on x86_64; it takes about a minute on one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+import transformers
+from export_dinov2 import VARIANTS, Weights, random_weights, shapes
+from PIL import Image, ImageOps
+from torchvision.transforms import InterpolationMode
+from torchvision.transforms import functional as transforms
+
+SEED = 7
+MEAN = [0.485, 0.456, 0.406]
+STD = [0.229, 0.224, 0.225]
+SQUARE, LARGE, OBLONG = (224, 224), (322, 322), (322, 224)  # width, height
+
+# Model, picture, and the sizes and ways of resizing to try. A vector is 4 to 8 kB of JSON.
+CASES = [
+    ("dinov2-small", "town-a.jpg", SQUARE, "squash"),
+    ("dinov2-small", "town-a.jpg", SQUARE, "centre_crop"),
+    ("dinov2-small", "town-a.jpg", LARGE, "squash"),
+    ("dinov2-small", "town-a.jpg", LARGE, "centre_crop"),
+    ("dinov2-small", "town-a.jpg", OBLONG, "squash"),
+    ("dinov2-small", "town-a.jpg", OBLONG, "centre_crop"),
+    ("dinov2-small", "town-b.jpg", SQUARE, "squash"),
+    ("dinov2-small", "town-b.jpg", OBLONG, "centre_crop"),
+    ("dinov2-with-registers-small", "town-a.jpg", SQUARE, "squash"),
+    ("dinov2-with-registers-small", "town-b.jpg", OBLONG, "squash"),
+    ("dinov2-base", "town-b.jpg", SQUARE, "squash"),
+    ("dinov2-base", "town-b.jpg", LARGE, "squash"),
+    ("dinov2-base", "town-b.jpg", OBLONG, "centre_crop"),
+]
+
+# Where transformers 5 keeps a tensor of export_dinov2.py; {} is the number of the block.
+OUTSIDE = {
+    "cls": "embeddings.cls_token",
+    "positions": "embeddings.position_embeddings",
+    "registers": "embeddings.register_tokens",
+    "patch": "embeddings.patch_embeddings.projection",
+    "norm": "layernorm",
+}
+INSIDE = {
+    "query": "attention.q_proj",
+    "key": "attention.k_proj",
+    "value": "attention.v_proj",
+    "out": "attention.o_proj",
+    "fc1": "mlp.fc1",
+    "fc2": "mlp.fc2",
+    "gate": "mlp.gate_proj",
+    "up": "mlp.up_proj",
+    "down": "mlp.down_proj",
+    "norm1": "norm1",
+    "norm2": "norm2",
+    "scale1": "layer_scale1.lambda1",
+    "scale2": "layer_scale2.lambda1",
+}
+
+
+def their_name(name: str) -> str:
+    """What transformers calls a tensor of export_dinov2.py."""
+    first, *rest = name.split(".")
+    if not first.isdigit():
+        return ".".join([OUTSIDE[first], *rest])
+    return ".".join(["encoder.layer", first, INSIDE[rest[0]], *rest[1:]])
+
+
+def transformers_model(name: str, weights: Weights, depth: int | None = None) -> torch.nn.Module:
+    """The model of transformers with these weights; `depth` cuts it to its first blocks."""
+    variant = VARIANTS[name]
+    kind = "Dinov2WithRegisters" if variant.registers else "Dinov2"
+    settings = {
+        "hidden_size": variant.channels,
+        "num_hidden_layers": depth or variant.depth,
+        "num_attention_heads": variant.channels // 64,
+        "image_size": 518,
+        "patch_size": 14,
+        "use_swiglu_ffn": variant.swiglu,
+    }
+    if variant.registers:
+        settings["num_register_tokens"] = variant.registers
+    config = getattr(transformers, f"{kind}Config")(**settings)
+    model = getattr(transformers, f"{kind}Model")(config)
+    state = model.state_dict()
+    ours = {their_name(tensor): tensor for tensor in shapes(variant)}
+    for key in state:
+        if key != "embeddings.mask_token":  # for training only
+            state[key] = torch.from_numpy(np.array(weights(ours[key])))
+    model.load_state_dict(state)
+    return model.eval()
+
+
+def fit(picture: Image.Image, size: tuple[int, int], resize: str) -> torch.Tensor:
+    """The picture as the model takes it: 1 × 3 × height × width."""
+    width, height = size
+    if resize == "squash":
+        fitted = transforms.resize(picture, [height, width], InterpolationMode.BICUBIC)
+    else:
+        fitted = ImageOps.fit(picture, size, Image.Resampling.BICUBIC)
+    return transforms.normalize(transforms.to_tensor(fitted), MEAN, STD)[None]
+
+
+def descriptors(tokens: torch.Tensor, registers: int) -> dict[str, torch.Tensor]:
+    """Both descriptors [N, C] of tokens [N, 1 + registers + h·w, C]."""
+    mean = (tokens[:, 1 + registers :] ** 3).mean(dim=1)
+    gem = mean.sign() * mean.abs() ** (1 / 3)
+    return {
+        kind: torch.nn.functional.normalize(pooled)
+        for kind, pooled in (("cls", tokens[:, 0]), ("gem", gem))
+    }
+
+
+def main() -> None:
+    """Writes the file."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path, help="where the pictures are")
+    folder: Path = parser.parse_args().folder
+    torch.set_num_threads(1)
+
+    models: dict[str, torch.nn.Module] = {}
+    lines = []
+    for name, file, size, resize in CASES:
+        if name not in models:
+            models = {name: transformers_model(name, random_weights(VARIANTS[name], SEED))}
+        picture = Image.open(folder / file).convert("RGB")
+        with torch.inference_mode():
+            tokens = models[name](fit(picture, size, resize)).last_hidden_state
+        for kind, vector in descriptors(tokens, VARIANTS[name].registers).items():
+            entry = {
+                "model": name,
+                "seed": SEED,
+                "width": size[0],
+                "height": size[1],
+                "resize": resize,
+                "kind": kind,
+                "picture": file,
+                "vector": [float(f"{value:.6g}") for value in vector[0].tolist()],
+            }
+            lines.append(json.dumps(entry, separators=(",", ":")))
+    (folder / "expected.json").write_text("[\n" + ",\n".join(lines) + "\n]\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
