@@ -11,6 +11,7 @@ use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
 use crate::domain::{Precision, RefinerKind};
+use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
 use crate::retrieve::{Provider, Wanted};
 
@@ -83,7 +84,7 @@ pub struct Data {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Model {
-    /// The model's name.
+    /// The model's name, or "auto".
     pub name: String,
     /// Who runs it.
     pub provider: ProviderWish,
@@ -97,6 +98,16 @@ pub struct Model {
     pub threads: usize,
     /// The most pictures in one run.
     pub max_batch: usize,
+    /// Where `whereabouts model pull` downloads from.
+    pub hub: String,
+    /// The largest file it downloads, in bytes.
+    pub max_download_bytes: u64,
+    /// The longest time without a byte, in seconds.
+    pub download_stall_s: u64,
+    /// How often it asks while nothing comes of it.
+    pub download_attempts: u32,
+    /// The pause before the second attempt, in milliseconds; it doubles each time.
+    pub download_backoff_ms: u64,
 }
 
 /// Who is to run the model.
@@ -359,6 +370,8 @@ impl Config {
             ("data.commit_batch", self.data.commit_batch),
             ("model.sessions", self.model.sessions),
             ("model.max_batch", self.model.max_batch),
+            ("model.download_attempts", self.model.download_attempts as usize),
+            ("model.download_stall_s", self.model.download_stall_s as usize),
             ("image.queue", self.image.queue),
             ("index.m", self.index.m),
             ("index.ef_construction", self.index.ef_construction),
@@ -378,6 +391,9 @@ impl Config {
         if self.refine.candidates > self.localize.max_k {
             return Some("refine.candidates must not exceed localize.max_k".into());
         }
+        if !self.model.hub.starts_with("https://") && !self.model.hub.starts_with("http://") {
+            return Some("model.hub must begin with https:// or http://".into());
+        }
         if self.index.m > 256 {
             return Some("index.m must not exceed 256".into());
         }
@@ -394,6 +410,23 @@ impl Config {
             ));
         }
         None
+    }
+}
+
+impl Model {
+    /// The folder to look in before the usual places, if there is one.
+    pub fn assets(&self) -> Option<&Path> {
+        Some(self.assets.as_path()).filter(|path| *path != Path::new(""))
+    }
+
+    /// Bounds on a download.
+    pub fn download(&self) -> DownloadSettings {
+        DownloadSettings {
+            max_bytes: self.max_download_bytes,
+            stall: Duration::from_secs(self.download_stall_s),
+            attempts: self.download_attempts,
+            backoff: Duration::from_millis(self.download_backoff_ms),
+        }
     }
 }
 

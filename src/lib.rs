@@ -5,6 +5,7 @@
 //! | [`domain`] | the words: map, image, pose, descriptor, candidate, job; no I/O |
 //! | [`retrieve`] | the coarse retriever: decode, preprocess, inference, pooling, index |
 //! | [`refine`] | the vision-language refiner: compare, describe, rank; the worker |
+//! | [`models`] | installing models: catalogue, download, the folder of those installed |
 //! | [`store`] | what must outlive the process |
 //! | [`service`] | the use cases: the one meaning behind HTTP and the command line |
 //! | [`http`] | axum: extract, call the service, convert |
@@ -20,6 +21,7 @@ pub mod config;
 pub mod demo;
 pub mod domain;
 pub mod http;
+pub mod models;
 pub mod refine;
 pub mod retrieve;
 pub mod service;

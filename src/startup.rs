@@ -1,7 +1,6 @@
 //! The only place where everything is wired: build, serve, drain.
 
 use std::net::SocketAddr;
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -173,11 +172,12 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
 
 /// Loads the model, at the precision of `maps` if nothing else is asked for.
 fn load_model(config: &Config, maps: &[Map]) -> anyhow::Result<Extractor> {
-    let configured = Some(config.model.assets.as_path()).filter(|path| *path != Path::new(""));
+    let assets = Assets::locate(config.model.assets());
+    let (model, why) = assets.resolve(&config.model.name)?;
     let mut wanted = config.model.wanted();
     wanted.precision = wanted.precision.or(maps.first().map(|map| map.precision));
     let settings = ExtractorSettings {
-        model: config.model.name.clone(),
+        model,
         wanted,
         remember: Some(config.data.dir.join("inference.toml")),
         sessions: config.model.sessions,
@@ -185,13 +185,9 @@ fn load_model(config: &Config, maps: &[Map]) -> anyhow::Result<Extractor> {
         max_batch: config.model.max_batch,
         limits: ImageLimits { max_pixels: config.image.max_pixels },
     };
-    let extractor = Extractor::load(&Assets::locate(configured), &settings)?;
-    tracing::info!(
-        model = extractor.manifest().name,
-        digest = %extractor.digest(),
-        execution = %extractor.execution(),
-        "model loaded"
-    );
+    let extractor = Extractor::load(&assets, &settings)?;
+    let (model, digest) = (&extractor.manifest().name, extractor.digest());
+    tracing::info!(model, %why, %digest, execution = %extractor.execution(), "model loaded");
     Ok(extractor)
 }
 

@@ -7,6 +7,7 @@ mod healthcheck;
 mod index;
 mod jobs;
 mod localize;
+mod model;
 mod openapi;
 mod serve;
 
@@ -33,6 +34,8 @@ enum Command {
     Localize(localize::Args),
     /// List jobs on a server, or show one
     Jobs(jobs::Args),
+    /// Install models, check them, and choose the one to use
+    Model(model::Args),
     /// Build a town, index it, localize frames in it, and print what happened
     Demo(demo::Args),
     /// Print the settings in force, or every setting with its default
@@ -53,6 +56,7 @@ impl Cli {
             Command::Index(args) => block_on(index::run(args)),
             Command::Localize(args) => block_on(localize::run(args)),
             Command::Jobs(args) => block_on(jobs::run(args)),
+            Command::Model(args) => block_on(model::run(args)),
             Command::Demo(args) => block_on(demo::run(args)),
             Command::Config(args) => config::run(&args),
             Command::Openapi => openapi::run(),

@@ -246,8 +246,8 @@ fn checked_digest(file: &Path, manifest: &Manifest) -> Result<Digest, ExtractErr
     let digest = Digest::of(&bytes);
     match manifest.sha256 {
         Some(pinned) if pinned != digest => Err(ExtractError::ModelFile(format!(
-            "{} is {digest}, but its manifest pins {pinned}; remove the folder and run `make \
-             build` again",
+            "{} is {digest}, but its manifest pins {pinned}; `whereabouts model verify` says how \
+             to put it right",
             file.display()
         ))),
         _ => Ok(digest),

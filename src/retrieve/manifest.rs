@@ -2,12 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::domain::{DescriptorKind, Digest};
 
+/// The manifest's file name in a model's folder.
+pub const MANIFEST: &str = "manifest.toml";
+
 /// All that is needed to feed a model and to pool what comes out.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     /// The name by which maps refer to the model.
@@ -18,6 +21,7 @@ pub struct Manifest {
     /// The ONNX file, beside the manifest.
     pub file: PathBuf,
     /// The digest that the file must have, if pinned.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub sha256: Option<Digest>,
     /// The licence of the weights.
     pub licence: String,
@@ -32,7 +36,7 @@ pub struct Manifest {
 }
 
 /// The input tensor: N × 3 × height × width, RGB.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Input {
     /// Its name in the graph.
@@ -54,7 +58,7 @@ pub struct Input {
 }
 
 /// How a picture is fitted to the input.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Resize {
     /// Stretch to width × height.
@@ -67,7 +71,7 @@ pub enum Resize {
 }
 
 /// The resampling filter.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Interpolation {
     /// Keys' cubic convolution with a = −0.5, as Pillow and torchvision use when antialiasing.
@@ -77,7 +81,7 @@ pub enum Interpolation {
 }
 
 /// The output tensors.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Output {
     /// The name of the local features in the graph.
@@ -85,6 +89,7 @@ pub struct Output {
     /// How they are laid out.
     pub layout: Layout,
     /// The name of the N × 1 × h × w reliability map, if the model has one.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub reliability: Option<String>,
     /// Numbers for each local feature.
     pub channels: usize,
@@ -99,7 +104,7 @@ pub struct Output {
 }
 
 /// How local features are laid out.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Layout {
     /// N × channels × h × w.
@@ -109,7 +114,7 @@ pub enum Layout {
 }
 
 /// How local features become a descriptor.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Pooling {
     /// The exponent of the generalised mean.
@@ -124,7 +129,9 @@ pub struct Pooling {
 #[derive(Debug, thiserror::Error)]
 pub enum ManifestError {
     /// The file cannot be read.
-    #[error("cannot read {path}: {source}; `make build` puts the built-in model in place")]
+    #[error(
+        "cannot read the manifest {path}: {source}; `whereabouts model list` shows what is installed"
+    )]
     Read {
         /// The manifest.
         path: PathBuf,
@@ -163,10 +170,24 @@ impl Manifest {
             path: path.to_owned(),
             detail: error.to_string(),
         })?;
-        match manifest.contradiction() {
+        manifest.check(path)?;
+        Ok(manifest)
+    }
+
+    /// Checks that the numbers fit each other; `path` is for messages.
+    pub fn check(&self, path: &Path) -> Result<(), ManifestError> {
+        match self.contradiction() {
             Some(detail) => Err(ManifestError::Inconsistent { path: path.to_owned(), detail }),
-            None => Ok(manifest),
+            None => Ok(()),
         }
+    }
+
+    /// The text that [`Self::parse`] reads.
+    pub fn to_toml(&self) -> Result<String, ManifestError> {
+        toml::to_string(self).map_err(|error| ManifestError::Malformed {
+            path: self.name.clone().into(),
+            detail: error.to_string(),
+        })
     }
 
     /// Numbers in a descriptor of the given kind; `None` if the model cannot make one.

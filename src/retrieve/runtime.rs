@@ -1,11 +1,51 @@
 //! Where ONNX Runtime and the installed models are found.
 
+use std::collections::BTreeMap;
+use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use ort::environment::Environment;
 
+use super::manifest::MANIFEST;
 use super::provider::Provider;
+
+/// The name that stands for whichever model [`Assets::resolve`] finds.
+pub const AUTO: &str = "auto";
+
+/// The file in `models/` that names the model which `auto` stands for.
+pub const CHOSEN: &str = "chosen";
+
+/// What `auto` looks for before the built-in model. The smallest comes first: it answers a robot
+/// soonest, and whoever wants a larger one can choose it.
+pub const PREFERRED_MODELS: [&str; 3] = ["dinov2-small", "dinov2-base", "dinov2-large"];
+
+/// The model that `make build` installs.
+pub const BUILT_IN_MODEL: &str = "xfeat";
+
+/// Why a model is the one in use.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum WhyModel {
+    /// A setting or a flag names it.
+    Named,
+    /// This file, which `whereabouts model use` wrote, names it.
+    Chosen(PathBuf),
+    /// It is the first of [`PREFERRED_MODELS`] that is installed.
+    Preferred,
+    /// None of these is installed.
+    BuiltIn,
+}
+
+impl fmt::Display for WhyModel {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Named => f.write_str("model.name says so"),
+            Self::Chosen(file) => write!(f, "chosen in {}", file.display()),
+            Self::Preferred => f.write_str("the first DINOv2 that is installed"),
+            Self::BuiltIn => f.write_str("built in; no DINOv2 is installed"),
+        }
+    }
+}
 
 /// The folder that `make build` fills: `onnxruntime/` and `models/`.
 #[derive(Debug, Clone)]
@@ -36,12 +76,26 @@ pub enum RuntimeError {
         reason: String,
     },
     /// No such model is installed.
-    #[error("the model {name:?} is not installed ({looked}); `make build` installs \"xfeat\"")]
+    #[error(
+        "the model {name:?} is not installed ({looked}); `whereabouts model list` shows what can \
+         be pulled, and `make build` installs \"xfeat\""
+    )]
     NoModel {
         /// The model.
         name: String,
         /// The places that were looked at.
         looked: String,
+    },
+    /// The model that was chosen is gone.
+    #[error(
+        "{file} names the model {name:?}, which is not installed; install it again, or run \
+         `whereabouts model use auto`"
+    )]
+    ChosenIsGone {
+        /// The model.
+        name: String,
+        /// The file that names it.
+        file: PathBuf,
     },
 }
 
@@ -62,8 +116,55 @@ impl Assets {
         let folders = self.candidates.iter().map(|folder| folder.join("models").join(name));
         folders
             .into_iter()
-            .find(|folder| plain && folder.join("manifest.toml").is_file())
+            .find(|folder| plain && folder.join(MANIFEST).is_file())
             .ok_or_else(|| RuntimeError::NoModel { name: name.to_owned(), looked: self.looked() })
+    }
+
+    /// The model that `name` stands for: itself, or for [`AUTO`] the one that was chosen, the
+    /// first of [`PREFERRED_MODELS`] that is installed, or the built-in one.
+    pub fn resolve(&self, name: &str) -> Result<(String, WhyModel), RuntimeError> {
+        if name != AUTO {
+            return Ok((name.to_owned(), WhyModel::Named));
+        }
+        if let Some((file, name)) = self.chosen() {
+            return match self.model(&name) {
+                Ok(_) => Ok((name, WhyModel::Chosen(file))),
+                Err(_) => Err(RuntimeError::ChosenIsGone { name, file }),
+            };
+        }
+        let preferred = PREFERRED_MODELS.into_iter().find(|name| self.model(name).is_ok());
+        Ok(match preferred {
+            Some(name) => (name.to_owned(), WhyModel::Preferred),
+            None => (BUILT_IN_MODEL.to_owned(), WhyModel::BuiltIn),
+        })
+    }
+
+    /// The file that chooses a model, and the model's name.
+    pub fn chosen(&self) -> Option<(PathBuf, String)> {
+        self.candidates.iter().find_map(|folder| {
+            let file = folder.join("models").join(CHOSEN);
+            let name = std::fs::read_to_string(&file).ok()?.trim().to_owned();
+            Some((file, name))
+        })
+    }
+
+    /// Every installed model with its folder, by name.
+    pub fn installed(&self) -> BTreeMap<String, PathBuf> {
+        let entries = self
+            .candidates
+            .iter()
+            .rev()
+            .filter_map(|folder| std::fs::read_dir(folder.join("models")).ok());
+        let folders = entries.flatten().flatten().map(|entry| entry.path());
+        folders
+            .filter(|folder| folder.join(MANIFEST).is_file())
+            .filter_map(|folder| Some((folder.file_name()?.to_str()?.to_owned(), folder)))
+            .collect()
+    }
+
+    /// The places where models are looked for, the first of which wins.
+    pub fn candidates(&self) -> &[PathBuf] {
+        &self.candidates
     }
 
     /// Loads ONNX Runtime: `ORT_DYLIB_PATH` if set, else the library among the assets; the one with
@@ -113,5 +214,56 @@ impl Assets {
         let places: Vec<_> =
             self.candidates.iter().map(|path| path.display().to_string()).collect();
         format!("looked in {}", places.join(", "))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    /// Assets of their own, without the checkout's.
+    fn assets(models: &[&str]) -> (tempfile::TempDir, Assets) {
+        let dir = tempfile::tempdir().unwrap();
+        for model in models {
+            let folder = dir.path().join("models").join(model);
+            fs::create_dir_all(&folder).unwrap();
+            fs::write(folder.join(MANIFEST), "").unwrap();
+        }
+        let assets = Assets { candidates: vec![dir.path().to_owned()] };
+        (dir, assets)
+    }
+
+    #[test]
+    fn auto_is_the_fastest_dinov2_else_the_built_in_model() {
+        for (installed, expected, why) in [
+            (&["xfeat"][..], "xfeat", WhyModel::BuiltIn),
+            (&["xfeat", "dinov2-large"], "dinov2-large", WhyModel::Preferred),
+            (&["xfeat", "dinov2-base", "dinov2-small"], "dinov2-small", WhyModel::Preferred),
+        ] {
+            let (_dir, assets) = assets(installed);
+            assert_eq!(assets.resolve(AUTO).unwrap(), (expected.to_owned(), why));
+        }
+    }
+
+    #[test]
+    fn a_choice_goes_over_the_order_and_a_name_over_the_choice() {
+        let (dir, assets) = assets(&["xfeat", "dinov2-small"]);
+        let chosen = dir.path().join("models").join(CHOSEN);
+        fs::write(&chosen, "xfeat\n").unwrap();
+        let choice = ("xfeat".to_owned(), WhyModel::Chosen(chosen));
+        assert_eq!(assets.resolve(AUTO).unwrap(), choice);
+        let named = ("dinov2-small".to_owned(), WhyModel::Named);
+        assert_eq!(assets.resolve("dinov2-small").unwrap(), named);
+        assert_eq!(assets.installed().len(), 2);
+    }
+
+    #[test]
+    fn a_choice_that_is_gone_is_an_error_and_not_another_model() {
+        let (dir, assets) = assets(&["xfeat"]);
+        fs::write(dir.path().join("models").join(CHOSEN), "gone").unwrap();
+        let error = assets.resolve(AUTO).unwrap_err().to_string();
+        assert!(error.contains("\"gone\"") && error.contains("model use auto"), "{error}");
     }
 }

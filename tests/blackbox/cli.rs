@@ -101,7 +101,7 @@ fn wrong_usage_is_2_and_every_command_explains_itself() {
     assert_eq!(whereabouts(&["serve", "--no-such-flag"]).status.code(), Some(2));
     assert_eq!(whereabouts(&[]).status.code(), Some(2));
     for command in
-        ["serve", "index", "localize", "jobs", "demo", "config", "openapi", "healthcheck"]
+        ["serve", "index", "localize", "jobs", "model", "demo", "config", "openapi", "healthcheck"]
     {
         let output = whereabouts(&[command, "--help"]);
         assert_eq!(output.status.code(), Some(0), "{command}");
@@ -136,7 +136,8 @@ fn what_is_missing_at_the_start_is_said_with_what_to_do() {
 fn the_demo_runs_and_refinement_helps() {
     let dir = TempDir::new().unwrap();
     let out = dir.path().join("out");
-    let args = ["demo", "--places", "24", "--out", out.to_str().unwrap(), "--json"];
+    let out_text = out.to_str().unwrap();
+    let args = ["demo", "--places", "24", "--model", "xfeat", "--out", out_text, "--json"];
     let outcome = json(&whereabouts(&args));
     assert_eq!(outcome["queries"], 24);
     let recall = |when: &str| outcome["recall_at_1"][when].as_f64().unwrap();

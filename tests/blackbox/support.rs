@@ -46,6 +46,8 @@ impl Server {
             .arg(&address_file)
             .env("WHEREABOUTS_LOG__FORMAT", "json")
             .env("WHEREABOUTS_MODEL__THREADS", "1")
+            // Whatever else is installed in the checkout.
+            .env("WHEREABOUTS_MODEL__NAME", "xfeat")
             .envs(settings.iter().copied())
             .stderr(Stdio::piped())
             .spawn()

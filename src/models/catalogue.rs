@@ -1,0 +1,157 @@
+//! The models that can be pulled by name.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use crate::retrieve::{Manifest, ManifestError};
+
+const BUILT_IN: &str = include_str!("../../deploy/models/catalogue.toml");
+
+/// What can be pulled.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Catalogue {
+    #[serde(rename = "model", default)]
+    entries: Vec<Entry>,
+}
+
+/// One model on the hub.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Entry {
+    /// The repository on the hub, as `owner/name`.
+    pub repository: String,
+    /// A commit, branch or tag of the repository.
+    pub revision: String,
+    /// The ONNX file in the repository.
+    pub path: String,
+    /// Its size, if known.
+    pub bytes: Option<u64>,
+    /// What is to be said about the licence beyond its name.
+    pub licence_note: Option<String>,
+    /// What is installed beside the file; its `sha256` is the pin, if there is one.
+    pub manifest: Manifest,
+}
+
+/// Why a catalogue cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum CatalogueError {
+    /// The file cannot be read.
+    #[error("cannot read the catalogue {path}: {source}")]
+    Read {
+        /// The catalogue.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file is not a catalogue.
+    #[error("{path} is not a catalogue of models: {detail}")]
+    Malformed {
+        /// The catalogue.
+        path: PathBuf,
+        /// What the reader said.
+        detail: String,
+    },
+    /// The manifest of an entry is wrong.
+    #[error("in the catalogue, {0}")]
+    Manifest(#[from] ManifestError),
+}
+
+impl Catalogue {
+    /// The catalogue of this release.
+    pub fn built_in() -> Result<Self, CatalogueError> {
+        Self::parse(BUILT_IN, Path::new("deploy/models/catalogue.toml"))
+    }
+
+    /// Reads another catalogue.
+    pub fn read(path: &Path) -> Result<Self, CatalogueError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| CatalogueError::Read { path: path.to_owned(), source })?;
+        Self::parse(&text, path)
+    }
+
+    fn parse(text: &str, path: &Path) -> Result<Self, CatalogueError> {
+        let catalogue: Self = toml::from_str(text).map_err(|error| CatalogueError::Malformed {
+            path: path.to_owned(),
+            detail: error.to_string(),
+        })?;
+        for entry in &catalogue.entries {
+            entry.manifest.check(Path::new(entry.name()))?;
+        }
+        Ok(catalogue)
+    }
+
+    /// All entries, in the order of the file.
+    pub fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// The model called `name`.
+    pub fn find(&self, name: &str) -> Option<&Entry> {
+        self.entries.iter().find(|entry| entry.name() == name)
+    }
+}
+
+impl Entry {
+    /// The model's name.
+    pub fn name(&self) -> &str {
+        &self.manifest.name
+    }
+
+    /// Where the file is on `hub`.
+    pub fn address(&self, hub: &str) -> String {
+        let Self { repository, revision, path, .. } = self;
+        format!("{}/{repository}/resolve/{revision}/{path}", hub.trim_end_matches('/'))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::DescriptorKind;
+    use crate::retrieve::PREFERRED_MODELS;
+
+    #[test]
+    fn every_entry_is_consistent_and_says_its_licence() {
+        let catalogue = Catalogue::built_in().unwrap();
+        for entry in catalogue.entries() {
+            let manifest = &entry.manifest;
+            assert_eq!(manifest.licence, "Apache-2.0", "{}", entry.name());
+            assert_eq!(manifest.dimension(DescriptorKind::Cls), Some(manifest.output.channels));
+            let named = |other: &&Entry| other.name() == entry.name();
+            assert_eq!(catalogue.entries().iter().filter(named).count(), 1);
+            assert!(entry.revision != "main" || manifest.sha256.is_none(), "a branch moves");
+        }
+    }
+
+    #[test]
+    fn every_model_that_auto_prefers_can_be_pulled() {
+        let catalogue = Catalogue::built_in().unwrap();
+        for name in PREFERRED_MODELS {
+            assert!(catalogue.find(name).is_some(), "{name}");
+        }
+        let dimensions = PREFERRED_MODELS
+            .map(|name| catalogue.find(name).unwrap().manifest.dimension(DescriptorKind::Gem));
+        assert_eq!(dimensions, [Some(384), Some(768), Some(1024)]);
+    }
+
+    #[test]
+    fn an_address_is_on_the_hub_that_is_set() {
+        let catalogue = Catalogue::built_in().unwrap();
+        let large = catalogue.find("dinov2-large").unwrap();
+        assert_eq!(
+            large.address("https://mirror.example/hub/"),
+            "https://mirror.example/hub/onnx-community/dinov2-large/resolve/main/onnx/model.onnx"
+        );
+    }
+
+    #[test]
+    fn an_installed_manifest_reads_back_the_same() {
+        for entry in Catalogue::built_in().unwrap().entries() {
+            let text = toml::to_string(&entry.manifest).unwrap();
+            let read = Manifest::parse(&text, Path::new("manifest.toml")).unwrap();
+            assert_eq!(format!("{read:?}"), format!("{:?}", entry.manifest));
+        }
+    }
+}

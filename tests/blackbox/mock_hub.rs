@@ -1,0 +1,182 @@
+//! A model hub with one file, on a free port, that misbehaves as it is told.
+
+use std::collections::VecDeque;
+use std::io;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use axum::Router;
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::http::header::{CONTENT_LENGTH, CONTENT_RANGE, ETAG, IF_RANGE, RANGE};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::Response;
+use bytes::Bytes;
+use futures_util::{Stream, StreamExt, stream};
+use tokio::net::TcpListener;
+
+/// What goes wrong with one request.
+#[derive(Debug, Clone, Copy)]
+pub enum Trouble {
+    None,
+    /// The connection breaks after so many bytes of the body.
+    CutAfter(usize),
+    /// No more bytes come after so many, but the connection stays.
+    StallAfter(usize),
+    /// No answer comes.
+    Hang,
+    /// One byte is another one.
+    Corrupt,
+    /// This answer instead.
+    Status(u16),
+    /// The whole file, whatever was asked for.
+    IgnoreRange,
+    /// The body's length is not told.
+    NoLength,
+    /// From this request on, the file is another one.
+    Change,
+}
+
+/// A running hub.
+pub struct Hub {
+    pub url: String,
+    shared: Arc<Mutex<Shared>>,
+}
+
+struct Shared {
+    file: Bytes,
+    version: u32,
+    troubles: VecDeque<Trouble>,
+    asked: Vec<String>,
+    ranges: Vec<Option<String>>,
+    sent: u64,
+}
+
+impl Hub {
+    /// Serves `file` under every path; the first requests meet `troubles`, one each.
+    pub async fn start(file: Vec<u8>, troubles: &[Trouble]) -> Self {
+        let shared = Arc::new(Mutex::new(Shared {
+            file: file.into(),
+            version: 1,
+            troubles: troubles.iter().copied().collect(),
+            asked: Vec::new(),
+            ranges: Vec::new(),
+            sent: 0,
+        }));
+        let router = Router::new().fallback(answer).with_state(Arc::clone(&shared));
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let url = format!("http://{}", listener.local_addr().unwrap());
+        tokio::spawn(async move { axum::serve(listener, router).await });
+        Self { url, shared }
+    }
+
+    /// The paths that were asked for.
+    pub fn asked(&self) -> Vec<String> {
+        self.shared.lock().unwrap().asked.clone()
+    }
+
+    /// The `Range` of each request.
+    pub fn ranges(&self) -> Vec<Option<String>> {
+        self.shared.lock().unwrap().ranges.clone()
+    }
+
+    /// Bytes of bodies that were sent.
+    pub fn sent(&self) -> u64 {
+        self.shared.lock().unwrap().sent
+    }
+
+    /// The file as it is now.
+    pub fn file(&self) -> Bytes {
+        self.shared.lock().unwrap().file.clone()
+    }
+}
+
+async fn answer(State(shared): State<Arc<Mutex<Shared>>>, request: Request) -> Response {
+    let (trouble, file, etag) = {
+        let mut shared = shared.lock().unwrap();
+        let trouble = shared.troubles.pop_front().unwrap_or(Trouble::None);
+        shared.asked.push(request.uri().path().to_owned());
+        shared.ranges.push(text(request.headers(), RANGE.as_str()));
+        if let Trouble::Change = trouble {
+            shared.file = shared.file.iter().rev().copied().collect();
+            shared.version += 1;
+        }
+        (trouble, shared.file.clone(), format!("\"{}\"", shared.version))
+    };
+    let whole = file.len();
+    let from = match trouble {
+        Trouble::IgnoreRange => 0,
+        _ => asked_from(request.headers(), &etag),
+    };
+    let mut body = file.slice(from..);
+    let response = Response::builder().header(ETAG, &etag);
+    match trouble {
+        Trouble::Status(status) => {
+            return response.status(status).body(Body::from("trouble")).unwrap();
+        }
+        Trouble::Hang => tokio::time::sleep(Duration::from_secs(60)).await,
+        Trouble::Corrupt => {
+            let mut bytes = body.to_vec();
+            bytes[whole / 2] ^= 1;
+            body = bytes.into();
+        }
+        _ => {}
+    }
+    let mut response = match from {
+        0 => response.status(StatusCode::OK),
+        _ => response
+            .status(StatusCode::PARTIAL_CONTENT)
+            .header(CONTENT_RANGE, format!("bytes {from}-{}/{whole}", whole - 1)),
+    };
+    if !matches!(trouble, Trouble::NoLength) {
+        response = response.header(CONTENT_LENGTH, body.len());
+    }
+    response.body(Body::from_stream(sent_in_parts(body, trouble, shared))).unwrap()
+}
+
+/// Where a range begins; a tag that is out of date asks for everything.
+fn asked_from(headers: &HeaderMap, etag: &str) -> usize {
+    let current = text(headers, IF_RANGE.as_str()).is_none_or(|asked| asked == etag);
+    let range = text(headers, RANGE.as_str()).filter(|_| current);
+    range.map_or(0, |range| {
+        range.strip_prefix("bytes=").unwrap().strip_suffix('-').unwrap().parse().unwrap()
+    })
+}
+
+/// The body in parts, so that what went over the line before the trouble has arrived.
+fn sent_in_parts(
+    body: Bytes,
+    trouble: Trouble,
+    shared: Arc<Mutex<Shared>>,
+) -> impl Stream<Item = io::Result<Bytes>> {
+    let good = match trouble {
+        Trouble::CutAfter(bytes) | Trouble::StallAfter(bytes) => bytes.min(body.len()),
+        _ => body.len(),
+    };
+    let parts: Vec<Bytes> = body[..good].chunks(1_000).map(Bytes::copy_from_slice).collect();
+    let parts = stream::iter(parts).then(move |part| {
+        shared.lock().unwrap().sent += part.len() as u64;
+        async move {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+            Ok(part)
+        }
+    });
+    let end = stream::once(async move {
+        match trouble {
+            Trouble::CutAfter(_) => {
+                tokio::time::sleep(Duration::from_millis(50)).await;
+                Some(Err(io::Error::other("cut")))
+            }
+            Trouble::StallAfter(_) => {
+                tokio::time::sleep(Duration::from_secs(60)).await;
+                None
+            }
+            _ => None,
+        }
+    });
+    parts.chain(end.filter_map(std::future::ready)).map(|item: Result<_, io::Error>| item)
+}
+
+fn text(headers: &HeaderMap, name: &str) -> Option<String> {
+    headers.get(name).map(|value| value.to_str().unwrap().to_owned())
+}
