@@ -17,8 +17,8 @@ use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits};
 ///
 /// town-b.jpg stores colour at half the resolution. zune-jpeg rounds otherwise than libjpeg when it
 /// scales that up (0.2 of 255 levels on average), and weights that have seen no picture are
-/// sensitive to it. As PNG, it passes at 0.9999 too.
-const LEAST: [(&str, f64); 2] = [("town-a.jpg", 0.9999), ("town-b.jpg", 0.9997)];
+/// sensitive to it. Made into a PNG by libjpeg, it passes at 0.9999 too.
+const LEAST: [(&str, f64); 2] = [("town-a.jpg", 0.9999), ("town-b.jpg", 0.999)];
 
 #[derive(Deserialize)]
 struct Expected {
@@ -84,8 +84,8 @@ fn check(model: &str) {
     for expected in expected {
         by_input.entry(with_input(root.path(), &exported, &expected)).or_default().push(expected);
     }
-    let mut least = 1.0_f64;
-    for (folder, expected) in by_input {
+    let mut least = BTreeMap::new();
+    for (folder, expected) in &by_input {
         let name = folder.file_name().unwrap().to_str().unwrap();
         let limits = ImageLimits { max_pixels: 10_000_000 };
         let settings =
@@ -114,11 +114,12 @@ fn check(model: &str) {
                     expected.kind,
                     expected.picture
                 );
-                least = least.min(similarity);
+                let least = least.entry(&expected.picture).or_insert(similarity);
+                *least = similarity.min(*least);
             }
         });
     }
-    eprintln!("{model}: the least cosine to transformers is {least:.7}");
+    eprintln!("{model}: the least cosines to transformers are {least:.6?}");
 }
 
 fn cosine(a: &[f32], b: &[f32]) -> f64 {
