@@ -223,20 +223,25 @@ fn try_one(
     execution: Execution,
     sample: &[Tensor],
 ) -> Result<Tried, InferenceError> {
-    const RUNS: usize = 11;
+    /// A large model on a small machine shows what it does in fewer.
+    const RUNS: std::ops::RangeInclusive<usize> = 3..=11;
+    const LONG_ENOUGH: Duration = Duration::from_millis(500);
     let mut runner = model.load(execution)?;
     let mut descriptors = Vec::with_capacity(sample.len());
     for tensor in sample {
         descriptors.push(descriptor(manifest, tensor, &mut runner)?);
     }
-    let mut times = Vec::with_capacity(RUNS);
-    for tensor in sample.iter().cycle().take(RUNS) {
+    let mut times: Vec<Duration> = Vec::with_capacity(*RUNS.end());
+    for tensor in sample.iter().cycle().take(*RUNS.end()) {
+        if times.len() >= *RUNS.start() && times.iter().sum::<Duration>() > LONG_ENOUGH {
+            break;
+        }
         let start = Instant::now();
         runner.run(std::slice::from_ref(tensor))?;
         times.push(start.elapsed());
     }
     times.sort();
-    Ok(Tried { latency: times.get(RUNS / 2).copied().unwrap_or_default(), descriptors })
+    Ok(Tried { latency: times.get(times.len() / 2).copied().unwrap_or_default(), descriptors })
 }
 
 fn descriptor(

@@ -66,14 +66,19 @@ impl Eq for WorstFirst {}
 pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
     const LANES: usize = 16;
     let mut sums = [0.0_f32; LANES];
-    let (a_chunks, b_chunks) = (a.chunks_exact(LANES), b.chunks_exact(LANES));
-    let rest: f32 = a_chunks.remainder().iter().zip(b_chunks.remainder()).map(|(x, y)| x * y).sum();
-    for (x, y) in a_chunks.zip(b_chunks) {
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    // Indices, because adapters of iterators are not always compiled into their caller.
+    for chunk in 0..a.len().min(b.len()) {
+        let (x, y) = (&a[chunk], &b[chunk]);
         for lane in 0..LANES {
             sums[lane] += x[lane] * y[lane];
         }
     }
-    sums.iter().sum::<f32>() + rest
+    let mut sum: f32 = sums.iter().sum();
+    for index in 0..a_rest.len().min(b_rest.len()) {
+        sum += a_rest[index] * b_rest[index];
+    }
+    sum
 }
 
 #[cfg(test)]
