@@ -85,18 +85,12 @@ fn code(vector: &[f32], into: &mut Vec<i8>) -> f32 {
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2", "aarch64+neon"))]
 fn coded_dot(a: &[i8], b: &[i8]) -> i32 {
-    const LANES: usize = 32;
-    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    let length = a.len().min(b.len());
+    let (a, b) = (&a[..length], &b[..length]);
     let mut sum = 0;
     // Indices, because adapters of iterators are not always compiled into their caller.
-    for chunk in 0..a.len().min(b.len()) {
-        let (x, y) = (&a[chunk], &b[chunk]);
-        for lane in 0..LANES {
-            sum += i32::from(x[lane]) * i32::from(y[lane]);
-        }
-    }
-    for index in 0..a_rest.len().min(b_rest.len()) {
-        sum += i32::from(a_rest[index]) * i32::from(b_rest[index]);
+    for index in 0..length {
+        sum += i32::from(a[index]) * i32::from(b[index]);
     }
     sum
 }
