@@ -6,7 +6,8 @@
 
 Both get the same seeded weights and the same pictures, those in the folder and their reflections.
 For `--position original` transformers' treatment of the position embedding is replaced by that of
-the authors' code, written again here. The large and the giant variant are cut to one block. Fails if a descriptor's cosine with transformers' is below 0.99999, or a position embedding changes at
+the authors' code, written again here. The large and the giant variant are cut to one block. Fails
+if a descriptor's cosine with transformers' is below 0.99999, or a position embedding changes at
 518×518.
 
 What it printed, in several runs, with torch 2.15.0, transformers 5.23.0, onnxruntime 1.24.4 and
