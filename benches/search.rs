@@ -1,5 +1,5 @@
-//! Search among clustered unit vectors of 384 dimensions, one thread: queries a second at equal
-//! recall, against exact search in this process and against hnswlib on the same vectors.
+//! Search among clustered unit vectors of 384 dimensions, one thread: recall and queries a second,
+//! against exact search in this process and against hnswlib on the same vectors.
 //!
 //! 76,000 vectors, as many as Tokyo 24/7 has images, or as many as the first argument says:
 //! `cargo bench --bench search -- 20000`.
@@ -128,13 +128,13 @@ fn main() -> anyhow::Result<()> {
     }
     match hnswlib(&rows, &queries, &truth) {
         Ok(theirs) => {
-            for wanted in [0.95, 0.99, 0.995] {
-                if let (Some(ours), Some(theirs)) = (at(&ours, wanted), at(&theirs, wanted)) {
-                    println!(
-                        "at recall@10 {wanted}: {ours:.0} queries/s, hnswlib {theirs:.0}: {:.2} ×",
-                        ours / theirs
-                    );
-                }
+            for ((ef, ours), theirs) in EFS.iter().zip(&ours).zip(&theirs) {
+                println!(
+                    "ef {ef:3}: {:.2} × hnswlib, at recall@10 {:.4} against {:.4}",
+                    ours.1 / theirs.1,
+                    ours.0,
+                    theirs.0
+                );
             }
         }
         Err(error) => println!("hnswlib was not run: {error:#}"),
@@ -152,15 +152,6 @@ fn recall(found: &[Vec<usize>], truth: &[Vec<usize>]) -> f64 {
         .zip(truth)
         .map(|(found, truth)| found.iter().filter(|slot| truth.contains(slot)).count());
     hits.sum::<usize>() as f64 / (K * truth.len()) as f64
-}
-
-/// Queries a second at a recall, between the two measurements around it.
-fn at(measured: &[(f64, f64)], wanted: f64) -> Option<f64> {
-    measured.windows(2).find_map(|pair| {
-        let [(low, fast), (high, slow)] = [pair[0], pair[1]];
-        (low <= wanted && wanted <= high && high > low)
-            .then(|| fast + (slow - fast) * (wanted - low) / (high - low))
-    })
 }
 
 /// Recall and queries a second of hnswlib for each of [`EFS`].

@@ -26,7 +26,7 @@ async fn until(reached: impl Fn() -> bool) {
             tokio::task::yield_now().await;
         }
     };
-    tokio::time::timeout(Duration::from_secs(30), come).await.expect("the mock never came so far");
+    tokio::time::timeout(Duration::from_secs(120), come).await.expect("the mock never came so far");
 }
 
 async fn refine(server: &Server, place: usize) -> Value {

@@ -111,13 +111,20 @@ impl Trees {
         for key in self.queue.iter().keys() {
             let key = key.map_err(failed)?;
             waiting += 1;
-            let job = queued_job(&key);
-            if let Some(mut record) = job.map(|id| self.job(id)).transpose()?.flatten()
-                && record.job.state == JobState::Running
-            {
+            // Before there were priorities, a job's place was its id.
+            let before = Uuid::from_slice(&key).ok();
+            let job = before.or_else(|| queued_job(&key));
+            let Some(mut record) = job.map(|id| self.job(id)).transpose()?.flatten() else {
+                continue;
+            };
+            if record.job.state == JobState::Running {
                 record.job.state = JobState::Queued;
                 put(&self.jobs, record.job.id.as_bytes(), &record)?;
                 put(&self.queue, &key, &Lease::None)?;
+            }
+            if before.is_some() {
+                put(&self.queue, &queue_key(&record.job), &Lease::None)?;
+                self.queue.remove(&key).map_err(failed)?;
             }
         }
         self.flush()?;
@@ -197,5 +204,41 @@ pub(super) fn transaction_failed(error: sled::transaction::TransactionError<()>)
             StoreError::Failed("a transaction was given up".into())
         }
         sled::transaction::TransactionError::Storage(error) => failed(error),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+
+    use super::*;
+    use crate::domain::{MediaType, RefinerKind};
+    use crate::store::Query;
+
+    #[test]
+    fn a_job_that_was_queued_before_there_were_priorities_keeps_its_place() {
+        let dir = tempfile::tempdir().unwrap();
+        let trees = Trees::open(dir.path(), 1 << 20).unwrap();
+        let (now, query) = (Timestamp::now(), Uuid::now_v7());
+        let mut job = Job::queued("m".parse().unwrap(), query, RefinerKind::Local, now);
+        job.state = JobState::Running;
+        let digest = Digest::of(b"frame");
+        let query = Query {
+            id: query,
+            digest,
+            media_type: MediaType::Jpeg,
+            created_at: now,
+            descriptor: None,
+        };
+        let record =
+            JobRecord { job: job.clone(), map_uid: Uuid::nil(), query, candidates: vec![] };
+        put(&trees.jobs, job.id.as_bytes(), &record).unwrap();
+        put(&trees.queue, job.id.as_bytes(), &Some(now)).unwrap();
+        for _ in 0..2 {
+            assert_eq!(trees.requeue_claimed().unwrap(), 1);
+            let keys: Vec<_> = trees.queue.iter().keys().map(Result::unwrap).collect();
+            assert_eq!(keys, [queue_key(&job)]);
+            assert_eq!(trees.job(job.id).unwrap().unwrap().job.state, JobState::Queued);
+        }
     }
 }
