@@ -6,14 +6,13 @@ use std::time::Duration;
 
 use anyhow::Context;
 use jiff::Timestamp;
-use jiff::tz::TimeZone;
 use tokio::net::TcpListener;
 use tokio::runtime::Handle;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::{Config, Refiner as ConfiguredRefiner};
-use crate::domain::Map;
+use crate::domain::{Map, utc_day};
 use crate::http::{AppState, HttpSettings, router};
 use crate::refine::local::{LocalMatcher, LocalSettings};
 use crate::refine::mllm::{MllmParts, MllmRefiner};
@@ -127,7 +126,7 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
             };
             let refiner = MllmRefiner::new(parts, config.mllm.clone())?;
             // Nobody else spends before the workers start.
-            let today = Timestamp::now().to_zoned(TimeZone::UTC).date();
+            let today = utc_day(Timestamp::now());
             refiner.seed_spent_today(&Handle::current().block_on(store.usage(today))?);
             Some(Arc::new(refiner))
         }

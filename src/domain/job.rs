@@ -6,6 +6,7 @@ use std::str::FromStr;
 
 use jiff::Timestamp;
 use jiff::civil::Date;
+use jiff::tz::TimeZone;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
@@ -136,6 +137,11 @@ impl AddAssign for Usage {
     fn add_assign(&mut self, other: Self) {
         *self = *self + other;
     }
+}
+
+/// The day that a moment falls on, in UTC: the days of budgets and accounts.
+pub fn utc_day(at: Timestamp) -> Date {
+    at.to_zoned(TimeZone::UTC).date()
 }
 
 /// What refining in one map cost on one day.

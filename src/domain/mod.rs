@@ -15,9 +15,11 @@ mod pose;
 pub use self::image::{Image, ImageId, MediaType};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
 pub use dense::DenseFeatures;
-pub use descriptor::{Descriptor, DescriptorError};
+pub use descriptor::{Descriptor, DescriptorError, dot};
 pub use digest::Digest;
-pub use job::{DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage};
+pub use job::{
+    DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage, utc_day,
+};
 pub use map::{DescriptorKind, Frame, Map, MapName, Precision, Scene};
 pub use pose::{GeographicPose, MetricPose, Pose, PoseError};
 

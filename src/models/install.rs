@@ -1,16 +1,14 @@
 //! The folder `ASSETS/models`: putting models there, and checking those that are there.
 
 use std::fs::{self, File, TryLockError};
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
-
-use sha2::{Digest as _, Sha256};
 
 use super::catalogue::Entry;
 use super::download::{Download, DownloadError, DownloadSettings, Progress};
 use super::partial::remove_if_there;
 use crate::domain::Digest;
-use crate::retrieve::{AUTO, CHOSEN, MANIFEST, Manifest, ManifestError};
+use crate::retrieve::{AUTO, CHOSEN, MANIFEST, Manifest, ManifestError, file_digest};
 
 /// `ASSETS/models` of an assets folder that can be written.
 #[derive(Debug, Clone)]
@@ -294,22 +292,8 @@ fn is_name(name: &str) -> bool {
         && ![AUTO, CHOSEN].contains(&name)
 }
 
-/// The digest and the size of a file that may not fit into memory.
 fn digest_of(path: &Path) -> Result<(Digest, u64), InstallError> {
-    let hash = || {
-        let (mut file, mut hasher, mut bytes) = (File::open(path)?, Sha256::new(), 0);
-        let mut buffer = vec![0; 1 << 20];
-        loop {
-            match file.read(&mut buffer)? {
-                0 => break Ok((Digest::from(<[u8; 32]>::from(hasher.finalize())), bytes)),
-                read => {
-                    hasher.update(&buffer[..read]);
-                    bytes += read as u64;
-                }
-            }
-        }
-    };
-    hash().map_err(disk("read", path))
+    file_digest(path).map_err(disk("read", path))
 }
 
 fn write_durably(path: &Path, text: &str) -> Result<(), InstallError> {

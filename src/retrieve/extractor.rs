@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::batcher::{Batcher, BatcherSettings, InferenceError, Model};
 use super::decode::{DecodeError, ImageLimits, Picture, decode};
-use super::manifest::{Input, Manifest, ManifestError};
+use super::manifest::{Input, Manifest, ManifestError, file_digest};
 use super::pooling::{LocalFeatures, PoolingError};
 use super::preprocess::{PreprocessError, Tensor, preprocess};
 use super::provider::{self, Execution, Wanted};
@@ -237,13 +237,12 @@ fn sample(input: &Input) -> Result<Vec<Tensor>, ExtractError> {
 }
 
 fn checked_digest(file: &Path, manifest: &Manifest) -> Result<Digest, ExtractError> {
-    let bytes = std::fs::read(file).map_err(|error| {
+    let (digest, _) = file_digest(file).map_err(|error| {
         ExtractError::ModelFile(format!(
             "cannot read {}: {error}; `make build` puts the built-in model in place",
             file.display()
         ))
     })?;
-    let digest = Digest::of(&bytes);
     match manifest.sha256 {
         Some(pinned) if pinned != digest => Err(ExtractError::ModelFile(format!(
             "{} is {digest}, but its manifest pins {pinned}; `whereabouts model verify` says how \

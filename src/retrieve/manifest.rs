@@ -1,8 +1,11 @@
 //! The manifest: what a TOML file beside an ONNX file says about it.
 
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 
 use crate::domain::{DescriptorKind, Digest};
 
@@ -33,6 +36,21 @@ pub struct Manifest {
     pub output: Output,
     /// How the output becomes a descriptor.
     pub pooling: Pooling,
+}
+
+/// The digest and the size of a file that may not fit into memory.
+pub fn file_digest(path: &Path) -> io::Result<(Digest, u64)> {
+    let (mut file, mut hasher, mut bytes) = (File::open(path)?, Sha256::new(), 0);
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        match file.read(&mut buffer)? {
+            0 => return Ok((Digest::from(<[u8; 32]>::from(hasher.finalize())), bytes)),
+            read => {
+                hasher.update(&buffer[..read]);
+                bytes += read as u64;
+            }
+        }
+    }
 }
 
 /// The input tensor: N × 3 × height × width, RGB.

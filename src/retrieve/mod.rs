@@ -19,7 +19,7 @@ mod runtime;
 
 pub use decode::{DecodeError, ImageLimits, Picture};
 pub use extractor::{ExtractError, Extraction, Extractor, ExtractorSettings, StageTimes};
-pub use manifest::{MANIFEST, Manifest, ManifestError};
+pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
 pub use provider::{Execution, LEAST_SIMILARITY, Measured, Provider, Trial, Wanted};
 pub use runtime::{AUTO, Assets, BUILT_IN_MODEL, CHOSEN, PREFERRED_MODELS, RuntimeError, WhyModel};

@@ -1,13 +1,12 @@
 //! What calls to models outside have cost.
 
 use jiff::civil::Date;
-use jiff::tz::TimeZone;
 use jiff::{SignedDuration, Timestamp};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::{Service, ServiceError};
-use crate::domain::{DayUsage, MapName, Usage};
+use crate::domain::{DayUsage, MapName, Usage, utc_day};
 
 /// What calls to models outside have cost.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
@@ -60,7 +59,7 @@ impl Service {
                 self.settings.usage_days
             )));
         }
-        let date = Timestamp::now().to_zoned(TimeZone::UTC).date();
+        let date = utc_day(Timestamp::now());
         let from = date.saturating_sub(SignedDuration::from_hours(24 * i64::from(days - 1)));
         let mut spent = self.accounts.usage(from).await?;
         spent.retain(|spent| map.as_ref().is_none_or(|map| *map == spent.map));

@@ -7,9 +7,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use jiff::Timestamp;
 use jiff::civil::Date;
-use jiff::tz::TimeZone;
 
-use crate::domain::DayUsage;
+use crate::domain::{DayUsage, utc_day};
 
 /// The bounds; 0 stands for none.
 #[derive(Debug, Clone, Copy, Default)]
@@ -122,7 +121,7 @@ impl Budget {
 
     /// Today's account; a new day starts an empty one.
     fn today(&self, now: Timestamp) -> MutexGuard<'_, Today> {
-        let date = now.to_zoned(TimeZone::UTC).date();
+        let date = utc_day(now);
         let mut today = self.today.lock().unwrap_or_else(PoisonError::into_inner);
         if date > today.date {
             *today = Today { date, spent: Spent::default() };

@@ -55,7 +55,7 @@ use self::flight::Flights;
 use self::pictures::Pictures;
 use self::retry::CallError;
 use super::{Progress, RefineError, Refinement, Refiner};
-use crate::domain::{DayUsage, Map, RefinerKind, Usage};
+use crate::domain::{DayUsage, Map, RefinerKind, Usage, utc_day};
 use crate::retrieve::ImageLimits;
 use crate::store::{BlobStore, JobRecord, MapStore, UsageStore};
 use crate::telemetry::Metrics;
@@ -130,7 +130,7 @@ impl MllmRefiner {
     /// Says what was spent today (UTC) before this process began.
     pub fn seed_spent_today(&self, spent: &[DayUsage]) {
         let now = Timestamp::now();
-        let today = now.to_zoned(TimeZone::UTC).date();
+        let today = utc_day(now);
         let spent = spent.iter().filter(|spent| spent.date == today);
         self.budget.seed(now, spent.map(Spent::from).fold(Spent::default(), Spent::plus));
     }
@@ -138,7 +138,7 @@ impl MllmRefiner {
     /// What a job spends at this moment.
     fn spent_now(&self, record: &JobRecord, usage: Usage) -> DayUsage {
         let money = self.budget.cost(usage.prompt_tokens, usage.completion_tokens).money;
-        let date = Timestamp::now().to_zoned(TimeZone::UTC).date();
+        let date = utc_day(Timestamp::now());
         DayUsage { date, map: record.job.map.clone(), usage, money }
     }
 
@@ -235,9 +235,9 @@ fn pause(why: &CallError) -> Option<Duration> {
         // At least a little: the breaker may have opened for no time at all.
         CallError::Suspended { wait } => Some((*wait).max(Duration::from_millis(100))),
         CallError::DaySpent => {
-            let now = Timestamp::now().to_zoned(TimeZone::UTC);
-            let midnight = now.date().tomorrow().ok()?.to_zoned(TimeZone::UTC).ok()?;
-            now.duration_until(&midnight).try_into().ok()
+            let now = Timestamp::now();
+            let midnight = utc_day(now).tomorrow().ok()?.to_zoned(TimeZone::UTC).ok()?;
+            now.duration_until(midnight.timestamp()).try_into().ok()
         }
         CallError::Hopeless(_) | CallError::Passing(_) | CallError::JobSpent => None,
     }

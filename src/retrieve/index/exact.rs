@@ -3,8 +3,6 @@
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
-use multiversion::multiversion;
-
 use super::Found;
 
 /// The `k` best of all that was offered.
@@ -61,26 +59,6 @@ impl PartialEq for WorstFirst {
 
 impl Eq for WorstFirst {}
 
-/// The dot product, in 16 running sums so that the compiler can keep them in vector registers.
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
-    const LANES: usize = 16;
-    let mut sums = [0.0_f32; LANES];
-    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
-    // Indices, because adapters of iterators are not always compiled into their caller.
-    for chunk in 0..a.len().min(b.len()) {
-        let (x, y) = (&a[chunk], &b[chunk]);
-        for lane in 0..LANES {
-            sums[lane] += x[lane] * y[lane];
-        }
-    }
-    let mut sum: f32 = sums.iter().sum();
-    for index in 0..a_rest.len().min(b_rest.len()) {
-        sum += a_rest[index] * b_rest[index];
-    }
-    sum
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -93,14 +71,5 @@ mod tests {
         }
         let slots: Vec<_> = best.into_sorted().iter().map(|found| found.slot).collect();
         assert_eq!(slots, [1, 0, 3]);
-    }
-
-    #[test]
-    fn the_dot_product_takes_any_length() {
-        for length in [0, 1, 15, 16, 17, 576] {
-            let a: Vec<f32> = (0..length).map(|i| i as f32 % 7.0).collect();
-            let expected: f32 = a.iter().map(|x| x * x).sum();
-            assert_eq!(dot(&a, &a), expected);
-        }
     }
 }

@@ -2,7 +2,8 @@
 
 use hnsw_rs::prelude::{Distance, FilterT, Hnsw};
 
-use super::{Found, IndexSettings, exact};
+use super::{Found, IndexSettings};
+use crate::domain::dot;
 
 /// One minus the dot product of unit vectors.
 ///
@@ -12,7 +13,7 @@ struct CosineDistance;
 
 impl Distance<f32> for CosineDistance {
     fn eval(&self, a: &[f32], b: &[f32]) -> f32 {
-        (1.0 - exact::dot(a, b)).max(0.0)
+        (1.0 - dot(a, b)).max(0.0)
     }
 }
 

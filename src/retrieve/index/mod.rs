@@ -19,6 +19,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, Rw
 use self::exact::Best;
 use self::graph::Graph;
 pub use self::sealed::{DamagedGraph, SealedGraph};
+use crate::domain::dot;
 
 /// Stored descriptors, by slot.
 pub trait Vectors: Send + Sync {
@@ -300,7 +301,7 @@ fn exactly(
 ) {
     vectors.scan(slots, &mut |slot, vector| {
         if is_live(slot) {
-            best.offer(Found { slot, similarity: exact::dot(query, vector) });
+            best.offer(Found { slot, similarity: dot(query, vector) });
         }
     });
 }

@@ -16,7 +16,8 @@ use multiversion::multiversion;
 
 use super::exact::Best;
 use super::graph::Linked;
-use super::{Found, IndexSettings, Vectors, exact};
+use super::{Found, IndexSettings, Vectors};
+use crate::domain::dot;
 
 /// Fills rows of neighbours that are shorter than the longest.
 const NONE: u32 = u32::MAX;
@@ -206,7 +207,7 @@ impl SealedGraph {
         for ranked in near.into_iter().rev().take(2 * k + 16) {
             let slot = self.slots[point_of(ranked) as usize] as usize;
             vectors.scan(slot..slot + 1, &mut |slot, vector| {
-                best.offer(Found { slot, similarity: exact::dot(query, vector) });
+                best.offer(Found { slot, similarity: dot(query, vector) });
             });
         }
         best.into_sorted()
@@ -390,7 +391,7 @@ mod tests {
             let (mut ca, mut cb) = (Vec::new(), Vec::new());
             let (sa, sb) = (code(&a, &mut ca), code(&b, &mut cb));
             let coded = coded_dot(&ca, &cb) as f32 * sa * sb;
-            assert!((coded - exact::dot(&a, &b)).abs() < 0.01);
+            assert!((coded - dot(&a, &b)).abs() < 0.01);
         }
     }
 }

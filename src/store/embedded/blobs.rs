@@ -96,14 +96,19 @@ fn write_durably(path: &Path, bytes: &[u8]) -> io::Result<()> {
     }
     // A name of its own, so that two writers of the same bytes do not meet.
     let beside = path.with_extension(format!("{}.tmp", uuid::Uuid::now_v7().simple()));
-    let written = File::create(&beside).and_then(|mut file| {
+    replace_durably(path, &beside, bytes)?;
+    File::open(folder)?.sync_all()
+}
+
+/// Writes bytes `beside` a file and renames them to it, so that nobody ever sees half of them.
+pub(super) fn replace_durably(path: &Path, beside: &Path, bytes: &[u8]) -> io::Result<()> {
+    let written = File::create(beside).and_then(|mut file| {
         file.write_all(bytes)?;
         file.sync_all()?;
-        fs::rename(&beside, path)?;
-        File::open(folder)?.sync_all()
+        fs::rename(beside, path)
     });
     if written.is_err() {
-        let _ = fs::remove_file(&beside);
+        let _ = fs::remove_file(beside);
     }
     written
 }

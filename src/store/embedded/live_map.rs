@@ -1,11 +1,11 @@
 //! One map in memory: which slot is which image, and its index.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
 use super::super::StoreError;
+use super::blobs::replace_durably;
 use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
 use crate::domain::{Candidate, ImageId, Map, Pose};
@@ -94,13 +94,7 @@ impl LiveMap {
     /// Writes a sealed graph where the next start finds it.
     pub fn keep(&self, sealed: &SealedGraph) {
         let beside = self.graph_file.with_extension("tmp");
-        let written = std::fs::File::create(&beside).and_then(|mut file| {
-            file.write_all(&sealed.to_bytes())?;
-            file.sync_all()?;
-            std::fs::rename(&beside, &self.graph_file)
-        });
-        if let Err(error) = written {
-            let _ = std::fs::remove_file(&beside);
+        if let Err(error) = replace_durably(&self.graph_file, &beside, &sealed.to_bytes()) {
             // The next start builds it again.
             tracing::warn!(file = %self.graph_file.display(), %error, "the graph cannot be kept");
         }

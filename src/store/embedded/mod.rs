@@ -27,7 +27,6 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, PoisonError, RwLock};
 
-use jiff::tz::TimeZone;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast;
 use uuid::Uuid;
@@ -40,7 +39,7 @@ use self::live_map::LiveMap;
 use self::trees::Trees;
 use self::writer::Writer;
 use super::StoreError;
-use crate::domain::MapName;
+use crate::domain::{MapName, utc_day};
 use crate::retrieve::index::IndexSettings;
 
 /// How the embedded store works.
@@ -102,7 +101,7 @@ impl EmbeddedStore {
             loaded.insert(name, Arc::new(live));
         }
         let kept = SignedDuration::from_hours(24 * i64::from(settings.usage_days));
-        let today = Timestamp::now().to_zoned(TimeZone::UTC).date();
+        let today = utc_day(Timestamp::now());
         usage::forget_before(&trees, today.saturating_sub(kept))?;
         let queued = trees.requeue_claimed()?;
         let inner = Inner {

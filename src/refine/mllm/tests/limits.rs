@@ -134,7 +134,7 @@ async fn a_day_never_passes_its_budget() {
         settings.money_per_day = 1.0;
     })
     .await;
-    let date = Timestamp::now().to_zoned(TimeZone::UTC).date();
+    let date = utc_day(Timestamp::now());
     let spent = |money| {
         let map = bench.shelf.map.name.clone();
         [DayUsage { date, map, usage: Usage::default(), money }]
