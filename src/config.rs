@@ -171,6 +171,8 @@ pub struct Image {
     pub threads: usize,
     /// Pictures that may wait.
     pub queue: usize,
+    /// Whether every pixel of a large JPEG is decoded before it is scaled down.
+    pub exact: bool,
 }
 
 /// `[index]`

@@ -183,6 +183,7 @@ fn load_model(config: &Config, maps: &[Map]) -> anyhow::Result<Extractor> {
         threads: threads_or(config.model.threads, 1),
         max_batch: config.model.max_batch,
         limits: ImageLimits { max_pixels: config.image.max_pixels },
+        exact_decode: config.image.exact,
     };
     let extractor = Extractor::load(&assets, &settings)?;
     let (model, digest) = (&extractor.manifest().name, extractor.digest());

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::batcher::{Batcher, BatcherSettings, InferenceError, Model};
-use super::decode::{DecodeError, ImageLimits, Picture, decode};
+use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode};
 use super::manifest::{Input, Manifest, ManifestError, file_digest};
 use super::pooling::{LocalFeatures, PoolingError};
-use super::preprocess::{PreprocessError, Tensor, preprocess};
+use super::preprocess::{self, PreprocessError, Tensor, preprocess};
 use super::provider::{self, Execution, Wanted};
 use super::runtime::{Assets, RuntimeError};
 use crate::demo::{Town, TownSpec};
@@ -31,10 +31,12 @@ pub struct ExtractorSettings {
     pub remember: Option<PathBuf>,
     /// Bounds on a picture.
     pub limits: ImageLimits,
+    /// Whether every pixel of a large JPEG is decoded before it is scaled down.
+    pub exact_decode: bool,
 }
 
 impl ExtractorSettings {
-    /// One session of a model on the CPU at full precision, one picture at a time.
+    /// One session of a model on the CPU at full precision, one picture at a time, exactly decoded.
     pub fn plain(model: &str, threads: usize, limits: ImageLimits) -> Self {
         let reference = Execution::REFERENCE;
         Self {
@@ -48,6 +50,7 @@ impl ExtractorSettings {
             },
             remember: None,
             limits,
+            exact_decode: true,
         }
     }
 }
@@ -60,6 +63,7 @@ pub struct Extractor {
     batcher: Batcher,
     execution: Execution,
     limits: ImageLimits,
+    exact_decode: bool,
 }
 
 /// What was extracted from one picture.
@@ -131,7 +135,14 @@ impl Extractor {
         let execution = chosen(&model, digest, settings)?;
         let (sessions, max_batch) = (settings.sessions, settings.max_batch);
         let batcher = Batcher::start(&model, BatcherSettings { sessions, max_batch, execution })?;
-        let extractor = Self { manifest, digest, batcher, execution, limits: settings.limits };
+        let extractor = Self {
+            manifest,
+            digest,
+            batcher,
+            execution,
+            limits: settings.limits,
+            exact_decode: settings.exact_decode,
+        };
         extractor.warm_up()?;
         Ok(extractor)
     }
@@ -159,9 +170,10 @@ impl Extractor {
     /// Decodes a picture and runs it through the model.
     pub fn extract(&self, bytes: &[u8], kind: DescriptorKind) -> Result<Extraction, ExtractError> {
         let start = Instant::now();
-        let Picture { pixels, media_type } = decode(bytes, self.limits)?;
-        let (width, height) = pixels.dimensions();
-        let tensor = preprocess(&pixels, &self.manifest.input)?;
+        let input = &self.manifest.input;
+        let needed = if self.exact_decode { Needed::All } else { preprocess::needed(input) };
+        let Picture { pixels, width, height, media_type } = decode(bytes, self.limits, needed)?;
+        let tensor = preprocess(&pixels, (width, height), input)?;
         drop(pixels);
         let decoded = Instant::now();
         let local = self.local_features(tensor)?;
@@ -186,7 +198,7 @@ impl Extractor {
         let pixels = image::RgbImage::from_fn(input.width, input.height, |x, y| {
             image::Rgb([(x * 7 + y * 13) as u8, (x * y) as u8, (x * 3 + y) as u8])
         });
-        let local = self.local_features(preprocess(&pixels, input)?)?;
+        let local = self.local_features(preprocess(&pixels, pixels.dimensions(), input)?)?;
         local.descriptor(DescriptorKind::Gem, &self.manifest.pooling)?;
         Ok(())
     }
@@ -233,7 +245,9 @@ fn chosen(
 fn sample(input: &Input) -> Result<Vec<Tensor>, ExtractError> {
     let town = Town::new(TownSpec { places: 2, ..TownSpec::default() });
     let pictures = [town.reference(0), town.query(1, 1)];
-    pictures.iter().map(|shot| Ok(preprocess(&shot.image, input)?)).collect()
+    let tensors =
+        pictures.iter().map(|shot| preprocess(&shot.image, shot.image.dimensions(), input));
+    Ok(tensors.collect::<Result<_, _>>()?)
 }
 
 fn checked_digest(file: &Path, manifest: &Manifest) -> Result<Digest, ExtractError> {

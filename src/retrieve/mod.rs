@@ -17,7 +17,7 @@ pub mod preprocess;
 mod provider;
 mod runtime;
 
-pub use decode::{DecodeError, ImageLimits, Picture};
+pub use decode::{DecodeError, ImageLimits, Needed, Picture};
 pub use extractor::{ExtractError, Extraction, Extractor, ExtractorSettings, StageTimes};
 pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};

@@ -1,10 +1,13 @@
 //! Pixels to the input tensor that a manifest asks for.
 
+use std::borrow::Cow;
+
 use fast_image_resize::images::{TypedImage, TypedImageRef};
 use fast_image_resize::pixels::U8x3;
 use fast_image_resize::{FilterType, ResizeAlg, ResizeOptions, Resizer};
 use image::RgbImage;
 
+use super::decode::Needed;
 use super::manifest::{Input, Interpolation, Resize};
 
 /// One picture as a model takes it: 3 × height × width, RGB planes.
@@ -27,19 +30,37 @@ pub struct PreprocessError {
     reason: String,
 }
 
+/// The pixels that fitting a picture to the input needs.
+pub fn needed(input: &Input) -> Needed {
+    match input.resize {
+        Resize::LongestEdge => Needed::LongestEdge(input.width.max(input.height)),
+        Resize::Squash | Resize::CentreCrop => Needed::Size(input.width, input.height),
+    }
+}
+
 /// Fits a picture to the input, with an antialiased filter, and normalises its channels.
-pub fn preprocess(pixels: &RgbImage, input: &Input) -> Result<Tensor, PreprocessError> {
-    let (width, height) = target_size(pixels.dimensions(), input);
+///
+/// `size` is that of the picture in its file (width, height), which decides what becomes of its
+/// shape; `pixels` may be fewer, see [`needed`].
+pub fn preprocess(
+    pixels: &RgbImage,
+    size: (u32, u32),
+    input: &Input,
+) -> Result<Tensor, PreprocessError> {
+    let (width, height) = target_size(size, input);
     let resized = resize(pixels, width, height, input)?;
     let plane = width as usize * height as usize;
     let mut data = vec![0.0; 3 * plane];
-    for (channel, out) in data.chunks_exact_mut(plane).enumerate() {
-        // One multiplication and one addition: x / 255, minus mean, over std.
-        let scale = 1.0 / (255.0 * input.std[channel]);
-        let offset = -input.mean[channel] / input.std[channel];
-        for (value, pixel) in out.iter_mut().zip(resized.chunks_exact(3)) {
-            *value = f32::from(pixel[channel]) * scale + offset;
-        }
+    let (red, rest) = data.split_at_mut(plane);
+    let (green, blue) = rest.split_at_mut(plane);
+    // One multiplication and one addition: x / 255, minus mean, over std.
+    let scale = input.std.map(|std| 1.0 / (255.0 * std));
+    let offset = [0, 1, 2].map(|channel| -input.mean[channel] / input.std[channel]);
+    let pixels = &resized[..3 * plane];
+    for i in 0..plane {
+        red[i] = f32::from(pixels[3 * i]) * scale[0] + offset[0];
+        green[i] = f32::from(pixels[3 * i + 1]) * scale[1] + offset[1];
+        blue[i] = f32::from(pixels[3 * i + 2]) * scale[2] + offset[2];
     }
     Ok(Tensor { height: height as usize, width: width as usize, data })
 }
@@ -76,14 +97,14 @@ fn target_size((width, height): (u32, u32), input: &Input) -> (u32, u32) {
     (fit(width), fit(height))
 }
 
-fn resize(
-    pixels: &RgbImage,
+fn resize<'a>(
+    pixels: &'a RgbImage,
     width: u32,
     height: u32,
     input: &Input,
-) -> Result<Vec<u8>, PreprocessError> {
+) -> Result<Cow<'a, [u8]>, PreprocessError> {
     if pixels.dimensions() == (width, height) {
-        return Ok(pixels.as_raw().clone());
+        return Ok(Cow::Borrowed(pixels.as_raw()));
     }
     let filter = match input.interpolation {
         Interpolation::Bicubic => FilterType::CatmullRom,
@@ -94,7 +115,7 @@ fn resize(
         Resize::CentreCrop => options.fit_into_destination(Some((0.5, 0.5))),
         Resize::Squash | Resize::LongestEdge => options,
     };
-    run_resize(pixels, width, height, &options)
+    Ok(run_resize(pixels, width, height, &options)?.into())
 }
 
 fn run_resize(
@@ -141,7 +162,7 @@ mod tests {
     #[test]
     fn channels_are_normalised_plane_by_plane() {
         let grey = RgbImage::from_pixel(32, 16, Rgb([255, 51, 0]));
-        let tensor = preprocess(&grey, &input(Resize::Squash)).unwrap();
+        let tensor = preprocess(&grey, grey.dimensions(), &input(Resize::Squash)).unwrap();
         assert_eq!(tensor.data.len(), 3 * 32 * 16);
         let plane = |c: usize| tensor.data[c * 512];
         assert!((plane(0) - 1.0).abs() < 1e-6);
@@ -157,7 +178,7 @@ mod tests {
                 wide.put_pixel(x, y, Rgb([0, 255, 0]));
             }
         }
-        let tensor = preprocess(&wide, &input(Resize::CentreCrop)).unwrap();
+        let tensor = preprocess(&wide, wide.dimensions(), &input(Resize::CentreCrop)).unwrap();
         assert!(tensor.data[512..1024].iter().all(|&green| green == 1.0));
     }
 
@@ -174,7 +195,7 @@ mod tests {
     fn downsizing_averages_instead_of_skipping() {
         let stripes =
             RgbImage::from_fn(320, 160, |x, _| Rgb([if x % 2 == 0 { 0 } else { 255 }; 3]));
-        let tensor = preprocess(&stripes, &input(Resize::Squash)).unwrap();
+        let tensor = preprocess(&stripes, stripes.dimensions(), &input(Resize::Squash)).unwrap();
         assert!(tensor.data[512..].iter().all(|&value| (value - 0.5).abs() < 0.05));
     }
 

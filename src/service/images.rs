@@ -119,7 +119,8 @@ impl Service {
         let limits = self.extractor.limits();
         let jpeg = self
             .on_pool(move || {
-                let picture = decode::decode(&bytes, limits)?;
+                let picture =
+                    decode::decode(&bytes, limits, decode::Needed::LongestEdge(max_edge))?;
                 let small = preprocess::shrink_to(&picture.pixels, max_edge)?;
                 Ok(decode::encode_jpeg(&small)?)
             })

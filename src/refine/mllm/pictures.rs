@@ -9,7 +9,7 @@ use image::RgbImage;
 use tokio::sync::Semaphore;
 
 use crate::domain::Digest;
-use crate::retrieve::decode::{decode, encode_jpeg};
+use crate::retrieve::decode::{Needed, decode, encode_jpeg};
 use crate::retrieve::preprocess::shrink_to;
 use crate::retrieve::{CpuPool, ImageLimits};
 use crate::store::{BlobStore, StoreError};
@@ -83,7 +83,8 @@ impl Pictures {
 /// and that is nobody's business outside.
 fn prepare(bytes: &Bytes, limits: ImageLimits, max_edge: u32) -> Result<SentPicture, PictureError> {
     let unfit = |error: &dyn std::error::Error| PictureError::Unfit(error.to_string());
-    let picture = decode(bytes, limits).map_err(|error| unfit(&error))?;
+    let needed = Needed::LongestEdge(max_edge);
+    let picture = decode(bytes, limits, needed).map_err(|error| unfit(&error))?;
     let pixels = shrink_to(&picture.pixels, max_edge).map_err(|error| unfit(&error))?;
     let jpeg = encode_jpeg(&pixels).map_err(|error| unfit(&error))?;
     let url = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
@@ -108,7 +109,7 @@ mod tests {
         let bytes = encode_jpeg(&RgbImage::new(800, 600)).unwrap();
         let sent = prepare(&bytes.into(), LIMITS, 400).unwrap();
         let data = sent.url.strip_prefix("data:image/jpeg;base64,").unwrap();
-        let pixels = decode(&STANDARD.decode(data).unwrap(), LIMITS).unwrap().pixels;
+        let pixels = decode(&STANDARD.decode(data).unwrap(), LIMITS, Needed::All).unwrap().pixels;
         assert_eq!(pixels.dimensions(), (400, 300));
         assert_eq!(sent.tokens, 85 + 170);
     }
