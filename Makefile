@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets openvino test lint format bench openapi clean
+.PHONY: help demo build assets nasm openvino test lint format bench openapi clean
 
 help: ## Say what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -11,17 +11,20 @@ help: ## Say what can be made
 demo: build ## Set up, build, index a town, localize in it, refine, print what happened
 	$(BINARY) demo --out demo-out
 
-build: assets ## Set up and build target/release/whereabouts
+build: assets nasm ## Set up and build target/release/whereabouts
 	@command -v $(CARGO) >/dev/null || { echo "cargo is missing: install Rust 1.95 or later, then run make again" >&2; exit 1; }
 	$(CARGO) build --release --locked
 
 assets: ## Get ONNX Runtime and the built-in model, pinned by version and hash
 	deploy/setup/assets.sh assets
 
+nasm:
+	@deploy/setup/nasm.sh
+
 openvino: ## Get ONNX Runtime with OpenVINO too, the faster one on many x86-64 processors
 	deploy/setup/assets.sh --openvino assets
 
-test: assets ## Set up, build and run every test
+test: assets nasm ## Set up, build and run every test
 	$(CARGO) test --release --locked
 
 lint: ## Check the format and the lints

@@ -1,8 +1,10 @@
-//! `/localize` of the real server, against bare extraction in one process.
+//! `/localize` of the real server, against what no server can undercut: the same frames through the
+//! same model in this process, without HTTP, search or store. Once one frame after another, and once
+//! as a batch job, which keeps inference full. All run in turn, in
+//! the same run, and the lines end with ratios.
 //!
-//! The peer is what no server can undercut: the same frames decoded and run through the same model
-//! in this process, one at a time, without HTTP, search or store. Both run in turn, in the same
-//! run, and the last lines are ratios.
+//! `cargo bench --bench localize -- MODEL` takes another model than xfeat; WHEREABOUTS_MODEL__ASSETS
+//! says where it is, if it is not among the checkout's assets.
 
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
@@ -11,7 +13,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use futures_util::{TryStreamExt, stream};
 use serde_json::Value;
+use whereabouts::config::{Config, Overrides};
 use whereabouts::demo::{Town, TownSpec};
 use whereabouts::domain::DescriptorKind;
 use whereabouts::retrieve::decode::encode_jpeg;
@@ -23,29 +27,32 @@ const REQUESTS: usize = 400;
 
 fn main() -> anyhow::Result<()> {
     let _ = rustls::crypto::ring::default_provider().install_default();
+    let given = std::env::args().skip(1).find(|argument| !argument.starts_with('-'));
+    let model = given.unwrap_or_else(|| "xfeat".into());
     let spec = TownSpec { places: PLACES, ..TownSpec::default() };
     let town = Town::new(spec);
     let frames: Vec<bytes::Bytes> = (0..FRAMES)
         .map(|place| Ok(encode_jpeg(&town.query(place, 0).image)?.into()))
         .collect::<anyhow::Result<_>>()?;
-    let bare = bare_extraction(&frames)?;
-    println!("bare extraction, one at a time   {bare}");
+    let (bare, batch) = in_process(&model, &frames)?;
+    println!("in this process, one frame after another   {bare}");
+    println!("in this process, as a batch job            {:31}{batch:6.1} frames/s", "");
 
     let data = tempfile::tempdir()?;
-    let server = Server::start(data.path())?;
+    let server = Server::start(&model, data.path())?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     runtime.block_on(async {
-        server.index(&town).await?;
+        server.index(&town, batch).await?;
         for refine in ["off", "async"] {
-            for clients in [1, 8] {
+            for clients in [1, 16] {
                 let load = server.load(&frames, clients, refine).await?;
-                println!("{clients} clients, refine={refine:<6} {load}");
+                println!("{clients:2} clients, refine={refine:<6}                  {load}");
                 println!(
-                    "    median is {:.2} × bare extraction; inference is {:.0} % of the answer; \
-                     throughput is {:.2} × bare",
+                    "    p50 {:.2} × one frame in this process; {:.2} × the batch job's frames a \
+                     second; inference and waiting for it are {:.0} % of the answer",
                     load.times.median_ms / bare.median_ms,
+                    load.times.per_second / batch,
                     load.inference_share * 100.0,
-                    load.times.per_second / bare.per_second
                 );
             }
         }
@@ -53,26 +60,45 @@ fn main() -> anyhow::Result<()> {
     })
 }
 
-/// Decode, resize, inference and pooling, one frame after another.
-fn bare_extraction(frames: &[bytes::Bytes]) -> anyhow::Result<Times> {
-    // By whoever is fastest on this machine, as the server does.
+/// Decode, resize, inference and pooling: one frame after another, and the frames a second of a batch
+/// job.
+fn in_process(model: &str, frames: &[bytes::Bytes]) -> anyhow::Result<(Times, f64)> {
+    let config = Config::load(None, &Overrides::default())?;
+    let threads = std::thread::available_parallelism()?.get();
+    // By whoever is fastest on this machine, and as the server does.
     let settings = ExtractorSettings {
         wanted: Wanted::default(),
-        ..ExtractorSettings::plain(
-            "xfeat",
-            std::thread::available_parallelism()?.get(),
-            ImageLimits { max_pixels: 50_000_000 },
-        )
+        layout: config.model.layout(),
+        exact_decode: config.image.exact,
+        ..ExtractorSettings::plain(model, threads, ImageLimits { max_pixels: 50_000_000 })
     };
-    let extractor = Extractor::load(&Assets::locate(None), &settings)?;
+    let extractor = Extractor::load(&Assets::locate(config.model.assets()), &settings)?;
     let start = Instant::now();
     let times = (0..REQUESTS).map(|i| {
         let start = Instant::now();
         extractor.extract(&frames[i % frames.len()], DescriptorKind::Gem)?;
         Ok(start.elapsed())
     });
-    let times = times.collect::<anyhow::Result<Vec<_>>>()?;
-    Ok(Times::new(times, start.elapsed()))
+    let one_by_one = Times::new(times.collect::<anyhow::Result<Vec<_>>>()?, start.elapsed());
+    let next = AtomicUsize::new(0);
+    let start = Instant::now();
+    // As many as keep every session busy and the next frames decoded.
+    std::thread::scope(|scope| {
+        let work = || {
+            while let i = next.fetch_add(1, Ordering::Relaxed)
+                && i < REQUESTS
+            {
+                extractor.extract(&frames[i % frames.len()], DescriptorKind::Gem)?;
+            }
+            anyhow::Ok(())
+        };
+        let running: Vec<_> = (0..16).map(|_| scope.spawn(work)).collect();
+        running.into_iter().try_for_each(|thread| match thread.join() {
+            Ok(result) => result,
+            Err(_) => anyhow::bail!("a thread panicked"),
+        })
+    })?;
+    Ok((one_by_one, REQUESTS as f64 / start.elapsed().as_secs_f64()))
 }
 
 struct Times {
@@ -122,10 +148,10 @@ struct Server {
 }
 
 impl Server {
-    fn start(data: &std::path::Path) -> anyhow::Result<Self> {
+    fn start(model: &str, data: &std::path::Path) -> anyhow::Result<Self> {
         let address_file = data.join("address");
         let mut child = Command::new(env!("CARGO_BIN_EXE_whereabouts"))
-            .args(["serve", "--listen", "127.0.0.1:0", "--data"])
+            .args(["serve", "--model", model, "--listen", "127.0.0.1:0", "--data"])
             .arg(data.join("data"))
             .arg("--address-file")
             .arg(&address_file)
@@ -139,18 +165,28 @@ impl Server {
         Ok(Self { child, url: format!("http://{}", address.trim()), http: reqwest::Client::new() })
     }
 
-    async fn index(&self, town: &Town) -> anyhow::Result<()> {
+    /// Adds the town's images, by as many clients as `whereabouts index` has.
+    async fn index(&self, town: &Town, batch: f64) -> anyhow::Result<()> {
+        const CLIENTS: usize = 8;
         let map = self.http.put(format!("{}/maps/town", self.url)).body("{}");
         map.send().await?.error_for_status()?;
+        let pictures = (0..town.places()).map(|place| encode_jpeg(&town.reference(place).image));
+        let pictures = pictures.collect::<Result<Vec<_>, _>>()?;
         let start = Instant::now();
-        for place in 0..town.places() {
-            let picture = encode_jpeg(&town.reference(place).image)?;
-            let url = format!("{}/maps/town/images?id={place}", self.url);
-            let request = self.http.post(url).header("content-type", "image/jpeg").body(picture);
-            request.send().await?.error_for_status()?;
-        }
-        let took = start.elapsed().as_secs_f64();
-        println!("indexed {PLACES} images in {took:.1} s, drawing included, one client");
+        stream::iter(pictures.into_iter().enumerate().map(anyhow::Ok))
+            .try_for_each_concurrent(CLIENTS, |(place, picture)| async move {
+                let url = format!("{}/maps/town/images?id={place}", self.url);
+                let request = self.http.post(url).header("content-type", "image/jpeg");
+                request.body(picture).send().await?.error_for_status()?;
+                Ok(())
+            })
+            .await?;
+        let per_second = PLACES as f64 / start.elapsed().as_secs_f64();
+        println!(
+            "indexed {PLACES} images by {CLIENTS} clients                        {per_second:6.1} \
+             images/s, {:.2} × the batch job",
+            per_second / batch
+        );
         Ok(())
     }
 

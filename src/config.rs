@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use crate::domain::{Precision, RefinerKind};
 use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
-use crate::retrieve::{Provider, Wanted};
+use crate::retrieve::{Layout, Provider, Wanted};
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
@@ -92,10 +92,10 @@ pub struct Model {
     pub precision: PrecisionWish,
     /// An assets folder to look in before the usual places; empty for none.
     pub assets: PathBuf,
-    /// Sessions side by side.
-    pub sessions: usize,
-    /// Threads in a session; 0 for one a core.
+    /// Threads of all inference; 0 for one a core.
     pub threads: usize,
+    /// Pictures run side by side while several wait; 0 for one a thread.
+    pub sessions: usize,
     /// The most pictures in one run.
     pub max_batch: usize,
     /// Where `whereabouts model pull` downloads from.
@@ -141,6 +141,13 @@ pub enum PrecisionWish {
 }
 
 impl Model {
+    /// How inference shares its threads among pictures.
+    pub fn layout(&self) -> Layout {
+        let threads = cores_unless(self.threads);
+        let sessions = if self.sessions == 0 { threads } else { self.sessions };
+        Layout { threads, sessions, max_batch: self.max_batch }
+    }
+
     /// What may be chosen from.
     pub fn wanted(&self) -> Wanted {
         Wanted {
@@ -161,13 +168,21 @@ impl Model {
     }
 }
 
+/// A number of threads, or where it is 0, one for each core.
+pub fn cores_unless(threads: usize) -> usize {
+    match threads {
+        0 => std::thread::available_parallelism().map_or(1, usize::from),
+        threads => threads,
+    }
+}
+
 /// `[image]`
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Image {
     /// The most pixels that are decoded.
     pub max_pixels: u64,
-    /// Decoding threads; 0 for two a core.
+    /// Decoding threads; 0 for one a core.
     pub threads: usize,
     /// Pictures that may wait.
     pub queue: usize,
@@ -370,7 +385,6 @@ impl Config {
             ("server.max_streams", self.server.max_streams),
             ("data.usage_days", self.data.usage_days as usize),
             ("data.commit_batch", self.data.commit_batch),
-            ("model.sessions", self.model.sessions),
             ("model.max_batch", self.model.max_batch),
             ("model.download_attempts", self.model.download_attempts as usize),
             ("model.download_stall_s", self.model.download_stall_s as usize),

@@ -11,7 +11,7 @@ use tokio::runtime::Handle;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
-use crate::config::{Config, Refiner as ConfiguredRefiner};
+use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
 use crate::domain::{Map, utc_day};
 use crate::http::{AppState, HttpSettings, router};
 use crate::refine::local::{LocalMatcher, LocalSettings};
@@ -101,7 +101,7 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
     })?);
     let maps = Handle::current().block_on(store.maps())?;
     let extractor = Arc::new(load_model(config, &maps)?);
-    let pool = CpuPool::new("frames", threads_or(config.image.threads, 2), config.image.queue)?;
+    let pool = CpuPool::new("frames", cores_unless(config.image.threads), config.image.queue)?;
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
     let local = Arc::new(LocalRefiner {
         maps: store.clone(),
@@ -179,9 +179,7 @@ fn load_model(config: &Config, maps: &[Map]) -> anyhow::Result<Extractor> {
         model,
         wanted,
         remember: Some(config.data.dir.join("inference.toml")),
-        sessions: config.model.sessions,
-        threads: threads_or(config.model.threads, 1),
-        max_batch: config.model.max_batch,
+        layout: config.model.layout(),
         limits: ImageLimits { max_pixels: config.image.max_pixels },
         exact_decode: config.image.exact,
     };
@@ -189,12 +187,4 @@ fn load_model(config: &Config, maps: &[Map]) -> anyhow::Result<Extractor> {
     let (model, digest) = (&extractor.manifest().name, extractor.digest());
     tracing::info!(model, %why, %digest, execution = %extractor.execution(), "model loaded");
     Ok(extractor)
-}
-
-/// The configured number of threads, or so many for each core.
-fn threads_or(configured: usize, for_each_core: usize) -> usize {
-    match configured {
-        0 => std::thread::available_parallelism().map_or(1, usize::from) * for_each_core,
-        threads => threads,
-    }
 }

@@ -1,154 +1,225 @@
-//! Inference: sessions that take whatever waits as one batch.
+//! The queue before inference, and the threads that empty it.
 
-use std::path::Path;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 
-use ort::environment::Environment;
-use ort::session::Session;
-use ort::session::builder::GraphOptimizationLevel;
-use ort::value::TensorRef;
+use serde::{Deserialize, Serialize};
+use tokio::sync::oneshot;
 
-use super::manifest::Manifest;
 use super::preprocess::Tensor;
 use super::provider::Execution;
+use super::session::{InferenceError, Model, RawOutput, Runner};
 
-/// One picture's part of the output tensors.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct RawOutput {
-    /// The local features, in the manifest's layout.
-    pub features: Vec<f32>,
-    /// The reliability map, if the manifest names one.
-    pub reliability: Option<Vec<f32>>,
-}
-
-/// Why inference gave no answer.
-#[derive(Debug, Clone, thiserror::Error)]
-pub enum InferenceError {
-    /// The model could not be loaded.
-    #[error("the model cannot be loaded: {0}")]
-    Load(String),
-    /// A run failed.
-    #[error("inference failed: {0}")]
-    Run(String),
-    /// The inference threads have ended.
-    #[error("inference has stopped")]
-    Stopped,
-}
-
-/// How inference runs.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct BatcherSettings {
-    /// Sessions that run side by side.
+/// How inference shares its threads among pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Layout {
+    /// Threads of all inference.
+    pub threads: usize,
+    /// Pictures that are run side by side while several wait, each by its share of the threads; 1:
+    /// one after another, by all threads.
     pub sessions: usize,
     /// The most pictures in one run.
     pub max_batch: usize,
-    /// By whom and how.
-    pub execution: Execution,
 }
 
-/// A model that can be loaded.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Model<'a> {
-    pub environment: &'a Arc<Environment>,
-    /// The ONNX file.
-    pub file: &'a Path,
-    pub manifest: &'a Arc<Manifest>,
-    /// Threads within one session.
-    pub threads: usize,
-}
-
-struct Request {
-    tensor: Tensor,
-    answer: SyncSender<Result<RawOutput, InferenceError>>,
-}
-
-/// The sessions of one model. No timer holds a request back: a free session takes what is there.
-#[derive(Debug, Clone)]
+/// The sessions of one model.
+///
+/// A picture that comes alone is run at once by the *wide* session, which has all threads. While
+/// pictures overlap, *narrow* sessions run side by side instead, each with its share of the threads:
+/// threads that work on pictures of their own need not wait for each other after every layer, so that
+/// more pictures are done in the same time. No timer holds a picture back: a free session takes what
+/// waits as one batch.
+#[derive(Debug)]
 pub(super) struct Batcher {
-    queue: SyncSender<Request>,
+    queue: Arc<Queue>,
+}
+
+/// An answer that is to come. Dropping it takes the picture out of the queue.
+#[derive(Debug)]
+pub(super) struct Inferring(oneshot::Receiver<Result<RawOutput, InferenceError>>);
+
+impl Inferring {
+    /// Blocks until the answer is there.
+    pub fn wait(self) -> Result<RawOutput, InferenceError> {
+        self.0.blocking_recv().map_err(|_| InferenceError::Stopped)?
+    }
+
+    /// Waits for the answer.
+    pub async fn answer(self) -> Result<RawOutput, InferenceError> {
+        self.0.await.map_err(|_| InferenceError::Stopped)?
+    }
 }
 
 impl Batcher {
-    /// Loads the model once for each session.
-    pub fn start(model: &Model<'_>, settings: BatcherSettings) -> Result<Self, InferenceError> {
-        let (queue, requests) = sync_channel(settings.max_batch.max(1));
-        let requests = Arc::new(Mutex::new(requests));
-        for index in 0..settings.sessions.max(1) {
-            let worker = Worker {
-                runner: model.load(settings.execution)?,
-                max_batch: settings.max_batch.max(1),
-            };
-            let requests = Arc::clone(&requests);
-            thread::Builder::new()
-                .name(format!("inference-{index}"))
-                .spawn(move || worker.serve(&requests))
-                .map_err(|error| InferenceError::Load(error.to_string()))?;
-        }
-        Ok(Self { queue })
-    }
-
-    /// Runs one picture through the model; blocks the calling thread until the answer is there.
-    pub fn infer(&self, tensor: Tensor) -> Result<RawOutput, InferenceError> {
-        let (answer, result) = sync_channel(1);
-        self.queue.send(Request { tensor, answer }).map_err(|_| InferenceError::Stopped)?;
-        result.recv().map_err(|_| InferenceError::Stopped)?
-    }
-}
-
-impl Model<'_> {
-    /// Makes a session.
-    pub fn load(&self, execution: Execution) -> Result<Runner, InferenceError> {
-        let session = self.session(execution).map_err(|error| {
-            InferenceError::Load(format!("{} by {execution}: {error}", self.file.display()))
+    /// Loads the model for each session: the wide one before this returns, narrow ones in the
+    /// background, as a service can begin without them.
+    pub fn start(
+        model: &Model,
+        execution: Execution,
+        layout: Layout,
+    ) -> Result<Self, InferenceError> {
+        let threads = layout.threads.max(1);
+        let sessions = layout.sessions.clamp(1, threads);
+        let layout = Layout { threads, sessions, max_batch: layout.max_batch.max(1) };
+        let queue = Arc::new(Queue {
+            state: Mutex::default(),
+            work: Condvar::new(),
+            room: Condvar::new(),
+            layout,
+        });
+        let batcher = Self { queue: Arc::clone(&queue) };
+        let mut wide = model.load(execution, threads)?;
+        wide.warm_up()?;
+        spawn("inference", {
+            let queue = Arc::clone(&queue);
+            move || queue.serve(wide, Kind::Wide)
         })?;
-        Ok(Runner {
-            session,
-            manifest: Arc::clone(self.manifest),
-            _environment: Arc::clone(self.environment),
-        })
-    }
-
-    fn session(&self, execution: Execution) -> Result<Session, ort::Error> {
-        let threads = self.threads.max(1);
-        let mut builder = Session::builder(self.environment)?
-            .with_optimization_level(GraphOptimizationLevel::Level3)?
-            .with_intra_threads(threads)?
-            // Threads that spin for work take the cores from decoding.
-            .with_intra_op_spinning(false)?;
-        if let Some(provider) = execution.registration(threads) {
-            builder = builder.with_execution_providers([provider])?;
+        let narrow = if sessions == 1 { 0 } else { sessions };
+        queue.lock().loading = narrow;
+        for index in 0..narrow {
+            let (queue, model) = (Arc::clone(&queue), model.clone());
+            spawn(&format!("inference-{index}"), move || {
+                let loaded = model.load(execution, threads / sessions).and_then(|mut runner| {
+                    runner.warm_up()?;
+                    Ok(runner)
+                });
+                queue.note_loaded(loaded.is_ok());
+                match loaded {
+                    Ok(runner) => queue.serve(runner, Kind::Narrow),
+                    Err(error) => tracing::error!(%error, "there is one session less"),
+                }
+            })?;
         }
-        builder.commit_from_file(self.file)
+        Ok(batcher)
+    }
+
+    /// Blocks until every session is loaded, or cannot be.
+    pub fn wait_until_complete(&self) {
+        let mut state = self.queue.lock();
+        while state.loading > 0 {
+            state = self.queue.room.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    /// Hands in one picture; blocks while the queue is full.
+    pub fn submit(&self, tensor: Tensor) -> Result<Inferring, InferenceError> {
+        let (answer, inferring) = oneshot::channel();
+        let mut state = self.queue.lock();
+        while state.waiting.len() >= self.queue.layout.capacity() && !state.closed {
+            state = self.queue.room.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+        if state.closed {
+            return Err(InferenceError::Stopped);
+        }
+        state.overlapped |= state.in_progress();
+        state.waiting.push_back(Request { tensor, answer });
+        drop(state);
+        self.queue.work.notify_all();
+        Ok(Inferring(inferring))
     }
 }
 
-/// One session.
-pub(super) struct Runner {
-    session: Session,
-    manifest: Arc<Manifest>,
-    /// It must outlive the session.
-    _environment: Arc<Environment>,
+impl Drop for Batcher {
+    fn drop(&mut self) {
+        self.queue.close();
+    }
 }
 
-struct Worker {
-    runner: Runner,
-    max_batch: usize,
+impl Layout {
+    /// Pictures that wait at the most: twice what the sessions take at once.
+    fn capacity(self) -> usize {
+        2 * self.sessions * self.max_batch
+    }
 }
 
-impl Worker {
-    fn serve(mut self, requests: &Mutex<Receiver<Request>>) {
-        while let Some(batch) = self.next_batch(requests) {
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Wide,
+    Narrow,
+}
+
+#[derive(Debug)]
+struct Request {
+    tensor: Tensor,
+    answer: Answer,
+}
+
+type Answer = oneshot::Sender<Result<RawOutput, InferenceError>>;
+
+#[derive(Debug)]
+struct Queue {
+    state: Mutex<State>,
+    /// Told when there may be something to do.
+    work: Condvar,
+    /// Told when there is room for another picture, and when a session is loaded.
+    room: Condvar,
+    layout: Layout,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    waiting: VecDeque<Request>,
+    /// Narrow sessions that are not loaded yet, and that are.
+    loading: usize,
+    narrow_sessions: usize,
+    wide_runs: bool,
+    narrow_runs: usize,
+    /// Whether narrow sessions take what comes.
+    crowded: bool,
+    /// Whether a picture came while another was in progress, since none was.
+    overlapped: bool,
+    closed: bool,
+}
+
+impl State {
+    fn in_progress(&self) -> bool {
+        self.wide_runs || self.narrow_runs > 0 || !self.waiting.is_empty()
+    }
+
+    fn may_take(&self, kind: Kind) -> bool {
+        let crowded = self.crowded && self.narrow_sessions > 0;
+        !self.waiting.is_empty()
+            && !self.wide_runs
+            && match kind {
+                Kind::Wide => !crowded && self.narrow_runs == 0,
+                Kind::Narrow => crowded,
+            }
+    }
+}
+
+impl Queue {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn close(&self) {
+        self.lock().closed = true;
+        self.work.notify_all();
+        self.room.notify_all();
+    }
+
+    fn note_loaded(&self, done: bool) {
+        let mut state = self.lock();
+        state.loading -= 1;
+        state.narrow_sessions += usize::from(done);
+        drop(state);
+        self.room.notify_all();
+    }
+
+    /// Runs one batch after another until the queue is closed.
+    fn serve(&self, mut runner: Runner, kind: Kind) {
+        while let Some(batch) = self.take(kind) {
+            let _run = Run { queue: self, kind };
             for (tensors, answers) in by_shape(batch) {
-                match self.runner.run(&tensors) {
+                match runner.run(&tensors) {
                     Ok(outputs) => {
-                        for (answer, output) in answers.iter().zip(outputs) {
+                        for (answer, output) in answers.into_iter().zip(outputs) {
                             let _ = answer.send(Ok(output));
                         }
                     }
                     Err(error) => {
-                        for answer in &answers {
+                        for answer in answers {
                             let _ = answer.send(Err(error.clone()));
                         }
                     }
@@ -157,60 +228,65 @@ impl Worker {
         }
     }
 
-    fn next_batch(&self, requests: &Mutex<Receiver<Request>>) -> Option<Vec<Request>> {
-        let requests = requests.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut batch = vec![requests.recv().ok()?];
-        while batch.len() < self.max_batch
-            && let Ok(request) = requests.try_recv()
-        {
-            batch.push(request);
+    /// Waits for something to do, less what nobody waits for any more; `None` when closed.
+    fn take(&self, kind: Kind) -> Option<Vec<Request>> {
+        let mut state = self.lock();
+        loop {
+            if state.closed {
+                return None;
+            }
+            state.waiting.retain(|request| !request.answer.is_closed());
+            if state.may_take(kind) {
+                break;
+            }
+            state = self.work.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
+        let fair = match kind {
+            Kind::Wide => state.waiting.len(),
+            Kind::Narrow => state.waiting.len().div_ceil(state.narrow_sessions),
+        };
+        let batch = state.waiting.drain(..fair.min(self.layout.max_batch)).collect();
+        match kind {
+            Kind::Wide => state.wide_runs = true,
+            Kind::Narrow => state.narrow_runs += 1,
+        }
+        drop(state);
+        self.room.notify_all();
         Some(batch)
     }
 }
 
-impl Runner {
-    /// Runs pictures of one shape together.
-    pub fn run(&mut self, tensors: &[Tensor]) -> Result<Vec<RawOutput>, InferenceError> {
-        let failed = |error: ort::Error| InferenceError::Run(error.to_string());
-        let (Some(first), count) = (tensors.first(), tensors.len()) else {
-            return Ok(Vec::new());
-        };
-        let shape = [count, 3, first.height, first.width];
-        let joined: Vec<f32>;
-        let data = if count == 1 {
-            first.data.as_slice()
-        } else {
-            joined = tensors.iter().flat_map(|tensor| tensor.data.iter().copied()).collect();
-            joined.as_slice()
-        };
-        let input = TensorRef::from_array_view((shape, data)).map_err(failed)?;
-        let outputs = self
-            .session
-            .run(ort::inputs![self.manifest.input.name.as_str() => input])
-            .map_err(failed)?;
-        let parts = |name: &str| {
-            let value = outputs.get(name).ok_or_else(|| {
-                InferenceError::Run(format!("the model has no output called {name:?}"))
-            })?;
-            let (_, numbers) = value.try_extract_tensor::<f32>().map_err(failed)?;
-            let each = numbers.len() / count;
-            Ok((0..count).map(|i| numbers[i * each..(i + 1) * each].to_vec()).collect::<Vec<_>>())
-        };
-        let features = parts(&self.manifest.output.features)?;
-        let reliability = match &self.manifest.output.reliability {
-            Some(name) => parts(name)?.into_iter().map(Some).collect(),
-            None => vec![None; count],
-        };
-        Ok(features
-            .into_iter()
-            .zip(reliability)
-            .map(|(features, reliability)| RawOutput { features, reliability })
-            .collect())
+/// A run in progress; its end is noted whatever becomes of it.
+struct Run<'a> {
+    queue: &'a Queue,
+    kind: Kind,
+}
+
+impl Drop for Run<'_> {
+    fn drop(&mut self) {
+        if thread::panicking() {
+            // Whoever waits should hear of it rather than wait for ever.
+            return self.queue.close();
+        }
+        let mut state = self.queue.lock();
+        match self.kind {
+            Kind::Wide => state.wide_runs = false,
+            Kind::Narrow => state.narrow_runs -= 1,
+        }
+        state.crowded |= state.overlapped;
+        if !state.in_progress() {
+            state.crowded = state.overlapped;
+            state.overlapped = false;
+        }
+        drop(state);
+        self.queue.work.notify_all();
     }
 }
 
-type Answer = SyncSender<Result<RawOutput, InferenceError>>;
+fn spawn(name: &str, body: impl FnOnce() + Send + 'static) -> Result<(), InferenceError> {
+    let spawned = thread::Builder::new().name(name.to_owned()).spawn(body);
+    spawned.map(drop).map_err(|error| InferenceError::Load(error.to_string()))
+}
 
 /// Groups a batch by the shape of its tensors: only like shapes run together.
 fn by_shape(batch: Vec<Request>) -> Vec<(Vec<Tensor>, Vec<Answer>)> {
@@ -228,4 +304,100 @@ fn by_shape(batch: Vec<Request>) -> Vec<(Vec<Tensor>, Vec<Answer>)> {
         }
     }
     groups
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn queue(narrow_sessions: usize, max_batch: usize) -> Queue {
+        let layout = Layout { threads: 4, sessions: narrow_sessions.max(1), max_batch };
+        let state = State { narrow_sessions, ..State::default() };
+        Queue { state: state.into(), work: Condvar::new(), room: Condvar::new(), layout }
+    }
+
+    fn submit(queue: &Queue) -> Inferring {
+        let (answer, inferring) = oneshot::channel();
+        let mut state = queue.lock();
+        state.overlapped |= state.in_progress();
+        state.waiting.push_back(Request { tensor: Tensor::grey(1, 1), answer });
+        Inferring(inferring)
+    }
+
+    fn may_take(queue: &Queue) -> (bool, bool) {
+        let state = queue.lock();
+        (state.may_take(Kind::Wide), state.may_take(Kind::Narrow))
+    }
+
+    /// What a session does, less inference.
+    fn run(queue: &Queue, kind: Kind) -> (Vec<Request>, Run<'_>) {
+        assert!(queue.lock().may_take(kind));
+        (queue.take(kind).unwrap(), Run { queue, kind })
+    }
+
+    #[test]
+    fn a_picture_that_comes_alone_has_all_threads() {
+        let queue = queue(2, 1);
+        for _ in 0..3 {
+            let _inferring = submit(&queue);
+            assert_eq!(may_take(&queue), (true, false));
+            drop(run(&queue, Kind::Wide));
+        }
+    }
+
+    #[test]
+    fn pictures_that_overlap_are_run_side_by_side_until_none_does() {
+        let queue = queue(2, 1);
+        let _a = submit(&queue);
+        let wide = run(&queue, Kind::Wide);
+        let (_b, _c) = (submit(&queue), submit(&queue));
+        assert_eq!(may_take(&queue), (false, false));
+        drop(wide);
+        let (first, second) = (run(&queue, Kind::Narrow), run(&queue, Kind::Narrow));
+        drop((first, second));
+        let _d = submit(&queue);
+        drop(run(&queue, Kind::Narrow));
+        let _e = submit(&queue);
+        assert_eq!(may_take(&queue), (true, false));
+    }
+
+    #[test]
+    fn the_wide_session_goes_on_where_there_is_no_other() {
+        let queue = queue(0, 8);
+        let _a = submit(&queue);
+        let wide = run(&queue, Kind::Wide);
+        let _more: Vec<_> = (0..9).map(|_| submit(&queue)).collect();
+        drop(wide);
+        assert_eq!(run(&queue, Kind::Wide).0.len(), 8);
+    }
+
+    #[test]
+    fn what_waits_is_shared_among_the_narrow_sessions() {
+        let queue = queue(2, 8);
+        let _inferring: Vec<_> = (0..6).map(|_| submit(&queue)).collect();
+        drop(run(&queue, Kind::Wide));
+        let _inferring: Vec<_> = (0..6).map(|_| submit(&queue)).collect();
+        queue.lock().crowded = true;
+        let first = run(&queue, Kind::Narrow);
+        assert_eq!((first.0.len(), queue.lock().waiting.len()), (3, 3));
+    }
+
+    #[test]
+    fn what_nobody_waits_for_any_more_is_not_run() {
+        let queue = queue(0, 8);
+        let mut inferring: Vec<_> = (0..5).map(|_| submit(&queue)).collect();
+        inferring.truncate(2);
+        assert_eq!(run(&queue, Kind::Wide).0.len(), 2);
+    }
+
+    #[test]
+    fn who_waits_hears_of_the_end() {
+        let queue = Arc::new(queue(0, 1));
+        let batcher = Batcher { queue: Arc::clone(&queue) };
+        let waits = batcher.submit(Tensor::grey(1, 1)).unwrap();
+        drop(batcher);
+        assert!(queue.take(Kind::Wide).is_none());
+        drop(queue);
+        assert!(matches!(waits.wait(), Err(InferenceError::Stopped)));
+    }
 }

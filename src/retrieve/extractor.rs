@@ -4,13 +4,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::batcher::{Batcher, BatcherSettings, InferenceError, Model};
-use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode};
-use super::manifest::{Input, Manifest, ManifestError, file_digest};
+use super::batcher::{Batcher, Inferring, Layout};
+use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jpeg};
+use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest};
 use super::pooling::{LocalFeatures, PoolingError};
 use super::preprocess::{self, PreprocessError, Tensor, preprocess};
-use super::provider::{self, Execution, Wanted};
+use super::provider::{self, Execution, Provider, Wanted};
 use super::runtime::{Assets, RuntimeError};
+use super::session::{InferenceError, Model, RawOutput};
 use crate::demo::{Town, TownSpec};
 use crate::domain::{DenseFeatures, Descriptor, DescriptorKind, Digest, MediaType};
 
@@ -19,12 +20,8 @@ use crate::domain::{DenseFeatures, Descriptor, DescriptorKind, Digest, MediaType
 pub struct ExtractorSettings {
     /// The model's name.
     pub model: String,
-    /// Sessions that run side by side.
-    pub sessions: usize,
-    /// Threads within one session.
-    pub threads: usize,
-    /// The most pictures in one run.
-    pub max_batch: usize,
+    /// How inference shares its threads among pictures.
+    pub layout: Layout,
     /// By whom and at which precision it may be run.
     pub wanted: Wanted,
     /// Where the choice among these is remembered; measured at each start if nowhere.
@@ -41,9 +38,7 @@ impl ExtractorSettings {
         let reference = Execution::REFERENCE;
         Self {
             model: model.into(),
-            sessions: 1,
-            threads,
-            max_batch: 1,
+            layout: Layout { threads, sessions: 1, max_batch: 1 },
             wanted: Wanted {
                 provider: Some(reference.provider),
                 precision: Some(reference.precision),
@@ -64,6 +59,37 @@ pub struct Extractor {
     execution: Execution,
     limits: ImageLimits,
     exact_decode: bool,
+}
+
+/// A picture that was handed to inference. Dropping it gives that up.
+#[derive(Debug)]
+pub struct Extracting {
+    shown: Shown,
+    inferring: Inferring,
+}
+
+/// What inference gave for one picture.
+#[derive(Debug)]
+pub struct Inferred {
+    shown: Shown,
+    raw: RawOutput,
+}
+
+#[derive(Debug)]
+struct Shown {
+    width: u32,
+    height: u32,
+    media_type: MediaType,
+    cells: (usize, usize),
+    decode: Duration,
+    decoded: Instant,
+}
+
+impl Extracting {
+    /// Waits for inference.
+    pub async fn inferred(self) -> Result<Inferred, ExtractError> {
+        Ok(Inferred { raw: self.inferring.answer().await?, shown: self.shown })
+    }
 }
 
 /// What was extracted from one picture.
@@ -121,29 +147,19 @@ pub enum ExtractError {
 impl Extractor {
     /// Loads a model and checks it by running one picture through it.
     pub fn load(assets: &Assets, settings: &ExtractorSettings) -> Result<Self, ExtractError> {
-        let environment = assets.load_onnxruntime(settings.wanted.provider)?;
-        let folder = assets.model(&settings.model)?;
-        let manifest = Arc::new(Manifest::read(&folder.join("manifest.toml"))?);
-        let file = folder.join(&manifest.file);
-        let digest = checked_digest(&file, &manifest)?;
-        let model = Model {
-            environment: &environment,
-            file: &file,
-            manifest: &manifest,
-            threads: settings.threads,
-        };
+        let Opened { model, digest } =
+            Opened::open(assets, &settings.model, settings.wanted.provider)?;
         let execution = chosen(&model, digest, settings)?;
-        let (sessions, max_batch) = (settings.sessions, settings.max_batch);
-        let batcher = Batcher::start(&model, BatcherSettings { sessions, max_batch, execution })?;
+        let batcher = Batcher::start(&model, execution, settings.layout)?;
         let extractor = Self {
-            manifest,
+            manifest: model.manifest,
             digest,
             batcher,
             execution,
             limits: settings.limits,
             exact_decode: settings.exact_decode,
         };
-        extractor.warm_up()?;
+        extractor.check()?;
         Ok(extractor)
     }
 
@@ -167,53 +183,98 @@ impl Extractor {
         self.limits
     }
 
-    /// Decodes a picture and runs it through the model.
+    /// Decodes a picture, runs it through the model and makes its descriptor; blocks.
     pub fn extract(&self, bytes: &[u8], kind: DescriptorKind) -> Result<Extraction, ExtractError> {
+        let Extracting { shown, inferring } = self.begin(bytes)?;
+        self.finish(Inferred { shown, raw: inferring.wait()? }, kind)
+    }
+
+    /// Decodes a picture and hands it to inference; blocks for the one, and while the queue before
+    /// the other is full.
+    pub fn begin(&self, bytes: &[u8]) -> Result<Extracting, ExtractError> {
         let start = Instant::now();
         let input = &self.manifest.input;
         let needed = if self.exact_decode { Needed::All } else { preprocess::needed(input) };
         let Picture { pixels, width, height, media_type } = decode(bytes, self.limits, needed)?;
         let tensor = preprocess(&pixels, (width, height), input)?;
         drop(pixels);
+        let stride = self.manifest.output.stride as usize;
+        let cells = (tensor.height / stride, tensor.width / stride);
         let decoded = Instant::now();
-        let local = self.local_features(tensor)?;
+        let inferring = self.batcher.submit(tensor)?;
+        let decode = decoded - start;
+        Ok(Extracting {
+            shown: Shown { width, height, media_type, cells, decode, decoded },
+            inferring,
+        })
+    }
+
+    /// Makes the descriptor of what inference gave; blocks for less than a millisecond.
+    pub fn finish(
+        &self,
+        inferred: Inferred,
+        kind: DescriptorKind,
+    ) -> Result<Extraction, ExtractError> {
+        let Inferred { shown, raw } = inferred;
+        let local = self.local_features(shown.cells, &raw)?;
         let descriptor = local.descriptor(kind, &self.manifest.pooling)?;
         let dense = local.into_dense()?;
-        let times = StageTimes { decode: decoded - start, extract: decoded.elapsed() };
+        let Shown { width, height, media_type, decode, decoded, .. } = shown;
+        let times = StageTimes { decode, extract: decoded.elapsed() };
         Ok(Extraction { descriptor, dense, media_type, width, height, times })
     }
 
-    fn local_features(&self, tensor: Tensor) -> Result<LocalFeatures, ExtractError> {
-        let stride = self.manifest.output.stride as usize;
-        let cells = (tensor.height / stride, tensor.width / stride);
-        let raw = self.batcher.infer(tensor)?;
+    fn local_features(
+        &self,
+        cells: (usize, usize),
+        raw: &RawOutput,
+    ) -> Result<LocalFeatures, PoolingError> {
         let output = &self.manifest.output;
-        Ok(LocalFeatures::from_output(output, cells, &raw.features, raw.reliability.as_deref())?)
+        LocalFeatures::from_output(output, cells, &raw.features, raw.reliability.as_deref())
     }
 
-    /// The first run of a graph allocates and optimises; a robot should not wait for that, and a
-    /// manifest that does not fit its model should stop the start, not the first request.
-    fn warm_up(&self) -> Result<(), ExtractError> {
-        let input = &self.manifest.input;
-        let pixels = image::RgbImage::from_fn(input.width, input.height, |x, y| {
+    /// A manifest that does not fit its model should stop the start, not the first request.
+    fn check(&self) -> Result<(), ExtractError> {
+        let Input { width, height, .. } = self.manifest.input;
+        let pixels = image::RgbImage::from_fn(width, height, |x, y| {
             image::Rgb([(x * 7 + y * 13) as u8, (x * y) as u8, (x * 3 + y) as u8])
         });
-        let local = self.local_features(preprocess(&pixels, pixels.dimensions(), input)?)?;
-        local.descriptor(DescriptorKind::Gem, &self.manifest.pooling)?;
-        Ok(())
+        self.extract(&encode_jpeg(&pixels)?, DescriptorKind::Gem).map(drop)
+    }
+}
+
+/// A model that was found and is the one that its manifest means.
+#[derive(Debug)]
+pub(super) struct Opened {
+    pub model: Model,
+    pub digest: Digest,
+}
+
+impl Opened {
+    pub fn open(
+        assets: &Assets,
+        name: &str,
+        provider: Option<Provider>,
+    ) -> Result<Self, ExtractError> {
+        let environment = assets.load_onnxruntime(provider)?;
+        let folder = assets.model(name)?;
+        let manifest = Arc::new(Manifest::read(&folder.join(MANIFEST))?);
+        let file = folder.join(&manifest.file);
+        let digest = checked_digest(&file, &manifest)?;
+        Ok(Self { model: Model { environment, file, manifest }, digest })
     }
 }
 
 /// The execution that was chosen at an earlier start under the same conditions, or the best of
 /// those that are tried now.
 fn chosen(
-    model: &Model<'_>,
+    model: &Model,
     digest: Digest,
     settings: &ExtractorSettings,
 ) -> Result<Execution, ExtractError> {
     let key = format!(
         "model {digest}, {} threads, {}, processor {}, {}",
-        settings.threads,
+        settings.layout.threads,
         settings.wanted,
         provider::processor(),
         ort::info()
@@ -223,7 +284,8 @@ fn chosen(
         return Ok(known);
     }
     let sample = sample(&model.manifest.input)?;
-    let (execution, trials) = provider::choose(model, model.manifest, settings.wanted, &sample)?;
+    let (execution, trials) =
+        provider::choose(model, settings.wanted, settings.layout.threads, &sample)?;
     for trial in &trials {
         match &trial.outcome {
             Ok(measured) => tracing::info!(
@@ -242,7 +304,7 @@ fn chosen(
 }
 
 /// Pictures such as a model meets: streets by day and by night.
-fn sample(input: &Input) -> Result<Vec<Tensor>, ExtractError> {
+pub(super) fn sample(input: &Input) -> Result<Vec<Tensor>, ExtractError> {
     let town = Town::new(TownSpec { places: 2, ..TownSpec::default() });
     let pictures = [town.reference(0), town.query(1, 1)];
     let tensors =

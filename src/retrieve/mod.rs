@@ -6,6 +6,7 @@
 //! business of [`crate::store`].
 
 mod batcher;
+mod bench;
 pub mod decode;
 mod extractor;
 pub mod index;
@@ -16,9 +17,14 @@ pub mod pooling;
 pub mod preprocess;
 mod provider;
 mod runtime;
+mod session;
 
+pub use batcher::Layout;
+pub use bench::{Bench, BenchRow, BenchSettings, Figures};
 pub use decode::{DecodeError, ImageLimits, Needed, Picture};
-pub use extractor::{ExtractError, Extraction, Extractor, ExtractorSettings, StageTimes};
+pub use extractor::{
+    ExtractError, Extracting, Extraction, Extractor, ExtractorSettings, Inferred, StageTimes,
+};
 pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
 pub use provider::{Execution, LEAST_SIMILARITY, Measured, Provider, Trial, Wanted};

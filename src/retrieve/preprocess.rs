@@ -21,6 +21,13 @@ pub struct Tensor {
     pub data: Vec<f32>,
 }
 
+impl Tensor {
+    /// A picture without content.
+    pub(super) fn grey(width: usize, height: usize) -> Self {
+        Self { height, width, data: vec![0.0; 3 * width * height] }
+    }
+}
+
 /// Why a picture could not be resized.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot resize a picture of {width}×{height} pixels: {reason}")]

@@ -11,10 +11,10 @@ use ort::ep::{ArbitrarilyConfigurableExecutionProvider, ExecutionProvider, OpenV
 use ort::ep::{CUDA, CoreML, ExecutionProviderDispatch, TensorRT};
 use serde::{Deserialize, Serialize};
 
-use super::batcher::{InferenceError, Model};
 use super::manifest::Manifest;
 use super::pooling::LocalFeatures;
 use super::preprocess::Tensor;
+use super::session::{InferenceError, Model, Runner};
 use crate::domain::{Descriptor, DescriptorKind, Digest, Precision};
 
 /// The least cosine similarity between a descriptor of a faster choice and that of the CPU at full
@@ -96,7 +96,7 @@ impl Execution {
     pub const REFERENCE: Self = Self { provider: Provider::Cpu, precision: Precision::Full };
 
     /// What can be tried for a wish, given what the library was built with.
-    fn candidates(wanted: Wanted) -> Vec<Self> {
+    pub(super) fn candidates(wanted: Wanted) -> Vec<Self> {
         const ALL: [Execution; 6] = [
             Execution::REFERENCE,
             Execution { provider: Provider::OpenVino, precision: Precision::Full },
@@ -157,9 +157,9 @@ impl Provider {
 /// Tries all that a wish allows on `sample`, and returns the fastest whose descriptors are right,
 /// with all trials.
 pub(super) fn choose(
-    model: &Model<'_>,
-    manifest: &Manifest,
+    model: &Model,
     wanted: Wanted,
+    threads: usize,
     sample: &[Tensor],
 ) -> Result<(Execution, Vec<Trial>), InferenceError> {
     let candidates = Execution::candidates(wanted);
@@ -172,13 +172,13 @@ pub(super) fn choose(
     if let [only] = candidates.as_slice() {
         return Ok((*only, Vec::new()));
     }
-    let reference = try_one(model, manifest, Execution::REFERENCE, sample)?;
+    let reference = try_one(model, Execution::REFERENCE, threads, sample)?;
     let mut trials = Vec::new();
     for execution in candidates {
         let outcome = if execution == Execution::REFERENCE {
             Ok(Measured { latency: reference.latency, similarity: 1.0 })
         } else {
-            try_one(model, manifest, execution, sample).map_err(|error| error.to_string()).map(
+            try_one(model, execution, threads, sample).map_err(|error| error.to_string()).map(
                 |tried| Measured {
                     latency: tried.latency,
                     similarity: least_similarity(&tried.descriptors, &reference.descriptors),
@@ -218,19 +218,16 @@ struct Tried {
 }
 
 fn try_one(
-    model: &Model<'_>,
-    manifest: &Manifest,
+    model: &Model,
     execution: Execution,
+    threads: usize,
     sample: &[Tensor],
 ) -> Result<Tried, InferenceError> {
     /// A large model on a small machine shows what it does in fewer.
     const RUNS: std::ops::RangeInclusive<usize> = 3..=11;
     const LONG_ENOUGH: Duration = Duration::from_millis(500);
-    let mut runner = model.load(execution)?;
-    let mut descriptors = Vec::with_capacity(sample.len());
-    for tensor in sample {
-        descriptors.push(descriptor(manifest, tensor, &mut runner)?);
-    }
+    let mut runner = model.load(execution, threads)?;
+    let descriptors = run_all(model, &mut runner, sample)?;
     let mut times: Vec<Duration> = Vec::with_capacity(*RUNS.end());
     for tensor in sample.iter().cycle().take(*RUNS.end()) {
         if times.len() >= *RUNS.start() && times.iter().sum::<Duration>() > LONG_ENOUGH {
@@ -244,22 +241,38 @@ fn try_one(
     Ok(Tried { latency: times.get(times.len() / 2).copied().unwrap_or_default(), descriptors })
 }
 
-fn descriptor(
-    manifest: &Manifest,
-    tensor: &Tensor,
-    runner: &mut super::batcher::Runner,
-) -> Result<Descriptor, InferenceError> {
-    let unfit = |error: super::pooling::PoolingError| InferenceError::Run(error.to_string());
-    let stride = manifest.output.stride as usize;
-    let cells = (tensor.height / stride, tensor.width / stride);
-    let raw = runner.run(std::slice::from_ref(tensor))?;
-    let raw = raw.first().ok_or_else(|| InferenceError::Run("the model gave nothing".into()))?;
-    LocalFeatures::from_output(&manifest.output, cells, &raw.features, raw.reliability.as_deref())
-        .and_then(|local| local.descriptor(DescriptorKind::Gem, &manifest.pooling))
-        .map_err(unfit)
+/// The descriptors of `sample` by one execution on so many threads.
+pub(super) fn descriptors(
+    model: &Model,
+    execution: Execution,
+    threads: usize,
+    sample: &[Tensor],
+) -> Result<Vec<Descriptor>, InferenceError> {
+    run_all(model, &mut model.load(execution, threads)?, sample)
 }
 
-fn least_similarity(tried: &[Descriptor], reference: &[Descriptor]) -> f32 {
+fn run_all(
+    model: &Model,
+    runner: &mut Runner,
+    sample: &[Tensor],
+) -> Result<Vec<Descriptor>, InferenceError> {
+    let unfit = |error: super::pooling::PoolingError| InferenceError::Run(error.to_string());
+    let Manifest { output, pooling, .. } = &*model.manifest;
+    let stride = output.stride as usize;
+    let one = |tensor: &Tensor| {
+        let cells = (tensor.height / stride, tensor.width / stride);
+        let raw = runner.run(std::slice::from_ref(tensor))?;
+        let raw =
+            raw.first().ok_or_else(|| InferenceError::Run("the model gave nothing".into()))?;
+        LocalFeatures::from_output(output, cells, &raw.features, raw.reliability.as_deref())
+            .and_then(|local| local.descriptor(DescriptorKind::Gem, pooling))
+            .map_err(unfit)
+    };
+    sample.iter().map(one).collect()
+}
+
+/// The least cosine similarity of descriptors, pair by pair.
+pub(super) fn least_similarity(tried: &[Descriptor], reference: &[Descriptor]) -> f32 {
     let pairs = tried.iter().zip(reference);
     pairs.map(|(tried, right)| tried.similarity(right)).fold(1.0, f32::min)
 }

@@ -142,13 +142,16 @@ impl Service {
         bytes: Bytes,
         kind: crate::domain::DescriptorKind,
     ) -> Result<crate::retrieve::Extraction, ServiceError> {
-        let (extractor, metrics) = (Arc::clone(&self.extractor), Arc::clone(&self.metrics));
-        self.on_pool(move || {
-            let extraction = extractor.extract(&bytes, kind)?;
-            metrics.observe_stages(extraction.times);
-            Ok(extraction)
-        })
-        .await
+        let extractor = Arc::clone(&self.extractor);
+        let extracting = self.on_pool(move || extractor.begin(&bytes)).await?;
+        let inferred = extracting.inferred().await?;
+        // Not by the pool, which might refuse it now that nearly all is done.
+        let extractor = Arc::clone(&self.extractor);
+        let finishing = tokio::task::spawn_blocking(move || extractor.finish(inferred, kind)).await;
+        let extraction = finishing
+            .map_err(|error| ServiceError::new(super::ErrorKind::Internal, error.to_string()))??;
+        self.metrics.observe_stages(extraction.times);
+        Ok(extraction)
     }
 
     async fn on_pool<T, F>(&self, work: F) -> Result<T, ServiceError>

@@ -11,7 +11,7 @@ use std::process::Command;
 use serde::Deserialize;
 use tempfile::TempDir;
 use whereabouts::domain::DescriptorKind;
-use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits};
+use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
 
 /// The least cosine similarity to the descriptor of the original, for each picture.
 const LEAST: f64 = 0.9999;
@@ -84,8 +84,8 @@ fn check(model: &str) {
     for (folder, expected) in &by_input {
         let name = folder.file_name().unwrap().to_str().unwrap();
         let limits = ImageLimits { max_pixels: 10_000_000 };
-        let settings =
-            ExtractorSettings { max_batch: 8, ..ExtractorSettings::plain(name, 2, limits) };
+        let layout = Layout { threads: 2, sessions: 1, max_batch: 8 };
+        let settings = ExtractorSettings { layout, ..ExtractorSettings::plain(name, 2, limits) };
         let extractor = Extractor::load(&Assets::locate(Some(root.path())), &settings).unwrap();
         // Each twice at once: what shares a batch must not depend on it.
         std::thread::scope(|scope| {

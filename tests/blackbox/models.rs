@@ -5,15 +5,19 @@ use std::path::Path;
 use serde_json::Value;
 use tempfile::TempDir;
 use whereabouts::domain::DescriptorKind;
-use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits};
+use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
 
 use super::support::{BINARY, Server, frame, reference};
 
-fn load(model: &str, max_batch: usize) -> Extractor {
+const ONE: Layout = Layout { threads: 1, sessions: 1, max_batch: 1 };
+const EIGHT: Layout = Layout { threads: 1, sessions: 1, max_batch: 8 };
+const SIDE_BY_SIDE: Layout = Layout { threads: 4, sessions: 2, max_batch: 2 };
+
+fn load(model: &str, layout: Layout) -> Extractor {
     // The fixtures first, then what `make build` installed.
     let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures");
     let limits = ImageLimits { max_pixels: 10_000_000 };
-    let settings = ExtractorSettings { max_batch, ..ExtractorSettings::plain(model, 1, limits) };
+    let settings = ExtractorSettings { layout, ..ExtractorSettings::plain(model, 1, limits) };
     Extractor::load(&Assets::locate(Some(&fixtures)), &settings).unwrap()
 }
 
@@ -35,7 +39,7 @@ fn cosine(a: &[f32], b: &[f32]) -> f64 {
 
 #[test]
 fn a_token_model_gives_the_descriptors_that_numpy_worked_out() {
-    let extractor = load("tiny-tokens", 1);
+    let extractor = load("tiny-tokens", ONE);
     let file =
         concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/models/tiny-tokens/expected.json");
     let expected: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
@@ -52,23 +56,28 @@ fn a_token_model_gives_the_descriptors_that_numpy_worked_out() {
 
 #[test]
 fn a_batch_gives_what_single_runs_give() {
-    let (single, batched) = (load("xfeat", 1), load("xfeat", 8));
+    let single = load("xfeat", ONE);
     let alone: Vec<_> = (0..8)
         .map(|place| single.extract(&reference(place), DescriptorKind::Gem).unwrap().descriptor)
         .collect();
-    std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..8)
-            .map(|place| {
-                let batched = &batched;
-                scope
-                    .spawn(move || batched.extract(&reference(place), DescriptorKind::Gem).unwrap())
-            })
-            .collect();
-        for (thread, alone) in threads.into_iter().zip(&alone) {
-            let together = thread.join().unwrap().descriptor;
-            assert!(cosine(together.as_slice(), alone.as_slice()) > 0.999_99);
-        }
-    });
+    for layout in [EIGHT, SIDE_BY_SIDE] {
+        let shared = load("xfeat", layout);
+        std::thread::scope(|scope| {
+            let shared = &shared;
+            let extract = move |place| {
+                shared.extract(&reference(place), DescriptorKind::Gem).unwrap().descriptor
+            };
+            // Several rounds, so that pictures come both alone and while others are in progress.
+            let threads: Vec<_> =
+                (0..8).map(|place| scope.spawn(move || [(); 5].map(|()| extract(place)))).collect();
+            for (thread, alone) in threads.into_iter().zip(&alone) {
+                for together in thread.join().unwrap() {
+                    let similarity = cosine(together.as_slice(), alone.as_slice());
+                    assert!(similarity > 0.999_99, "{layout:?}: {similarity}");
+                }
+            }
+        });
+    }
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! `whereabouts model`.
 
 mod account;
+mod bench;
 mod screen;
 
 use std::path::PathBuf;
@@ -70,6 +71,8 @@ enum Action {
         #[arg(long)]
         json: bool,
     },
+    /// Measure each way of running a model on this machine: provider, precision, threads, batch
+    Bench(bench::BenchArgs),
     /// Choose the model that a server runs
     Use {
         /// An installed model; or auto, to take a choice back
@@ -108,6 +111,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
             Ok(())
         }
         Action::Verify { name, json } => account::verify(&place, name.as_deref(), json),
+        Action::Bench(args) => tokio::task::block_in_place(|| bench::run(&place, args)),
         Action::Use { name } => choose(&place, &name),
     }
 }
