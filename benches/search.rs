@@ -1,12 +1,11 @@
 //! Search among clustered unit vectors of 384 dimensions, one thread: recall and queries a second,
-//! against exact search in this process and against hnswlib on the same vectors.
+//! against exact search in this process and against hnswlib, faiss and usearch on the same vectors.
 //!
 //! 76,000 vectors, as many as Tokyo 24/7 has images, or as many as the first argument says:
-//! `cargo bench --bench search -- 20000`.
+//! `PYTHON=$(benches/peers/setup.sh) cargo bench --bench search -- 20000`.
 //!
-//! hnswlib runs in Python, called with all queries at once so that Python itself costs nothing:
-//! `benches/peers/hnswlib_search.py`, with whatever `python3` finds (`pip install hnswlib numpy`).
-//! Without it, its lines are left out and that is said.
+//! The peers run in Python, called with all queries at once so that Python itself costs nothing. One
+//! that this Python lacks is left out, and that is said.
 
 use std::io::Write;
 use std::ops::Range;
@@ -26,6 +25,7 @@ const K: usize = 10;
 const M: usize = 16;
 const EF_CONSTRUCTION: usize = 200;
 const EFS: [usize; 6] = [16, 24, 32, 48, 96, 192];
+const PEERS: [&str; 3] = ["hnswlib", "faiss", "usearch"];
 
 struct Rows(Vec<f32>);
 
@@ -74,7 +74,13 @@ fn clustered(count: usize, seed: u64) -> Rows {
 }
 
 fn settings(ef_search: usize) -> IndexSettings {
-    IndexSettings { exact_up_to: 1000, m: M, ef_construction: EF_CONSTRUCTION, ef_search }
+    IndexSettings {
+        exact_up_to: 1000,
+        m: M,
+        ef_construction: EF_CONSTRUCTION,
+        ef_search,
+        max_dead_share: 1.0,
+    }
 }
 
 fn main() -> anyhow::Result<()> {
@@ -97,15 +103,16 @@ fn main() -> anyhow::Result<()> {
     let exact = 50.0 / start.elapsed().as_secs_f64();
     println!("exact: {exact:.0} queries/s");
 
+    let threads = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
     let start = Instant::now();
     let mut sealed = None;
     while index.has_work() {
-        sealed = index.catch_up(&rows, 1000).or(sealed);
+        sealed = index.catch_up(&rows, 1000, &threads).or(sealed);
     }
+    let built = start.elapsed().as_secs_f64();
     let bytes = sealed.context("no graph was sealed")?.to_bytes();
     println!(
-        "{vectors} built and sealed in {:.1} s; its file has {:.1} MB, {:.2} × the vectors",
-        start.elapsed().as_secs_f64(),
+        "{vectors} built and sealed in {built:.1} s; its file has {:.1} MB, {:.2} × the vectors",
         bytes.len() as f64 / 1e6,
         bytes.len() as f64 / (vectors * DIM * 4) as f64
     );
@@ -126,20 +133,36 @@ fn main() -> anyhow::Result<()> {
         println!("sealed graph, ef {ef:3}: recall@10 {recall:.4}, {per_second:.0} queries/s");
         ours.push((recall, per_second));
     }
-    match hnswlib(&rows, &queries, &truth) {
-        Ok(theirs) => {
-            for ((ef, ours), theirs) in EFS.iter().zip(&ours).zip(&theirs) {
-                println!(
-                    "ef {ef:3}: {:.2} × hnswlib, at recall@10 {:.4} against {:.4}",
-                    ours.1 / theirs.1,
-                    ours.0,
-                    theirs.0
-                );
-            }
+    for peer in PEERS {
+        match run_peer(peer, &rows, &queries, &truth) {
+            Ok(theirs) => compare(peer, (built, &ours), &theirs),
+            Err(error) => println!("{peer} was not run: {error:#}"),
         }
-        Err(error) => println!("hnswlib was not run: {error:#}"),
     }
     Ok(())
+}
+
+/// Prints our speed over a peer's at the recalls that the peer reached. Between two of our points the
+/// speed is taken from the line through them.
+fn compare(peer: &str, (built, ours): (f64, &[(f64, f64)]), theirs: &Measured) {
+    println!("{peer}: our graph takes {:.2} × its time to build", built / theirs.built);
+    for &(recall, per_second) in &theirs.points {
+        let above = ours.iter().position(|point| point.0 >= recall);
+        let Some(above) = above else {
+            println!("{peer}: at recall@10 {recall:.4} there is nothing of ours to compare");
+            continue;
+        };
+        let speed = match above.checked_sub(1).map(|below| (ours[below], ours[above])) {
+            Some((low, high)) if high.0 > low.0 => {
+                low.1 + (high.1 - low.1) * (recall - low.0) / (high.0 - low.0)
+            }
+            _ => ours[above].1,
+        };
+        println!(
+            "{peer}: at recall@10 {recall:.4}, {:.2} × its queries a second",
+            speed / per_second
+        );
+    }
 }
 
 fn slots(index: &MapIndex, rows: &Rows, query: &[f32], mode: SearchMode) -> Vec<usize> {
@@ -154,36 +177,49 @@ fn recall(found: &[Vec<usize>], truth: &[Vec<usize>]) -> f64 {
     hits.sum::<usize>() as f64 / (K * truth.len()) as f64
 }
 
-/// Recall and queries a second of hnswlib for each of [`EFS`].
-fn hnswlib(rows: &Rows, queries: &Rows, truth: &[Vec<usize>]) -> anyhow::Result<Vec<(f64, f64)>> {
+/// What a peer did.
+struct Measured {
+    /// Seconds to build its graph.
+    built: f64,
+    /// Recall and queries a second for each of [`EFS`].
+    points: Vec<(f64, f64)>,
+}
+
+fn run_peer(
+    peer: &str,
+    rows: &Rows,
+    queries: &Rows,
+    truth: &[Vec<usize>],
+) -> anyhow::Result<Measured> {
     let dir = tempfile::tempdir()?;
     write(&dir.path().join("vectors"), bytemuck::cast_slice(&rows.0))?;
     write(&dir.path().join("queries"), bytemuck::cast_slice(&queries.0))?;
     let truth: Vec<u32> = truth.iter().flatten().map(|&slot| slot as u32).collect();
     write(&dir.path().join("truth"), bytemuck::cast_slice(&truth))?;
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers/hnswlib_search.py");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers/search.py");
     let efs: Vec<String> = EFS.iter().map(usize::to_string).collect();
     let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".into());
     let output = Command::new(python)
         .arg(script)
+        .arg(peer)
         .arg(dir.path())
         .args([DIM, K, M, EF_CONSTRUCTION].map(|number| number.to_string()))
         .args(efs)
         .output()
-        .context("cannot start python3")?;
+        .context("cannot start Python")?;
     let said = String::from_utf8_lossy(&output.stderr);
     anyhow::ensure!(output.status.success(), "{}", said.lines().last().unwrap_or_default());
-    let mut measured = Vec::new();
-    for line in String::from_utf8(output.stdout)?.lines() {
-        println!("hnswlib, {line}");
-        let number = |name: &str| -> Option<f64> {
-            line.split_once(name)?.1.split_whitespace().next()?.trim_end_matches(',').parse().ok()
-        };
-        if let (Some(recall), Some(per_second)) = (number("recall@10 "), number("speed ")) {
-            measured.push((recall, per_second));
-        }
+    let text = String::from_utf8(output.stdout)?;
+    let mut lines = text.lines();
+    let built = lines.next().context("it said nothing")?.parse()?;
+    let mut points = Vec::new();
+    for (ef, line) in EFS.iter().zip(lines) {
+        let (recall, per_second) = line.split_once(' ').context("it said half a line")?;
+        let (recall, per_second): (f64, f64) = (recall.parse()?, per_second.parse()?);
+        println!("{peer}, ef {ef:3}: recall@10 {recall:.4}, {per_second:.0} queries/s");
+        points.push((recall, per_second));
     }
-    Ok(measured)
+    Ok(Measured { built, points })
 }
 
 fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {

@@ -202,6 +202,10 @@ pub struct Index {
     pub ef_construction: usize,
     /// HNSW: points looked at when searching.
     pub ef_search: usize,
+    /// Threads that build graphs; 0 for half of the cores.
+    pub threads: usize,
+    /// The share of dead points from which a graph is built again.
+    pub max_dead_share: f32,
 }
 
 /// `[localize]`

@@ -90,6 +90,11 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
             m: config.index.m,
             ef_construction: config.index.ef_construction,
             ef_search: config.index.ef_search,
+            max_dead_share: config.index.max_dead_share,
+        },
+        index_threads: match config.index.threads {
+            0 => (cores_unless(0) / 2).max(1),
+            threads => threads,
         },
         db_cache_bytes: config.data.db_cache_bytes,
         commit_batch: config.data.commit_batch,

@@ -16,6 +16,9 @@ mod sealed;
 use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
+use rayon::ThreadPool;
+use rayon::prelude::*;
+
 use self::exact::Best;
 use self::graph::Graph;
 pub use self::sealed::{DamagedGraph, SealedGraph};
@@ -40,6 +43,8 @@ pub struct IndexSettings {
     pub ef_construction: usize,
     /// Points looked at when searching (ef); raised to k where that is larger.
     pub ef_search: usize,
+    /// A sealed graph is built again once this share of its points, 0 to 1, has been removed.
+    pub max_dead_share: f32,
 }
 
 /// A stored descriptor and its similarity to the query.
@@ -77,6 +82,30 @@ pub struct MapIndex {
 struct Live {
     slots: Vec<bool>,
     count: usize,
+    /// Where the sealed graph ends, and how many of the slots below are live.
+    sealed_end: usize,
+    sealed_count: usize,
+}
+
+impl Live {
+    fn set(&mut self, slot: usize, live: bool) {
+        if self.slots.len() <= slot {
+            self.slots.resize(slot + 1, false);
+        }
+        if std::mem::replace(&mut self.slots[slot], live) == live {
+            return;
+        }
+        let step = |count: &mut usize| *count = if live { *count + 1 } else { *count - 1 };
+        step(&mut self.count);
+        if slot < self.sealed_end {
+            step(&mut self.sealed_count);
+        }
+    }
+
+    fn seal(&mut self, end: usize) {
+        self.sealed_end = end;
+        self.sealed_count = self.slots.iter().take(end).filter(|live| **live).count();
+    }
 }
 
 #[derive(Default, Clone)]
@@ -115,28 +144,17 @@ impl MapIndex {
 
     /// Searches with a graph that was sealed by an earlier process.
     pub fn restore(&self, sealed: SealedGraph) {
-        let graphed = sealed.end();
-        let sealed = Some(Arc::new(sealed));
-        *self.graphs_mut() = Graphs { sealed, growing: None, graphed };
+        self.replace_graphs(Arc::new(sealed));
     }
 
     /// Makes the image in `slot` part of every later answer.
     pub fn add(&self, slot: usize) {
-        let mut live = self.live.write().unwrap_or_else(PoisonError::into_inner);
-        if live.slots.len() <= slot {
-            live.slots.resize(slot + 1, false);
-        }
-        if !std::mem::replace(&mut live.slots[slot], true) {
-            live.count += 1;
-        }
+        self.live_mut().set(slot, true);
     }
 
     /// Keeps the image in `slot` out of every later answer.
     pub fn remove(&self, slot: usize) {
-        let mut live = self.live.write().unwrap_or_else(PoisonError::into_inner);
-        if live.slots.get_mut(slot).is_some_and(|live| std::mem::replace(live, false)) {
-            live.count -= 1;
-        }
+        self.live_mut().set(slot, false);
     }
 
     /// How many images are part of the map.
@@ -205,11 +223,15 @@ impl MapIndex {
         self.is_behind() || self.merging().is_some() || self.wants_sealing()
     }
 
-    /// Whether the growing graph has become as large as the sealed one.
+    /// Whether the growing graph has become as large as the sealed one, or too many points of the
+    /// sealed one are dead: a search walks over them in vain.
     fn wants_sealing(&self) -> bool {
         let graphs = self.graphs();
         let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
-        graphs.growing.is_some() && graphed - sealed_end >= sealed_end.max(1)
+        let has_grown = graphs.growing.is_some() && graphed - sealed_end >= sealed_end.max(1);
+        let points = graphs.sealed.as_ref().map_or(0, |sealed| sealed.len());
+        let dead = points.saturating_sub(self.live().sealed_count);
+        has_grown || dead as f32 > self.settings.max_dead_share * points as f32
     }
 
     /// Does a piece of the work that waits, over at most `most` slots; returns the graph that was
@@ -217,12 +239,17 @@ impl MapIndex {
     ///
     /// New slots go into the growing graph. When none waits and that graph has become as large as
     /// the sealed one, the two are made one, which is then sealed: each slot is put into a graph
-    /// twice on average, whatever the size of the map.
-    pub fn catch_up(&self, vectors: &dyn Vectors, most: usize) -> Option<Arc<SealedGraph>> {
+    /// twice on average, whatever the size of the map. `threads` share the work on the graph.
+    pub fn catch_up(
+        &self,
+        vectors: &dyn Vectors,
+        most: usize,
+        threads: &ThreadPool,
+    ) -> Option<Arc<SealedGraph>> {
         let mut merging = self.merging();
         if let Some(merge) = merging.as_mut() {
             let end = merge.end.min(merge.done + most);
-            self.insert(&merge.graph, vectors, merge.done..end);
+            self.insert(&merge.graph, vectors, merge.done..end, threads);
             merge.done = end;
             if merge.done < merge.end {
                 return None;
@@ -234,7 +261,7 @@ impl MapIndex {
             let graphs = self.graphs().clone();
             let growing = graphs.growing.unwrap_or_else(|| Arc::new(Graph::new(&self.settings)));
             let end = self.live().slots.len().min(graphs.graphed + most);
-            self.insert(&growing, vectors, graphs.graphed..end);
+            self.insert(&growing, vectors, graphs.graphed..end, threads);
             let mut graphs = self.graphs_mut();
             graphs.growing = Some(growing);
             graphs.graphed = end;
@@ -254,24 +281,41 @@ impl MapIndex {
         }
     }
 
-    fn insert(&self, graph: &Graph, vectors: &dyn Vectors, slots: Range<usize>) {
+    fn insert(
+        &self,
+        graph: &Graph,
+        vectors: &dyn Vectors,
+        slots: Range<usize>,
+        threads: &ThreadPool,
+    ) {
         let live: Vec<bool> = {
             let live = self.live();
             slots.clone().map(|slot| live.slots.get(slot).copied().unwrap_or(false)).collect()
         };
+        let mut rows = Vec::with_capacity(slots.len());
         vectors.scan(slots.clone(), &mut |slot, vector| {
             if live[slot - slots.start] {
-                graph.insert(slot, vector);
+                rows.push((slot, vector.to_vec()));
             }
         });
+        threads.install(|| rows.par_iter().for_each(|(slot, vector)| graph.insert(*slot, vector)));
     }
 
     /// Replaces the graphs there are by a finished one.
     fn seal(&self, graph: &Graph, end: usize, vectors: &dyn Vectors) -> Arc<SealedGraph> {
         let sealed = Arc::new(SealedGraph::new(&graph.linked(), end, vectors, &self.settings));
-        *self.graphs_mut() =
-            Graphs { sealed: Some(Arc::clone(&sealed)), growing: None, graphed: end };
+        self.replace_graphs(Arc::clone(&sealed));
         sealed
+    }
+
+    fn replace_graphs(&self, sealed: Arc<SealedGraph>) {
+        let graphed = sealed.end();
+        *self.graphs_mut() = Graphs { sealed: Some(sealed), growing: None, graphed };
+        self.live_mut().seal(graphed);
+    }
+
+    fn live_mut(&self) -> RwLockWriteGuard<'_, Live> {
+        self.live.write().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn live(&self) -> RwLockReadGuard<'_, Live> {
@@ -324,8 +368,17 @@ mod tests {
         }
     }
 
-    const SETTINGS: IndexSettings =
-        IndexSettings { exact_up_to: 100, m: 16, ef_construction: 100, ef_search: 64 };
+    const SETTINGS: IndexSettings = IndexSettings {
+        exact_up_to: 100,
+        m: 16,
+        ef_construction: 100,
+        ef_search: 64,
+        max_dead_share: 0.3,
+    };
+
+    fn threads() -> ThreadPool {
+        rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap()
+    }
 
     /// Unit vectors around a few dozen centres, as the descriptors of one building are.
     fn clustered(count: usize, dim: usize) -> Rows {
@@ -356,7 +409,7 @@ mod tests {
         let index = filled(&rows);
         let mut sealed = None;
         while index.has_work() {
-            sealed = index.catch_up(&rows, 200).or(sealed);
+            sealed = index.catch_up(&rows, 200, &threads()).or(sealed);
         }
         assert_eq!(index.graphed(), 1500);
         let sealed = sealed.unwrap();
@@ -378,7 +431,7 @@ mod tests {
         let index = filled(&rows);
         let mut sealed = None;
         while index.has_work() {
-            sealed = index.catch_up(&rows, 100).or(sealed);
+            sealed = index.catch_up(&rows, 100, &threads()).or(sealed);
         }
         let mut bytes = sealed.unwrap().to_bytes();
         let again = filled(&rows);
@@ -405,7 +458,7 @@ mod tests {
             index.add(slot);
             // Images come in bursts; between them there is time to seal what has grown.
             while slot % 100 == 70 && index.has_work() {
-                seals.extend(index.catch_up(&rows, 16).map(|sealed| sealed.end()));
+                seals.extend(index.catch_up(&rows, 16, &threads()).map(|sealed| sealed.end()));
             }
             if slot % 50 == 0 {
                 let found = index.search(&rows, &rows.0[slot], 1, SearchMode::Fast);
@@ -413,7 +466,7 @@ mod tests {
             }
         }
         while index.has_work() {
-            seals.extend(index.catch_up(&rows, 16).map(|sealed| sealed.end()));
+            seals.extend(index.catch_up(&rows, 16, &threads()).map(|sealed| sealed.end()));
         }
         assert!(seals.len() > 1 && seals.is_sorted(), "{seals:?}");
         assert_eq!(index.graphed(), 1000);
@@ -427,7 +480,7 @@ mod tests {
     fn an_image_is_found_before_the_graph_has_it() {
         let rows = clustered(300, 16);
         let index = filled(&rows);
-        index.catch_up(&rows, 250);
+        index.catch_up(&rows, 250, &threads());
         assert_eq!(index.graphed(), 250);
         let found = index.search(&rows, &rows.0[299], 1, SearchMode::Fast);
         assert_eq!(found[0].slot, 299);
@@ -438,7 +491,7 @@ mod tests {
         let rows = clustered(300, 16);
         let index = filled(&rows);
         while index.has_work() {
-            index.catch_up(&rows, 64);
+            index.catch_up(&rows, 64, &threads());
         }
         for slot in (0..300).step_by(2) {
             index.remove(slot);
@@ -453,10 +506,31 @@ mod tests {
     }
 
     #[test]
+    fn a_graph_with_too_many_dead_points_is_built_again_without_them() {
+        let rows = clustered(400, 16);
+        let index = filled(&rows);
+        let threads = threads();
+        let settle = || {
+            let mut sealed = None;
+            while index.has_work() {
+                sealed = index.catch_up(&rows, 64, &threads).or(sealed);
+            }
+            sealed.map(|sealed| sealed.len())
+        };
+        assert_eq!(settle(), Some(400));
+        (0..100).for_each(|slot| index.remove(slot));
+        assert_eq!(settle(), None);
+        (100..125).for_each(|slot| index.remove(slot));
+        assert_eq!(settle(), Some(275));
+        let found = index.search(&rows, &rows.0[200], 1, SearchMode::Fast);
+        assert_eq!(found[0].slot, 200);
+    }
+
+    #[test]
     fn a_small_map_never_builds_a_graph() {
         let rows = clustered(100, 8);
         let index = filled(&rows);
-        index.catch_up(&rows, 1000);
+        index.catch_up(&rows, 1000, &threads());
         assert_eq!(index.graphed(), 0);
         assert_eq!(index.search(&rows, &rows.0[3], 500, SearchMode::Fast).len(), 100);
     }

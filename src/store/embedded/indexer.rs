@@ -4,6 +4,8 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Weak};
 use std::thread;
 
+use rayon::{ThreadPool, ThreadPoolBuilder};
+
 use super::super::StoreError;
 use super::live_map::LiveMap;
 
@@ -16,12 +18,19 @@ pub(super) struct Indexer {
 }
 
 impl Indexer {
-    pub fn start() -> Result<Self, StoreError> {
+    /// `threads` share the work on one graph.
+    pub fn start(threads: usize) -> Result<Self, StoreError> {
+        let failed = |error: &dyn std::error::Error| StoreError::Failed(error.to_string());
+        let threads = ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .thread_name(|index| format!("indexer-{index}"))
+            .build()
+            .map_err(|error| failed(&error))?;
         let (wake, maps) = sync_channel(1024);
         thread::Builder::new()
             .name("indexer".into())
-            .spawn(move || run(&maps))
-            .map_err(|error| StoreError::Failed(error.to_string()))?;
+            .spawn(move || run(&maps, &threads))
+            .map_err(|error| failed(&error))?;
         Ok(Self { wake })
     }
 
@@ -38,7 +47,7 @@ impl Indexer {
     }
 }
 
-fn run(wake: &Receiver<Weak<LiveMap>>) {
+fn run(wake: &Receiver<Weak<LiveMap>>, threads: &ThreadPool) {
     let mut behind: Vec<Weak<LiveMap>> = Vec::new();
     loop {
         if behind.is_empty() {
@@ -52,7 +61,7 @@ fn run(wake: &Receiver<Weak<LiveMap>>) {
         }
         behind.retain(|map| {
             map.upgrade().is_some_and(|map| {
-                if let Some(sealed) = map.index.catch_up(map.vectors.as_ref(), TURN) {
+                if let Some(sealed) = map.index.catch_up(map.vectors.as_ref(), TURN, threads) {
                     map.keep(&sealed);
                 }
                 map.index.has_work()

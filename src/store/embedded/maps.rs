@@ -226,6 +226,7 @@ impl MapStore for EmbeddedStore {
                     if let Some(stored) = stored {
                         live.withdraw(stored.slot);
                         inner.blobs.remove_unreferenced(&stored.image.digest, &inner.trees);
+                        inner.indexer.look_at(&live);
                     }
                 },
             )

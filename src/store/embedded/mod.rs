@@ -49,6 +49,8 @@ pub struct EmbeddedSettings {
     pub dir: PathBuf,
     /// How maps are indexed.
     pub index: IndexSettings,
+    /// Threads that build graphs.
+    pub index_threads: usize,
     /// Memory for sled's page cache, in bytes.
     pub db_cache_bytes: u64,
     /// The most changes that are made durable together.
@@ -106,7 +108,7 @@ impl EmbeddedStore {
         let queued = trees.requeue_claimed()?;
         let inner = Inner {
             writer: Writer::start(trees.clone(), settings.commit_batch)?,
-            indexer: Indexer::start()?,
+            indexer: Indexer::start(settings.index_threads)?,
             descriptions: DescriptionUse::load(&trees, settings.descriptions)?,
             trees,
             blobs,
