@@ -90,6 +90,8 @@ pub struct Model {
     pub provider: ProviderWish,
     /// At which precision.
     pub precision: PrecisionWish,
+    /// The most models in memory.
+    pub loaded: usize,
     /// An assets folder to look in before the usual places; empty for none.
     pub assets: PathBuf,
     /// Threads of all inference; 0 for one a core.
@@ -404,6 +406,9 @@ impl Config {
         ];
         if let Some((key, _)) = at_least_one.iter().find(|(_, value)| *value == 0) {
             return Some(format!("{key} must be at least 1"));
+        }
+        if self.model.loaded < 2 {
+            return Some("model.loaded must be at least 2: a reindex needs two models".into());
         }
         if self.localize.max_k > 100 || self.localize.k > self.localize.max_k {
             return Some("localize.k <= localize.max_k <= 100 must hold".into());

@@ -12,16 +12,17 @@ use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
-use crate::domain::{Map, utc_day};
+use crate::domain::utc_day;
 use crate::http::{AppState, HttpSettings, router};
 use crate::refine::local::{LocalMatcher, LocalSettings};
 use crate::refine::mllm::{MllmParts, MllmRefiner};
 use crate::refine::{DenseCache, LocalRefiner, Refiner, Worker, WorkerSettings};
 use crate::retrieve::index::IndexSettings;
-use crate::retrieve::{Assets, CpuPool, Extractor, ExtractorSettings, ImageLimits};
-use crate::service::{Service, ServiceSettings};
+use crate::retrieve::{Assets, CpuPool, ExtractorSettings, ImageLimits};
+use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
+use crate::service::{Reindexes, Service, ServiceSettings};
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
-use crate::store::{JobStore, MapStore, UsageStore};
+use crate::store::{JobStore, UsageStore};
 use crate::telemetry::Metrics;
 
 /// Serves on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200.
@@ -104,14 +105,13 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
         },
         usage_days: config.data.usage_days,
     })?);
-    let maps = Handle::current().block_on(store.maps())?;
-    let extractor = Arc::new(load_model(config, &maps)?);
+    let (models, why) = models(config)?;
     let pool = CpuPool::new("frames", cores_unless(config.image.threads), config.image.queue)?;
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
     let local = Arc::new(LocalRefiner {
         maps: store.clone(),
         blobs: store.clone(),
-        extractor: Arc::clone(&extractor),
+        models: models.clone(),
         dense: Arc::clone(&dense),
         pool: CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?,
         matcher: LocalMatcher::new(LocalSettings::default()),
@@ -126,7 +126,7 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
                 cache: store.clone(),
                 usage: store.clone(),
                 metrics: Arc::clone(&metrics),
-                limits: extractor.limits(),
+                limits: models.limits(),
                 fallback: Some(local),
             };
             let refiner = MllmRefiner::new(parts, config.mllm.clone())?;
@@ -153,10 +153,12 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
     let workers = workers.collect();
     let service = Service {
         maps: store.clone(),
+        drafts: store.clone(),
+        reindexes: Reindexes::default(),
         blobs: store.clone(),
         jobs,
         accounts: store.clone(),
-        extractor,
+        models,
         pool,
         refiner,
         dense,
@@ -171,25 +173,25 @@ fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec
             usage_days: config.data.usage_days,
         },
     };
+    let model = service.models.default_model();
+    tracing::info!(model, %why, "the model of maps that name none");
+    service.models.manifest(model)?;
+    Handle::current().block_on(service.installed_model(model))?;
     Ok((service, workers))
 }
 
-/// Loads the model, at the precision of `maps` if nothing else is asked for.
-fn load_model(config: &Config, maps: &[Map]) -> anyhow::Result<Extractor> {
+/// No model yet, and why the default one is what it is.
+fn models(config: &Config) -> anyhow::Result<(LoadedModels, WhyModel)> {
     let assets = Assets::locate(config.model.assets());
     let (model, why) = assets.resolve(&config.model.name)?;
-    let mut wanted = config.model.wanted();
-    wanted.precision = wanted.precision.or(maps.first().map(|map| map.precision));
-    let settings = ExtractorSettings {
+    let each = ExtractorSettings {
         model,
-        wanted,
-        remember: Some(config.data.dir.join("inference.toml")),
+        wanted: config.model.wanted(),
+        remember: None,
         layout: config.model.layout(),
         limits: ImageLimits { max_pixels: config.image.max_pixels },
         exact_decode: config.image.exact,
     };
-    let extractor = Extractor::load(&assets, &settings)?;
-    let (model, digest) = (&extractor.manifest().name, extractor.digest());
-    tracing::info!(model, %why, %digest, execution = %extractor.execution(), "model loaded");
-    Ok(extractor)
+    let (most, remember) = (config.model.loaded, config.data.dir.clone());
+    Ok((LoadedModels::new(assets, LoadedSettings { most, remember, each }), why))
 }

@@ -161,6 +161,9 @@ pub struct Map {
     pub precision: Precision,
     /// Numbers in a descriptor.
     pub dim: usize,
+    /// How often all its descriptors were replaced by others.
+    #[serde(default)]
+    pub revision: u32,
     /// What a person wrote about it.
     #[serde(default)]
     pub description: Option<String>,

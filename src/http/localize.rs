@@ -51,7 +51,7 @@ struct FrameForm {
         (status = 200, body = Answer),
         (status = 400, body = Problem, description = "Malformed, or an empty body", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
-        (status = 409, body = Problem, description = "The map was indexed with another model", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The map's model is not installed, or is another by now", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
         (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "Cannot be decoded, or k out of range", content_type = "application/problem+json"),

@@ -9,7 +9,7 @@ use super::body::{JsonBody, Segments};
 use super::problem::Problem;
 use super::state::Ready;
 use crate::domain::MapName;
-use crate::service::{MapChange, MapState};
+use crate::service::{MapChange, MapState, ReindexRequest};
 
 /// All maps.
 #[derive(Debug, Serialize, ToSchema)]
@@ -51,7 +51,7 @@ pub(super) async fn get_map(
         (status = 201, body = MapState, description = "Created"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
         (status = 409, body = Problem, description = "Fixed, because the map has images", content_type = "application/problem+json"),
-        (status = 422, body = Problem, description = "Not possible with this model", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "Not installed, or not possible with this model", content_type = "application/problem+json"),
     ))]
 pub(super) async fn put_map(
     Ready(service): Ready,
@@ -60,6 +60,28 @@ pub(super) async fn put_map(
 ) -> Result<(StatusCode, Json<MapState>), Problem> {
     let (state, new) = service.put_map(map_name(&map)?, change).await?;
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(state)))
+}
+
+/// Make all descriptors of a map anew, with another model
+///
+/// Answers at once. The old descriptors serve until the new ones are all there; then the map changes
+/// over in one step. `reindex` of the map says how far that has come.
+#[utoipa::path(post, path = "/maps/{map}/reindex", tag = "maps", params(("map" = String, Path)),
+    request_body(content = ReindexRequest, description = "Which descriptors; what is left out stays as it is"),
+    responses(
+        (status = 202, body = MapState, description = "Begun"),
+        (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The map is being reindexed already", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "Not installed, or not possible with this model", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn reindex(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+    JsonBody(request): JsonBody<ReindexRequest>,
+) -> Result<(StatusCode, Json<MapState>), Problem> {
+    let state = service.reindex(&map_name(&map)?, request).await?;
+    Ok((StatusCode::ACCEPTED, Json(state)))
 }
 
 /// Remove a map with all its images

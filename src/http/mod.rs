@@ -50,6 +50,7 @@ fn described() -> OpenApiRouter<AppState> {
     OpenApiRouter::with_openapi(Description::openapi())
         .routes(routes!(maps::list_maps))
         .routes(routes!(maps::get_map, maps::put_map, maps::delete_map))
+        .routes(routes!(maps::reindex))
         .routes(routes!(images::list_images, images::add_image))
         .routes(routes!(images::get_image, images::delete_image))
         .routes(routes!(images::image_content))

@@ -7,7 +7,16 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use crate::domain::{DenseFeatures, Digest};
 
-/// A cache by image digest, bounded in bytes; the least recently used goes first.
+/// Whose features they are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct DenseKey {
+    /// The identity of the model that made them.
+    pub model: Digest,
+    /// The digest of the picture.
+    pub picture: Digest,
+}
+
+/// A cache by model and picture, bounded in bytes; the least recently used goes first.
 #[derive(Debug)]
 pub struct DenseCache {
     max_bytes: usize,
@@ -16,7 +25,7 @@ pub struct DenseCache {
 
 #[derive(Debug, Default)]
 struct State {
-    entries: HashMap<Digest, Entry>,
+    entries: HashMap<DenseKey, Entry>,
     bytes: usize,
     clock: u64,
 }
@@ -34,17 +43,17 @@ impl DenseCache {
     }
 
     /// The features of a picture, if they are still here.
-    pub fn get(&self, digest: &Digest) -> Option<Arc<DenseFeatures>> {
+    pub fn get(&self, key: &DenseKey) -> Option<Arc<DenseFeatures>> {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.clock += 1;
         let now = state.clock;
-        let entry = state.entries.get_mut(digest)?;
+        let entry = state.entries.get_mut(key)?;
         entry.used = now;
         Some(Arc::clone(&entry.features))
     }
 
     /// Keeps the features of a picture, at the expense of those used longest ago.
-    pub fn insert(&self, digest: Digest, features: Arc<DenseFeatures>) {
+    pub fn insert(&self, key: DenseKey, features: Arc<DenseFeatures>) {
         let bytes = features.bytes();
         if bytes > self.max_bytes {
             return;
@@ -52,7 +61,7 @@ impl DenseCache {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.clock += 1;
         let used = state.clock;
-        if let Some(old) = state.entries.insert(digest, Entry { features, used }) {
+        if let Some(old) = state.entries.insert(key, Entry { features, used }) {
             state.bytes -= old.features.bytes();
         }
         state.bytes += bytes;
@@ -85,30 +94,36 @@ mod tests {
         Arc::new(DenseFeatures::new(1, cells, 1, vec![1.0; cells], None).unwrap())
     }
 
+    fn key(picture: &[u8]) -> DenseKey {
+        DenseKey { model: Digest::of(b"model"), picture: Digest::of(picture) }
+    }
+
     #[test]
     fn the_least_recently_used_goes_first() {
         let cache = DenseCache::new(3 * 40);
-        let digests = [b"a", b"b", b"c", b"d"].map(|name| Digest::of(name));
-        for digest in &digests[..3] {
-            cache.insert(*digest, features(10));
+        let keys = [b"a", b"b", b"c", b"d"].map(|name| key(name));
+        for key in &keys[..3] {
+            cache.insert(*key, features(10));
         }
-        assert!(cache.get(&digests[0]).is_some());
-        cache.insert(digests[3], features(10));
-        let kept: Vec<bool> = digests.iter().map(|d| cache.get(d).is_some()).collect();
+        assert!(cache.get(&keys[0]).is_some());
+        cache.insert(keys[3], features(10));
+        let kept: Vec<bool> = keys.iter().map(|key| cache.get(key).is_some()).collect();
         assert_eq!(kept, [true, false, true, true]);
         assert_eq!(cache.bytes(), 120);
+        let of_another_model = DenseKey { model: Digest::of(b"another"), ..keys[0] };
+        assert!(cache.get(&of_another_model).is_none());
     }
 
     #[test]
     fn the_bound_holds_whatever_comes() {
         let cache = DenseCache::new(100);
-        cache.insert(Digest::of(b"huge"), features(26));
+        cache.insert(key(b"huge"), features(26));
         assert_eq!(cache.bytes(), 0);
         for size in [1, 25, 3, 20, 7, 7] {
-            cache.insert(Digest::of(&[size as u8]), features(size));
+            cache.insert(key(&[size as u8]), features(size));
             assert!(cache.bytes() <= 100);
         }
-        cache.insert(Digest::of(&[7]), features(7));
+        cache.insert(key(&[7]), features(7));
         assert!(cache.bytes() <= 100);
     }
 }

@@ -6,11 +6,11 @@ use async_trait::async_trait;
 use bytes::Bytes;
 
 use super::local::{LocalMatcher, PairMatch, describe, rank};
-use super::{DenseCache, Progress, RefineError, Refinement, Refiner};
+use super::{DenseCache, DenseKey, Progress, RefineError, Refinement, Refiner};
 use crate::domain::{
     Candidate, DenseFeatures, Description, DescriptorKind, Digest, Map, Ranking, RefinerKind, Usage,
 };
-use crate::retrieve::{CpuPool, ExtractError, Extractor};
+use crate::retrieve::{CpuPool, ExtractError, Extractor, LoadedModels, ModelError};
 use crate::store::{BlobStore, JobRecord, MapStore};
 
 /// Geometric matching of dense features, on this machine.
@@ -19,8 +19,8 @@ pub struct LocalRefiner {
     pub maps: Arc<dyn MapStore>,
     /// Where their bytes are.
     pub blobs: Arc<dyn BlobStore>,
-    /// Makes dense features that the cache has lost.
-    pub extractor: Arc<Extractor>,
+    /// The models that make dense features which the cache has lost.
+    pub models: LoadedModels,
     /// Dense features.
     pub dense: Arc<DenseCache>,
     /// Where matching runs.
@@ -32,7 +32,7 @@ pub struct LocalRefiner {
 /// A picture whose dense features are known, or whose bytes are.
 enum Source {
     Dense(Arc<DenseFeatures>),
-    Bytes(Digest, Bytes),
+    Bytes(DenseKey, Bytes),
 }
 
 #[async_trait]
@@ -50,20 +50,21 @@ impl Refiner for LocalRefiner {
             Some(map) if map.uid == record.map_uid => map,
             _ => return Err(RefineError::Hopeless("the map was removed".into())),
         };
+        let extractor = self.models.of(&map).await.map_err(no_model)?;
+        let model = extractor.identity();
         let query = self
-            .source(record.query.digest)
+            .source(DenseKey { model, picture: record.query.digest })
             .await?
             .ok_or_else(|| RefineError::Hopeless("the frame is missing from the store".into()))?;
         let mut present = Vec::new();
         let mut sources = Vec::new();
         for (index, candidate) in record.candidates.iter().enumerate() {
-            if let Some(source) = self.candidate_source(&map, candidate).await? {
+            if let Some(source) = self.candidate_source(&map, model, candidate).await? {
                 present.push(index);
                 sources.push(source);
             }
         }
-        let (extractor, dense, matcher) =
-            (Arc::clone(&self.extractor), Arc::clone(&self.dense), self.matcher.clone());
+        let (dense, matcher) = (Arc::clone(&self.dense), self.matcher.clone());
         let pairs = self
             .pool
             .run(move || compare(&extractor, &dense, &matcher, query, sources))
@@ -77,20 +78,31 @@ impl LocalRefiner {
     async fn candidate_source(
         &self,
         map: &Map,
+        model: Digest,
         candidate: &Candidate,
     ) -> Result<Option<Source>, RefineError> {
         match self.maps.image(map, &candidate.image_id).await? {
-            Some(image) => self.source(image.digest).await,
+            Some(image) => self.source(DenseKey { model, picture: image.digest }).await,
             None => Ok(None),
         }
     }
 
-    async fn source(&self, digest: Digest) -> Result<Option<Source>, RefineError> {
-        if let Some(features) = self.dense.get(&digest) {
+    async fn source(&self, key: DenseKey) -> Result<Option<Source>, RefineError> {
+        if let Some(features) = self.dense.get(&key) {
             return Ok(Some(Source::Dense(features)));
         }
-        let bytes = self.blobs.blob(&digest).await?;
-        Ok(bytes.map(|bytes| Source::Bytes(digest, bytes)))
+        let bytes = self.blobs.blob(&key.picture).await?;
+        Ok(bytes.map(|bytes| Source::Bytes(key, bytes)))
+    }
+}
+
+/// Any version of the map's model will do: both pictures are looked at with the same one.
+fn no_model(error: ModelError) -> RefineError {
+    match error {
+        ModelError::NotInstalled(_) | ModelError::Broken { .. } => {
+            RefineError::Hopeless(error.to_string())
+        }
+        ModelError::AllInUse(_) => RefineError::Passing(error.to_string()),
     }
 }
 
@@ -104,12 +116,12 @@ fn compare(
 ) -> Result<Vec<PairMatch>, RefineError> {
     let features = |source: Source| match source {
         Source::Dense(features) => Ok(features),
-        Source::Bytes(digest, bytes) => {
+        Source::Bytes(key, bytes) => {
             let extraction = extractor
                 .extract(&bytes, DescriptorKind::Gem)
                 .map_err(|error: ExtractError| RefineError::Passing(error.to_string()))?;
             let features = Arc::new(extraction.dense);
-            dense.insert(digest, Arc::clone(&features));
+            dense.insert(key, Arc::clone(&features));
             Ok(features)
         }
     };

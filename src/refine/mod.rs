@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 
-pub use dense_cache::DenseCache;
+pub use dense_cache::{DenseCache, DenseKey};
 pub use local_refiner::LocalRefiner;
 pub use worker::{Worker, WorkerSettings};
 
@@ -90,7 +90,7 @@ impl From<StoreError> for RefineError {
             StoreError::NotFound(_) | StoreError::Conflict(_) | StoreError::Damaged(_) => {
                 Self::Hopeless(error.to_string())
             }
-            StoreError::QueueFull { .. } | StoreError::Failed(_) => {
+            StoreError::QueueFull { .. } | StoreError::Failed(_) | StoreError::Superseded(_) => {
                 Self::Passing(error.to_string())
             }
         }

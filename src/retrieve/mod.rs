@@ -11,6 +11,7 @@ pub mod decode;
 mod extractor;
 pub mod index;
 mod jpeg;
+mod loaded;
 pub mod manifest;
 mod pool;
 pub mod pooling;
@@ -25,6 +26,7 @@ pub use decode::{DecodeError, ImageLimits, Needed, Picture};
 pub use extractor::{
     ExtractError, Extracting, Extraction, Extractor, ExtractorSettings, Inferred, StageTimes,
 };
+pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
 pub use provider::{Execution, LEAST_SIMILARITY, Measured, Provider, Trial, Wanted};

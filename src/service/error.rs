@@ -63,7 +63,7 @@ impl From<StoreError> for ServiceError {
     fn from(error: StoreError) -> Self {
         let kind = match &error {
             StoreError::NotFound(_) => ErrorKind::NotFound,
-            StoreError::Conflict(_) => ErrorKind::Conflict,
+            StoreError::Conflict(_) | StoreError::Superseded(_) => ErrorKind::Conflict,
             StoreError::QueueFull { .. } => ErrorKind::Overloaded,
             StoreError::Failed(_) | StoreError::Damaged(_) => ErrorKind::Internal,
         };

@@ -9,9 +9,9 @@ use serde_json::Value;
 use utoipa::ToSchema;
 
 use super::{Service, ServiceError};
-use crate::domain::{Digest, Image, ImageId, Map, MapName, MediaType, Pose};
-use crate::retrieve::{decode, preprocess};
-use crate::store::Added;
+use crate::domain::{DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose};
+use crate::retrieve::{Extraction, Extractor, decode, preprocess};
+use crate::store::{Added, StoreError};
 
 /// What a caller says about an image.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
@@ -53,26 +53,36 @@ pub struct ImagePage {
 impl Service {
     /// Stores an image with its descriptor.
     pub async fn add_image(&self, map: &MapName, new: NewImage) -> Result<Added, ServiceError> {
-        let map = self.searchable_map(map).await?;
-        let meta = CheckedMeta::new(new.meta, &map)?;
         if new.bytes.is_empty() {
             return Err(empty_body());
         }
-        let extraction = self.extract(new.bytes.clone(), map.descriptor).await?;
         let digest = Digest::of(&new.bytes);
-        let image = Image {
-            id: meta.id.unwrap_or_else(|| ImageId::from_digest(&digest)),
-            digest,
-            pose: meta.pose,
-            captured_at: meta.captured_at,
-            tags: meta.tags,
-            media_type: extraction.media_type,
-            width: extraction.width,
-            height: extraction.height,
-            created_at: Timestamp::now(),
-        };
-        let _pin = self.blobs.put_blob(digest, new.bytes).await?;
-        Ok(self.maps.add_image(&map, image, extraction.descriptor).await?)
+        let mut pin = None;
+        loop {
+            let (map, extractor) = self.usable_map(map).await?;
+            let meta = CheckedMeta::new(new.meta.clone(), &map)?;
+            let extraction = self.extract(&extractor, new.bytes.clone(), map.descriptor).await?;
+            self.metrics.observe_stages(extraction.times);
+            let image = Image {
+                id: meta.id.unwrap_or_else(|| ImageId::from_digest(&digest)),
+                digest,
+                pose: meta.pose,
+                captured_at: meta.captured_at,
+                tags: meta.tags,
+                media_type: extraction.media_type,
+                width: extraction.width,
+                height: extraction.height,
+                created_at: Timestamp::now(),
+            };
+            if pin.is_none() {
+                pin = Some(self.blobs.put_blob(digest, new.bytes.clone()).await?);
+            }
+            match self.maps.add_image(&map, image, extraction.descriptor).await {
+                // Its descriptor is of the model that the map had a moment ago.
+                Err(StoreError::Superseded(_)) => {}
+                added => return Ok(added?),
+            }
+        }
     }
 
     /// One image.
@@ -116,7 +126,7 @@ impl Service {
         if !(16..=4096).contains(&max_edge) {
             return Err(ServiceError::unprocessable("max_edge must be between 16 and 4096 pixels"));
         }
-        let limits = self.extractor.limits();
+        let limits = self.models.limits();
         let jpeg = self
             .on_pool(move || {
                 let picture =
@@ -139,22 +149,22 @@ impl Service {
 
     pub(super) async fn extract(
         &self,
+        extractor: &Arc<Extractor>,
         bytes: Bytes,
-        kind: crate::domain::DescriptorKind,
-    ) -> Result<crate::retrieve::Extraction, ServiceError> {
-        let extractor = Arc::clone(&self.extractor);
-        let extracting = self.on_pool(move || extractor.begin(&bytes)).await?;
+        kind: DescriptorKind,
+    ) -> Result<Extraction, ServiceError> {
+        let beginning = Arc::clone(extractor);
+        let extracting = self.on_pool(move || beginning.begin(&bytes)).await?;
         let inferred = extracting.inferred().await?;
         // Not by the pool, which might refuse it now that nearly all is done.
-        let extractor = Arc::clone(&self.extractor);
+        let extractor = Arc::clone(extractor);
         let finishing = tokio::task::spawn_blocking(move || extractor.finish(inferred, kind)).await;
         let extraction = finishing
             .map_err(|error| ServiceError::new(super::ErrorKind::Internal, error.to_string()))??;
-        self.metrics.observe_stages(extraction.times);
         Ok(extraction)
     }
 
-    async fn on_pool<T, F>(&self, work: F) -> Result<T, ServiceError>
+    pub(super) async fn on_pool<T, F>(&self, work: F) -> Result<T, ServiceError>
     where
         T: Send + 'static,
         F: FnOnce() -> Result<T, crate::retrieve::ExtractError> + Send + 'static,

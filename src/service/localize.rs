@@ -1,7 +1,7 @@
 //! Localize a frame: extract, search, answer, and queue its refinement.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use jiff::Timestamp;
@@ -12,6 +12,8 @@ use uuid::Uuid;
 use super::images::empty_body;
 use super::{ErrorKind, Service, ServiceError};
 use crate::domain::{Candidate, Digest, ImageId, Job, JobState, Map, MapName, Pose, Priority};
+use crate::refine::DenseKey;
+use crate::retrieve::Extraction;
 use crate::retrieve::index::SearchMode;
 use crate::store::{JobRecord, Query, StoreError};
 
@@ -102,12 +104,22 @@ pub struct TimingMs {
     pub total: f64,
 }
 
+/// A frame and what a map has like it.
+struct Coarse {
+    map: Map,
+    /// The identity of the model.
+    model: Digest,
+    extraction: Extraction,
+    candidates: Vec<Candidate>,
+    /// How long the search took.
+    searched: Duration,
+}
+
 impl Service {
     /// Answers with the most similar images and queues their refinement.
     pub async fn localize(&self, request: LocalizeRequest) -> Result<Answer, ServiceError> {
         let start = Instant::now();
         let k = self.checked_k(request.k)?;
-        let map = self.searchable_map(&request.map).await?;
         if request.frame.is_empty() {
             return Err(empty_body());
         }
@@ -116,15 +128,11 @@ impl Service {
             // Before any work is done: a robot that needs no job asks without one.
             return Err(StoreError::QueueFull { limit: self.settings.job_queue }.into());
         }
-        let extraction = self.extract(request.frame.clone(), map.descriptor).await?;
-        let searching = Instant::now();
         let wanted = if refined { k.max(self.settings.candidates) } else { k };
+        let Coarse { map, model, extraction, mut candidates, searched } =
+            self.coarse(&request.map, &request.frame, wanted).await?;
         let kept = self.refiner.as_ref().filter(|refiner| refiner.wants_descriptor());
-        let descriptor = kept.map(|_| extraction.descriptor.clone());
-        let mut candidates =
-            self.maps.search(&map, extraction.descriptor, wanted, SearchMode::Fast).await?;
-        let searched = searching.elapsed();
-        self.metrics.observe_search(searched);
+        let descriptor = kept.map(|_| extraction.descriptor);
 
         let query_id = Uuid::now_v7();
         let mut job = None;
@@ -136,7 +144,8 @@ impl Service {
                 created_at: Timestamp::now(),
                 descriptor,
             };
-            self.dense.insert(query.digest, Arc::new(extraction.dense));
+            let key = DenseKey { model, picture: query.digest };
+            self.dense.insert(key, Arc::new(extraction.dense));
             let compared = candidates.iter().take(self.settings.candidates).cloned().collect();
             job = Some(self.submit(&map, query, compared, request.frame, request.priority).await?);
         }
@@ -148,7 +157,7 @@ impl Service {
             *queued = self.wait_for(queued.id, self.settings.max_wait).await?;
             estimate = self.refined_estimate(queued, &candidates).or(estimate);
         }
-        let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
+        let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
         Ok(Answer {
             query_id,
             map: map.name,
@@ -167,6 +176,27 @@ impl Service {
                 total: ms(start.elapsed()),
             },
         })
+    }
+
+    /// Searches a map with the model that its descriptors are of.
+    async fn coarse(&self, map: &MapName, frame: &Bytes, k: usize) -> Result<Coarse, ServiceError> {
+        loop {
+            let (map, extractor) = self.usable_map(map).await?;
+            let extraction = self.extract(&extractor, frame.clone(), map.descriptor).await?;
+            self.metrics.observe_stages(extraction.times);
+            let searching = Instant::now();
+            let query = extraction.descriptor.clone();
+            match self.maps.search(&map, query, k, SearchMode::Fast).await {
+                // The frame's descriptor is of the model that the map had a moment ago.
+                Err(StoreError::Superseded(_)) => {}
+                found => {
+                    let (candidates, searched) = (found?, searching.elapsed());
+                    self.metrics.observe_search(searched);
+                    let model = extractor.identity();
+                    return Ok(Coarse { map, model, extraction, candidates, searched });
+                }
+            }
+        }
     }
 
     fn checked_k(&self, k: Option<usize>) -> Result<usize, ServiceError> {
@@ -212,7 +242,13 @@ impl Service {
             priority,
             ..Job::queued(map.name.clone(), query.id, refiner.kind(), query.created_at)
         };
-        let record = JobRecord { job: job.clone(), map_uid: map.uid, query, candidates };
+        let record = JobRecord {
+            job: job.clone(),
+            map_uid: map.uid,
+            revision: map.revision,
+            query,
+            candidates,
+        };
         let _pin = self.blobs.put_blob(record.query.digest, frame).await?;
         self.jobs.submit(record, self.settings.job_queue).await?;
         self.metrics.job_submitted();

@@ -5,9 +5,10 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-use super::{ErrorKind, Service, ServiceError};
+use super::models::dimension;
+use super::{ErrorKind, Reindex, Service, ServiceError};
 use crate::domain::{DescriptorKind, Digest, Frame, Map, MapName, Precision, Scene};
-use crate::store::IndexState;
+use crate::store::{IndexState, StoreError};
 
 /// What to set on a map. What is left out keeps its value, or its default in a new map.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
@@ -16,13 +17,14 @@ pub struct MapChange {
     /// Indoor or outdoor (default).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scene: Option<Scene>,
-    /// `gem` (default) or `cls`; fixed once the map has images.
+    /// `gem` (default) or `cls`; once the map has images, only a reindex changes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub descriptor: Option<DescriptorKind>,
     /// `wgs84` (default) or `metric`; fixed once the map has images.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frame: Option<Frame>,
-    /// The model; it must be the one that the server runs. Fixed once the map has images.
+    /// The model, one that is installed; in a new map by default the one that the server was
+    /// started with. Once the map has images, only a reindex changes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub model: Option<String>,
     /// For people, up to 2,000 characters.
@@ -46,7 +48,7 @@ pub struct MapState {
     /// The digest of that model's ONNX file.
     #[schema(value_type = String)]
     pub model_digest: Digest,
-    /// The arithmetic that the model runs in; descriptors of another are refused.
+    /// The arithmetic that the model runs in; descriptors of another do not mix with them.
     pub precision: Precision,
     /// Numbers in a descriptor.
     pub dim: usize,
@@ -55,6 +57,10 @@ pub struct MapState {
     /// How it is searched: `exact`, `building` (a graph for part of it, the rest exactly), or
     /// `hnsw`.
     pub index: IndexKind,
+    /// The reindex that goes on, or the last one since the server was started.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub reindex: Option<Reindex>,
     /// What a person wrote about it.
     pub description: Option<String>,
     /// When it was created.
@@ -80,56 +86,77 @@ impl Service {
         name: MapName,
         change: MapChange,
     ) -> Result<(MapState, bool), ServiceError> {
-        let manifest = self.extractor.manifest();
-        if let Some(model) = &change.model
-            && *model != manifest.name
-        {
-            return Err(ServiceError::unprocessable(format!(
-                "this server runs the model {:?}, not {model:?}; start one with --model {model}",
-                manifest.name
-            )));
-        }
         if change.description.as_ref().is_some_and(|text| text.chars().count() > 2000) {
             return Err(ServiceError::unprocessable("the description exceeds 2,000 characters"));
         }
-        let known = self.maps.map(&name).await?;
+        loop {
+            let known = self.maps.map(&name).await?;
+            let wanted = self.changed(&name, &change, known).await?;
+            match self.maps.put_map(wanted).await {
+                // It was reindexed since it was looked up.
+                Err(StoreError::Superseded(_)) => {}
+                put => {
+                    let (map, new) = put?;
+                    return Ok((self.state_of(&map.name).await?, new));
+                }
+            }
+        }
+    }
+
+    /// The map as a change wants it.
+    async fn changed(
+        &self,
+        name: &MapName,
+        change: &MapChange,
+        known: Option<Map>,
+    ) -> Result<Map, ServiceError> {
         let known = known.as_ref();
+        let model = change.model.as_deref().or(known.map(|map| map.model.as_str()));
+        let model = model.unwrap_or(self.models.default_model());
         let descriptor = change.descriptor.or(known.map(|map| map.descriptor)).unwrap_or_default();
-        let dim = manifest.dimension(descriptor).ok_or_else(|| {
-            ServiceError::unprocessable(format!(
-                "the model {:?} has no [CLS] token; use \"descriptor\": \"gem\"",
-                manifest.name
-            ))
-        })?;
-        let map = Map {
+        let (model_digest, precision, dim) = match known {
+            // Those of its images, whatever is installed by now.
+            Some(map)
+                if (map.model.as_str(), map.descriptor) == (model, descriptor)
+                    && self.maps.index_state(map).await?.images > 0 =>
+            {
+                (map.model_digest, map.precision, map.dim)
+            }
+            _ => {
+                let extractor = self.installed_model(model).await?;
+                let dim = dimension(extractor.manifest(), descriptor)?;
+                (extractor.digest(), extractor.execution().precision, dim)
+            }
+        };
+        Ok(Map {
             uid: Uuid::now_v7(),
-            name,
+            name: name.clone(),
             scene: change.scene.or(known.map(|map| map.scene)).unwrap_or_default(),
             descriptor,
             frame: change.frame.or(known.map(|map| map.frame)).unwrap_or_default(),
-            model: manifest.name.clone(),
-            model_digest: self.extractor.digest(),
-            precision: self.extractor.execution().precision,
+            model: model.to_owned(),
+            model_digest,
+            precision,
             dim,
+            revision: known.map_or(0, |map| map.revision),
             description: change
                 .description
+                .clone()
                 .or_else(|| known.and_then(|map| map.description.clone())),
             created_at: Timestamp::now(),
-        };
-        let (map, new) = self.maps.put_map(map).await?;
-        Ok((self.state_of(map).await?, new))
+        })
     }
 
     /// One map.
     pub async fn get_map(&self, name: &MapName) -> Result<MapState, ServiceError> {
-        self.state_of(self.known_map(name).await?).await
+        self.state_of(name).await
     }
 
     /// All maps, by name.
     pub async fn list_maps(&self) -> Result<Vec<MapState>, ServiceError> {
         let mut states = Vec::new();
         for map in self.maps.maps().await? {
-            match self.state_of(map).await {
+            match self.state_of(&map.name).await {
                 Ok(state) => states.push(state),
                 // Removed since it was listed.
                 Err(error) if error.kind == ErrorKind::NotFound => {}
@@ -141,8 +168,12 @@ impl Service {
 
     /// Removes a map with all its images.
     pub async fn delete_map(&self, name: &MapName) -> Result<(), ServiceError> {
+        let map = self.known_map(name).await?;
         match self.maps.delete_map(name).await? {
-            true => Ok(()),
+            true => {
+                self.reindexes.forget(map.uid);
+                Ok(())
+            }
             false => Err(no_map(name)),
         }
     }
@@ -151,37 +182,10 @@ impl Service {
         self.maps.map(name).await?.ok_or_else(|| no_map(name))
     }
 
-    /// The map, if its descriptors are of the model that is loaded.
-    pub(super) async fn searchable_map(&self, name: &MapName) -> Result<Map, ServiceError> {
+    pub(super) async fn state_of(&self, name: &MapName) -> Result<MapState, ServiceError> {
+        let reindex = self.reindexes.of(self.known_map(name).await?.uid);
+        // Looked up after that: when a reindex has succeeded, the map shows it.
         let map = self.known_map(name).await?;
-        let precision = self.extractor.execution().precision;
-        if map.model_digest == self.extractor.digest() {
-            if map.precision == precision {
-                return Ok(map);
-            }
-            let detail = format!(
-                "the map {name} was indexed at {} precision, but the server runs the model at \
-                 {precision} precision; start it with model.precision = \"{}\", or index the images \
-                 into a new map",
-                map.precision, map.precision
-            );
-            return Err(ServiceError::new(ErrorKind::Conflict, detail));
-        }
-        Err(ServiceError::new(
-            ErrorKind::Conflict,
-            format!(
-                "the map {name} was indexed with the model {:?} ({}), but the server runs {:?} \
-                 ({}); start it with --model {}, or index the images into a new map",
-                map.model,
-                map.model_digest,
-                self.extractor.manifest().name,
-                self.extractor.digest(),
-                map.model
-            ),
-        ))
-    }
-
-    async fn state_of(&self, map: Map) -> Result<MapState, ServiceError> {
         let IndexState { images, graph, behind } = self.maps.index_state(&map).await?;
         let index = match (graph, behind) {
             (false, _) => IndexKind::Exact,
@@ -200,6 +204,7 @@ impl Service {
             images,
             index,
             description: map.description,
+            reindex,
             created_at: map.created_at,
         })
     }

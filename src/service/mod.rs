@@ -9,6 +9,8 @@ mod images;
 mod jobs;
 mod localize;
 mod maps;
+mod models;
+mod reindex;
 mod usage;
 
 use std::sync::Arc;
@@ -19,11 +21,12 @@ pub use self::images::{ImageMeta, ImagePage, NewImage};
 pub use self::jobs::JobPage;
 pub use self::localize::{Answer, Estimate, JobLink, LocalizeRequest, RefineMode, TimingMs};
 pub use self::maps::{MapChange, MapState};
+pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
 pub use self::usage::{Today, Total, UsageReport};
 use crate::refine::DenseCache;
 use crate::refine::Refiner;
-use crate::retrieve::{CpuPool, Extractor};
-use crate::store::{BlobStore, JobStore, MapStore, UsageStore};
+use crate::retrieve::{CpuPool, LoadedModels};
+use crate::store::{BlobStore, DraftStore, JobStore, MapStore, UsageStore};
 use crate::telemetry::Metrics;
 
 /// Bounds and defaults of the use cases.
@@ -49,14 +52,18 @@ pub struct ServiceSettings {
 pub struct Service {
     /// Maps, images, descriptors.
     pub maps: Arc<dyn MapStore>,
+    /// Descriptors in the making.
+    pub drafts: Arc<dyn DraftStore>,
+    /// How far that has come.
+    pub reindexes: Reindexes,
     /// Image bytes.
     pub blobs: Arc<dyn BlobStore>,
     /// Jobs.
     pub jobs: Arc<dyn JobStore>,
     /// What calls to models outside have cost.
     pub accounts: Arc<dyn UsageStore>,
-    /// The model.
-    pub extractor: Arc<Extractor>,
+    /// The models in memory.
+    pub models: LoadedModels,
     /// Where decoding and inference run.
     pub pool: CpuPool,
     /// Who refines, if anybody.

@@ -28,6 +28,9 @@ pub enum StoreError {
     /// It contradicts what is stored.
     #[error("{0}")]
     Conflict(String),
+    /// The descriptors of the map were replaced since the caller looked at it.
+    #[error("the descriptors of the map {0} were replaced meanwhile; try again")]
+    Superseded(MapName),
     /// The job queue has reached its bound.
     #[error("the refinement queue holds {limit} jobs, its bound (jobs.queue)")]
     QueueFull {
@@ -68,7 +71,8 @@ pub trait MapStore: Send + Sync {
     async fn index_state(&self, map: &Map) -> Result<IndexState, StoreError>;
 
     /// Adds an image; its bytes must be among the stored blobs.
-    /// [`StoreError::Conflict`] if the id is taken by other bytes.
+    /// [`StoreError::Conflict`] if the id is taken by other bytes, [`StoreError::Superseded`] if the
+    /// descriptor is of another revision than the map.
     async fn add_image(
         &self,
         map: &Map,
@@ -87,7 +91,8 @@ pub trait MapStore: Send + Sync {
     /// Removes an image; `false` if there was none.
     async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError>;
 
-    /// The `k` most similar images, best first.
+    /// The `k` most similar images, best first; [`StoreError::Superseded`] if the query is of
+    /// another revision than the map.
     async fn search(
         &self,
         map: &Map,
@@ -95,6 +100,30 @@ pub trait MapStore: Send + Sync {
         k: usize,
         mode: SearchMode,
     ) -> Result<Vec<Candidate>, StoreError>;
+}
+
+/// Where the descriptors of a map are made anew while the old ones serve.
+#[async_trait]
+pub trait DraftStore: Send + Sync {
+    /// Begins a draft of the map's next revision: `next` is the map as it will be.
+    /// [`StoreError::Conflict`] while there is another draft of the map.
+    async fn draft(&self, next: Map) -> Result<Box<dyn Draft>, StoreError>;
+}
+
+/// Descriptors in the making, which are to replace those of a map all at once. Images may be added
+/// and removed meanwhile. A draft does not outlive its process.
+#[async_trait]
+pub trait Draft: Send + Sync {
+    /// Some images that have no descriptor in the draft, at most `limit`; each must have been given
+    /// one before the next call. None, if there are no more.
+    async fn missing(&mut self, limit: usize) -> Result<Vec<Image>, StoreError>;
+    /// Gives an image its descriptor, unless it was removed meanwhile.
+    async fn write(&mut self, image: &Image, descriptor: Descriptor) -> Result<(), StoreError>;
+    /// Puts the draft in the place of the map's descriptors, for good and in one step; `false` if
+    /// more images are missing by now.
+    async fn replace(&mut self) -> Result<bool, StoreError>;
+    /// Clears away a draft that is given up.
+    async fn discard(self: Box<Self>);
 }
 
 /// How a map is indexed at the moment.
@@ -144,6 +173,9 @@ pub struct JobRecord {
     pub job: Job,
     /// Tells the map from a later one of the same name.
     pub map_uid: Uuid,
+    /// The revision of the map whose descriptors the query's is like.
+    #[serde(default)]
+    pub revision: u32,
     /// The query.
     pub query: Query,
     /// The candidates in coarse order.

@@ -47,7 +47,7 @@ async fn a_map_says_what_this_model_cannot_do() {
     let why = server.put("/maps/m", json!({"descriptor": "cls"})).await.problem(422);
     assert!(why.contains("[CLS]") && why.contains("gem"), "{why}");
     let why = server.put("/maps/m", json!({"model": "dinov2-small"})).await.problem(422);
-    assert!(why.contains("--model"), "{why}");
+    assert!(why.contains("model pull dinov2-small"), "{why}");
 }
 
 #[tokio::test]

@@ -15,7 +15,7 @@ use super::prompts::{self, PROMPT_VERSION, Switches, clean};
 use super::retry::CallError;
 use super::wire::{Content, ImageUrl, Message, Part, Role};
 use super::{MllmRefiner, Progress, RefineError};
-use crate::domain::{Candidate, Description, Digest, Map, Scene, StandIn, Usage};
+use crate::domain::{Candidate, Description, Descriptor, Digest, Map, Scene, StandIn, Usage};
 use crate::store::{JobRecord, Step, StoreError};
 use crate::telemetry::CacheLookup;
 
@@ -25,6 +25,8 @@ pub(super) struct Work<'a> {
     pub scene: Scene,
     pub budget: JobBudget,
     pub progress: &'a dyn Progress,
+    /// The frame's descriptor, if it is like those that the map has now.
+    pub descriptor: Option<&'a Descriptor>,
     /// Earlier frames that are nearly the same, whose descriptions may stand in.
     pub similar: Vec<SimilarFrame>,
     /// What was bought so far.
@@ -87,13 +89,15 @@ pub(super) struct Findings {
 impl<'a> Work<'a> {
     pub fn new(
         record: &'a JobRecord,
-        scene: Scene,
+        map: &Map,
         budget: JobBudget,
         progress: &'a dyn Progress,
     ) -> Self {
+        let descriptor = record.query.descriptor.as_ref();
         Self {
             record,
-            scene,
+            scene: map.scene,
+            descriptor: descriptor.filter(|_| record.revision == map.revision),
             budget,
             progress,
             similar: Vec::new(),
@@ -153,12 +157,12 @@ impl MllmRefiner {
     /// Earlier frames whose descriptions may stand in for those of this job.
     pub(super) async fn similar_frames(
         &self,
-        record: &JobRecord,
+        work: &Work<'_>,
     ) -> Result<Vec<SimilarFrame>, RefineError> {
         let at_least = self.settings.similar_frame_min;
-        match &record.query.descriptor {
+        match work.descriptor {
             Some(descriptor) if at_least > 0.0 => {
-                Ok(self.cache.similar_frames(record.map_uid, descriptor, at_least).await?)
+                Ok(self.cache.similar_frames(work.record.map_uid, descriptor, at_least).await?)
             }
             _ => Ok(Vec::new()),
         }
@@ -188,18 +192,17 @@ impl MllmRefiner {
             self.keep(work, usage, None).await;
         }
         if known < findings.described.len() {
-            self.keep_frame(work.record).await;
+            self.keep_frame(work).await;
         }
         findings
     }
 
     /// Remembers a frame some of whose descriptions are new.
-    async fn keep_frame(&self, record: &JobRecord) {
-        let Some(descriptor) = record.query.descriptor.clone() else { return };
-        let frame =
-            DescribedFrame { query_id: record.query.id, digest: record.query.digest, descriptor };
-        let most = self.settings.similar_frames_kept;
-        if let Err(error) = self.cache.keep_frame(record.map_uid, frame, most).await {
+    async fn keep_frame(&self, work: &Work<'_>) {
+        let Some(descriptor) = work.descriptor.cloned() else { return };
+        let (query, most) = (&work.record.query, self.settings.similar_frames_kept);
+        let frame = DescribedFrame { query_id: query.id, digest: query.digest, descriptor };
+        if let Err(error) = self.cache.keep_frame(work.record.map_uid, frame, most).await {
             // The next frame like it will have to be described.
             tracing::error!(%error, "a described frame could not be remembered");
         }

@@ -204,8 +204,8 @@ impl Refiner for MllmRefiner {
         // What earlier attempts spent is spent.
         let spent = record.job.usage;
         let budget = self.budget.for_job(spent.prompt_tokens, spent.completion_tokens);
-        let mut work = Work::new(record, map.scene, budget, progress);
-        work.similar = self.similar_frames(record).await?;
+        let mut work = Work::new(record, &map, budget, progress);
+        work.similar = self.similar_frames(&work).await?;
         let pairs = self.pairs(&map, record).await?;
         let findings = self.describe_all(&work, &pairs).await;
         let ranked = match (findings.described.as_slice(), conclude::gravest(&findings.failed)) {

@@ -14,6 +14,7 @@ const TURN: usize = 64;
 
 /// Builds graphs in the background.
 pub(super) struct Indexer {
+    threads: Arc<ThreadPool>,
     wake: SyncSender<Weak<LiveMap>>,
 }
 
@@ -26,12 +27,21 @@ impl Indexer {
             .thread_name(|index| format!("indexer-{index}"))
             .build()
             .map_err(|error| failed(&error))?;
+        let threads = Arc::new(threads);
         let (wake, maps) = sync_channel(1024);
+        let sharing = Arc::clone(&threads);
         thread::Builder::new()
             .name("indexer".into())
-            .spawn(move || run(&maps, &threads))
+            .spawn(move || run(&maps, &sharing))
             .map_err(|error| failed(&error))?;
-        Ok(Self { wake })
+        Ok(Self { threads, wake })
+    }
+
+    /// Brings a map up to date that nobody else has got hold of yet. Blocks.
+    pub fn finish(&self, map: &LiveMap) {
+        while map.index.has_work() {
+            step(map, &self.threads);
+        }
     }
 
     /// Asks for a map to be brought up to date.
@@ -61,11 +71,15 @@ fn run(wake: &Receiver<Weak<LiveMap>>, threads: &ThreadPool) {
         }
         behind.retain(|map| {
             map.upgrade().is_some_and(|map| {
-                if let Some(sealed) = map.index.catch_up(map.vectors.as_ref(), TURN, threads) {
-                    map.keep(&sealed);
-                }
+                step(&map, threads);
                 map.index.has_work()
             })
         });
+    }
+}
+
+fn step(map: &LiveMap, threads: &ThreadPool) {
+    if let Some(sealed) = map.index.catch_up(map.vectors.as_ref(), TURN, threads) {
+        map.keep(&sealed);
     }
 }

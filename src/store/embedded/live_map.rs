@@ -38,16 +38,7 @@ impl LiveMap {
         trees: &Trees,
     ) -> Result<Self, StoreError> {
         let uid = map.uid;
-        let folder = descriptors.join(uid.simple().to_string());
-        let vectors = VectorFiles::open(folder.clone(), map.dim)?;
-        let live = Self {
-            map: RwLock::new(map),
-            vectors: Arc::new(vectors),
-            index: MapIndex::new(index),
-            graph_file: folder.join("graph"),
-            entries: RwLock::default(),
-            next_slot: AtomicUsize::new(0),
-        };
+        let live = Self::open(map, descriptors, index)?;
         live.restore_graph(index);
         for stored in trees.images_of(uid) {
             let stored = stored?;
@@ -62,6 +53,20 @@ impl LiveMap {
             }
         }
         Ok(live)
+    }
+
+    /// A map of which nothing is known yet but its descriptors.
+    pub fn open(map: Map, descriptors: &Path, index: IndexSettings) -> Result<Self, StoreError> {
+        let folder = folder_of(&map, descriptors);
+        let vectors = VectorFiles::open(folder.clone(), map.dim)?;
+        Ok(Self {
+            map: RwLock::new(map),
+            vectors: Arc::new(vectors),
+            index: MapIndex::new(index),
+            graph_file: folder.join("graph"),
+            entries: RwLock::default(),
+            next_slot: AtomicUsize::new(0),
+        })
     }
 
     /// Takes up the graph of an earlier process. One that is damaged or missing is built again in
@@ -113,6 +118,17 @@ impl LiveMap {
         self.next_slot.fetch_add(1, Ordering::Relaxed)
     }
 
+    /// The slot that the next image will have. Only on the writer thread does it mean that every
+    /// image with a lower one is stored.
+    pub fn next_slot(&self) -> usize {
+        self.next_slot.load(Ordering::Relaxed)
+    }
+
+    /// Gives out slots where `other`, which this one replaces, leaves off.
+    pub fn go_on_from(&self, other: &Self) {
+        self.next_slot.store(other.next_slot(), Ordering::Relaxed);
+    }
+
     /// Makes a stored image part of every later answer.
     pub fn publish(&self, stored: &StoredImage) {
         let mut entries = self.entries.write().unwrap_or_else(PoisonError::into_inner);
@@ -150,4 +166,13 @@ impl LiveMap {
             })
             .collect()
     }
+}
+
+/// Where the descriptors of a map are: each revision has a folder of its own.
+pub(super) fn folder_of(map: &Map, descriptors: &Path) -> PathBuf {
+    let uid = map.uid.simple();
+    descriptors.join(match map.revision {
+        0 => uid.to_string(),
+        revision => format!("{uid}-{revision}"),
+    })
 }

@@ -10,7 +10,7 @@ use uuid::Uuid;
 
 use super::super::{Added, BlobPin, BlobStore, IndexState, MapStore, StoreError};
 use super::blobs::Blobs;
-use super::live_map::LiveMap;
+use super::live_map::{LiveMap, folder_of};
 use super::trees::{
     BlobOwner, StoredImage, Trees, blob_ref_key, decode, encode, failed, get, image_key, put,
     transaction_failed,
@@ -23,11 +23,33 @@ use crate::retrieve::index::SearchMode;
 const SWEEP: usize = 256;
 
 impl Inner {
-    fn live(&self, map: &Map) -> Result<Arc<LiveMap>, StoreError> {
+    /// The map as it is now, whatever its revision.
+    pub(super) fn live(&self, map: &Map) -> Result<Arc<LiveMap>, StoreError> {
         let maps = self.maps.read().unwrap_or_else(PoisonError::into_inner);
         match maps.get(&map.name) {
             Some(live) if live.map().uid == map.uid => Ok(Arc::clone(live)),
-            _ => Err(StoreError::NotFound(format!("the map {:?} was removed", map.name.as_str()))),
+            _ => Err(removed(map)),
+        }
+    }
+
+    /// The map, if its descriptors are still those that the caller knows.
+    pub(super) fn live_revision(&self, map: &Map) -> Result<Arc<LiveMap>, StoreError> {
+        let live = self.live(map)?;
+        match live.map().revision == map.revision {
+            true => Ok(live),
+            false => Err(StoreError::Superseded(map.name.clone())),
+        }
+    }
+
+    /// Keeps an image out of every later answer, also of those of a draft. On the writer thread.
+    fn withdraw(&self, map: &Map, slot: usize) {
+        if let Ok(live) = self.live(map) {
+            live.withdraw(slot);
+            self.indexer.look_at(&live);
+        }
+        let drafts = self.drafts.read().unwrap_or_else(PoisonError::into_inner);
+        if let Some(draft) = drafts.get(&map.uid) {
+            draft.withdraw(slot);
         }
     }
 
@@ -36,18 +58,24 @@ impl Inner {
         let stored: Option<Map> = get(&trees.maps, wanted.name.as_str().as_bytes())?;
         let (map, new) = match stored {
             None => (wanted, true),
+            Some(stored) if stored.revision != wanted.revision => {
+                return Err(StoreError::Superseded(stored.name));
+            }
             Some(stored) => {
-                let same = stored.model_digest == wanted.model_digest
+                let same = stored.model == wanted.model
+                    && stored.model_digest == wanted.model_digest
                     && stored.precision == wanted.precision
                     && stored.descriptor == wanted.descriptor
                     && stored.frame == wanted.frame;
                 let has_images = trees.images.scan_prefix(stored.uid.as_bytes()).next().is_some();
                 if !same && has_images {
                     return Err(StoreError::Conflict(format!(
-                        "the map {:?} has images, so its model ({}), descriptor ({}) and frame \
-                         ({}) are fixed; make a new map, or delete this one first",
-                        stored.name.as_str(),
+                        "the map {} has images, so its model ({} at {} precision), descriptor ({}) \
+                         and frame ({}) are fixed; `whereabouts index --reindex` changes model and \
+                         descriptor, a new map has any frame",
+                        stored.name,
                         stored.model,
+                        stored.precision,
                         stored.descriptor,
                         stored.frame
                     )));
@@ -120,8 +148,12 @@ impl MapStore for EmbeddedStore {
         // The map is gone for every caller; what it leaves behind is cleared away in small steps,
         // and by the next start if this process ends before.
         let inner = Arc::clone(&self.inner);
-        blocking(move || sweep(map.uid, &inner.trees, &inner.blobs, &inner.descriptors)).await?;
-        Ok(true)
+        blocking(move || {
+            sweep(map.uid, &inner.trees, &inner.blobs)?;
+            remove_folder(&folder_of(&map, &inner.descriptors));
+            Ok(true)
+        })
+        .await
     }
 
     async fn index_state(&self, map: &Map) -> Result<IndexState, StoreError> {
@@ -139,9 +171,9 @@ impl MapStore for EmbeddedStore {
         image: Image,
         descriptor: Descriptor,
     ) -> Result<Added, StoreError> {
-        let live = self.inner.live(map)?;
-        let (uid, writing, publishing) = (map.uid, Arc::clone(&live), Arc::clone(&live));
-        let inner = Arc::clone(&self.inner);
+        let live = self.inner.live_revision(map)?;
+        let (map, writing, publishing) = (map.clone(), Arc::clone(&live), Arc::clone(&live));
+        let (uid, inner) = (map.uid, Arc::clone(&self.inner));
         let (stored, new) = self
             .inner
             .writer
@@ -150,11 +182,7 @@ impl MapStore for EmbeddedStore {
                     if let Some(present) = trees.image(uid, &image.id)? {
                         return same_bytes(present, &image).map(|present| (present, false));
                     }
-                    if get::<Map>(&trees.maps, writing.map().name.as_str().as_bytes())?
-                        .is_none_or(|map| map.uid != uid)
-                    {
-                        return Err(StoreError::NotFound("the map was removed".into()));
-                    }
+                    still_there(trees, &map)?;
                     let slot = writing.take_slot();
                     writing.vectors.write(slot, descriptor.as_slice())?;
                     touched.vectors.push(Arc::clone(&writing.vectors));
@@ -186,31 +214,16 @@ impl MapStore for EmbeddedStore {
     ) -> Result<Vec<Image>, StoreError> {
         let (inner, uid, after) = (Arc::clone(&self.inner), map.uid, after.cloned());
         blocking(move || {
-            let start = match &after {
-                // The smallest key behind the cursor's.
-                Some(id) => [image_key(uid, id), vec![0]].concat(),
-                None => uid.as_bytes().to_vec(),
-            };
-            inner
-                .trees
-                .images
-                .range(start..)
-                .take_while(|entry| {
-                    entry.as_ref().map_or(true, |(key, _)| key.starts_with(uid.as_bytes()))
-                })
-                .take(limit)
-                .map(|entry| {
-                    let (_, value) = entry.map_err(failed)?;
-                    Ok(decode::<StoredImage>(&value)?.image)
-                })
-                .collect()
+            let images = inner.trees.images_after(uid, after.as_ref()).take(limit);
+            images.map(|stored| Ok(stored?.image)).collect()
         })
         .await
     }
 
     async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {
-        let live = self.inner.live(map)?;
-        let (uid, id, inner) = (map.uid, id.clone(), Arc::clone(&self.inner));
+        self.inner.live(map)?;
+        let (map, uid, id) = (map.clone(), map.uid, id.clone());
+        let inner = Arc::clone(&self.inner);
         let removed = self
             .inner
             .writer
@@ -224,9 +237,8 @@ impl MapStore for EmbeddedStore {
                 },
                 move |stored: &Option<StoredImage>| {
                     if let Some(stored) = stored {
-                        live.withdraw(stored.slot);
+                        inner.withdraw(&map, stored.slot);
                         inner.blobs.remove_unreferenced(&stored.image.digest, &inner.trees);
-                        inner.indexer.look_at(&live);
                     }
                 },
             )
@@ -241,7 +253,7 @@ impl MapStore for EmbeddedStore {
         k: usize,
         mode: SearchMode,
     ) -> Result<Vec<Candidate>, StoreError> {
-        let live = self.inner.live(map)?;
+        let live = self.inner.live_revision(map)?;
         if query.dim() != map.dim {
             return Err(StoreError::Conflict(format!(
                 "a descriptor of {} numbers cannot be searched in a map of {}",
@@ -264,6 +276,19 @@ impl BlobStore for EmbeddedStore {
         let (inner, digest) = (Arc::clone(&self.inner), *digest);
         blocking(move || inner.blobs.get(&digest)).await
     }
+}
+
+/// Whether the map is stored and has the descriptors that the caller knows.
+pub(super) fn still_there(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
+    match get::<Map>(&trees.maps, map.name.as_str().as_bytes())? {
+        Some(stored) if stored.uid == map.uid && stored.revision == map.revision => Ok(stored),
+        Some(stored) if stored.uid == map.uid => Err(StoreError::Superseded(stored.name)),
+        _ => Err(removed(map)),
+    }
+}
+
+fn removed(map: &Map) -> StoreError {
+    StoreError::NotFound(format!("the map {} was removed", map.name))
 }
 
 fn same_bytes(present: StoredImage, sent: &Image) -> Result<StoredImage, StoreError> {
@@ -311,36 +336,34 @@ pub(super) fn sweep_deleted(
     blobs: &Blobs,
     descriptors: &Path,
 ) -> Result<(), StoreError> {
-    let known: Vec<Uuid> = trees.maps()?.iter().map(|map| map.uid).collect();
+    let maps = trees.maps()?;
+    let known: Vec<Uuid> = maps.iter().map(|map| map.uid).collect();
     let mut at = Uuid::nil();
     while let Some(entry) = trees.images.range(at.as_bytes().to_vec()..).next() {
         let (key, _) = entry.map_err(failed)?;
         let Some(uid) = key.get(..16).and_then(|uid| Uuid::from_slice(uid).ok()) else { break };
         if !known.contains(&uid) {
-            sweep(uid, trees, blobs, descriptors)?;
+            sweep(uid, trees, blobs)?;
         }
         match uid.as_u128().checked_add(1) {
             Some(next) => at = Uuid::from_u128(next),
             None => break,
         }
     }
-    // A map whose model changed while it was empty left a folder without images.
-    let named = |uid: &Uuid, folder: &std::fs::DirEntry| {
-        folder.file_name().to_str() == Some(uid.simple().to_string().as_str())
-    };
+    // Left by maps that are gone, by a map whose model changed while it was empty, by a reindex
+    // that did not end.
+    let in_use: Vec<_> = maps.iter().map(|map| folder_of(map, descriptors)).collect();
     for folder in std::fs::read_dir(descriptors).into_iter().flatten().flatten() {
-        if !known.iter().any(|uid| named(uid, &folder)) {
+        if !in_use.contains(&folder.path()) {
             remove_folder(&folder.path());
         }
     }
     trees.flush()
 }
 
-/// Clears away the frames, images, references, bytes and descriptors of a map that is gone.
-fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs, descriptors: &Path) -> Result<(), StoreError> {
-    for key in trees.frames.scan_prefix(uid.as_bytes()).keys() {
-        trees.frames.remove(key.map_err(failed)?).map_err(failed)?;
-    }
+/// Clears away the frames, images, references and bytes of a map that is gone.
+fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs) -> Result<(), StoreError> {
+    trees.forget_frames(uid)?;
     loop {
         let some: Vec<StoredImage> = trees.images_of(uid).take(SWEEP).collect::<Result<_, _>>()?;
         if some.is_empty() {
@@ -352,12 +375,11 @@ fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs, descriptors: &Path) -> Result<
             blobs.remove_unreferenced(&stored.image.digest, trees);
         }
     }
-    remove_folder(&descriptors.join(uid.simple().to_string()));
     Ok(())
 }
 
 /// What cannot be removed stays as rubbish, which harms nobody.
-fn remove_folder(folder: &Path) {
+pub(super) fn remove_folder(folder: &Path) {
     if let Err(error) = std::fs::remove_dir_all(folder)
         && error.kind() != std::io::ErrorKind::NotFound
     {

@@ -3,7 +3,8 @@
 //! ```text
 //! DATA/lock              held while a process uses the folder
 //! DATA/db/               sled: records of maps, images, queries and jobs
-//! DATA/descriptors/UID/  append-only segments of one map's descriptors, memory-mapped
+//! DATA/descriptors/UID/  append-only segments of one map's descriptors, memory-mapped; UID-N/ from
+//!                        its Nth reindex on
 //! DATA/images/ab/…       image bytes by digest
 //! ```
 //!
@@ -12,6 +13,7 @@
 
 mod blobs;
 mod descriptions;
+mod drafts;
 mod indexer;
 mod jobs;
 mod live_map;
@@ -72,6 +74,8 @@ struct Inner {
     writer: Writer,
     blobs: Blobs,
     maps: RwLock<BTreeMap<MapName, Arc<LiveMap>>>,
+    /// Descriptors in the making, by the uid of their map.
+    drafts: RwLock<BTreeMap<Uuid, Arc<LiveMap>>>,
     indexer: Indexer,
     index: IndexSettings,
     descriptors: PathBuf,
@@ -113,6 +117,7 @@ impl EmbeddedStore {
             trees,
             blobs,
             maps: RwLock::new(loaded),
+            drafts: RwLock::default(),
             index: settings.index,
             descriptors,
             queued: AtomicUsize::new(queued),

@@ -95,6 +95,33 @@ impl Trees {
             .map(|value| decode(&value.map_err(failed)?))
     }
 
+    /// Forgets the frames of a map whose pairs were described.
+    pub fn forget_frames(&self, map_uid: Uuid) -> Result<(), StoreError> {
+        for key in self.frames.scan_prefix(map_uid.as_bytes()).keys() {
+            self.frames.remove(key.map_err(failed)?).map_err(failed)?;
+        }
+        Ok(())
+    }
+
+    /// Images of a map by id: those after `after`.
+    pub fn images_after(
+        &self,
+        map_uid: Uuid,
+        after: Option<&ImageId>,
+    ) -> impl Iterator<Item = Result<StoredImage, StoreError>> + use<> {
+        let start = match after {
+            // The smallest key behind the cursor's.
+            Some(id) => [image_key(map_uid, id), vec![0]].concat(),
+            None => map_uid.as_bytes().to_vec(),
+        };
+        self.images
+            .range(start..)
+            .take_while(move |entry| {
+                entry.as_ref().map_or(true, |(key, _)| key.starts_with(map_uid.as_bytes()))
+            })
+            .map(|entry| decode(&entry.map_err(failed)?.1))
+    }
+
     pub fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {
         get(&self.jobs, id.as_bytes())
     }
@@ -230,8 +257,13 @@ mod tests {
             created_at: now,
             descriptor: None,
         };
-        let record =
-            JobRecord { job: job.clone(), map_uid: Uuid::nil(), query, candidates: vec![] };
+        let record = JobRecord {
+            job: job.clone(),
+            map_uid: Uuid::nil(),
+            revision: 0,
+            query,
+            candidates: vec![],
+        };
         put(&trees.jobs, job.id.as_bytes(), &record).unwrap();
         put(&trees.queue, job.id.as_bytes(), &Some(now)).unwrap();
         for _ in 0..2 {

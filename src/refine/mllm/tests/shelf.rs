@@ -112,6 +112,7 @@ impl Shelf {
             model_digest: Digest::of(b"none"),
             precision: Precision::Full,
             dim: 1,
+            revision: 0,
             description: None,
             created_at: Timestamp::UNIX_EPOCH,
         };
@@ -141,6 +142,7 @@ impl Shelf {
         JobRecord {
             job: Job::queued(self.map.name.clone(), query.id, RefinerKind::Mllm, now),
             map_uid: self.map.uid,
+            revision: self.map.revision,
             query,
             candidates: (0..candidates).map(candidate).collect(),
         }

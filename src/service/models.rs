@@ -1,0 +1,123 @@
+//! Which model makes the descriptors of a map.
+
+use std::sync::Arc;
+
+use super::{ErrorKind, Service, ServiceError};
+use crate::domain::{DescriptorKind, Map, MapName};
+use crate::retrieve::{Extractor, Manifest, ModelError};
+
+impl Service {
+    /// The map, and the very model that made its descriptors.
+    pub(super) async fn usable_map(
+        &self,
+        name: &MapName,
+    ) -> Result<(Map, Arc<Extractor>), ServiceError> {
+        let map = self.known_map(name).await?;
+        let extractor = self.models.of(&map).await.map_err(|error| match error {
+            ModelError::NotInstalled(_) => ServiceError::new(
+                ErrorKind::Conflict,
+                format!(
+                    "the map {name} needs the model {:?}, which is not installed on the server; \
+                     install it there ({}), or have another model make its descriptors anew ({})",
+                    map.model,
+                    how_to_install(&map.model),
+                    how_to_reindex(name, "NAME"),
+                ),
+            ),
+            error => unusable(&map.model, error),
+        })?;
+        match contradiction(&map, &extractor) {
+            Some(detail) => Err(ServiceError::new(ErrorKind::Conflict, detail)),
+            None => Ok((map, extractor)),
+        }
+    }
+
+    /// A model as it is installed, for descriptors yet to be made: at the precision that the
+    /// settings say, else at that of the maps which have it already.
+    pub async fn installed_model(&self, name: &str) -> Result<Arc<Extractor>, ServiceError> {
+        let precision = match self.models.precision() {
+            Some(precision) => Some(precision),
+            None => {
+                let maps = self.maps.maps().await?;
+                maps.iter().find(|map| map.model == name).map(|map| map.precision)
+            }
+        };
+        self.models.installed(name, precision).await.map_err(|error| unusable(name, error))
+    }
+
+    /// What an installed model says about itself.
+    pub(super) async fn manifest(&self, name: &str) -> Result<Manifest, ServiceError> {
+        let (models, wanted) = (self.models.clone(), name.to_owned());
+        tokio::task::spawn_blocking(move || models.manifest(&wanted))
+            .await
+            .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))?
+            .map_err(|error| unusable(name, error))
+    }
+}
+
+/// Numbers in a descriptor of that kind.
+pub(super) fn dimension(manifest: &Manifest, kind: DescriptorKind) -> Result<usize, ServiceError> {
+    manifest.dimension(kind).ok_or_else(|| {
+        ServiceError::unprocessable(format!(
+            "the model {:?} has no [CLS] token; use \"descriptor\": \"gem\"",
+            manifest.name
+        ))
+    })
+}
+
+/// Why the model in memory cannot serve the map, if it cannot.
+fn contradiction(map: &Map, extractor: &Extractor) -> Option<String> {
+    if extractor.is_of(map) {
+        return None;
+    }
+    let (name, model, reindex) = (&map.name, &map.model, how_to_reindex(&map.name, &map.model));
+    let (digest, precision) = (extractor.digest(), extractor.execution().precision);
+    Some(if digest != map.model_digest {
+        format!(
+            "the map {name} was indexed with the model {model:?} of {}, but the one installed is \
+             {digest}; install the former again, or make the descriptors anew: {reindex}",
+            map.model_digest
+        )
+    } else if precision != map.precision {
+        format!(
+            "the map {name} was indexed at {} precision, but the server runs the model at \
+             {precision} precision; start it with model.precision = {:?}, or make the descriptors \
+             anew: {reindex}",
+            map.precision,
+            map.precision.as_str()
+        )
+    } else {
+        format!(
+            "the map {name} has descriptors of {} numbers, which the manifest of {model:?} says no \
+             longer; install the former again, or make the descriptors anew: {reindex}",
+            map.dim
+        )
+    })
+}
+
+/// A model that was named and cannot be used.
+fn unusable(name: &str, error: ModelError) -> ServiceError {
+    match error {
+        ModelError::NotInstalled(_) => ServiceError::unprocessable(format!(
+            "the model {name:?} is not installed on the server; install it there ({}), or name one \
+             that `whereabouts model list` shows there as installed",
+            how_to_install(name)
+        )),
+        ModelError::Broken { .. } => ServiceError::new(
+            ErrorKind::Unavailable,
+            format!("{error}; `whereabouts model verify {name}` on the server checks it"),
+        ),
+        ModelError::AllInUse(_) => ServiceError::new(
+            ErrorKind::Overloaded,
+            format!("{error}; try again in a moment, or raise model.loaded"),
+        ),
+    }
+}
+
+fn how_to_install(model: &str) -> String {
+    format!("`whereabouts model pull {model}`, or `whereabouts model add` from a file")
+}
+
+fn how_to_reindex(map: &MapName, model: &str) -> String {
+    format!("`whereabouts index --reindex --map {map} --model {model}`")
+}

@@ -1,0 +1,206 @@
+//! Descriptors made anew beside those that serve, and the step that puts them in their place.
+//!
+//! An image has the same slot in both, so that the step is one record: the map's, which names the
+//! revision. Every slot below a mark has its descriptor in the draft; the step is taken on the writer
+//! thread, and only while no image has a slot beyond the mark.
+
+use std::fs::File;
+use std::path::PathBuf;
+use std::sync::{Arc, PoisonError};
+
+use async_trait::async_trait;
+
+use super::super::{Draft, DraftStore, StoreError};
+use super::live_map::{LiveMap, folder_of};
+use super::maps::{remove_folder, still_there};
+use super::trees::{StoredImage, put};
+use super::{EmbeddedStore, Inner, blocking};
+use crate::domain::{Descriptor, Image, ImageId, Map};
+
+struct EmbeddedDraft {
+    inner: Arc<Inner>,
+    /// The map that serves.
+    old: Map,
+    current: Arc<LiveMap>,
+    /// The map as it will be.
+    next: Arc<LiveMap>,
+    /// Every image with a slot below this one has its descriptor.
+    done: usize,
+    /// Every image with a slot below this one will have it when the walk over the images has ended.
+    end: usize,
+    /// How far the walk has come.
+    cursor: Option<ImageId>,
+}
+
+#[async_trait]
+impl DraftStore for EmbeddedStore {
+    async fn draft(&self, next: Map) -> Result<Box<dyn Draft>, StoreError> {
+        let old = Map { revision: next.revision.saturating_sub(1), ..next.clone() };
+        let inner = Arc::clone(&self.inner);
+        let draft = blocking(move || {
+            let current = inner.live_revision(&old)?;
+            let mut drafts = inner.drafts.write().unwrap_or_else(PoisonError::into_inner);
+            if drafts.contains_key(&next.uid) {
+                return Err(StoreError::Conflict(format!(
+                    "the map {} is being reindexed already",
+                    next.name
+                )));
+            }
+            // What a draft that failed may have left.
+            remove_folder(&folder_of(&next, &inner.descriptors));
+            let next = Arc::new(LiveMap::open(next, &inner.descriptors, inner.index)?);
+            drafts.insert(old.uid, Arc::clone(&next));
+            drop(drafts);
+            Ok(EmbeddedDraft { inner, old, current, next, done: 0, end: 0, cursor: None })
+        });
+        Ok(Box::new(draft.await?))
+    }
+}
+
+#[async_trait]
+impl Draft for EmbeddedDraft {
+    async fn missing(&mut self, limit: usize) -> Result<Vec<Image>, StoreError> {
+        loop {
+            self.inner.live_revision(&self.old)?;
+            let page = self.page(limit).await?;
+            if let Some(last) = page.last() {
+                self.cursor = Some(last.id.clone());
+                return Ok(page);
+            }
+            (self.done, self.cursor) = (self.end, None);
+            let current = Arc::clone(&self.current);
+            self.end =
+                self.inner.writer.commit(move |_, _| Ok(current.next_slot()), |_| {}).await?;
+            if self.end == self.done {
+                return Ok(Vec::new());
+            }
+        }
+    }
+
+    async fn write(&mut self, image: &Image, descriptor: Descriptor) -> Result<(), StoreError> {
+        let (uid, end, image) = (self.old.uid, self.end, image.clone());
+        let (writing, publishing) = (Arc::clone(&self.next), Arc::clone(&self.next));
+        self.inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    // Its id may have gone to another image, which a later walk meets.
+                    let same = |stored: &StoredImage| {
+                        stored.image.digest == image.digest && stored.slot < end
+                    };
+                    let stored = trees.image(uid, &image.id)?.filter(same);
+                    if let Some(stored) = &stored {
+                        // Synced with all others before they serve.
+                        writing.vectors.write(stored.slot, descriptor.as_slice())?;
+                    }
+                    Ok(stored)
+                },
+                move |stored| {
+                    if let Some(stored) = stored {
+                        publishing.publish(stored);
+                    }
+                },
+            )
+            .await?;
+        Ok(())
+    }
+
+    async fn replace(&mut self) -> Result<bool, StoreError> {
+        let (inner, next) = (Arc::clone(&self.inner), Arc::clone(&self.next));
+        blocking(move || {
+            // Before it serves: a large map should not be searched exactly until its graph is there.
+            inner.indexer.finish(&next);
+            next.vectors.sync()?;
+            sync_folder(&inner)
+        })
+        .await?;
+        let (old, done) = (self.old.clone(), self.done);
+        let (reading, current) = (Arc::clone(&self.current), Arc::clone(&self.current));
+        let (inner, next, wanted) =
+            (Arc::clone(&self.inner), Arc::clone(&self.next), self.next.map());
+        let replaced = self
+            .inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    let stored = still_there(trees, &old)?;
+                    if reading.next_slot() != done {
+                        return Ok(None);
+                    }
+                    // Scene and description may have changed.
+                    let map =
+                        Map { scene: stored.scene, description: stored.description, ..wanted };
+                    put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
+                    // Their descriptors are not like those that come now.
+                    trees.forget_frames(map.uid)?;
+                    Ok(Some(map))
+                },
+                move |map| {
+                    let Some(map) = map else { return };
+                    next.set_map(map.clone());
+                    next.go_on_from(&current);
+                    inner.indexer.look_at(&next);
+                    let mut maps = inner.maps.write().unwrap_or_else(PoisonError::into_inner);
+                    maps.insert(map.name.clone(), next);
+                    drop(maps);
+                    inner.forget_draft(map);
+                },
+            )
+            .await?
+            .is_some();
+        if replaced {
+            let folder = folder_of(&self.old, &self.inner.descriptors);
+            remove(folder).await?;
+        }
+        Ok(replaced)
+    }
+
+    async fn discard(self: Box<Self>) {
+        let folder = folder_of(&self.next.map(), &self.inner.descriptors);
+        if let Err(error) = remove(folder).await {
+            tracing::warn!(%error, "a draft is left to the next start");
+        }
+        self.inner.forget_draft(&self.old);
+    }
+}
+
+impl EmbeddedDraft {
+    /// The next images of the walk.
+    async fn page(&self, limit: usize) -> Result<Vec<Image>, StoreError> {
+        let (slots, after) = (self.done..self.end, self.cursor.clone());
+        if slots.is_empty() {
+            return Ok(Vec::new());
+        }
+        let (trees, uid) = (self.inner.trees.clone(), self.old.uid);
+        blocking(move || {
+            let wanted = |stored: &Result<StoredImage, _>| {
+                stored.as_ref().map_or(true, |stored| slots.contains(&stored.slot))
+            };
+            let images = trees.images_after(uid, after.as_ref()).filter(wanted).take(limit);
+            images.map(|stored| Ok(stored?.image)).collect()
+        })
+        .await
+    }
+}
+
+impl Inner {
+    fn forget_draft(&self, map: &Map) {
+        self.drafts.write().unwrap_or_else(PoisonError::into_inner).remove(&map.uid);
+    }
+}
+
+async fn remove(folder: PathBuf) -> Result<(), StoreError> {
+    blocking(move || {
+        remove_folder(&folder);
+        Ok(())
+    })
+    .await
+}
+
+/// The folder of a draft is there after a power cut.
+fn sync_folder(inner: &Inner) -> Result<(), StoreError> {
+    let folder = &inner.descriptors;
+    File::open(folder)
+        .and_then(|folder| folder.sync_all())
+        .map_err(|error| StoreError::Failed(format!("cannot sync {}: {error}", folder.display())))
+}
