@@ -26,4 +26,5 @@ mod mock_mllm;
 mod model_files;
 mod models;
 mod real_images;
+mod reindex;
 mod service;

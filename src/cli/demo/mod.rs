@@ -82,17 +82,19 @@ async fn index_town(
     folders: &Folders,
 ) -> anyhow::Result<index::Outcome> {
     let args = index::Args {
-        dir: folders.map.clone(),
+        dir: None,
+        reindex: false,
         map: MAP.parse()?,
         poses: None,
         scene: Some(Scene::Outdoor),
+        model: None,
         descriptor: None,
         frame: None,
         concurrency: 4,
         json: false,
         server: server.clone(),
     };
-    index::add_folder(client, &args).await
+    index::add_folder(client, &folders.map, &args).await
 }
 
 /// Posts every frame, one after another as a robot would, and then waits for the jobs.

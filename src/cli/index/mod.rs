@@ -1,21 +1,22 @@
-//! `whereabouts index`: a folder of images into a map, over HTTP.
+//! `whereabouts index`: a folder of images into a map, over HTTP; or a map to another model.
 
 mod poses;
+mod progress;
+mod reindex;
 
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::{Context, bail};
 use futures_util::StreamExt;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use reqwest::StatusCode;
 use reqwest::multipart::{Form, Part};
 use serde::Serialize;
 use walkdir::WalkDir;
 
 use self::poses::PoseSource;
+use self::progress::Progress;
 use super::client::{Client, ServerArg, segment};
 use crate::domain::{DescriptorKind, Frame, ImageId, MapName, MediaType, Scene};
 use crate::service::{ImageMeta, MapChange};
@@ -23,10 +24,17 @@ use crate::service::{ImageMeta, MapChange};
 /// Poses come from a CSV file (--poses, or poses.csv in the folder), from file names of the form
 /// @easting@northing@..., or from EXIF GPS. It is safe to run this again: what is there already is
 /// left as it is.
+///
+/// With --reindex, the server makes new descriptors of all images that the map has, with another
+/// model or with the one installed now. The map answers with the old ones until that is done.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// The folder; folders in it are searched too
-    pub dir: PathBuf,
+    #[arg(required_unless_present = "reindex")]
+    pub dir: Option<PathBuf>,
+    /// Make the descriptors of all images of the map anew
+    #[arg(long, conflicts_with_all = ["dir", "poses", "scene", "frame", "concurrency"])]
+    pub reindex: bool,
     /// The map; made if it is not there
     #[arg(long)]
     pub map: MapName,
@@ -36,7 +44,10 @@ pub struct Args {
     /// What the map shows
     #[arg(long)]
     pub scene: Option<Scene>,
-    /// The descriptor of a new map
+    /// The model of a new map; with --reindex, the one that makes the descriptors anew
+    #[arg(long, value_name = "NAME")]
+    pub model: Option<String>,
+    /// The descriptor of a new map; with --reindex, the one to make
     #[arg(long)]
     pub descriptor: Option<DescriptorKind>,
     /// The frame of a new map; otherwise it follows from the poses
@@ -74,15 +85,19 @@ struct Failure {
 }
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
-    let outcome = add_folder(&Client::new(&args.server)?, &args).await?;
-    report(&outcome, args.json)
+    let client = Client::new(&args.server)?;
+    match &args.dir {
+        Some(dir) => report(&add_folder(&client, dir, &args).await?, args.json),
+        None => reindex::run(&client, &args).await,
+    }
 }
 
 /// Adds a folder to a map; what became of each image is in the outcome.
-pub async fn add_folder(client: &Client, args: &Args) -> anyhow::Result<Outcome> {
-    let files = pictures(&args.dir)?;
-    let source = Arc::new(PoseSource::find(&args.dir, args.poses.as_deref(), &files)?);
+pub async fn add_folder(client: &Client, dir: &Path, args: &Args) -> anyhow::Result<Outcome> {
+    let files = pictures(dir)?;
+    let source = Arc::new(PoseSource::find(dir, args.poses.as_deref(), &files)?);
     let change = MapChange {
+        model: args.model.clone(),
         scene: args.scene,
         descriptor: args.descriptor,
         frame: args.frame.or(source.frame()),
@@ -97,9 +112,8 @@ pub async fn add_folder(client: &Client, args: &Args) -> anyhow::Result<Outcome>
     let mut sent = futures_util::stream::iter(files.iter().cloned())
         .map(|file| {
             let (client, path, source) = (client.clone(), Arc::clone(&path), Arc::clone(&source));
-            let dir = args.dir.clone();
             async move {
-                let result = send(&client, &path, &dir, &file, &source).await;
+                let result = send(&client, &path, dir, &file, &source).await;
                 (file, result)
             }
         })
@@ -212,43 +226,4 @@ fn pictures(dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
         bail!("there is no .jpg, .jpeg, .png or .webp file in {}", dir.display());
     }
     Ok(files)
-}
-
-/// A bar on a terminal, a line every few seconds in a pipe.
-struct Progress {
-    bar: ProgressBar,
-    on_terminal: bool,
-    last_line: std::cell::Cell<Instant>,
-}
-
-impl Progress {
-    fn new(total: usize) -> Self {
-        let on_terminal = std::io::stderr().is_terminal();
-        let target =
-            if on_terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
-        let bar = ProgressBar::with_draw_target(Some(total as u64), target);
-        if let Ok(style) =
-            ProgressStyle::with_template("{bar:40} {pos}/{len} images, {per_sec}, {eta} left")
-        {
-            bar.set_style(style);
-        }
-        Self { bar, on_terminal, last_line: std::cell::Cell::new(Instant::now()) }
-    }
-
-    fn step(&self) {
-        const PAUSE: Duration = Duration::from_secs(5);
-        self.bar.inc(1);
-        if !self.on_terminal && self.last_line.get().elapsed() >= PAUSE {
-            self.last_line.set(Instant::now());
-            eprintln!("{}/{} images", self.bar.position(), self.bar.length().unwrap_or_default());
-        }
-    }
-
-    fn say(&self, text: &str) {
-        self.bar.suspend(|| eprintln!("{text}"));
-    }
-
-    fn end(&self) {
-        self.bar.finish_and_clear();
-    }
 }

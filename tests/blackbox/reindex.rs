@@ -1,0 +1,374 @@
+//! Several models in one server, and maps that move from one to another.
+
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use super::support::{BINARY, Server, frame, reference};
+
+const XFEAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/models/xfeat");
+
+/// Models beside the built-in one, and a data folder.
+struct Bench {
+    dir: TempDir,
+}
+
+impl Bench {
+    fn new() -> Self {
+        Self { dir: TempDir::new().unwrap() }
+    }
+
+    fn assets(&self) -> PathBuf {
+        self.dir.path().join("assets")
+    }
+
+    fn data(&self) -> PathBuf {
+        self.dir.path().join("data")
+    }
+
+    /// XFeat with another input and another grid, which makes other descriptors.
+    fn install(&self, name: &str, (width, height): (u32, u32), grid: usize) {
+        let manifest = std::fs::read_to_string(format!("{XFEAT}/manifest.toml")).unwrap();
+        let manifest = manifest
+            .replace("width = 320", &format!("width = {width}"))
+            .replace("height = 240", &format!("height = {height}"))
+            .replace("dimension = 576", &format!("dimension = {}", 64 * grid * grid));
+        let grids = ["grid = [3, 3]", "grid = [\n    3,\n    3,\n]"];
+        let manifest = grids
+            .iter()
+            .fold(manifest, |text, old| text.replace(old, &format!("grid = [{grid}, {grid}]")));
+        let file = self.dir.path().join("manifest.toml");
+        std::fs::write(&file, manifest).unwrap();
+        let output = Command::new(BINARY)
+            .args(["model", "add", &format!("{XFEAT}/model.onnx"), "--name", name, "--manifest"])
+            .arg(&file)
+            .arg("--assets")
+            .arg(self.assets())
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+
+    /// A model that takes its time.
+    fn install_slow(&self) {
+        self.install("slow", (960, 720), 1);
+    }
+
+    fn server(&self, settings: &[(&str, &str)]) -> Server {
+        let assets = self.assets();
+        let ours = [("WHEREABOUTS_MODEL__ASSETS", assets.to_str().unwrap())];
+        Server::start(&self.data(), &[&ours, settings].concat())
+    }
+
+    fn descriptor_folders(&self) -> usize {
+        std::fs::read_dir(self.data().join("descriptors")).unwrap().count()
+    }
+}
+
+/// A map of the first `places` places, of that model.
+async fn town(server: &Server, map: &str, model: &str, places: usize) {
+    server.put(&format!("/maps/{map}"), json!({ "model": model })).await.expect(201);
+    for place in 0..places {
+        add(server, map, place).await;
+    }
+}
+
+async fn add(server: &Server, map: &str, place: usize) {
+    let path = format!("/maps/{map}/images?id=place-{place}&lat=45.{place:03}&lon=7");
+    server.post_jpeg(&path, reference(place)).await.expect(201);
+}
+
+/// The ids of the candidates for the picture of a place itself, and the model that found them.
+async fn look(server: &Server, map: &str, place: usize) -> (Vec<String>, String) {
+    let path = format!("/localize?map={map}&refine=off&k=3");
+    let answer = server.post_jpeg(&path, reference(place)).await.expect(200);
+    let ids = answer["candidates"].as_array().unwrap().iter();
+    let ids = ids.map(|candidate| candidate["image_id"].as_str().unwrap().to_owned()).collect();
+    (ids, answer["model"].as_str().unwrap().to_owned())
+}
+
+#[track_caller]
+fn first(found: &(Vec<String>, String), place: usize, model: &str) {
+    assert_eq!((found.0[0].as_str(), found.1.as_str()), (&*format!("place-{place}"), model));
+}
+
+async fn begin(server: &Server, map: &str, request: Value) -> Value {
+    let body = request.to_string().into_bytes();
+    server.post(&format!("/maps/{map}/reindex"), "application/json", body).await.expect(202)
+}
+
+/// The map, once its reindex is as far as `far` says.
+async fn until(server: &Server, map: &str, far: impl Fn(&Value) -> bool) -> Value {
+    let start = Instant::now();
+    loop {
+        let state = server.get(&format!("/maps/{map}")).await.expect(200);
+        if far(&state["reindex"]) {
+            return state;
+        }
+        assert!(start.elapsed() < Duration::from_secs(60), "{state}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+async fn ended(server: &Server, map: &str) -> Value {
+    until(server, map, |reindex| reindex["state"] != "running").await
+}
+
+async fn in_the_middle(server: &Server, map: &str) -> Value {
+    until(server, map, |reindex| reindex["done"].as_u64().unwrap() >= 2).await
+}
+
+#[tokio::test]
+async fn maps_of_several_models_are_served_side_by_side_within_the_bound() {
+    let bench = Bench::new();
+    bench.install("small", (160, 120), 2);
+    bench.install("middle", (240, 160), 2);
+    let server = bench.server(&[("WHEREABOUTS_MODEL__LOADED", "2")]);
+    for (map, model, dim) in [("a", "xfeat", 576), ("b", "small", 256), ("c", "middle", 256)] {
+        town(&server, map, model, 4).await;
+        let state = server.get(&format!("/maps/{map}")).await.expect(200);
+        assert_eq!((&state["model"], &state["dim"]), (&json!(model), &json!(dim)));
+        assert!(state["reindex"].is_null());
+    }
+    for _ in 0..2 {
+        for (map, model) in [("a", "xfeat"), ("b", "small"), ("c", "middle")] {
+            first(&look(&server, map, 2).await, 2, model);
+        }
+    }
+    assert!(server.log().contains("model dropped to make room"), "{}", server.log());
+    // The refiner, too, looks with the model of the map.
+    for (map, model) in [("a", "xfeat"), ("b", "small")] {
+        let path = format!("/localize?map={map}&refine=wait");
+        let answer = server.post_jpeg(&path, frame(1, 0)).await.expect(200);
+        assert_eq!(
+            (&answer["job"]["state"], &answer["model"]),
+            (&"succeeded".into(), &model.into())
+        );
+    }
+    // What has images keeps its model, and says how to change it.
+    server.put("/maps/b", json!({"description": "b"})).await.expect(200);
+    let why = server.put("/maps/b", json!({"model": "xfeat"})).await.problem(409);
+    assert!(why.contains("--reindex"), "{why}");
+    let why = server.put("/maps/d", json!({"model": "no-such-model"})).await.problem(422);
+    assert!(why.contains("model add"), "{why}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed() {
+    let bench = Bench::new();
+    bench.install_slow();
+    let server = bench.server(&[]);
+    town(&server, "m", "xfeat", 24).await;
+    let begun = begin(&server, "m", json!({"model": "slow"})).await;
+    assert_eq!(begun["model"], "xfeat");
+    let reindex = &begun["reindex"];
+    assert_eq!((&reindex["model"], &reindex["state"]), (&json!("slow"), &json!("running")));
+    assert_eq!((&reindex["total"], &reindex["error"]), (&json!(24), &Value::Null));
+    let twice = server.post("/maps/m/reindex", "application/json", Vec::new()).await.problem(409);
+    assert!(twice.contains("GET /maps/m"), "{twice}");
+
+    in_the_middle(&server, "m").await;
+    // One that has its new descriptor already, one that does not, and both sent again.
+    for place in [0, 9, 23] {
+        server.delete(&format!("/maps/m/images/place-{place}")).await.expect(204);
+    }
+    for place in [0, 30, 31] {
+        add(&server, "m", place).await;
+    }
+    server.put("/maps/m", json!({"description": "in between"})).await.expect(200);
+
+    let (mut models, mut state) = (Vec::new(), json!({"reindex": begun["reindex"]}));
+    while state["reindex"]["state"] == "running" {
+        let (ids, model) = look(&server, "m", 30).await;
+        assert_eq!(ids[0], "place-30");
+        models.push(model);
+        state = server.get("/maps/m").await.expect(200);
+    }
+    assert_eq!(state["reindex"]["state"], "succeeded", "{state}");
+    assert_eq!(
+        (&state["model"], &state["dim"], &state["images"]),
+        (&json!("slow"), &json!(64), &json!(24))
+    );
+    assert_eq!(state["description"], "in between");
+    assert!(models.iter().filter(|model| *model == "xfeat").count() > 3, "{models:?}");
+    assert!(models.is_sorted_by_key(|model| model == "slow"), "{models:?}");
+
+    async fn check(server: &Server) {
+        for place in [0, 1, 22, 30, 31] {
+            first(&look(server, "m", place).await, place, "slow");
+        }
+        for place in [9, 23] {
+            assert_ne!(look(server, "m", place).await.0[0], format!("place-{place}"));
+        }
+    }
+    check(&server).await;
+    assert_eq!(bench.descriptor_folders(), 1, "the old descriptors are removed");
+    add(&server, "m", 32).await;
+    server.kill();
+    let server = bench.server(&[]);
+    check(&server).await;
+    first(&look(&server, "m", 32).await, 32, "slow");
+    let state = server.get("/maps/m").await.expect(200);
+    assert_eq!((&state["images"], &state["model"]), (&json!(25), &json!("slow")));
+    assert!(!server.log().contains("damaged"), "{}", server.log());
+}
+
+#[tokio::test]
+async fn images_that_are_sent_all_the_time_are_neither_lost_nor_refused() {
+    let bench = Bench::new();
+    bench.install("small", (160, 120), 2);
+    let server = bench.server(&[]);
+    town(&server, "m", "xfeat", 8).await;
+    begin(&server, "m", json!({"model": "small"})).await;
+    for place in 8..24 {
+        add(&server, "m", place).await;
+    }
+    let state = ended(&server, "m").await;
+    assert_eq!(state["reindex"]["state"], "succeeded", "{state}");
+    assert_eq!(state["images"], 24);
+    for place in 0..24 {
+        first(&look(&server, "m", place).await, place, "small");
+    }
+}
+
+#[tokio::test]
+async fn kill_9_in_the_middle_loses_nothing_and_it_can_be_run_again() {
+    let bench = Bench::new();
+    bench.install_slow();
+    let server = bench.server(&[]);
+    town(&server, "m", "xfeat", 16).await;
+    begin(&server, "m", json!({"model": "slow"})).await;
+    in_the_middle(&server, "m").await;
+    add(&server, "m", 16).await;
+    server.kill();
+
+    let server = bench.server(&[]);
+    let state = server.get("/maps/m").await.expect(200);
+    assert_eq!((&state["model"], &state["images"]), (&json!("xfeat"), &json!(17)));
+    assert!(state["reindex"].is_null());
+    assert_eq!(bench.descriptor_folders(), 1, "the unfinished ones are removed");
+    for place in [0, 15, 16] {
+        first(&look(&server, "m", place).await, place, "xfeat");
+    }
+    begin(&server, "m", json!({"model": "slow"})).await;
+    assert_eq!(ended(&server, "m").await["model"], "slow");
+    first(&look(&server, "m", 16).await, 16, "slow");
+}
+
+#[tokio::test]
+async fn a_map_whose_model_is_gone_says_so_and_can_move_to_another() {
+    let bench = Bench::new();
+    bench.install("small", (160, 120), 2);
+    let server = bench.server(&[]);
+    town(&server, "m", "small", 4).await;
+    let answer = server.post_jpeg("/localize?map=m", frame(1, 0)).await.expect(200);
+    server.terminate();
+    std::fs::remove_dir_all(bench.assets().join("models/small")).unwrap();
+
+    let server = bench.server(&[]);
+    for path in ["/localize?map=m&refine=off", "/maps/m/images?id=late"] {
+        let why = server.post_jpeg(path, reference(9)).await.problem(409);
+        assert!(why.contains("model pull small") && why.contains("--reindex --map m"), "{why}");
+    }
+    server.put("/maps/m", json!({"scene": "indoor"})).await.expect(200);
+    let href = answer["job"]["href"].as_str().unwrap();
+    assert_ne!(server.get(&format!("{href}?wait=20")).await.expect(200)["state"], "queued");
+    let why = server.post("/maps/m/reindex", "application/json", b"{}".to_vec()).await.problem(422);
+    assert!(why.contains("not installed"), "{why}");
+    let cls = json!({"model": "xfeat", "descriptor": "cls"}).to_string().into_bytes();
+    let why = server.post("/maps/m/reindex", "application/json", cls).await.problem(422);
+    assert!(why.contains("[CLS]"), "{why}");
+    begin(&server, "m", json!({"model": "xfeat"})).await;
+    assert_eq!(ended(&server, "m").await["model"], "xfeat");
+    first(&look(&server, "m", 3).await, 3, "xfeat");
+}
+
+#[tokio::test]
+async fn a_model_that_is_installed_anew_is_taken_up_by_a_reindex() {
+    let bench = Bench::new();
+    bench.install("mine", (160, 120), 2);
+    let server = bench.server(&[]);
+    town(&server, "m", "mine", 4).await;
+    let before = server.get("/maps/m").await.expect(200);
+    // The same graph with a word in its description, as an export on another day has it.
+    let file = bench.assets().join("models/mine/model.onnx");
+    let bytes = [std::fs::read(&file).unwrap(), b"\x32\x05again".to_vec()].concat();
+    std::fs::write(&file, &bytes).unwrap();
+    let manifest = bench.assets().join("models/mine/manifest.toml");
+    let text = std::fs::read_to_string(&manifest).unwrap();
+    let unpinned: Vec<_> = text.lines().filter(|line| !line.starts_with("sha256")).collect();
+    std::fs::write(&manifest, unpinned.join("\n")).unwrap();
+
+    // The one in memory serves; after a restart there is only the other.
+    first(&look(&server, "m", 2).await, 2, "mine");
+    server.terminate();
+    let server = bench.server(&[]);
+    let why = server.post_jpeg("/localize?map=m", frame(1, 0)).await.problem(409);
+    assert!(why.contains("--reindex --map m --model mine"), "{why}");
+    begin(&server, "m", json!({})).await;
+    let after = ended(&server, "m").await;
+    assert_eq!(after["reindex"]["state"], "succeeded", "{after}");
+    assert_ne!(after["model_digest"], before["model_digest"]);
+    first(&look(&server, "m", 2).await, 2, "mine");
+
+    // The same again without a restart.
+    std::fs::write(&file, [&bytes[..], b"\x32\x07further"].concat()).unwrap();
+    begin(&server, "m", json!({"model": "mine"})).await;
+    assert_ne!(ended(&server, "m").await["model_digest"], after["model_digest"]);
+    first(&look(&server, "m", 2).await, 2, "mine");
+}
+
+#[tokio::test]
+async fn an_image_that_cannot_be_taken_over_stops_the_reindex_and_nothing_else() {
+    let bench = Bench::new();
+    bench.install("small", (160, 120), 2);
+    let server = bench.server(&[]);
+    town(&server, "m", "xfeat", 4).await;
+    let digest = server.get("/maps/m/images/place-2").await.expect(200)["digest"].clone();
+    let hex = digest.as_str().unwrap().strip_prefix("sha256:").unwrap().to_owned();
+    std::fs::remove_file(bench.data().join("images").join(&hex[..2]).join(&hex[2..])).unwrap();
+    begin(&server, "m", json!({"model": "small"})).await;
+    let state = ended(&server, "m").await;
+    assert_eq!((&state["reindex"]["state"], &state["model"]), (&json!("failed"), &json!("xfeat")));
+    let why = state["reindex"]["error"].as_str().unwrap();
+    assert!(why.contains("place-2") && why.contains("delete it"), "{why}");
+    assert_eq!(bench.descriptor_folders(), 1);
+    first(&look(&server, "m", 2).await, 2, "xfeat");
+    // As it says.
+    server.delete("/maps/m/images/place-2").await.expect(204);
+    begin(&server, "m", json!({"model": "small"})).await;
+    assert_eq!(ended(&server, "m").await["model"], "small");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_command_waits_for_the_end_and_says_how_it_went() {
+    let bench = Bench::new();
+    bench.install_slow();
+    let server = bench.server(&[]);
+    town(&server, "m", "xfeat", 6).await;
+    let run = async |map: &str, more: &[&str]| {
+        let mut command = Command::new(BINARY);
+        command.args(["index", "--reindex", "--map", map, "--server", &server.url]).args(more);
+        tokio::task::spawn_blocking(move || command.output().unwrap()).await.unwrap()
+    };
+    let done = run("m", &["--model", "slow"]).await;
+    let said = String::from_utf8_lossy(&done.stdout);
+    assert!(
+        done.status.success() && said.contains("6 images") && said.contains("slow"),
+        "{done:?}"
+    );
+    let again = run("m", &["--model", "xfeat", "--json"]).await;
+    let state: Value = serde_json::from_slice(&again.stdout).unwrap();
+    assert_eq!((&state["model"], &state["reindex"]["done"]), (&json!("xfeat"), &json!(6)));
+    for (map, model, word) in [("m", "no-such-model", "model add"), ("n", "slow", "no map")] {
+        let failed = run(map, &["--model", model]).await;
+        assert_eq!(failed.status.code(), Some(1));
+        let said = String::from_utf8_lossy(&failed.stderr);
+        assert!(said.contains(word), "{said}");
+    }
+    let wrong = Command::new(BINARY).args(["index", ".", "--reindex", "--map", "m"]).output();
+    assert_eq!(wrong.unwrap().status.code(), Some(2));
+}
