@@ -102,6 +102,8 @@ pub struct Model {
     pub max_batch: usize,
     /// Where `whereabouts model pull` downloads from.
     pub hub: String,
+    /// How long the demo waits for it to answer, in seconds; 0: it does not ask.
+    pub hub_patience_s: u64,
     /// The largest file it downloads, in bytes.
     pub max_download_bytes: u64,
     /// The longest time without a byte, in seconds.

@@ -64,6 +64,11 @@ impl Catalogue {
         Self::parse(BUILT_IN, Path::new("deploy/models/catalogue.toml"))
     }
 
+    /// The catalogue in a file, or that of this release.
+    pub fn of(file: Option<&Path>) -> Result<Self, CatalogueError> {
+        file.map_or_else(Self::built_in, Self::read)
+    }
+
     /// Reads another catalogue.
     pub fn read(path: &Path) -> Result<Self, CatalogueError> {
         let text = std::fs::read_to_string(path)

@@ -9,7 +9,8 @@ use tempfile::TempDir;
 use super::support::{BINARY, Server, frame, reference, server};
 
 fn whereabouts(args: &[&str]) -> Output {
-    Command::new(BINARY).args(args).output().unwrap()
+    // Whatever else is installed in the checkout, or could be.
+    Command::new(BINARY).args(args).env("WHEREABOUTS_MODEL__NAME", "xfeat").output().unwrap()
 }
 
 fn json(output: &Output) -> Value {

@@ -12,12 +12,12 @@ use super::support::{BINARY, Server};
 
 const FIXTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/models/tiny-tokens");
 
-fn fixture(file: &str) -> PathBuf {
+pub fn fixture(file: &str) -> PathBuf {
     Path::new(FIXTURE).join(file)
 }
 
 /// Assets of their own and a catalogue with one model, `tiny`.
-struct Bench {
+pub struct Bench {
     dir: TempDir,
 }
 
@@ -27,7 +27,7 @@ impl Bench {
     }
 
     /// The catalogue's manifest is what `change` makes of the fixture's.
-    fn with(change: impl FnOnce(String) -> String) -> Self {
+    pub fn with(change: impl FnOnce(String) -> String) -> Self {
         let dir = TempDir::new().unwrap();
         let manifest = std::fs::read_to_string(fixture("manifest.toml")).unwrap();
         let manifest = change(manifest.replace("name = \"tiny-tokens\"", "name = \"tiny\""));
@@ -40,6 +40,10 @@ impl Bench {
         Self { dir }
     }
 
+    pub fn catalogue(&self) -> PathBuf {
+        self.dir.path().join("catalogue.toml")
+    }
+
     /// Without a pin, the first download is believed.
     fn unpinned() -> Self {
         Self::with(|manifest| {
@@ -48,7 +52,7 @@ impl Bench {
         })
     }
 
-    fn assets(&self) -> PathBuf {
+    pub fn assets(&self) -> PathBuf {
         self.dir.path().join("assets")
     }
 
@@ -63,7 +67,7 @@ impl Bench {
             .args(args)
             .arg("--assets")
             .arg(self.assets())
-            .env("WHEREABOUTS_CATALOGUE", self.dir.path().join("catalogue.toml"))
+            .env("WHEREABOUTS_CATALOGUE", self.catalogue())
             .env("WHEREABOUTS_MODEL__HUB", hub)
             .env("WHEREABOUTS_MODEL__DOWNLOAD_BACKOFF_MS", "1")
             .env("WHEREABOUTS_MODEL__DOWNLOAD_STALL_S", "1");

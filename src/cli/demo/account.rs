@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::super::localize::pose_text;
 use super::pictures::picture_of;
 use super::town::Folders;
-use super::{Args, MAP, Visit, index, shown};
+use super::{Args, Choice, MAP, Visit, index, shown};
 use crate::demo::SUCCESS_RADIUS_M;
 use crate::domain::Pose;
 
@@ -50,6 +50,12 @@ pub fn rendered(args: &Args, folders: &Folders, places: usize, took: Duration) {
     }
 }
 
+pub fn chosen(args: &Args, choice: &Choice) {
+    if !args.json {
+        println!("   model {}: {}", choice.model, choice.why);
+    }
+}
+
 pub fn indexed(args: &Args, outcome: &index::Outcome, server: &str) {
     if !args.json {
         println!("   indexed {} images at {server} in {:.1} s", outcome.images, outcome.seconds);
@@ -60,12 +66,13 @@ pub fn indexed(args: &Args, outcome: &index::Outcome, server: &str) {
 pub fn visits(
     args: &Args,
     visits: &[Visit],
+    choice: &Choice,
     folders: &Folders,
     took: Duration,
 ) -> anyhow::Result<()> {
     let verdicts: Vec<Verdict> = visits.iter().map(Verdict::of).collect();
     if args.json {
-        println!("{}", as_json(visits, &verdicts, took));
+        println!("{}", as_json(visits, &verdicts, choice, took));
         return Ok(());
     }
     let told = telling(&verdicts);
@@ -194,10 +201,17 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or_default()
 }
 
-fn as_json(visits: &[Visit], verdicts: &[Verdict], took: Duration) -> serde_json::Value {
+fn as_json(
+    visits: &[Visit],
+    verdicts: &[Verdict],
+    choice: &Choice,
+    took: Duration,
+) -> serde_json::Value {
     let outcome = Outcome::of(visits, verdicts);
     serde_json::json!({
         "queries": visits.len(),
+        "model": choice.model,
+        "why": choice.why,
         "recall_at_1": { "before": outcome.before, "after": outcome.after },
         "helped": outcome.helped,
         "harmed": outcome.harmed,

@@ -4,6 +4,7 @@
 //! folder, posts frames, and waits for their jobs.
 
 mod account;
+mod model;
 mod pictures;
 mod town;
 
@@ -16,6 +17,7 @@ use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
+use self::model::{Choice, Choosing};
 use self::town::{Folders, Frame};
 use super::client::{Client, ServerArg};
 use super::index;
@@ -28,6 +30,8 @@ use crate::{startup, telemetry};
 /// The map's name.
 const MAP: &str = "town";
 
+/// The model is the one of --model or the settings; else DINOv2 if one is installed; else DINOv2
+/// small from the hub, if that answers within seconds; else the built-in xfeat.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Where to put the pictures and the data; what an earlier demo left there is replaced
@@ -42,6 +46,12 @@ pub struct Args {
     /// The model
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
+    /// Ask no hub; without an installed DINOv2 the model is the built-in one
+    #[arg(long)]
+    offline: bool,
+    /// A catalogue to use instead of the built-in one
+    #[arg(long, value_name = "FILE", hide = true, env = "WHEREABOUTS_CATALOGUE")]
+    catalogue: Option<PathBuf>,
     /// Print the outcome as JSON
     #[arg(long)]
     json: bool,
@@ -57,6 +67,8 @@ pub(super) struct Visit {
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let start = Instant::now();
     let folders = Folders::fresh(&args.out)?;
+    // The hub has the time to answer that the town takes to be drawn.
+    let choosing = Choosing::begin(&args)?;
     let spec =
         TownSpec { seed: args.seed, places: usize::from(args.places), ..TownSpec::default() };
     account::heading(&args, "1. A town");
@@ -64,7 +76,9 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     account::rendered(&args, &folders, frames.len(), start.elapsed());
 
     account::heading(&args, "2. A server, and the town's pictures in a map");
-    let server = Server::start(&folders, args.model.clone()).await?;
+    let choice = choosing.end().await?;
+    account::chosen(&args, &choice);
+    let server = Server::start(&folders, choice.model.clone()).await?;
     let client = Client::new(&server.address)?;
     let indexed = index_town(&client, &server.address, &folders).await?;
     account::indexed(&args, &indexed, &server.address.server);
@@ -72,7 +86,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     account::heading(&args, "3. Frames from the same places on another day");
     let visits = localize_all(&client, frames).await?;
     pictures::side_by_side(&visits, &folders)?;
-    account::visits(&args, &visits, &folders, start.elapsed())?;
+    account::visits(&args, &visits, &choice, &folders, start.elapsed())?;
     server.stop().await
 }
 
@@ -126,11 +140,11 @@ struct Server {
 }
 
 impl Server {
-    async fn start(folders: &Folders, model: Option<String>) -> anyhow::Result<Self> {
+    async fn start(folders: &Folders, model: String) -> anyhow::Result<Self> {
         let flags = Overrides::default()
             .listen(Some(([127, 0, 0, 1], 0).into()))
             .data(Some(folders.data.clone()))
-            .model(model);
+            .model(Some(model));
         let mut config = Config::load(None, &flags)?;
         "warn".clone_into(&mut config.log.filter);
         telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;

@@ -4,18 +4,18 @@ mod account;
 mod bench;
 mod screen;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-use self::screen::Screen;
+pub use self::screen::Screen;
 use crate::config::{Config, Overrides};
 use crate::models::{Added, Catalogue, ModelsFolder, Pulled};
 use crate::retrieve::{AUTO, Assets, BUILT_IN_MODEL};
 
-/// A server whose model.name is "auto", as it is by default, runs the model that `use` chose; else
-/// the first that is installed of dinov2-small, dinov2-base and dinov2-large; else the built-in
-/// xfeat. A running server keeps its model until it is started again.
+/// A map that names no model has the one that the server was started with. Where model.name is
+/// "auto", as it is by default, that is the model that `use` chose; else the first that is installed
+/// of dinov2-small, dinov2-base and dinov2-large; else the built-in xfeat.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     #[command(subcommand)]
@@ -73,7 +73,7 @@ enum Action {
     },
     /// Measure each way of running a model on this machine: provider, precision, threads, batch
     Bench(bench::BenchArgs),
-    /// Choose the model that a server runs
+    /// Choose the model that a server starts with
     Use {
         /// An installed model; or auto, to take a choice back
         name: String,
@@ -119,30 +119,14 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
 impl Place {
     fn of(args: &Args) -> anyhow::Result<Self> {
         let config = Config::load(args.config.as_deref(), &Overrides::default())?;
-        let catalogue = match &args.catalogue {
-            Some(file) => Catalogue::read(file)?,
-            None => Catalogue::built_in()?,
-        };
+        let catalogue = Catalogue::of(args.catalogue.as_deref())?;
         let named = args.assets.as_deref().or(config.model.assets()).map(PathBuf::from);
         let assets = Assets::locate(named.as_deref());
         Ok(Self { config, catalogue, assets, named })
     }
 
-    /// The folder named, or the first of the usual ones that is there and can be written.
     fn folder(&self) -> anyhow::Result<ModelsFolder> {
-        if let Some(named) = &self.named {
-            return Ok(ModelsFolder::open(named)?);
-        }
-        let there = self.assets.candidates().iter().filter(|folder| folder.is_dir());
-        there.flat_map(|folder| ModelsFolder::open(folder)).next().with_context(|| {
-            let looked: Vec<_> =
-                self.assets.candidates().iter().map(|path| path.display().to_string()).collect();
-            format!(
-                "no assets folder is there that can be written (looked in {}); run `make build` in \
-                 the checkout, or name a folder with --assets DIR",
-                looked.join(", ")
-            )
-        })
+        models_folder(self.named.as_deref(), &self.assets)
     }
 
     /// A folder that a server does not look in by itself has to be named to it.
@@ -153,6 +137,24 @@ impl Place {
             println!("  start the server with WHEREABOUTS_MODEL__ASSETS={}", named.display());
         }
     }
+}
+
+/// Where to install: the folder named, or the first of the usual ones that is there and can be
+/// written.
+pub fn models_folder(named: Option<&Path>, assets: &Assets) -> anyhow::Result<ModelsFolder> {
+    if let Some(named) = named {
+        return Ok(ModelsFolder::open(named)?);
+    }
+    let there = assets.candidates().iter().filter(|folder| folder.is_dir());
+    there.flat_map(|folder| ModelsFolder::open(folder)).next().with_context(|| {
+        let looked: Vec<_> =
+            assets.candidates().iter().map(|path| path.display().to_string()).collect();
+        format!(
+            "no assets folder is there that can be written (looked in {}); run `make build` in \
+             the checkout, or name a folder with --assets DIR",
+            looked.join(", ")
+        )
+    })
 }
 
 async fn pull(place: &Place, name: &str) -> anyhow::Result<()> {
