@@ -26,7 +26,7 @@ pub struct Args {
     /// Write the address here once the server is ready
     #[arg(long, value_name = "FILE")]
     address_file: Option<PathBuf>,
-    /// The model
+    /// The model of maps that name none
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
     /// Who refines the candidates

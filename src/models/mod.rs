@@ -2,7 +2,7 @@
 //!
 //! A model is installed when `ASSETS/models/NAME` holds its manifest and its ONNX file; that folder
 //! appears whole or not at all. What is in the making lies in `ASSETS/models/.partial`. Which
-//! installed model a server runs is decided by [`crate::retrieve::Assets::resolve`].
+//! installed model a server starts with is decided by [`crate::retrieve::Assets::resolve`].
 
 mod catalogue;
 mod download;

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use utoipa::ToSchema;
 
-use super::{Service, ServiceError};
+use super::{SUPERSEDED, Service, ServiceError};
 use crate::domain::{DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose};
 use crate::retrieve::{Extraction, Extractor, decode, preprocess};
 use crate::store::{Added, StoreError};
@@ -57,7 +57,7 @@ impl Service {
             return Err(empty_body());
         }
         let digest = Digest::of(&new.bytes);
-        let mut pin = None;
+        let (mut pin, mut left) = (None, SUPERSEDED);
         loop {
             let (map, extractor) = self.usable_map(map).await?;
             let meta = CheckedMeta::new(new.meta.clone(), &map)?;
@@ -79,7 +79,7 @@ impl Service {
             }
             match self.maps.add_image(&map, image, extraction.descriptor).await {
                 // Its descriptor is of the model that the map had a moment ago.
-                Err(StoreError::Superseded(_)) => {}
+                Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
                 added => return Ok(added?),
             }
         }
@@ -164,7 +164,7 @@ impl Service {
         Ok(extraction)
     }
 
-    pub(super) async fn on_pool<T, F>(&self, work: F) -> Result<T, ServiceError>
+    async fn on_pool<T, F>(&self, work: F) -> Result<T, ServiceError>
     where
         T: Send + 'static,
         F: FnOnce() -> Result<T, crate::retrieve::ExtractError> + Send + 'static,

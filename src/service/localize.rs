@@ -10,7 +10,7 @@ use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::images::empty_body;
-use super::{ErrorKind, Service, ServiceError};
+use super::{ErrorKind, SUPERSEDED, Service, ServiceError};
 use crate::domain::{Candidate, Digest, ImageId, Job, JobState, Map, MapName, Pose, Priority};
 use crate::refine::DenseKey;
 use crate::retrieve::Extraction;
@@ -180,6 +180,7 @@ impl Service {
 
     /// Searches a map with the model that its descriptors are of.
     async fn coarse(&self, map: &MapName, frame: &Bytes, k: usize) -> Result<Coarse, ServiceError> {
+        let mut left = SUPERSEDED;
         loop {
             let (map, extractor) = self.usable_map(map).await?;
             let extraction = self.extract(&extractor, frame.clone(), map.descriptor).await?;
@@ -188,7 +189,7 @@ impl Service {
             let query = extraction.descriptor.clone();
             match self.maps.search(&map, query, k, SearchMode::Fast).await {
                 // The frame's descriptor is of the model that the map had a moment ago.
-                Err(StoreError::Superseded(_)) => {}
+                Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
                 found => {
                     let (candidates, searched) = (found?, searching.elapsed());
                     self.metrics.observe_search(searched);

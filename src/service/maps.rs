@@ -6,7 +6,7 @@ use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::models::dimension;
-use super::{ErrorKind, Reindex, Service, ServiceError};
+use super::{ErrorKind, Reindex, SUPERSEDED, Service, ServiceError};
 use crate::domain::{DescriptorKind, Digest, Frame, Map, MapName, Precision, Scene};
 use crate::store::{IndexState, StoreError};
 
@@ -89,12 +89,13 @@ impl Service {
         if change.description.as_ref().is_some_and(|text| text.chars().count() > 2000) {
             return Err(ServiceError::unprocessable("the description exceeds 2,000 characters"));
         }
+        let mut left = SUPERSEDED;
         loop {
             let known = self.maps.map(&name).await?;
             let wanted = self.changed(&name, &change, known).await?;
             match self.maps.put_map(wanted).await {
                 // It was reindexed since it was looked up.
-                Err(StoreError::Superseded(_)) => {}
+                Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
                 put => {
                     let (map, new) = put?;
                     return Ok((self.state_of(&map.name).await?, new));

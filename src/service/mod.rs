@@ -48,6 +48,10 @@ pub struct ServiceSettings {
     pub usage_days: u32,
 }
 
+/// How often a use case begins again because the map's descriptors were replaced meanwhile. Twice in
+/// a row would be strange; more often is a store that is broken.
+const SUPERSEDED: usize = 2;
+
 /// Everything a use case needs.
 pub struct Service {
     /// Maps, images, descriptors.

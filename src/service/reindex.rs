@@ -19,7 +19,7 @@ use crate::store::Draft;
 /// Images that are looked up at a time.
 const PAGE: usize = 256;
 
-/// The pause when the queue for pictures is full.
+/// The pause when a queue is full.
 const PAUSE: Duration = Duration::from_millis(50);
 
 /// Which descriptors to make.
@@ -171,7 +171,7 @@ impl Service {
         model: &str,
         descriptor: DescriptorKind,
     ) -> Result<(), ServiceError> {
-        let extractor = self.installed_model(model).await?;
+        let extractor = patiently(|| self.installed_model(model)).await?;
         let next = Map {
             model: model.to_owned(),
             model_digest: extractor.digest(),
@@ -228,18 +228,23 @@ impl Service {
                 _ => Ok(None),
             };
         };
-        loop {
-            let (extractor, bytes) = (Arc::clone(extractor), bytes.clone());
-            let turn = self.reindexes.turn.acquire().await;
-            let made = self.on_pool(move || extractor.extract(&bytes, descriptor)).await;
-            drop(turn);
-            match made {
-                Ok(extraction) => return Ok(Some(extraction.descriptor)),
-                Err(error) if error.kind == ErrorKind::Overloaded => {
-                    tokio::time::sleep(PAUSE).await;
-                }
-                Err(error) => return Err(left_behind(image, &error.detail)),
-            }
+        let _turn = self.reindexes.turn.acquire().await;
+        match patiently(|| self.extract(extractor, bytes.clone(), descriptor)).await {
+            Ok(extraction) => Ok(Some(extraction.descriptor)),
+            Err(error) => Err(left_behind(image, &error.detail)),
+        }
+    }
+}
+
+/// Does it as soon as robots leave room for it.
+async fn patiently<T, F>(work: impl Fn() -> F) -> Result<T, ServiceError>
+where
+    F: Future<Output = Result<T, ServiceError>>,
+{
+    loop {
+        match work().await {
+            Err(error) if error.kind == ErrorKind::Overloaded => tokio::time::sleep(PAUSE).await,
+            ended => return ended,
         }
     }
 }

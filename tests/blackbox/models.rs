@@ -138,6 +138,13 @@ async fn another_provider_gives_the_same_descriptors_and_another_precision_is_re
     assert!(refused.contains("model.precision"), "{refused}");
     server.town("b", 2).await;
     assert_eq!(server.get("/maps/b").await.expect(200)["precision"], "bf16");
+    // As it says, too: the descriptors are made anew.
+    assert!(refused.contains("--reindex --map m"), "{refused}");
+    server.post("/maps/m/reindex", "application/json", Vec::new()).await.expect(202);
+    while server.get("/maps/m").await.expect(200)["precision"] == "full" {
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+    }
+    assert_eq!(localize(&server).await.len(), 4);
 }
 
 #[test]

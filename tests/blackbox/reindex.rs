@@ -160,7 +160,9 @@ async fn maps_of_several_models_are_served_side_by_side_within_the_bound() {
 async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed() {
     let bench = Bench::new();
     bench.install_slow();
-    let server = bench.server(&[]);
+    // Such a small map with a graph stands for a large one.
+    let graph = [("WHEREABOUTS_INDEX__EXACT_UP_TO", "4")];
+    let server = bench.server(&graph);
     town(&server, "m", "xfeat", 24).await;
     let begun = begin(&server, "m", json!({"model": "slow"})).await;
     assert_eq!(begun["model"], "xfeat");
@@ -192,7 +194,7 @@ async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed()
         (&state["model"], &state["dim"], &state["images"]),
         (&json!("slow"), &json!(64), &json!(24))
     );
-    assert_eq!(state["description"], "in between");
+    assert_eq!((&state["description"], &state["index"]), (&json!("in between"), &json!("hnsw")));
     assert!(models.iter().filter(|model| *model == "xfeat").count() > 3, "{models:?}");
     assert!(models.is_sorted_by_key(|model| model == "slow"), "{models:?}");
 
@@ -208,7 +210,7 @@ async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed()
     assert_eq!(bench.descriptor_folders(), 1, "the old descriptors are removed");
     add(&server, "m", 32).await;
     server.kill();
-    let server = bench.server(&[]);
+    let server = bench.server(&graph);
     check(&server).await;
     first(&look(&server, "m", 32).await, 32, "slow");
     let state = server.get("/maps/m").await.expect(200);

@@ -19,10 +19,9 @@ pub async fn run(client: &Client, args: &Args) -> anyhow::Result<()> {
     let begun: MapState = client.json(begin).await?;
     let progress = Progress::new(begun.images);
     let ended = loop {
-        let map: MapState = client
-            .json(client.get(&path))
-            .await
-            .context("it is not known how the reindex ended; GET /maps/{map} tells")?;
+        let looked = client.send_patiently(|| Ok(client.get(&path))).await;
+        let unknown = || format!("it is not known how the reindex ended; GET {path} tells");
+        let map: MapState = looked.with_context(unknown)?.json().await.with_context(unknown)?;
         let Some(reindex) = &map.reindex else {
             bail!(
                 "the server was started again before the reindex had ended, and the map {} still \
