@@ -24,7 +24,13 @@ authors' code: by the factor (h + 0.1) / 37, where the 0.1 moves the samples a l
 hub` does so by size, as transformers 5 does. At 518×518 neither changes it. With registers, both
 go by size and with antialiasing, and the option makes no difference.
 
-Not done: half precision and quantisation; checkpoints in several files; checkpoints of training
+`--int8` makes the linear layers multiply 8-bit numbers: a quarter of the file, and about half the time
+with ONNX Runtime's CPU provider on processors with VNNI. It is another model, whose descriptors no map mixes
+with those of the first: with seeded weights of ViT-S/14 and twelve photographs at 224×224 the cosines
+between the two were 0.998 (GeM) and 0.9995 (CLS) at the least. Processors without VNNI saturate sums of
+such products; measure before you use it there.
+
+Not done: half precision; checkpoints in several files; checkpoints of training
 (a teacher or a student, or blocks in chunks); position embeddings of another grid than 37×37; and
 the manifest has no word for a pooled output, so the service pools `last_hidden_state` itself and
 ignores what --pool adds. The weights of dinov2-…-giant, 4.5 GB, do not fit into one ONNX file: they
@@ -361,6 +367,8 @@ class Graph:
     data: BinaryIO | None = None  # where large constants go, if not into the model
     nodes: list[onnx.NodeProto] = field(default_factory=list)
     constants: list[onnx.TensorProto] = field(default_factory=list)
+    int8: bool = False  # linear layers multiply bytes
+    quantized: set[str] = field(default_factory=set)  # values that have been made bytes
     digest: Any = field(default_factory=hashlib.sha256)  # of all constants so far
 
     def constant(self, name: str, value: Any, dtype: Any = np.float32) -> str:
@@ -395,10 +403,32 @@ class Graph:
     def linear(self, source: str, name: str, scale: np.ndarray | float = 1.0) -> str:
         """Adds a linear layer whose results, [out], are multiplied by `scale`."""
         weight, bias = self.weights(f"{name}.weight"), self.weights(f"{name}.bias")
-        weight = self.constant(f"{name}.weight", weight.T * scale)
-        product = self.node("MatMul", [source, weight], f"{name}.product")
+        if self.int8:
+            product = self.integer_product(source, name, weight.T * scale)
+        else:
+            weight = self.constant(f"{name}.weight", weight.T * scale)
+            product = self.node("MatMul", [source, weight], f"{name}.product")
         bias = self.constant(f"{name}.bias", bias * scale)
         return self.node("Add", [product, bias], name)
+
+    def integer_product(self, source: str, name: str, weight: np.ndarray) -> str:
+        """Adds a product with `weight`, [in, out], in whole numbers.
+
+        Each column of the weight has a scale of its own, its largest number over 127; the other
+        side is made bytes when it is there, by its least and largest number.
+        """
+        scales = np.maximum(np.abs(weight).max(axis=0), np.finfo(np.float32).tiny) / 127
+        whole = self.constant(f"{name}.weight", np.rint(weight / scales), np.int8)
+        scales = self.constant(f"{name}.scales", scales)
+        parts = [f"{source}.bytes", f"{source}.scale", f"{source}.zero"]
+        if source not in self.quantized:
+            self.quantized.add(source)
+            self.nodes.append(helper.make_node("DynamicQuantizeLinear", [source], parts, parts[0]))
+        values, scale, zero = parts
+        product = self.node("MatMulInteger", [values, whole, zero], f"{name}.integer")
+        product = self.node("Cast", [product], f"{name}.float", to=TensorProto.FLOAT)
+        scales = self.node("Mul", [scale, scales], f"{name}.scale")
+        return self.node("Mul", [product, scales], f"{name}.product")
 
 
 def outside(name: str, array: np.ndarray, data: BinaryIO) -> onnx.TensorProto:
@@ -559,11 +589,12 @@ def build_model(
     position: str = "original",
     size: list[int] | None = None,
     pool: str | None = None,
+    int8: bool = False,
     data: BinaryIO | None = None,
 ) -> onnx.ModelProto:
     """The model; `size` is [height, width] if it is to take no other, `data` gets the weights if
     they are to be in a file of their own."""
-    graph = Graph(weights, data)
+    graph = Graph(weights, data, int8=int8)
     tokens = add_embeddings(graph, variant, position, size)
     tokens = add_blocks(graph, variant, tokens)
     if pool:
@@ -629,6 +660,8 @@ def describe(
     by_size = variant.registers or choices["position"] == "hub"
     way = "by size" if by_size else "as the authors' code does"
     description = f"DINOv2 {variant.title}; its position embedding is stretched {way}."
+    if choices["int8"]:
+        description += " Its linear layers multiply 8-bit numbers."
     if "random" in name:
         description = f"Seeded random weights in the shape of {description}"
     height, width = choices["size"] or (MANIFEST_SIZE, MANIFEST_SIZE)
@@ -677,6 +710,7 @@ def main() -> None:
         "--fixed", type=size_of, metavar="HxW", help="take pictures of this height and width only"
     )
     parser.add_argument("--pool", choices=["cls", "gem"], help="add the output `descriptor`")
+    parser.add_argument("--int8", action="store_true", help="multiply 8-bit numbers")
     arguments = parser.parse_args()
 
     name, variant = arguments.model, VARIANTS[arguments.model]
@@ -684,6 +718,7 @@ def main() -> None:
         "position": arguments.position,
         "size": arguments.fixed,
         "pool": arguments.pool,
+        "int8": arguments.int8,
     }
     try:
         if arguments.weights:
@@ -693,6 +728,8 @@ def main() -> None:
             weights = random_weights(variant, arguments.random)
             name = f"{name}-random-{arguments.random}"
             source = f"deploy/models/export_dinov2.py --random {arguments.random}"
+        if arguments.int8:
+            name = f"{name}-int8"
         export(arguments.folder, name, weights, source, choices)
     except (WeightsError, OSError, ValueError, KeyError) as error:
         origin_text = arguments.weights or f"seed {arguments.random}"
