@@ -34,8 +34,8 @@ lint: ## Check the format and the lints
 format: ## Format the code
 	$(CARGO) fmt
 
-bench: build ## Measure localizing, searching, refining by an MLLM (a mock), and drawing the town
-	$(CARGO) bench --locked --bench localize --bench search --bench mllm --bench town
+bench: build ## Measure all that is about speed, each against its peers; gets those, some gigabytes
+	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked
 
 openapi: build ## Write docs/openapi.json anew from the handlers
 	$(BINARY) openapi > docs/openapi.json
