@@ -35,7 +35,7 @@ format: ## Format the code
 	$(CARGO) fmt
 
 bench: build ## Measure all that is about speed, each against its peers; gets those, some gigabytes
-	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked
+	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked --bench '*'
 
 openapi: build ## Write docs/openapi.json anew from the handlers
 	$(BINARY) openapi > docs/openapi.json

@@ -154,7 +154,8 @@ pub struct Map {
     pub frame: Frame,
     /// The name of the model that makes its descriptors.
     pub model: String,
-    /// The digest of that model's ONNX file: descriptors of different weights do not mix.
+    /// The digest of that model's weights and of how they are fed and pooled: descriptors of another
+    /// do not mix with them.
     pub model_digest: Digest,
     /// The arithmetic that the model runs in.
     #[serde(default)]

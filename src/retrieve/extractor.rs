@@ -168,7 +168,7 @@ impl Extractor {
         &self.manifest
     }
 
-    /// The digest of the ONNX file.
+    /// The digest of all that decides a descriptor: weights, and how they are fed and pooled.
     pub fn digest(&self) -> Digest {
         self.digest
     }
@@ -260,7 +260,7 @@ impl Opened {
         let folder = assets.model(name)?;
         let manifest = Arc::new(Manifest::read(&folder.join(MANIFEST))?);
         let file = folder.join(&manifest.file);
-        let digest = checked_digest(&file, &manifest)?;
+        let digest = manifest.digest(checked_digest(&file, &manifest)?);
         Ok(Self { model: Model { environment, file, manifest }, digest })
     }
 }

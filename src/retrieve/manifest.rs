@@ -38,6 +38,25 @@ pub struct Manifest {
     pub pooling: Pooling,
 }
 
+/// All in a manifest that decides a descriptor.
+#[derive(Serialize)]
+struct Deciding<'a> {
+    input: &'a Input,
+    output: &'a Output,
+    pooling: &'a Pooling,
+}
+
+impl Manifest {
+    /// The digest of all that decides a descriptor: the file of weights, whose digest is `file`, and
+    /// how it is fed and pooled. What a manifest says to people does not count.
+    pub fn digest(&self, file: Digest) -> Digest {
+        let Self { input, output, pooling, .. } = self;
+        // Structs of numbers, words and lists of these can always be written as TOML.
+        let text = toml::to_string(&Deciding { input, output, pooling }).unwrap_or_default();
+        Digest::of(format!("{file}\n{text}").as_bytes())
+    }
+}
+
 /// The digest and the size of a file that may not fit into memory.
 pub fn file_digest(path: &Path) -> io::Result<(Digest, u64)> {
     let (mut file, mut hasher, mut bytes) = (File::open(path)?, Sha256::new(), 0);
@@ -295,6 +314,21 @@ mod tests {
             let error = parse(&XFEAT.replace(from, to)).unwrap_err().to_string();
             assert!(error.contains(named), "{to}: {error}");
         }
+    }
+
+    #[test]
+    fn the_digest_covers_what_decides_a_descriptor_and_nothing_else() {
+        let file = Digest::of(b"weights");
+        let digest = |from: &str, to: &str| {
+            let text = XFEAT.replace(from, to);
+            assert!(from.is_empty() || text != XFEAT, "{from}");
+            parse(&text).unwrap().digest(file)
+        };
+        let plain = digest("", "");
+        assert_eq!(digest("licence = \"Apache-2.0\"", "licence = \"other\""), plain);
+        assert_ne!(digest("gem_p = 3.0", "gem_p = 4.0"), plain);
+        assert_ne!(digest("width = 320", "width = 640"), plain);
+        assert_ne!(parse(XFEAT).unwrap().digest(Digest::of(b"others")), plain);
     }
 
     #[test]

@@ -45,7 +45,7 @@ pub struct MapState {
     pub frame: Frame,
     /// The model that makes its descriptors.
     pub model: String,
-    /// The digest of that model's ONNX file.
+    /// The digest of that model's weights and of how they are fed and pooled.
     #[schema(value_type = String)]
     pub model_digest: Digest,
     /// The arithmetic that the model runs in; descriptors of another do not mix with them.

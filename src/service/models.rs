@@ -78,19 +78,13 @@ fn contradiction(map: &Map, extractor: &Extractor) -> Option<String> {
              {digest}; install the former again, or make the descriptors anew: {reindex}",
             map.model_digest
         )
-    } else if precision != map.precision {
+    } else {
         format!(
             "the map {name} was indexed at {} precision, but the server runs the model at \
              {precision} precision; start it with model.precision = {:?}, or make the descriptors \
              anew: {reindex}",
             map.precision,
             map.precision.as_str()
-        )
-    } else {
-        format!(
-            "the map {name} has descriptors of {} numbers, which the manifest of {model:?} says no \
-             longer; install the former again, or make the descriptors anew: {reindex}",
-            map.dim
         )
     })
 }
