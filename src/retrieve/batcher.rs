@@ -52,8 +52,7 @@ impl Inferring {
 }
 
 impl Batcher {
-    /// Loads the model for each session: the wide one before this returns, narrow ones in the
-    /// background, as a service can begin without them.
+    /// Loads the wide session, which is enough to begin with.
     pub fn start(
         model: &Model,
         execution: Execution,
@@ -68,36 +67,38 @@ impl Batcher {
             room: Condvar::new(),
             layout,
         });
-        let batcher = Self { queue: Arc::clone(&queue) };
         let mut wide = model.load(execution, threads)?;
         wide.warm_up()?;
-        spawn("inference", {
-            let queue = Arc::clone(&queue);
-            move || queue.serve(wide, Kind::Wide)
-        })?;
-        let narrow = if sessions == 1 { 0 } else { sessions };
-        queue.lock().loading = narrow;
-        for index in 0..narrow {
-            let (queue, model) = (Arc::clone(&queue), model.clone());
-            spawn(&format!("inference-{index}"), move || {
-                let loaded = model.load(execution, threads / sessions).and_then(|mut runner| {
-                    runner.warm_up()?;
-                    Ok(runner)
-                });
-                queue.note_loaded(loaded.is_ok());
-                match loaded {
-                    Ok(runner) => queue.serve(runner, Kind::Narrow),
-                    Err(error) => tracing::error!(%error, "there is one session less"),
-                }
-            })?;
+        let serving = Arc::clone(&queue);
+        spawn("inference", move || serving.serve(wide, Kind::Wide))?;
+        Ok(Self { queue })
+    }
+
+    /// Loads the narrow sessions in the background, one after another, so that a core is left for
+    /// those who come meanwhile.
+    pub fn add_narrow(&self, model: Model, execution: Execution) -> Result<(), InferenceError> {
+        let Layout { threads, sessions, .. } = self.queue.layout;
+        if sessions == 1 {
+            return Ok(());
         }
-        Ok(batcher)
+        self.queue.lock().loading = sessions;
+        let queue = Arc::clone(&self.queue);
+        spawn("inference-load", move || {
+            for index in 0..sessions {
+                if let Err(error) = add_narrow(&queue, &model, execution, threads / sessions, index)
+                {
+                    tracing::error!(%error, "there is one session less");
+                }
+                queue.lock().loading -= 1;
+                queue.room.notify_all();
+            }
+        })
     }
 
     /// Blocks until every session is loaded, or cannot be.
     pub fn wait_until_complete(&self) {
         let mut state = self.queue.lock();
-        while state.loading > 0 {
+        while state.loading > 0 && !state.closed {
             state = self.queue.room.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
     }
@@ -199,14 +200,6 @@ impl Queue {
         self.room.notify_all();
     }
 
-    fn note_loaded(&self, done: bool) {
-        let mut state = self.lock();
-        state.loading -= 1;
-        state.narrow_sessions += usize::from(done);
-        drop(state);
-        self.room.notify_all();
-    }
-
     /// Runs one batch after another until the queue is closed.
     fn serve(&self, mut runner: Runner, kind: Kind) {
         while let Some(batch) = self.take(kind) {
@@ -281,6 +274,21 @@ impl Drop for Run<'_> {
         drop(state);
         self.queue.work.notify_all();
     }
+}
+
+fn add_narrow(
+    queue: &Arc<Queue>,
+    model: &Model,
+    execution: Execution,
+    threads: usize,
+    index: usize,
+) -> Result<(), InferenceError> {
+    let mut runner = model.load(execution, threads)?;
+    runner.warm_up()?;
+    let serving = Arc::clone(queue);
+    spawn(&format!("inference-{index}"), move || serving.serve(runner, Kind::Narrow))?;
+    queue.lock().narrow_sessions += 1;
+    Ok(())
 }
 
 fn spawn(name: &str, body: impl FnOnce() + Send + 'static) -> Result<(), InferenceError> {

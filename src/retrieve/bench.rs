@@ -131,6 +131,7 @@ impl Bench {
         duration: Duration,
     ) -> Result<(Duration, f64), InferenceError> {
         let batcher = Batcher::start(&self.opened.model, execution, layout)?;
+        batcher.add_narrow(self.opened.model.clone(), execution)?;
         batcher.wait_until_complete();
         let mut pictures = self.sample.iter().cycle();
         let mut next = || pictures.next().cloned().unwrap_or_else(|| Tensor::grey(1, 1));

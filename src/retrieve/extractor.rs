@@ -152,7 +152,7 @@ impl Extractor {
         let execution = chosen(&model, digest, settings)?;
         let batcher = Batcher::start(&model, execution, settings.layout)?;
         let extractor = Self {
-            manifest: model.manifest,
+            manifest: Arc::clone(&model.manifest),
             digest,
             batcher,
             execution,
@@ -160,6 +160,7 @@ impl Extractor {
             exact_decode: settings.exact_decode,
         };
         extractor.check()?;
+        extractor.batcher.add_narrow(model, execution)?;
         Ok(extractor)
     }
 
