@@ -8,18 +8,20 @@
 //! | [`models`] | installing models: catalogue, download, the folder of those installed |
 //! | [`store`] | what must outlive the process |
 //! | [`service`] | the use cases: the one meaning behind HTTP and the command line |
+//! | [`evaluate`] | how often the service is right on two folders: layouts, recall, reports |
 //! | [`http`] | axum: extract, call the service, convert |
 //! | [`cli`] | one file for each command |
 //! | [`demo`] | a procedural town, to try it all on |
 //! | [`config`], [`telemetry`], [`startup`] | settings, logs and metrics, wiring |
 //!
-//! Dependencies point one way: `cli, http → service → retrieve, refine, store → domain`. Only
+//! Dependencies point one way: `cli, http, evaluate → service → retrieve, refine, store → domain`. Only
 //! [`startup`] sees everything.
 
 pub mod cli;
 pub mod config;
 pub mod demo;
 pub mod domain;
+pub mod evaluate;
 pub mod http;
 pub mod models;
 pub mod refine;

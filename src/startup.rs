@@ -83,7 +83,7 @@ fn http_settings(config: &Config) -> HttpSettings {
 }
 
 /// Opens the store, loads the model, and puts the service together. Blocks.
-fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec<Worker>)> {
+pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec<Worker>)> {
     let store = Arc::new(EmbeddedStore::open(&EmbeddedSettings {
         dir: config.data.dir.clone(),
         index: IndexSettings {

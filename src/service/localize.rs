@@ -104,15 +104,19 @@ pub struct TimingMs {
     pub total: f64,
 }
 
-/// A frame and what a map has like it.
-struct Coarse {
-    map: Map,
+/// What the coarse retriever found for a frame.
+#[derive(Debug)]
+pub struct Retrieved {
+    /// The map, as it was searched.
+    pub map: Map,
     /// The identity of the model.
-    model: Digest,
-    extraction: Extraction,
-    candidates: Vec<Candidate>,
+    pub model: Digest,
+    /// The most similar images, best first.
+    pub candidates: Vec<Candidate>,
+    /// What was extracted from the frame.
+    pub extraction: Extraction,
     /// How long the search took.
-    searched: Duration,
+    pub searched: Duration,
 }
 
 impl Service {
@@ -129,8 +133,8 @@ impl Service {
             return Err(StoreError::QueueFull { limit: self.settings.job_queue }.into());
         }
         let wanted = if refined { k.max(self.settings.candidates) } else { k };
-        let Coarse { map, model, extraction, mut candidates, searched } =
-            self.coarse(&request.map, &request.frame, wanted).await?;
+        let Retrieved { map, model, extraction, mut candidates, searched } =
+            self.retrieve(&request.map, &request.frame, wanted, SearchMode::Fast).await?;
         let kept = self.refiner.as_ref().filter(|refiner| refiner.wants_descriptor());
         let descriptor = kept.map(|_| extraction.descriptor);
 
@@ -178,23 +182,29 @@ impl Service {
         })
     }
 
-    /// Searches a map with the model that its descriptors are of.
-    async fn coarse(&self, map: &MapName, frame: &Bytes, k: usize) -> Result<Coarse, ServiceError> {
+    /// The coarse retriever: the `k` images of a map that look most like a frame, by the model that
+    /// the map's descriptors are of.
+    pub async fn retrieve(
+        &self,
+        map: &MapName,
+        frame: &Bytes,
+        k: usize,
+        mode: SearchMode,
+    ) -> Result<Retrieved, ServiceError> {
         let mut left = SUPERSEDED;
         loop {
             let (map, extractor) = self.usable_map(map).await?;
             let extraction = self.extract(&extractor, frame.clone(), map.descriptor).await?;
             self.metrics.observe_stages(extraction.times);
             let searching = Instant::now();
-            let query = extraction.descriptor.clone();
-            match self.maps.search(&map, query, k, SearchMode::Fast).await {
+            match self.maps.search(&map, extraction.descriptor.clone(), k, mode).await {
                 // The frame's descriptor is of the model that the map had a moment ago.
                 Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
                 found => {
                     let (candidates, searched) = (found?, searching.elapsed());
                     self.metrics.observe_search(searched);
                     let model = extractor.identity();
-                    return Ok(Coarse { map, model, extraction, candidates, searched });
+                    return Ok(Retrieved { map, model, extraction, candidates, searched });
                 }
             }
         }

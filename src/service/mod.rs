@@ -19,8 +19,10 @@ pub use self::error::{ErrorKind, ServiceError};
 pub use self::events::{JobEvent, JobStatus, PairDescribed};
 pub use self::images::{ImageMeta, ImagePage, NewImage};
 pub use self::jobs::JobPage;
-pub use self::localize::{Answer, Estimate, JobLink, LocalizeRequest, RefineMode, TimingMs};
-pub use self::maps::{MapChange, MapState};
+pub use self::localize::{
+    Answer, Estimate, JobLink, LocalizeRequest, RefineMode, Retrieved, TimingMs,
+};
+pub use self::maps::{IndexKind, MapChange, MapState};
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
 pub use self::usage::{Today, Total, UsageReport};
 use crate::refine::DenseCache;

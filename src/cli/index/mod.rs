@@ -1,7 +1,5 @@
 //! `whereabouts index`: a folder of images into a map, over HTTP; or a map to another model.
 
-mod poses;
-mod progress;
 mod reindex;
 
 use std::path::{Path, PathBuf};
@@ -13,12 +11,11 @@ use futures_util::StreamExt;
 use reqwest::StatusCode;
 use reqwest::multipart::{Form, Part};
 use serde::Serialize;
-use walkdir::WalkDir;
 
-use self::poses::PoseSource;
-use self::progress::Progress;
 use super::client::{Client, ServerArg, segment};
-use crate::domain::{DescriptorKind, Frame, ImageId, MapName, MediaType, Scene};
+use super::progress::Progress;
+use crate::domain::{DescriptorKind, Frame, MapName, MediaType, Scene};
+use crate::evaluate::{PictureFile, PoseSource, pictures};
 use crate::service::{ImageMeta, MapChange};
 
 /// Poses come from a CSV file (--poses, or poses.csv in the folder), from file names of the form
@@ -107,14 +104,14 @@ pub async fn add_folder(client: &Client, dir: &Path, args: &Args) -> anyhow::Res
     client.send(client.put(&path).json(&change)).await?;
 
     let start = Instant::now();
-    let progress = Progress::new(files.len());
+    let progress = Progress::new("images", files.len());
     let path = Arc::new(format!("{path}/images"));
     let mut sent = futures_util::stream::iter(files.iter().cloned())
         .map(|file| {
             let (client, path, source) = (client.clone(), Arc::clone(&path), Arc::clone(&source));
             async move {
-                let result = send(&client, &path, dir, &file, &source).await;
-                (file, result)
+                let result = send(&client, &path, &file, &source).await;
+                (file.file, result)
             }
         })
         .buffer_unordered(usize::from(args.concurrency));
@@ -178,52 +175,26 @@ struct Sent {
 async fn send(
     client: &Client,
     path: &str,
-    dir: &Path,
-    file: &Path,
+    picture: &PictureFile,
     source: &PoseSource,
 ) -> anyhow::Result<Sent> {
-    let bytes: bytes::Bytes = tokio::fs::read(file).await.context("cannot be read")?.into();
+    let bytes: bytes::Bytes =
+        tokio::fs::read(&picture.file).await.context("cannot be read")?.into();
     let media_type = MediaType::sniff(&bytes).context("is not a JPEG, PNG or WebP picture")?;
-    let id = image_id(dir, file)?;
-    let pose = source.pose(id.as_str(), &bytes)?;
+    let pose = source.pose(picture.id.as_str(), &bytes)?;
     let posed = pose.is_some();
     let meta = ImageMeta {
-        id: Some(id.to_string()),
+        id: Some(picture.id.to_string()),
         pose: pose.map(serde_json::to_value).transpose()?,
         ..ImageMeta::default()
     };
     let meta = serde_json::to_string(&meta)?;
     let response = client
         .send_patiently(|| {
-            let picture = Part::stream(bytes.clone()).mime_str(media_type.as_str())?;
-            let form = Form::new().part("image", picture).text("meta", meta.clone());
+            let part = Part::stream(bytes.clone()).mime_str(media_type.as_str())?;
+            let form = Form::new().part("image", part).text("meta", meta.clone());
             Ok(client.post(path).multipart(form))
         })
         .await?;
     Ok(Sent { new: response.status() == StatusCode::CREATED, posed })
-}
-
-/// The id of a file: its path below the folder.
-fn image_id(dir: &Path, file: &Path) -> anyhow::Result<ImageId> {
-    let below = file.strip_prefix(dir).unwrap_or(file);
-    let text = below.to_str().context("its name is not UTF-8; rename it")?;
-    Ok(text.parse::<ImageId>()?)
-}
-
-fn pictures(dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let known = |path: &Path| {
-        let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or("");
-        matches!(extension.to_ascii_lowercase().as_str(), "jpg" | "jpeg" | "png" | "webp")
-    };
-    let mut files = Vec::new();
-    for entry in WalkDir::new(dir).follow_links(true).sort_by_file_name() {
-        let entry = entry.with_context(|| format!("cannot read the folder {}", dir.display()))?;
-        if entry.file_type().is_file() && known(entry.path()) {
-            files.push(entry.into_path());
-        }
-    }
-    if files.is_empty() {
-        bail!("there is no .jpg, .jpeg, .png or .webp file in {}", dir.display());
-    }
-    Ok(files)
 }

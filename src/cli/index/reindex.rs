@@ -6,7 +6,7 @@ use anyhow::{Context, bail};
 
 use super::super::client::{Client, segment};
 use super::Args;
-use super::progress::Progress;
+use crate::cli::progress::Progress;
 use crate::service::{MapState, ReindexRequest, ReindexState};
 
 /// The pause between two looks at the map.
@@ -17,7 +17,7 @@ pub async fn run(client: &Client, args: &Args) -> anyhow::Result<()> {
     let request = ReindexRequest { model: args.model.clone(), descriptor: args.descriptor };
     let begin = client.post(&format!("{path}/reindex")).json(&request);
     let begun: MapState = client.json(begin).await?;
-    let progress = Progress::new(begun.images);
+    let progress = Progress::new("images", begun.images);
     let ended = loop {
         let looked = client.send_patiently(|| Ok(client.get(&path))).await;
         let unknown = || format!("it is not known how the reindex ended; GET {path} tells");

@@ -2,19 +2,25 @@
 
 use std::collections::HashMap;
 use std::io::Cursor;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, bail};
 use exif::{In, Rational, Tag, Value};
 use serde::Deserialize;
 
+use super::PictureFile;
 use crate::domain::{Frame, GeographicPose, MetricPose, Pose};
 
 /// Where poses come from; one source for a whole folder.
 #[derive(Debug)]
-pub(super) enum PoseSource {
-    /// A CSV file: path below the folder, or file name → pose.
-    Csv { frame: Frame, poses: HashMap<String, Pose> },
+pub enum PoseSource {
+    /// A CSV file.
+    Csv {
+        /// The frame of all of them.
+        frame: Frame,
+        /// By path below the folder, or by file name.
+        poses: HashMap<String, Pose>,
+    },
     /// `@easting@northing@…` in the file names: metres of a UTM zone.
     Names,
     /// GPS in the EXIF block of each file.
@@ -24,11 +30,13 @@ pub(super) enum PoseSource {
 impl PoseSource {
     /// The CSV file that was named or lies in the folder; else the names, if they hold positions;
     /// else EXIF.
-    pub fn find(dir: &Path, csv: Option<&Path>, files: &[PathBuf]) -> anyhow::Result<Self> {
+    pub fn find(dir: &Path, csv: Option<&Path>, files: &[PictureFile]) -> anyhow::Result<Self> {
         let beside = dir.join("poses.csv");
         match csv.or(beside.is_file().then_some(beside.as_path())) {
             Some(file) => Self::from_csv(file),
-            None if files.iter().all(|file| in_name(&file_name(file)).is_some()) => Ok(Self::Names),
+            None if files.iter().all(|file| in_name(file_name(file.id.as_str())).is_some()) => {
+                Ok(Self::Names)
+            }
             None => Ok(Self::Exif),
         }
     }
@@ -55,6 +63,15 @@ impl PoseSource {
         Ok(Self::Csv { frame, poses })
     }
 
+    /// Where it looks, in a few words.
+    pub fn said(&self) -> &'static str {
+        match self {
+            Self::Csv { .. } => "the CSV of positions",
+            Self::Names => "their names",
+            Self::Exif => "their EXIF data",
+        }
+    }
+
     /// The frame of the poses, as far as the source decides it.
     pub fn frame(&self) -> Option<Frame> {
         match self {
@@ -68,10 +85,9 @@ impl PoseSource {
     pub fn pose(&self, id: &str, bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
         match self {
             Self::Csv { poses, .. } => {
-                let name = id.rsplit('/').next().unwrap_or(id);
-                Ok(poses.get(id).or_else(|| poses.get(name)).copied())
+                Ok(poses.get(id).or_else(|| poses.get(file_name(id))).copied())
             }
-            Self::Names => Ok(in_name(id.rsplit('/').next().unwrap_or(id))),
+            Self::Names => Ok(in_name(file_name(id))),
             Self::Exif => in_exif(bytes),
         }
     }
@@ -111,8 +127,8 @@ impl Row {
     }
 }
 
-fn file_name(path: &Path) -> String {
-    path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned())
+fn file_name(id: &str) -> &str {
+    id.rsplit('/').next().unwrap_or(id)
 }
 
 /// The first two fields of `@easting@northing@…`, the names that the field's data sets share.

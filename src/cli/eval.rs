@@ -1,0 +1,289 @@
+//! `whereabouts eval`: how often the service is right on two folders, without a server.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+
+use super::progress::Progress;
+use crate::config::{Config, Overrides, Refiner as ConfiguredRefiner};
+use crate::domain::{DescriptorKind, Digest, RefinerKind, Scene};
+use crate::evaluate::{
+    Dataset, Evaluator, Folders, RunSettings, Sampling, Summary, Told, TruthSource, Watch,
+    predictions, report, table,
+};
+use crate::refine::local::{LocalMatcher, LocalSettings};
+use crate::refine::mllm::PROMPT_VERSION;
+use crate::refine::{LocalRefiner, Refiner};
+use crate::retrieve::CpuPool;
+use crate::retrieve::index::SearchMode;
+use crate::service::Service;
+use crate::startup;
+use crate::telemetry::{self, Metrics};
+
+/// Indexes a folder of references, asks every picture of a folder of queries, and prints Recall@1,
+/// 5 and 10 before and after refinement. Which references are true for which query is taken from, in
+/// this order: --ground-truth, --frame-tolerance, a ground_truth.csv in or beside the folder of
+/// queries, and positions: --database-poses and --queries-poses or a poses.csv in each folder, file
+/// names @easting@northing@..., or EXIF GPS. A run that was stopped goes on where it was.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The folder of references; folders in it are searched too
+    #[arg(long, value_name = "DIR")]
+    database: PathBuf,
+    /// The folder of queries
+    #[arg(long, value_name = "DIR")]
+    queries: PathBuf,
+    /// A folder of pictures of other places, to measure how well `known` tells them apart
+    #[arg(long, value_name = "DIR")]
+    unknown: Option<PathBuf>,
+    /// A CSV file with the columns query,references; the references separated by spaces
+    #[arg(long, value_name = "FILE", conflicts_with = "frame_tolerance")]
+    ground_truth: Option<PathBuf>,
+    /// Both folders are in the order of the same way; true references are so many frames off
+    #[arg(long, value_name = "N")]
+    frame_tolerance: Option<usize>,
+    /// Positions of the references: a CSV file with file, and lat,lon or x,y
+    #[arg(long, value_name = "FILE")]
+    database_poses: Option<PathBuf>,
+    /// Positions of the queries
+    #[arg(long, value_name = "FILE")]
+    queries_poses: Option<PathBuf>,
+    /// How far off a true reference may be, in metres
+    #[arg(long, value_name = "METRES", default_value_t = 25.0)]
+    threshold_m: f64,
+    /// What the coarse retriever compares: gem, cls, or both
+    #[arg(long, value_delimiter = ',', default_value = "gem")]
+    descriptor: Vec<DescriptorKind>,
+    /// Who refines its candidates: local, mllm, both, or off
+    #[arg(long, value_delimiter = ',', default_value = "local")]
+    refine: Vec<ConfiguredRefiner>,
+    /// Candidates that are refined
+    #[arg(short, default_value_t = 10, value_parser = clap::value_parser!(u8).range(1..=100))]
+    k: u8,
+    /// So many of the queries, chosen by chance
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    sample: Option<u32>,
+    /// Decides which queries are chosen
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// What the pictures show; it chooses the words of the prompts
+    #[arg(long, default_value_t = Scene::Outdoor)]
+    scene: Scene,
+    /// Compare every descriptor instead of searching a graph
+    #[arg(long)]
+    exact: bool,
+    /// Write report.html, summary.json and predictions.csv here
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Where descriptors, descriptions and outcomes are kept [default: eval-work/ and a name for
+    /// the database]
+    #[arg(long, value_name = "DIR")]
+    work: Option<PathBuf>,
+    /// Pictures in work at a time [default: one for each core]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64))]
+    concurrency: Option<u16>,
+    /// A configuration file, as of `serve`
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// The model
+    #[arg(long, value_name = "NAME")]
+    model: Option<String>,
+    /// A server that speaks the OpenAI chat-completions format, for --refine mllm; its key comes
+    /// from WHEREABOUTS_MLLM__API_KEY
+    #[arg(long, value_name = "URL")]
+    mllm_base_url: Option<String>,
+    /// Print the outcome as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub async fn run(args: Args) -> anyhow::Result<()> {
+    let folders = Folders {
+        database: args.database.clone(),
+        queries: args.queries.clone(),
+        unknown: args.unknown.clone(),
+    };
+    let truth = args.truth()?;
+    let sampling = Sampling { size: args.sample.map(|size| size as usize), seed: args.seed };
+    let data = Dataset::read(&folders, &truth, sampling)?;
+    if let Some(out) = &args.out {
+        std::fs::create_dir_all(out)
+            .with_context(|| format!("cannot make the folder {}", out.display()))?;
+    }
+
+    let config = args.config()?;
+    telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
+    let service = open(config.clone()).await?;
+    let model = service.models.default_model().to_owned();
+    let limits = service.models.limits();
+    let watch = Bars::default();
+    let evaluator = Evaluator {
+        refiners: args.refiners(&service, &config)?,
+        service,
+        settings: args.settings(&config)?,
+        watch: &watch,
+    };
+    let mut found = Vec::new();
+    for descriptor in &args.descriptor {
+        found.extend(evaluator.run(&data, *descriptor).await?);
+    }
+
+    let told = Told {
+        database: args.database.display().to_string(),
+        query_folder: args.queries.display().to_string(),
+        truth: truth.said(),
+        model,
+        k: usize::from(args.k),
+        search: if args.exact { "exact" } else { "fast" }.into(),
+    };
+    let summary = Summary::new(told, &data, &found);
+    if let Some(out) = &args.out {
+        write(&out.join("summary.json"), &serde_json::to_vec_pretty(&summary)?)?;
+        predictions::write(&out.join("predictions.csv"), &data, &found)?;
+        let page = report::html(&summary, &data, &found, limits)?;
+        write(&out.join("report.html"), page.as_bytes())?;
+    }
+    if args.json {
+        println!("{}", serde_json::to_string(&summary)?);
+    } else {
+        print!("{}", table(&summary));
+    }
+    Ok(())
+}
+
+/// The service on the work folder. Its workers are not needed: there is no queue of jobs.
+async fn open(config: Config) -> anyhow::Result<Arc<Service>> {
+    let work = config.data.dir.clone();
+    let building =
+        tokio::task::spawn_blocking(move || startup::build(&config, Arc::new(Metrics::new())));
+    let (service, _) = building
+        .await?
+        .with_context(|| format!("the work folder is {} (--work)", work.display()))?;
+    Ok(Arc::new(service))
+}
+
+fn write(file: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    std::fs::write(file, bytes).with_context(|| format!("cannot write {}", file.display()))
+}
+
+impl Args {
+    fn truth(&self) -> anyhow::Result<TruthSource> {
+        if !self.threshold_m.is_finite() || self.threshold_m < 0.0 {
+            bail!("--threshold-m must be 0 metres or more");
+        }
+        let posed = self.database_poses.is_some() || self.queries_poses.is_some();
+        let beside = || TruthSource::beside(&self.database, &self.queries).filter(|_| !posed);
+        Ok(match (&self.ground_truth, self.frame_tolerance) {
+            (Some(file), _) => TruthSource::Csv(file.clone()),
+            (None, Some(tolerance)) => TruthSource::Frames { tolerance },
+            (None, None) => beside().unwrap_or_else(|| TruthSource::Positions {
+                database: self.database_poses.clone(),
+                queries: self.queries_poses.clone(),
+                threshold_m: self.threshold_m,
+            }),
+        })
+    }
+
+    /// The configuration of a server on the work folder.
+    fn config(&self) -> anyhow::Result<Config> {
+        let mllm = self.refine.contains(&ConfiguredRefiner::Mllm);
+        let refiner = if mllm { ConfiguredRefiner::Mllm } else { ConfiguredRefiner::Off };
+        let flags = Overrides::default()
+            .data(Some(self.work_folder()?))
+            .model(self.model.clone())
+            .refiner(Some(refiner))
+            .mllm_base_url(self.mllm_base_url.clone());
+        let mut config = Config::load(self.config.as_deref(), &flags)?;
+        if std::env::var_os("WHEREABOUTS_LOG__FILTER").is_none() {
+            "warn".clone_into(&mut config.log.filter);
+        }
+        config.jobs.workers = self.side_by_side();
+        config.image.queue = config.image.queue.max(self.side_by_side());
+        Ok(config)
+    }
+
+    /// Its name tells the folder of references, so that evaluations of others do not wait for it.
+    fn work_folder(&self) -> anyhow::Result<PathBuf> {
+        if let Some(work) = &self.work {
+            return Ok(work.clone());
+        }
+        let database = self
+            .database
+            .canonicalize()
+            .with_context(|| format!("there is no folder {}", self.database.display()))?;
+        let name = database.file_name().unwrap_or_default().to_string_lossy();
+        let digest = Digest::of(database.as_os_str().as_encoded_bytes()).hex();
+        Ok(Path::new("eval-work").join(format!("{name}-{}", &digest[..8])))
+    }
+
+    fn side_by_side(&self) -> usize {
+        let cores = || std::thread::available_parallelism().map_or(1, usize::from);
+        self.concurrency.map_or_else(cores, usize::from)
+    }
+
+    fn settings(&self, config: &Config) -> anyhow::Result<RunSettings> {
+        Ok(RunSettings {
+            k: usize::from(self.k),
+            search: if self.exact { SearchMode::Exact } else { SearchMode::Fast },
+            scene: self.scene,
+            side_by_side: self.side_by_side(),
+            work: config.data.dir.clone(),
+            attempts: config.jobs.attempts,
+            retry_pause: Duration::from_secs(config.jobs.retry_pause_s),
+            refiner_settings: format!(
+                "{PROMPT_VERSION} {} {:?}",
+                serde_json::to_string(&config.mllm)?,
+                LocalSettings::default()
+            ),
+        })
+    }
+
+    /// Those that were asked for, in the order of the flag.
+    fn refiners(
+        &self,
+        service: &Arc<Service>,
+        config: &Config,
+    ) -> anyhow::Result<Vec<Arc<dyn Refiner>>> {
+        let mut refiners: Vec<Arc<dyn Refiner>> = Vec::new();
+        for kind in self.refine.iter().filter_map(|refiner| refiner.kind()) {
+            refiners.push(match (kind, &service.refiner) {
+                (RefinerKind::Mllm, Some(mllm)) => Arc::clone(mllm),
+                _ => Arc::new(LocalRefiner {
+                    maps: Arc::clone(&service.maps),
+                    blobs: Arc::clone(&service.blobs),
+                    models: service.models.clone(),
+                    dense: Arc::clone(&service.dense),
+                    pool: CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?,
+                    matcher: LocalMatcher::new(LocalSettings::default()),
+                }),
+            });
+        }
+        Ok(refiners)
+    }
+}
+
+/// One bar after another.
+#[derive(Default)]
+struct Bars(Mutex<Option<Progress>>);
+
+impl Bars {
+    fn bar(&self) -> std::sync::MutexGuard<'_, Option<Progress>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Watch for Bars {
+    fn begin(&self, what: &str, total: usize) {
+        *self.bar() = Some(Progress::new(what, total));
+    }
+
+    fn step(&self) {
+        self.bar().iter().for_each(Progress::step);
+    }
+
+    fn end(&self) {
+        self.bar().take().iter().for_each(Progress::end);
+    }
+}
