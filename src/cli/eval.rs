@@ -71,6 +71,9 @@ pub struct Args {
     /// What the pictures show; it chooses the words of the prompts
     #[arg(long, default_value_t = Scene::Outdoor)]
     scene: Scene,
+    /// The least similarity of a known place: `auto` suggests one, a number is looked at besides
+    #[arg(long, value_name = "auto|NUMBER", default_value = "auto", value_parser = known_threshold)]
+    known_threshold: KnownThreshold,
     /// Compare every descriptor instead of searching a graph
     #[arg(long)]
     exact: bool,
@@ -135,7 +138,9 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         query_folder: args.queries.display().to_string(),
         truth: truth.said(),
         model,
+        execution: evaluator.service.extractor.execution().to_string(),
         k: usize::from(args.k),
+        known_threshold: args.known_threshold.0,
         search: if args.exact { "exact" } else { "fast" }.into(),
     };
     let summary = Summary::new(told, &data, &found);
@@ -166,6 +171,18 @@ async fn open(config: Config) -> anyhow::Result<Arc<Service>> {
 
 fn write(file: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     std::fs::write(file, bytes).with_context(|| format!("cannot write {}", file.display()))
+}
+
+/// A threshold to look at besides the suggested one.
+#[derive(Debug, Clone, Copy)]
+struct KnownThreshold(Option<f64>);
+
+fn known_threshold(text: &str) -> Result<KnownThreshold, String> {
+    if text == "auto" {
+        return Ok(KnownThreshold(None));
+    }
+    let number = text.parse::<f64>().ok().filter(|number| number.is_finite());
+    number.map(|number| KnownThreshold(Some(number))).ok_or("it is `auto` or a number".into())
 }
 
 impl Args {

@@ -41,7 +41,7 @@ enum Command {
     /// Build a town, index it, localize frames in it, and print what happened
     Demo(demo::Args),
     /// Say how often the service is right on a folder of references and a folder of queries
-    Eval(eval::Args),
+    Eval(Box<eval::Args>),
     /// Print the settings in force, or every setting with its default
     Config(config::Args),
     /// Print the OpenAPI description
@@ -62,7 +62,7 @@ impl Cli {
             Command::Jobs(args) => block_on(jobs::run(args)),
             Command::Model(args) => block_on(model::run(args)),
             Command::Demo(args) => block_on(demo::run(args)),
-            Command::Eval(args) => block_on(eval::run(args)),
+            Command::Eval(args) => block_on(eval::run(*args)),
             Command::Config(args) => config::run(&args),
             Command::Openapi => openapi::run(),
             Command::Healthcheck(args) => block_on(healthcheck::run(args)),

@@ -26,6 +26,9 @@ mod summary;
 mod table;
 mod truth;
 
+#[cfg(test)]
+mod tests;
+
 pub use dataset::{Dataset, EvaluatedQuery, Folders, QueryKind, Sampling};
 pub use folder::{PictureFile, pictures};
 pub use outcome::{Answered, MethodOutcomes, Outcome, Times};

@@ -66,6 +66,12 @@ pub fn at_recall(curve: &[Point], recall: f64) -> Option<Point> {
     enough.copied().max_by(|a, b| a.precision.total_cmp(&b.precision))
 }
 
+/// What is taken from this threshold on; `None` if nothing is.
+pub fn at_threshold(curve: &[Point], threshold: f64) -> Option<Point> {
+    let taken = curve.iter().rfind(|point| point.threshold >= threshold)?;
+    Some(Point { threshold, ..*taken })
+}
+
 /// The point of the highest F1, the harmonic mean of precision and recall (van Rijsbergen, 1979).
 pub fn best(curve: &[Point]) -> Option<Point> {
     let f1 = |point: &Point| {
@@ -100,6 +106,8 @@ pub fn auc(first: &[First]) -> Option<f64> {
 pub struct Knowing {
     /// The threshold with the best F1 of taking true answers.
     pub suggested: Option<Point>,
+    /// Taking true answers at the threshold that was given.
+    pub given: Option<Point>,
     /// Queries that are not in the map.
     pub unknown: usize,
     /// Calling places known at a recall of 95 %; without unknown places there is nothing to tell.
@@ -111,12 +119,14 @@ pub struct Knowing {
 }
 
 impl Knowing {
-    /// Works it out.
-    pub fn of(first: &[First]) -> Self {
+    /// Works it out; `given` is a threshold to look at besides.
+    pub fn of(first: &[First], given: Option<f64>) -> Self {
+        let curve = precision_recall(first);
         let unknown = first.iter().filter(|first| !first.in_map).count();
         let knowing = if unknown > 0 { knowing(first) } else { Vec::new() };
         Self {
-            suggested: best(&precision_recall(first)),
+            suggested: best(&curve),
+            given: given.and_then(|threshold| at_threshold(&curve, threshold)),
             unknown,
             at_95: at_recall(&knowing, 0.95),
             at_99: at_recall(&knowing, 0.99),
@@ -148,6 +158,8 @@ mod tests {
             [of(0.9, 1.0, 1.0 / 3.0), of(0.8, 2.0 / 3.0, 2.0 / 3.0), of(0.5, 0.5, 2.0 / 3.0)]
         );
         assert_eq!(best(&points).unwrap().threshold, 0.8);
+        assert_eq!(at_threshold(&points, 0.6), Some(of(0.6, 2.0 / 3.0, 2.0 / 3.0)));
+        assert_eq!(at_threshold(&points, 0.95), None);
         let known = knowing(&answers);
         assert_eq!(at_recall(&known, 0.95).unwrap(), of(0.8, 1.0, 1.0));
     }

@@ -36,8 +36,12 @@ pub struct Told {
     pub truth: String,
     /// The model.
     pub model: String,
+    /// Who runs it, and at which precision; descriptors differ a little between them.
+    pub execution: String,
     /// Candidates that were refined.
     pub k: usize,
+    /// The least similarity of a known place, if one was given.
+    pub known_threshold: Option<f64>,
     /// `fast` (a graph where the map is large) or `exact`.
     pub search: String,
 }
@@ -92,13 +96,14 @@ pub struct Spread {
 impl Summary {
     /// Sums up what was found. Methods come as coarse ones each followed by its refined ones.
     pub fn new(told: Told, data: &Dataset, found: &[MethodOutcomes]) -> Self {
+        let threshold = told.known_threshold;
         let mut methods = Vec::with_capacity(found.len());
         let mut coarse = Vec::new();
         for method in found {
             let first = first_places(data, method);
             let is_coarse = method.method.refiner.is_none();
             let changed = (!is_coarse).then(|| change(&coarse, &first));
-            methods.push(summed_up(data, method, &first, changed));
+            methods.push(summed_up(data, method, &first, changed, threshold));
             if is_coarse {
                 coarse = first;
             }
@@ -151,6 +156,7 @@ fn summed_up(
     found: &MethodOutcomes,
     first: &[FirstTrue],
     change: Option<Change>,
+    threshold: Option<f64>,
 ) -> MethodSummary {
     let recall = recall(first);
     let outcomes = &found.outcomes;
@@ -173,7 +179,7 @@ fn summed_up(
         usage: outcomes.iter().fold(Usage::default(), |sum, outcome| sum + outcome.usage),
         degraded: outcomes.iter().filter(|outcome| outcome.degraded.is_some()).count(),
         degraded_why: outcomes.iter().find_map(|outcome| outcome.degraded.clone()),
-        known: Knowing::of(&firsts(data, found)),
+        known: Knowing::of(&firsts(data, found), threshold),
     }
 }
 

@@ -15,7 +15,11 @@ pub fn table(summary: &Summary) -> String {
 
 fn write(summary: &Summary, out: &mut String) -> fmt::Result {
     let Summary { queries, skipped, unknown, references, told, methods } = summary;
-    writeln!(out, "{queries} queries, {references} references; model {}", told.model)?;
+    writeln!(
+        out,
+        "{queries} queries, {references} references; model {} ({})",
+        told.model, told.execution
+    )?;
     writeln!(out, "a reference is true if it is {}", told.truth)?;
     if *skipped > 0 {
         writeln!(out, "{skipped} more queries have no true reference and are left out")?;
@@ -90,15 +94,17 @@ fn write_method(method: &MethodSummary, k: usize, out: &mut String) -> fmt::Resu
 
 fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
     let (name, known) = (&method.name, &method.known);
-    if let Some(point) = &known.suggested {
-        writeln!(
-            out,
-            "{name}: first answers of similarity {:.3} or more: {:.1} % true, {:.1} % of all found \
-             (best F1)",
-            point.threshold,
-            100.0 * point.precision,
-            100.0 * point.recall
-        )?;
+    for (point, why) in [(&known.suggested, "best F1"), (&known.given, "as given")] {
+        if let Some(point) = point {
+            writeln!(
+                out,
+                "{name}: first answers of similarity {:.3} or more ({why}): {:.1} % true, {:.1} % of \
+                 all found",
+                point.threshold,
+                100.0 * point.precision,
+                100.0 * point.recall
+            )?;
+        }
     }
     if let (Some(at_95), Some(at_99), Some(auc)) = (&known.at_95, &known.at_99, known.auc) {
         writeln!(

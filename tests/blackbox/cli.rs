@@ -101,9 +101,18 @@ fn a_server_that_is_not_there_is_named_with_what_to_do() {
 fn wrong_usage_is_2_and_every_command_explains_itself() {
     assert_eq!(whereabouts(&["serve", "--no-such-flag"]).status.code(), Some(2));
     assert_eq!(whereabouts(&[]).status.code(), Some(2));
-    for command in
-        ["serve", "index", "localize", "jobs", "model", "demo", "config", "openapi", "healthcheck"]
-    {
+    for command in [
+        "serve",
+        "index",
+        "localize",
+        "jobs",
+        "model",
+        "demo",
+        "eval",
+        "config",
+        "openapi",
+        "healthcheck",
+    ] {
         let output = whereabouts(&[command, "--help"]);
         assert_eq!(output.status.code(), Some(0), "{command}");
         assert!(output.stdout.len() > 80, "{command}");

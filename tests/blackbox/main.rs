@@ -16,6 +16,7 @@ mod cli;
 mod demo;
 mod dinov2;
 mod durability;
+mod eval;
 mod events;
 mod images;
 mod jobs;

@@ -11,7 +11,7 @@ use tempfile::TempDir;
 
 use super::support::{BINARY, Server};
 
-fn data(set: &str) -> Option<PathBuf> {
+pub fn data(set: &str) -> Option<PathBuf> {
     let root = std::env::var_os("WHEREABOUTS_DATA").map_or_else(
         || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
         PathBuf::from,

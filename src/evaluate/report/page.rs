@@ -4,10 +4,11 @@ use std::fmt::{self, Write};
 
 use super::super::open_set::precision_recall;
 use super::super::summary::firsts;
-use super::super::{Answered, Dataset, MethodOutcomes, MethodSummary, QueryKind, Summary};
+use super::super::{Answered, Dataset, MethodOutcomes, MethodSummary, Outcome, QueryKind, Summary};
 use super::Escaped;
 use super::charts;
 use super::examples::{Example, Group, Pictures};
+use crate::domain::ImageId;
 
 const STYLE: &str = include_str!("page.css");
 
@@ -44,11 +45,12 @@ fn head(summary: &Summary, out: &mut String) -> fmt::Result {
     write!(
         out,
         "<h1>How often the first answer is right</h1>\n<p>{queries} queries of <b>{}</b> against \
-         {references} references of <b>{}</b>, with the model <b>{}</b>. A reference is true if it \
+         {references} references of <b>{}</b>, with the model <b>{}</b> ({}). A reference is true if it \
          is {}.",
         Escaped(&told.query_folder),
         Escaped(&told.database),
         Escaped(&told.model),
+        Escaped(&told.execution),
         Escaped(&told.truth),
     )?;
     if *skipped > 0 {
@@ -87,8 +89,8 @@ fn recalls(summary: &Summary, out: &mut String) -> fmt::Result {
         out.push_str("</tr>\n");
     }
     out.push_str(
-        "</table></div>\n<p class=\"soft\">In percent of the queries; the change by refinement in \
-         brackets, below each the 95 % bootstrap interval.</p>\n",
+        "</table></div>\n<p class=\"soft\">In percent of the queries; below each the change by \
+         refinement and the 95 % bootstrap interval.</p>\n",
     );
     Ok(())
 }
@@ -97,12 +99,12 @@ fn cell(recall: f64, [low, high]: [f64; 2], change: Option<f64>, out: &mut Strin
     write!(out, "<td>{recall:.1}")?;
     match change {
         Some(change) if change >= 0.05 => {
-            write!(out, " <span class=\"up\">({change:.1} ↑)</span>")?
+            write!(out, "<small class=\"up\">{change:.1} ↑</small>")?;
         }
         Some(change) if change <= -0.05 => {
-            write!(out, " <span class=\"down\">({:.1} ↓)</span>", -change)?;
+            write!(out, "<small class=\"down\">{:.1} ↓</small>", -change)?;
         }
-        Some(_) => out.push_str(" (0.0)"),
+        Some(_) => out.push_str("<small>no change</small>"),
         None => {}
     }
     write!(out, "<small>{low:.1} – {high:.1}</small></td>")
@@ -265,7 +267,7 @@ fn write_example(
     if let Some((after, _)) = after {
         out.push_str(&answer("after", after)?);
     }
-    let shown = |id: &crate::domain::ImageId| {
+    let shown = |id: &ImageId| {
         before.image_id == *id || after.is_some_and(|(after, _)| after.image_id == *id)
     };
     let missed = query.kind == QueryKind::InMap && !query.truth.iter().any(shown);
@@ -275,21 +277,36 @@ fn write_example(
     }
     out.push_str("</div>\n");
     if let Some((after, outcome)) = after {
-        out.push_str("<details open><summary>What the refiner said</summary>\n");
-        for (label, id) in [("after", &after.image_id), ("before", &before.image_id)] {
-            let said = outcome.descriptions.iter().find(|description| description.image_id == *id);
-            if let Some(said) = said {
-                writeln!(out, "<b>{label}</b><p class=\"said\">{}</p>", Escaped(&said.text))?;
-            }
-            if after.image_id == before.image_id {
-                break;
-            }
-        }
-        if let Some(reasoning) = &outcome.reasoning {
-            writeln!(out, "<b>why</b><p class=\"said\">{}</p>", Escaped(reasoning))?;
-        }
-        out.push_str("</details>\n");
+        write_said(before, after, outcome, out)?;
     }
     out.push_str("</section>\n");
+    Ok(())
+}
+
+/// What the refiner said of the first after refinement, and folded up what it said besides.
+fn write_said(
+    before: &Answered,
+    after: &Answered,
+    outcome: &Outcome,
+    out: &mut String,
+) -> fmt::Result {
+    let said = |id: &ImageId| {
+        let of = outcome.descriptions.iter().find(|description| description.image_id == *id);
+        of.map(|description| description.text.as_str())
+    };
+    if let Some(text) = said(&after.image_id) {
+        writeln!(out, "<p class=\"said\"><b>after:</b> {}</p>", Escaped(text))?;
+    }
+    let other = said(&before.image_id).filter(|_| before.image_id != after.image_id);
+    if other.is_none() && outcome.reasoning.is_none() {
+        return Ok(());
+    }
+    out.push_str("<details><summary>What else the refiner said</summary>\n");
+    for (label, text) in [("before", other), ("why", outcome.reasoning.as_deref())] {
+        if let Some(text) = text {
+            writeln!(out, "<p class=\"said\"><b>{label}:</b> {}</p>", Escaped(text))?;
+        }
+    }
+    out.push_str("</details>\n");
     Ok(())
 }

@@ -1,0 +1,261 @@
+//! `whereabouts eval`, as a user types it.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::Duration;
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+use super::mock_mllm::{MockMllm, Script};
+use super::real_images::data;
+use super::support::{BINARY, frame, reference};
+
+/// References and queries in folders, and room for what eval writes.
+struct Folders {
+    dir: TempDir,
+}
+
+impl Folders {
+    fn new() -> Self {
+        let dir = TempDir::new().unwrap();
+        std::fs::create_dir(dir.path().join("database")).unwrap();
+        std::fs::create_dir(dir.path().join("queries")).unwrap();
+        Self { dir }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
+    fn write(&self, name: &str, bytes: impl AsRef<[u8]>) {
+        std::fs::write(self.path(name), bytes).unwrap();
+    }
+
+    /// A town of `places` with positions in the names, 100 m apart, and a query of each.
+    fn town(places: usize) -> Self {
+        let folders = Self::new();
+        for place in 0..places {
+            let easting = 1000.0 + 100.0 * place as f64;
+            folders.write(&format!("database/@{easting:.1}@5.0@.jpg"), reference(place));
+            folders.write(&format!("queries/@{:.1}@9.0@q@.jpg", easting + 3.0), frame(place, 0));
+        }
+        folders
+    }
+
+    fn command(&self, args: &[&str]) -> Command {
+        let mut command = Command::new(BINARY);
+        command
+            .current_dir(self.dir.path())
+            .args(["eval", "--database", "database", "--queries", "queries", "--work", "work"])
+            .args(["--model", "xfeat", "--json"])
+            .args(args)
+            .env("WHEREABOUTS_MODEL__ASSETS", Path::new(env!("CARGO_MANIFEST_DIR")).join("assets"))
+            .env("WHEREABOUTS_MODEL__THREADS", "1");
+        command
+    }
+
+    fn eval(&self, args: &[&str]) -> Value {
+        json(&self.command(args).output().unwrap())
+    }
+
+    fn refused(&self, args: &[&str]) -> String {
+        let output = self.command(args).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        String::from_utf8(output.stderr).unwrap()
+    }
+}
+
+fn json(output: &Output) -> Value {
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{error}");
+    serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{error}"))
+}
+
+fn recalls(summary: &Value) -> Vec<[f64; 3]> {
+    let methods = summary["methods"].as_array().unwrap();
+    let of = |method: &Value, k: &str| method["recall"][k].as_f64().unwrap();
+    methods.iter().map(|method| ["1", "5", "10"].map(|k| of(method, k))).collect()
+}
+
+fn names(summary: &Value) -> Vec<&str> {
+    let methods = summary["methods"].as_array().unwrap();
+    methods.iter().map(|method| method["name"].as_str().unwrap()).collect()
+}
+
+#[test]
+fn a_town_is_evaluated_and_told_in_a_table_a_csv_and_a_page() {
+    let folders = Folders::town(12);
+    // A query far from every reference, with a name that must not become markup.
+    folders.write("queries/@1.0@90000.0@<b>@.jpg", frame(13, 0));
+    let summary = folders.eval(&["--out", "out"]);
+    assert_eq!((&summary["queries"], &summary["skipped"]), (&12.into(), &1.into()));
+    assert_eq!(names(&summary), ["gem", "gem+local"]);
+    let [before, after] = recalls(&summary)[..] else { panic!("{summary}") };
+    assert!(after[0] >= before[0] && after[0] >= 75.0, "{summary}");
+    assert!(before[0] <= before[1] && before[1] <= before[2], "{summary}");
+    let change = &summary["methods"][1]["change"];
+    let sum: u64 =
+        ["helped", "harmed", "left_alone"].iter().map(|key| change[key].as_u64().unwrap()).sum();
+    assert_eq!(sum, 12);
+
+    let csv = std::fs::read_to_string(folders.path("out/predictions.csv")).unwrap();
+    // 13 queries, two methods, ten answers, and a header.
+    assert_eq!(csv.lines().count(), 1 + 13 * 2 * 10);
+    let first = csv.lines().filter(|line| line.contains(",gem+local,1,") && line.ends_with(",yes"));
+    let share = 100.0 * first.count() as f64 / 12.0;
+    assert!((share - after[0]).abs() < 1e-9, "the CSV says {share}");
+
+    let page = std::fs::read_to_string(folders.path("out/report.html")).unwrap();
+    assert!(page.contains("data:image/jpeg;base64,") && page.contains("<svg"));
+    for outside in ["<script", "http://", "https://", "<link", "<b>@"] {
+        assert!(!page.contains(outside), "{outside}");
+    }
+    let kept: Value =
+        serde_json::from_slice(&std::fs::read(folders.path("out/summary.json")).unwrap()).unwrap();
+    assert_eq!(kept["methods"], summary["methods"]);
+}
+
+#[test]
+fn a_sample_is_of_the_size_that_was_asked_for() {
+    let folders = Folders::town(6);
+    let summary = folders.eval(&["--sample", "4", "--seed", "3", "--refine", "off"]);
+    assert_eq!(summary["queries"], 4);
+    assert_eq!(names(&summary), ["gem"]);
+}
+
+#[test]
+fn every_layout_gives_the_same_recall() {
+    let folders = Folders::town(6);
+    let expected = recalls(&folders.eval(&["--refine", "off"]));
+    // Names in the order of the places.
+    let other = Folders::new();
+    let (mut database, mut queries, mut truth) =
+        ("file,lat,lon\n".to_owned(), "file,lat,lon\n".to_owned(), "query,references\n".to_owned());
+    for place in 0..6 {
+        other.write(&format!("database/r{place}.jpg"), reference(place));
+        other.write(&format!("queries/q{place}.jpg"), frame(place, 0));
+        database.push_str(&format!("r{place}.jpg,45.00{place},7\n"));
+        queries.push_str(&format!("q{place}.jpg,45.00{place}01,7\n"));
+        truth.push_str(&format!("q{place}.jpg,r{place}.jpg\n"));
+    }
+    assert_eq!(recalls(&other.eval(&["--refine", "off", "--frame-tolerance", "0"])), expected);
+    let refused = other.refused(&["--refine", "off"]);
+    assert!(refused.contains("--ground-truth") && refused.contains("6 of 6"), "{refused}");
+    other.write("truth.csv", &truth);
+    let named = other.eval(&["--refine", "off", "--ground-truth", "truth.csv"]);
+    assert_eq!(recalls(&named), expected);
+    other.write("database.csv", &database);
+    other.write("queries/poses.csv", &queries);
+    let posed = ["--refine", "off", "--database-poses", "database.csv", "--threshold-m", "30"];
+    assert_eq!(recalls(&other.eval(&posed)), expected);
+    // Beside the folders it is found without being named.
+    std::fs::remove_file(other.path("queries/poses.csv")).unwrap();
+    other.write("ground_truth.csv", &truth);
+    assert_eq!(recalls(&other.eval(&["--refine", "off"])), expected);
+}
+
+#[test]
+fn what_has_changed_in_the_folder_has_changed_in_the_map() {
+    let folders = Folders::town(4);
+    assert_eq!(recalls(&folders.eval(&["--refine", "off"]))[0][2], 100.0);
+    // One reference is gone, and another shows something else.
+    std::fs::remove_file(folders.path("database/@1000.0@5.0@.jpg")).unwrap();
+    folders.write("database/@1100.0@5.0@.jpg", reference(40));
+    let summary = folders.eval(&["--refine", "off"]);
+    assert_eq!((&summary["references"], &summary["skipped"]), (&3.into(), &1.into()));
+    std::fs::remove_dir_all(folders.path("work")).unwrap();
+    let fresh = folders.eval(&["--refine", "off"]);
+    assert_eq!(summary["methods"][0]["recall"], fresh["methods"][0]["recall"]);
+}
+
+#[test]
+fn a_picture_that_cannot_be_decoded_is_named() {
+    let folders = Folders::town(3);
+    folders.write("database/@1000.0@5.0@.jpg", "text");
+    let refused = folders.refused(&["--refine", "off"]);
+    assert!(refused.contains("@1000.0@5.0@.jpg"), "{refused}");
+}
+
+fn kill_when(mut child: Child, enough: impl Fn() -> bool) {
+    while !enough() {
+        assert!(child.try_wait().unwrap().is_none(), "it ended before it was killed");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_killed_run_goes_on_and_buys_no_description_twice() {
+    let folders = Folders::town(6);
+    let script = Script { latency: Duration::from_millis(20), ..Script::default() };
+    let mock = MockMllm::start(script).await;
+    let url = mock.url();
+    let args = ["--refine", "local,mllm", "--mllm-base-url", &url, "-k", "4", "--out", "out"];
+    let mut command = folders.command(&args);
+    let child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    kill_when(child, || mock.reason_calls() >= 2);
+
+    let summary = folders.eval(&args);
+    assert_eq!(names(&summary), ["gem", "gem+local", "gem+mllm"]);
+    assert_eq!(mock.pairs().len(), 6 * 4);
+    // Only pairs that were on their way when the process was killed are asked again.
+    assert!(mock.asked_again() <= 8, "{}", mock.asked_again());
+    let [before, _, after] = recalls(&summary)[..] else { panic!("{summary}") };
+    assert_eq!(before[1], after[1], "the same four, in another order");
+    let usage = &summary["methods"][2]["usage"];
+    assert!(usage["calls"].as_u64().unwrap() >= 6, "{usage}");
+    assert_eq!(summary["methods"][2]["degraded"], 0);
+    let page = std::fs::read_to_string(folders.path("out/report.html")).unwrap();
+    assert!(page.contains("calls,"));
+
+    let (described, reasoned) = (mock.describe_calls(), mock.reason_calls());
+    let again = folders.eval(&args);
+    assert_eq!(again["methods"], summary["methods"]);
+    assert_eq!((mock.describe_calls(), mock.reason_calls()), (described, reasoned));
+}
+
+#[test]
+fn places_that_are_not_in_the_map_say_what_known_is_worth() {
+    let folders = Folders::town(8);
+    std::fs::create_dir(folders.path("elsewhere")).unwrap();
+    for place in 20..26 {
+        folders.write(&format!("elsewhere/{place}.jpg"), frame(place, 1));
+    }
+    let summary = folders.eval(&["--unknown", "elsewhere", "--refine", "off"]);
+    assert_eq!((&summary["queries"], &summary["unknown"]), (&8.into(), &6.into()));
+    let known = &summary["methods"][0]["known"];
+    let auc = known["auc"].as_f64().unwrap();
+    assert!((0.0..=1.0).contains(&auc) && known["at_95"]["recall"].as_f64().unwrap() >= 0.95);
+}
+
+/// Corridor or tower, where the photographs are at hand.
+fn photographs(set: &str, [database, queries]: [&str; 2], args: &[&str]) -> Option<Value> {
+    let folder = data(set)?;
+    let work = TempDir::new().unwrap();
+    let output = Command::new(BINARY)
+        .args(["eval", "--json", "--scene", "indoor", "--model", "xfeat", "--work"])
+        .args([work.path(), Path::new("--database"), &folder.join(database)])
+        .args([Path::new("--queries"), &folder.join(queries)])
+        .args(args)
+        // A graph, however small the map.
+        .env("WHEREABOUTS_INDEX__EXACT_UP_TO", "0")
+        .env("WHEREABOUTS_MODEL__THREADS", "1")
+        .output()
+        .unwrap();
+    Some(json(&output))
+}
+
+#[test]
+fn the_graph_and_the_exact_search_have_the_same_recall() {
+    for (set, folders) in [("corridor", ["ref", "query"]), ("tower", ["database", "queries"])] {
+        let Some(graph) = photographs(set, folders, &["--refine", "off"]) else { return };
+        let Some(exact) = photographs(set, folders, &["--refine", "off", "--exact"]) else {
+            return;
+        };
+        assert_eq!((&graph["search"], &exact["search"]), (&"fast".into(), &"exact".into()));
+        assert_eq!(graph["skipped"], 0);
+        assert_eq!(recalls(&graph), recalls(&exact), "{set}");
+    }
+}
