@@ -54,7 +54,7 @@ impl Default for LocalSettings {
     fn default() -> Self {
         Self {
             min_similarity: 0.0,
-            neighbourhood: 0.1,
+            neighbourhood: 0.16,
             motion_tolerance: 0.1,
             grid_slack: 1.5,
             min_support: 0.06,
