@@ -120,6 +120,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
     let service = open(config.clone()).await?;
     let model = service.models.default_model().to_owned();
+    let execution = service.installed_model(&model).await?.execution().to_string();
     let limits = service.models.limits();
     let watch = Bars::default();
     let evaluator = Evaluator {
@@ -138,7 +139,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         query_folder: args.queries.display().to_string(),
         truth: truth.said(),
         model,
-        execution: evaluator.service.extractor.execution().to_string(),
+        execution,
         k: usize::from(args.k),
         known_threshold: args.known_threshold.0,
         search: if args.exact { "exact" } else { "fast" }.into(),

@@ -36,11 +36,18 @@ fn truth(query: usize) -> Vec<usize> {
 }
 
 fn store(dir: &std::path::Path, exact_up_to: usize) -> EmbeddedStore {
-    let index = IndexSettings { exact_up_to, m: 16, ef_construction: 200, ef_search: 200 };
+    let index = IndexSettings {
+        exact_up_to,
+        m: 16,
+        ef_construction: 200,
+        ef_search: 200,
+        max_dead_share: 1.0,
+    };
     let max_age = std::time::Duration::from_secs(3600);
     EmbeddedStore::open(&EmbeddedSettings {
         dir: dir.to_owned(),
         index,
+        index_threads: 1,
         db_cache_bytes: 1 << 20,
         commit_batch: 64,
         descriptions: DescriptionBounds { max_bytes: 1 << 20, max_age },
@@ -61,6 +68,7 @@ async fn map_of(store: &EmbeddedStore, descriptors: &[Descriptor]) -> Map {
         model_digest: Digest::of(b""),
         precision: Precision::Full,
         dim: DIM,
+        revision: 0,
         description: None,
         created_at: now,
     };
