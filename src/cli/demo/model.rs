@@ -67,7 +67,7 @@ impl Choosing {
         let built_in = |why: String| Choice { model: BUILT_IN_MODEL.to_owned(), why };
         if let Err(why) = answer {
             return Ok(built_in(format!(
-                "built in; no DINOv2 is installed, and {from} cannot be reached ({why})"
+                "built in; no DINOv2 is installed, and none can be had from {from} ({why})"
             )));
         }
         Ok(match hub.pull().await {

@@ -4,6 +4,9 @@
 //! revision. Every slot below a mark has its descriptor in the draft; the step is taken on the writer
 //! thread, and only while no image has a slot beyond the mark.
 
+#[cfg(test)]
+mod tests;
+
 use std::fs::File;
 use std::path::PathBuf;
 use std::sync::{Arc, PoisonError};
