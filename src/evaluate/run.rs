@@ -189,7 +189,7 @@ impl Evaluator<'_> {
             descriptor: Some(extraction.descriptor),
         };
         let job = Job::queued(map.name.clone(), query.id, RefinerKind::Local, now);
-        JobRecord { job, map_uid: map.uid, revision: map.revision, query, candidates }
+        JobRecord { job, map_uid: map.uid, revision: map.revision, query, candidates, claims: 0 }
     }
 
     async fn refine(

@@ -7,11 +7,10 @@ use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast::error::RecvError;
 use tokio_util::sync::CancellationToken;
-use uuid::Uuid;
 
 use super::{Progress, RefineError, Refinement, Refiner};
 use crate::domain::{Job, JobState};
-use crate::store::{JobRecord, JobStore, Release, Step, StoreError};
+use crate::store::{Claim, JobRecord, JobStore, Release, Step, StoreError};
 use crate::telemetry::Metrics;
 
 /// Bounds on a worker's patience.
@@ -42,7 +41,7 @@ pub struct Worker {
 /// Why a refinement was given up.
 enum Stopped {
     Failed(RefineError),
-    Cancelled,
+    NoLongerOurs,
     ShuttingDown,
 }
 
@@ -72,19 +71,19 @@ impl Worker {
         let Some(record) = self.jobs.claim(Timestamp::now(), until).await? else {
             return Ok(false);
         };
-        let job = record.job.clone();
+        let (job, claim) = (record.job.clone(), record.claim());
         match self.refine(&record, shutdown).await {
-            Ok(refinement) => self.end(succeeded(job, refinement)).await?,
-            Err(Stopped::Cancelled) => {}
+            Ok(refinement) => self.end(claim, succeeded(job, refinement)).await?,
+            Err(Stopped::NoLongerOurs) => {}
             Err(Stopped::ShuttingDown) => {
                 let why = "the server was stopped".to_owned();
                 let release = Release { why, not_before: None, counts: false };
-                self.jobs.release(job.id, release).await?;
+                self.jobs.release(claim, release).await?;
             }
             Err(Stopped::Failed(RefineError::Later { why, after: pause })) => {
                 tracing::info!(job = %job.id, why, seconds = pause.as_secs(), "a job waits");
                 let release = Release { why, not_before: Some(after(pause)), counts: false };
-                self.jobs.release(job.id, release).await?;
+                self.jobs.release(claim, release).await?;
             }
             Err(Stopped::Failed(RefineError::Passing(why)))
                 if job.attempts < self.settings.attempts =>
@@ -93,20 +92,20 @@ impl Worker {
                 let doubled = 2_u32.saturating_pow(job.attempts.saturating_sub(1));
                 let pause = self.settings.retry_pause.saturating_mul(doubled);
                 let release = Release { why, not_before: Some(after(pause)), counts: true };
-                self.jobs.release(job.id, release).await?;
+                self.jobs.release(claim, release).await?;
             }
-            Err(Stopped::Failed(error)) => self.fail(job, &error).await?,
+            Err(Stopped::Failed(error)) => self.fail(claim, job, &error).await?,
         }
         Ok(true)
     }
 
     /// Ends a job with what it has so far.
-    async fn fail(&self, job: Job, error: &RefineError) -> Result<(), StoreError> {
+    async fn fail(&self, claim: Claim, job: Job, error: &RefineError) -> Result<(), StoreError> {
         let job = match self.jobs.job(job.id).await? {
             Some(record) => record.job,
             None => job,
         };
-        self.end(failed(job, error)).await
+        self.end(claim, failed(job, error)).await
     }
 
     async fn refine(
@@ -115,10 +114,10 @@ impl Worker {
         shutdown: &CancellationToken,
     ) -> Result<Refinement, Stopped> {
         let timeout = self.settings.timeout;
-        let progress = JobProgress { jobs: self.jobs.as_ref(), job: record.job.id };
+        let progress = JobProgress { jobs: self.jobs.as_ref(), claim: record.claim() };
         tokio::select! {
             () = shutdown.cancelled() => Err(Stopped::ShuttingDown),
-            () = self.cancelled(record.job.id) => Err(Stopped::Cancelled),
+            () = self.taken_away(record.claim()) => Err(Stopped::NoLongerOurs),
             outcome = tokio::time::timeout(timeout, self.refiner.refine(record, &progress)) => match outcome {
                 Ok(refined) => refined.map_err(Stopped::Failed),
                 Err(_) => Err(Stopped::Failed(RefineError::Passing(format!(
@@ -129,42 +128,43 @@ impl Worker {
         }
     }
 
-    /// Returns when the job has been cancelled.
-    async fn cancelled(&self, id: Uuid) {
+    /// Returns when the job has been cancelled, even if it is queued again by the time of a look, or
+    /// when another worker has it.
+    async fn taken_away(&self, claim: Claim) {
         let mut changes = self.jobs.changes();
         loop {
             let look = match changes.recv().await {
-                Ok(changed) => changed == id,
+                Ok(changed) => changed == claim.job,
                 Err(RecvError::Lagged(_)) => true,
                 Err(RecvError::Closed) => return std::future::pending().await,
             };
             if look
-                && let Ok(Some(record)) = self.jobs.job(id).await
-                && record.job.state == JobState::Cancelled
+                && let Ok(Some(record)) = self.jobs.job(claim.job).await
+                && !record.is_held_by(claim)
             {
                 return;
             }
         }
     }
 
-    async fn end(&self, job: Job) -> Result<(), StoreError> {
+    async fn end(&self, claim: Claim, job: Job) -> Result<(), StoreError> {
         self.metrics.job_ended(&job);
-        self.jobs.finish(job).await
+        self.jobs.finish(claim, job).await
     }
 }
 
 /// Writes the steps of a refinement into its job.
 struct JobProgress<'a> {
     jobs: &'a dyn JobStore,
-    job: Uuid,
+    claim: Claim,
 }
 
 #[async_trait]
 impl Progress for JobProgress<'_> {
     async fn step(&self, step: Step) {
-        if let Err(error) = self.jobs.progress(self.job, step).await {
+        if let Err(error) = self.jobs.progress(self.claim, step).await {
             // The refinement says it all again at its end.
-            tracing::error!(job = %self.job, %error, "a step of a job could not be written down");
+            tracing::error!(job = %self.claim.job, %error, "a step of a job could not be written down");
         }
     }
 }

@@ -125,6 +125,8 @@ impl Execution {
                     "INFERENCE_PRECISION_HINT": precision,
                     "PERFORMANCE_HINT": "LATENCY",
                     "INFERENCE_NUM_THREADS": threads.to_string(),
+                    // It would pin the threads of sessions side by side to the same cores.
+                    "ENABLE_CPU_PINNING": "NO",
                 }});
                 OpenVINO::default()
                     .with_device_type("CPU")

@@ -259,6 +259,7 @@ impl Service {
             revision: map.revision,
             query,
             candidates,
+            claims: 0,
         };
         let _pin = self.blobs.put_blob(record.query.digest, frame).await?;
         self.jobs.submit(record, self.settings.job_queue).await?;

@@ -180,9 +180,32 @@ pub struct JobRecord {
     pub query: Query,
     /// The candidates in coarse order.
     pub candidates: Vec<Candidate>,
+    /// How often a worker has claimed it, whatever became of that.
+    #[serde(default)]
+    pub claims: u32,
+}
+
+/// The right of one worker to a job, which ends when the job is cancelled, or when its lease runs out
+/// and another worker claims it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Claim {
+    /// The job.
+    pub job: Uuid,
+    /// Which of its claims.
+    number: u32,
 }
 
 impl JobRecord {
+    /// The claim of the worker that this record was given to.
+    pub fn claim(&self) -> Claim {
+        Claim { job: self.job.id, number: self.claims }
+    }
+
+    /// Whether the job is still that worker's.
+    pub fn is_held_by(&self, claim: Claim) -> bool {
+        self.job.state == JobState::Running && self.claim() == claim
+    }
+
     /// Adds a step: its cost, and its description in the place of one of the same image.
     pub fn add(&mut self, step: Step) {
         let Self { job, candidates, .. } = self;
@@ -251,11 +274,12 @@ pub trait JobStore: Send + Sync {
     ) -> Result<Option<JobRecord>, StoreError>;
     /// Adds a step to a claimed job: its cost, and its description in the place of one of the same
     /// image.
-    async fn progress(&self, id: Uuid, step: Step) -> Result<(), StoreError>;
+    async fn progress(&self, claim: Claim, step: Step) -> Result<(), StoreError>;
     /// Gives a claimed job back to the queue.
-    async fn release(&self, id: Uuid, release: Release) -> Result<(), StoreError>;
-    /// Ends a claimed job with what its worker found. A job that was cancelled meanwhile stays so.
-    async fn finish(&self, job: Job) -> Result<(), StoreError>;
+    async fn release(&self, claim: Claim, release: Release) -> Result<(), StoreError>;
+    /// Ends a claimed job with what its worker found. As with the two above, nothing happens to a job
+    /// that is no longer that worker's.
+    async fn finish(&self, claim: Claim, job: Job) -> Result<(), StoreError>;
     /// Cancels a job that has not ended; returns it as it then is.
     async fn cancel(&self, id: Uuid) -> Result<Job, StoreError>;
     /// Queues a job again that ended without success. Its attempts and its cost begin anew.

@@ -12,7 +12,7 @@ use sled::Transactional;
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
-use super::super::{JobFilter, JobRecord, JobStore, Release, Step, StoreError};
+use super::super::{Claim, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
 use super::trees::{
     BlobOwner, Lease, Trees, blob_ref_key, decode, encode, failed, put, queue_key, queued_job,
     transaction_failed,
@@ -125,6 +125,7 @@ impl JobStore for EmbeddedStore {
                     record.job.error = None;
                     record.job.started_at.get_or_insert(now);
                     record.job.attempts += 1;
+                    record.claims += 1;
                     write_job(trees, &record, Some(Some(lease_until)))?;
                     Ok(Some(record))
                 },
@@ -137,11 +138,11 @@ impl JobStore for EmbeddedStore {
             .await
     }
 
-    async fn progress(&self, id: Uuid, step: Step) -> Result<(), StoreError> {
-        self.change(id, move |trees, mut record| {
-            if record.job.state == JobState::Running {
+    async fn progress(&self, claim: Claim, step: Step) -> Result<(), StoreError> {
+        self.change(claim.job, move |trees, mut record| {
+            if record.is_held_by(claim) {
                 record.add(step);
-                put(&trees.jobs, id.as_bytes(), &record)?;
+                put(&trees.jobs, claim.job.as_bytes(), &record)?;
             }
             Ok(record)
         })
@@ -149,9 +150,9 @@ impl JobStore for EmbeddedStore {
         .map(drop)
     }
 
-    async fn release(&self, id: Uuid, release: Release) -> Result<(), StoreError> {
-        self.change(id, move |trees, mut record| {
-            if record.job.state == JobState::Running {
+    async fn release(&self, claim: Claim, release: Release) -> Result<(), StoreError> {
+        self.change(claim.job, move |trees, mut record| {
+            if record.is_held_by(claim) {
                 record.job.state = JobState::Queued;
                 record.job.error = Some(release.why);
                 if !release.counts {
@@ -165,9 +166,9 @@ impl JobStore for EmbeddedStore {
         .map(drop)
     }
 
-    async fn finish(&self, job: Job) -> Result<(), StoreError> {
-        self.change(job.id, move |trees, mut record| {
-            if record.job.state == JobState::Running {
+    async fn finish(&self, claim: Claim, job: Job) -> Result<(), StoreError> {
+        self.change(claim.job, move |trees, mut record| {
+            if record.is_held_by(claim) {
                 record.job = job;
                 write_job(trees, &record, None)?;
             }

@@ -263,6 +263,7 @@ mod tests {
             revision: 0,
             query,
             candidates: vec![],
+            claims: 0,
         };
         put(&trees.jobs, job.id.as_bytes(), &record).unwrap();
         put(&trees.queue, job.id.as_bytes(), &Some(now)).unwrap();

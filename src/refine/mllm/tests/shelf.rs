@@ -145,6 +145,7 @@ impl Shelf {
             revision: self.map.revision,
             query,
             candidates: (0..candidates).map(candidate).collect(),
+            claims: 0,
         }
     }
 }
