@@ -203,20 +203,23 @@ impl Queue {
     /// Runs one batch after another until the queue is closed.
     fn serve(&self, mut runner: Runner, kind: Kind) {
         while let Some(batch) = self.take(kind) {
-            let _run = Run { queue: self, kind };
+            let run = Run { queue: self, kind };
+            let mut answered: Vec<(Answer, Result<RawOutput, InferenceError>)> = Vec::new();
             for (tensors, answers) in by_shape(batch) {
                 match runner.run(&tensors) {
                     Ok(outputs) => {
-                        for (answer, output) in answers.into_iter().zip(outputs) {
-                            let _ = answer.send(Ok(output));
-                        }
+                        answered.extend(answers.into_iter().zip(outputs.into_iter().map(Ok)))
                     }
                     Err(error) => {
-                        for answer in answers {
-                            let _ = answer.send(Err(error.clone()));
-                        }
+                        answered
+                            .extend(answers.into_iter().map(|answer| (answer, Err(error.clone()))));
                     }
                 }
+            }
+            // Before the answers: whoever sends one picture after another is alone each time.
+            drop(run);
+            for (answer, result) in answered {
+                let _ = answer.send(result);
             }
         }
     }

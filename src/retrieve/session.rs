@@ -8,7 +8,7 @@ use ort::session::Session;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::value::TensorRef;
 
-use super::manifest::{Input, Manifest};
+use super::manifest::{Input, Manifest, Resize};
 use super::preprocess::Tensor;
 use super::provider::Execution;
 
@@ -72,6 +72,14 @@ impl Model {
             .with_intra_threads(threads)?
             // Threads that spin for work take the cores from decoding.
             .with_intra_op_spinning(false)?;
+        // A graph whose shapes are known is planned better.
+        let Input { resize, width, height, .. } = self.manifest.input;
+        let builder = match resize {
+            Resize::LongestEdge => builder,
+            Resize::Squash | Resize::CentreCrop => builder
+                .with_dimension_override("height", i64::from(height))?
+                .with_dimension_override("width", i64::from(width))?,
+        };
         match execution.registration(threads) {
             Some(provider) => Ok(builder.with_execution_providers([provider])?),
             None => Ok(builder),
