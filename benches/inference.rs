@@ -14,23 +14,18 @@ use whereabouts::retrieve::{Assets, Bench, BenchRow, BenchSettings, Layout, Want
 
 const MODEL: &str = "dinov2-small";
 const SIZE: usize = 224;
-const BATCHES: [usize; 3] = [1, 4, 8];
-const SECONDS: f64 = 3.0;
+const BATCHES: [usize; 2] = [1, 8];
+const SECONDS: f64 = 1.5;
 const PEERS: [&str; 3] = ["onnxruntime", "openvino-latency", "openvino-throughput"];
-/// The machine's speed changes with the moment, so that all are measured in turn, some times over.
-const ROUNDS: usize = 3;
+/// The machine's speed changes with the moment: all are measured in turn, some times over, and what
+/// counts is the median of the ratios of each round.
+const ROUNDS: usize = 5;
 
-#[derive(Debug, Clone, Copy, Default)]
-struct Best {
+#[derive(Debug, Clone, Copy)]
+struct Measured {
+    /// The time of a run alone, in milliseconds.
     ms: f64,
     per_second: f64,
-}
-
-impl Best {
-    fn or(self, other: Self) -> Self {
-        let ms = if self.ms == 0.0 { other.ms } else { self.ms.min(other.ms) };
-        Self { ms, per_second: self.per_second.max(other.per_second) }
-    }
 }
 
 fn main() -> anyhow::Result<()> {
@@ -40,68 +35,68 @@ fn main() -> anyhow::Result<()> {
     let bench = Bench::open(&Assets::locate(Some(&folder)), MODEL, Wanted::default())?;
     let flop = bench.flop().context("the model is no transformer")?;
     println!("{MODEL} at {SIZE}×{SIZE}, {:.2} GFLOP a picture, {threads} threads", flop / 1e9);
-    let execution = best_of_ours(&bench, Wanted::default(), threads, 1)?.execution;
+    let execution = fastest(&run_ours(&bench, Wanted::default(), threads, 1)?)?.execution;
     let wanted =
         Wanted { provider: Some(execution.provider), precision: Some(execution.precision) };
     for batch in BATCHES {
-        let (mut ours, mut theirs) = (Best::default(), [Best::default(); PEERS.len()]);
-        let mut how = None;
+        println!("\nbatch {batch}; whereabouts by {execution}");
+        let (mut more, mut longer) = (Vec::new(), Vec::new());
         for _ in 0..ROUNDS {
-            let row = best_of_ours(&bench, wanted, threads, batch)?;
-            let figures = row.right().context("no descriptors were right")?;
-            let ms = figures.alone.as_secs_f64() * 1e3;
-            if figures.per_second > ours.per_second {
-                how = Some((row.layout.sessions, figures.peak));
-            }
-            ours = ours.or(Best { ms, per_second: figures.per_second });
-            for (peer, best) in PEERS.iter().zip(&mut theirs) {
-                *best = best.or(run_peer(peer, &file, batch, threads)?);
-            }
-        }
-        let (sessions, peak) = how.context("nothing was measured")?;
-        println!("\nbatch {batch}");
-        println!(
-            "  whereabouts          {:6.1} pictures/s   ({execution}, {sessions} side by side; \
-             {:.0} % of its GEMM peak)",
-            ours.per_second,
-            100.0 * ours.per_second * flop / peak
-        );
-        if batch == 1 {
-            println!("    a picture alone    {:6.1} ms", ours.ms);
-        }
-        let mut best = Best::default();
-        for (peer, measured) in PEERS.iter().zip(theirs) {
-            println!(
-                "  {peer:<20} {:6.1} pictures/s   a run alone {:.1} ms",
-                measured.per_second, measured.ms
+            let rows = run_ours(&bench, wanted, threads, batch)?;
+            let most = fastest(&rows)?;
+            let figures = most.right().context("no descriptors were right")?;
+            let alone = rows.iter().filter_map(|row| Some(row.right()?.alone)).min();
+            let alone = alone.context("no descriptors were right")?.as_secs_f64() * 1e3;
+            print!(
+                "  whereabouts {:.1}/s ({} side by side, {:.0} % of GEMM), alone {alone:.1} ms",
+                figures.per_second,
+                most.layout.sessions,
+                100.0 * figures.per_second * flop / figures.peak
             );
-            best = best.or(measured);
+            let mut peers = Vec::new();
+            for peer in PEERS {
+                let measured = run_peer(peer, &file, batch, threads)?;
+                print!("; {peer} {:.1}/s, {:.1} ms", measured.per_second, measured.ms);
+                peers.push(measured);
+            }
+            println!();
+            let best = peers.iter().map(|peer| peer.per_second).fold(0.0, f64::max);
+            let quickest = peers.iter().map(|peer| peer.ms).fold(f64::MAX, f64::min);
+            more.push(figures.per_second / best);
+            longer.push(alone / quickest);
         }
-        print!("  {:.2} × the best peer's pictures/s", ours.per_second / best.per_second);
-        match batch {
-            1 => println!(", {:.2} × the time of the quickest alone", ours.ms / best.ms),
-            _ => println!(),
+        println!("  {:.2} × the best peer's pictures/s (median of the rounds)", median(more));
+        if batch == 1 {
+            println!("  {:.2} × the time of the quickest peer for one alone", median(longer));
         }
     }
     Ok(())
 }
 
-/// The way with the most pictures a second, with the least time of a picture alone by any.
-fn best_of_ours(
+fn median(mut numbers: Vec<f64>) -> f64 {
+    numbers.sort_by(f64::total_cmp);
+    numbers[numbers.len() / 2]
+}
+
+/// One picture after another, and side by side.
+fn run_ours(
     bench: &Bench,
     wanted: Wanted,
     threads: usize,
     max_batch: usize,
-) -> anyhow::Result<BenchRow> {
+) -> anyhow::Result<Vec<BenchRow>> {
     let layouts = [1, threads].map(|sessions| Layout { threads, sessions, max_batch }).to_vec();
-    let duration = Duration::from_secs_f64(SECONDS / 2.0);
-    let settings = BenchSettings { wanted, layouts, duration };
-    let rows = bench.run(&settings, |_| {})?;
-    let rate = |row: &&BenchRow| row.right().map_or(0.0, |figures| figures.per_second);
-    rows.iter().max_by(|a, b| rate(a).total_cmp(&rate(b))).cloned().context("nothing to run")
+    let duration = Duration::from_secs_f64(SECONDS);
+    Ok(bench.run(&BenchSettings { wanted, layouts, duration }, |_| {})?)
 }
 
-fn run_peer(peer: &str, file: &Path, batch: usize, threads: usize) -> anyhow::Result<Best> {
+/// The row with the most pictures a second.
+fn fastest(rows: &[BenchRow]) -> anyhow::Result<&BenchRow> {
+    let rate = |row: &&BenchRow| row.right().map_or(0.0, |figures| figures.per_second);
+    rows.iter().max_by(|a, b| rate(a).total_cmp(&rate(b))).context("nothing was run")
+}
+
+fn run_peer(peer: &str, file: &Path, batch: usize, threads: usize) -> anyhow::Result<Measured> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers/inference.py");
     let output = Command::new(std::env::var("PYTHON").unwrap_or_else(|_| "python3".into()))
         .arg(script)
@@ -119,7 +114,7 @@ fn run_peer(peer: &str, file: &Path, batch: usize, threads: usize) -> anyhow::Re
     );
     let text = String::from_utf8(output.stdout)?;
     let (ms, per_second) = text.trim().split_once(' ').context("the peer said nothing")?;
-    Ok(Best { ms: ms.parse()?, per_second: per_second.parse()? })
+    Ok(Measured { ms: ms.parse()?, per_second: per_second.parse()? })
 }
 
 /// Makes the model once.
