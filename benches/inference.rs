@@ -136,6 +136,7 @@ fn export(folder: &Path) -> anyhow::Result<PathBuf> {
         anyhow::ensure!(status.success(), "the model could not be made");
         let text = std::fs::read_to_string(&manifest)?;
         let mut table: toml::Table = text.parse()?;
+        table.insert("name".into(), MODEL.into());
         let input = table["input"].as_table_mut().context("no input")?;
         input.insert("width".into(), (SIZE as i64).into());
         input.insert("height".into(), (SIZE as i64).into());
