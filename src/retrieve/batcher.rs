@@ -52,7 +52,7 @@ impl Inferring {
 }
 
 impl Batcher {
-    /// Loads the wide session, which is enough to begin with.
+    /// Loads the wide session, which is enough to begin with. Its first run takes longer than others.
     pub fn start(
         model: &Model,
         execution: Execution,
@@ -67,8 +67,7 @@ impl Batcher {
             room: Condvar::new(),
             layout,
         });
-        let mut wide = model.load(execution, threads)?;
-        wide.warm_up()?;
+        let wide = model.load(execution, threads)?;
         let serving = Arc::clone(&queue);
         spawn("inference", move || serving.serve(wide, Kind::Wide))?;
         Ok(Self { queue })
@@ -129,7 +128,7 @@ impl Drop for Batcher {
 
 impl Layout {
     /// Pictures that wait at the most: twice what the sessions take at once.
-    fn capacity(self) -> usize {
+    pub(super) fn capacity(self) -> usize {
         2 * self.sessions * self.max_batch
     }
 }
@@ -231,7 +230,11 @@ impl Queue {
             if state.closed {
                 return None;
             }
+            let waiting = state.waiting.len();
             state.waiting.retain(|request| !request.answer.is_closed());
+            if state.waiting.len() < waiting {
+                self.room.notify_all();
+            }
             if state.may_take(kind) {
                 break;
             }
@@ -399,6 +402,21 @@ mod tests {
         let mut inferring: Vec<_> = (0..5).map(|_| submit(&queue)).collect();
         inferring.truncate(2);
         assert_eq!(run(&queue, Kind::Wide).0.len(), 2);
+    }
+
+    #[test]
+    fn the_room_of_those_who_have_gone_is_given_away() {
+        let queue = Arc::new(queue(0, 1));
+        let gone: Vec<_> = (0..queue.layout.capacity()).map(|_| submit(&queue)).collect();
+        let batcher = Batcher { queue: Arc::clone(&queue) };
+        let waits = thread::spawn(move || {
+            let inferring = batcher.submit(Tensor::grey(2, 2));
+            (batcher, inferring)
+        });
+        drop(gone);
+        let taken = queue.take(Kind::Wide).unwrap();
+        assert_eq!((taken.len(), taken[0].tensor.width), (1, 2));
+        assert!(waits.join().unwrap().1.is_ok());
     }
 
     #[test]
