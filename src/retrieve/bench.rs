@@ -1,6 +1,6 @@
 //! What a model does on this machine, by each way of running it.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use ort::value::TensorRef;
@@ -108,10 +108,15 @@ impl Bench {
         for execution in Execution::candidates(settings.wanted) {
             let similarity = provider::descriptors(model, execution, 1, &self.sample)
                 .map(|tried| provider::least_similarity(&tried, &reference));
+            let mut peaks = BTreeMap::new();
             for &layout in &settings.layouts {
                 let outcome = similarity.clone().and_then(|similarity| {
                     let (alone, per_second) = self.pace(execution, layout, settings.duration)?;
-                    let peak = gemm_peak(model, execution, layout.threads, settings.duration)?;
+                    let peak = match peaks.get(&layout.threads) {
+                        Some(&peak) => peak,
+                        None => gemm_peak(model, execution, layout.threads, settings.duration)?,
+                    };
+                    peaks.insert(layout.threads, peak);
                     Ok(Figures { alone, per_second, similarity, peak })
                 });
                 let outcome = outcome.map_err(|error| error.to_string());
@@ -145,7 +150,7 @@ impl Bench {
         }
         times.sort_unstable();
         let mut in_progress = VecDeque::new();
-        let ahead = 2 * layout.sessions * layout.max_batch;
+        let ahead = layout.capacity();
         for _ in 0..ahead {
             in_progress.push_back(batcher.submit(next())?);
         }

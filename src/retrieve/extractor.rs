@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::batcher::{Batcher, Inferring, Layout};
 use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jpeg};
 use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest};
-use super::pooling::{LocalFeatures, PoolingError};
+use super::pooling::PoolingError;
 use super::preprocess::{self, PreprocessError, Tensor, preprocess};
 use super::provider::{self, Execution, Provider, Wanted};
 use super::runtime::{Assets, RuntimeError};
@@ -199,8 +199,7 @@ impl Extractor {
         let Picture { pixels, width, height, media_type } = decode(bytes, self.limits, needed)?;
         let tensor = preprocess(&pixels, (width, height), input)?;
         drop(pixels);
-        let stride = self.manifest.output.stride as usize;
-        let cells = (tensor.height / stride, tensor.width / stride);
+        let cells = self.manifest.output.cells(&tensor);
         let decoded = Instant::now();
         let inferring = self.batcher.submit(tensor)?;
         let decode = decoded - start;
@@ -217,7 +216,7 @@ impl Extractor {
         kind: DescriptorKind,
     ) -> Result<Extraction, ExtractError> {
         let Inferred { shown, raw } = inferred;
-        let local = self.local_features(shown.cells, &raw)?;
+        let local = raw.local_features(&self.manifest.output, shown.cells)?;
         let descriptor = local.descriptor(kind, &self.manifest.pooling)?;
         let dense = local.into_dense()?;
         let Shown { width, height, media_type, decode, decoded, .. } = shown;
@@ -225,16 +224,8 @@ impl Extractor {
         Ok(Extraction { descriptor, dense, media_type, width, height, times })
     }
 
-    fn local_features(
-        &self,
-        cells: (usize, usize),
-        raw: &RawOutput,
-    ) -> Result<LocalFeatures, PoolingError> {
-        let output = &self.manifest.output;
-        LocalFeatures::from_output(output, cells, &raw.features, raw.reliability.as_deref())
-    }
-
-    /// A manifest that does not fit its model should stop the start, not the first request.
+    /// A manifest that does not fit its model should stop the start, not the first request; and that
+    /// request should not wait for the graph's first run.
     fn check(&self) -> Result<(), ExtractError> {
         let Input { width, height, .. } = self.manifest.input;
         let pixels = image::RgbImage::from_fn(width, height, |x, y| {

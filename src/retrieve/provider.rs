@@ -12,7 +12,6 @@ use ort::ep::{CUDA, CoreML, ExecutionProviderDispatch, TensorRT};
 use serde::{Deserialize, Serialize};
 
 use super::manifest::Manifest;
-use super::pooling::LocalFeatures;
 use super::preprocess::Tensor;
 use super::session::{InferenceError, Model, Runner};
 use crate::domain::{Descriptor, DescriptorKind, Digest, Precision};
@@ -260,13 +259,11 @@ fn run_all(
 ) -> Result<Vec<Descriptor>, InferenceError> {
     let unfit = |error: super::pooling::PoolingError| InferenceError::Run(error.to_string());
     let Manifest { output, pooling, .. } = &*model.manifest;
-    let stride = output.stride as usize;
     let one = |tensor: &Tensor| {
-        let cells = (tensor.height / stride, tensor.width / stride);
         let raw = runner.run(std::slice::from_ref(tensor))?;
         let raw =
             raw.first().ok_or_else(|| InferenceError::Run("the model gave nothing".into()))?;
-        LocalFeatures::from_output(output, cells, &raw.features, raw.reliability.as_deref())
+        raw.local_features(output, output.cells(tensor))
             .and_then(|local| local.descriptor(DescriptorKind::Gem, pooling))
             .map_err(unfit)
     };

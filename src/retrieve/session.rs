@@ -8,7 +8,8 @@ use ort::session::Session;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::value::TensorRef;
 
-use super::manifest::{Input, Manifest, Resize};
+use super::manifest::{Input, Manifest, Output, Resize};
+use super::pooling::{LocalFeatures, PoolingError};
 use super::preprocess::Tensor;
 use super::provider::Execution;
 
@@ -19,6 +20,25 @@ pub(super) struct RawOutput {
     pub features: Vec<f32>,
     /// The reliability map, if the manifest names one.
     pub reliability: Option<Vec<f32>>,
+}
+
+impl RawOutput {
+    /// The local features of a picture of so many cells (rows, columns).
+    pub fn local_features(
+        &self,
+        output: &Output,
+        cells: (usize, usize),
+    ) -> Result<LocalFeatures, PoolingError> {
+        LocalFeatures::from_output(output, cells, &self.features, self.reliability.as_deref())
+    }
+}
+
+impl Output {
+    /// Rows and columns of cells in a tensor.
+    pub(super) fn cells(&self, tensor: &Tensor) -> (usize, usize) {
+        let stride = self.stride as usize;
+        (tensor.height / stride, tensor.width / stride)
+    }
 }
 
 /// Why inference gave no answer.
