@@ -150,4 +150,23 @@ mod tests {
         assert_eq!(["a", "b", "c", "d"].map(known), [true, false, false, true]);
         assert!(kept.get(&"a".parse().unwrap(), Digest::of(b"other bytes")).is_none());
     }
+
+    #[test]
+    fn what_is_read_again_is_what_was_measured_to_the_last_bit() {
+        let dir = tempfile::TempDir::new().unwrap();
+        let file = dir.path().join("kept.jsonl");
+        let kept = Kept::open(&file).unwrap();
+        let measured = |i: u32| {
+            let ms = f64::from(i) * 1e-6;
+            let times =
+                Times { decode: ms / 3.0, extract: ms / 7.0, refine: ms, ..outcome("a").times };
+            Outcome { times, ..outcome(&i.to_string()) }
+        };
+        let all: Vec<Outcome> = (0..200).map(|i| measured(i * 7919 + 1)).collect();
+        all.iter().for_each(|outcome| kept.keep(outcome).unwrap());
+        let kept = Kept::open(&file).unwrap();
+        assert!(
+            all.iter().all(|known| kept.get(&known.query, known.digest).as_ref() == Some(known))
+        );
+    }
 }
