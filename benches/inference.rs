@@ -14,7 +14,7 @@ use whereabouts::retrieve::{Assets, Bench, BenchRow, BenchSettings, Layout, Want
 
 const MODEL: &str = "dinov2-small";
 const SIZE: usize = 224;
-const BATCHES: [usize; 2] = [1, 8];
+const BATCHES: [usize; 3] = [1, 4, 8];
 const SECONDS: f64 = 1.5;
 const PEERS: [&str; 3] = ["onnxruntime", "openvino-latency", "openvino-throughput"];
 /// The machine's speed changes with the moment: all are measured in turn, some times over, and what

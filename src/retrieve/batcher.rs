@@ -67,7 +67,7 @@ impl Batcher {
             room: Condvar::new(),
             layout,
         });
-        let wide = model.load(execution, threads)?;
+        let wide = model.load(execution, threads, layout.max_batch)?;
         let serving = Arc::clone(&queue);
         spawn("inference", move || serving.serve(wide, Kind::Wide))?;
         Ok(Self { queue })
@@ -289,7 +289,7 @@ fn add_narrow(
     threads: usize,
     index: usize,
 ) -> Result<(), InferenceError> {
-    let mut runner = model.load(execution, threads)?;
+    let mut runner = model.load(execution, threads, queue.layout.max_batch)?;
     runner.warm_up()?;
     let serving = Arc::clone(queue);
     spawn(&format!("inference-{index}"), move || serving.serve(runner, Kind::Narrow))?;

@@ -174,7 +174,7 @@ fn gemm_peak(
     duration: Duration,
 ) -> Result<f64, InferenceError> {
     let failed = |error: ort::Error| InferenceError::Run(error.to_string());
-    let builder = model.builder(execution, threads).map_err(failed)?;
+    let builder = model.builder(execution, threads, 1).map_err(failed)?;
     let mut session = { builder }.commit_from_memory(GEMM).map_err(failed)?;
     let ones = vec![1.0_f32; GEMM_SIZE * GEMM_SIZE];
     let (mut best, start) = (Duration::MAX, Instant::now());

@@ -227,7 +227,7 @@ fn try_one(
     /// A large model on a small machine shows what it does in fewer.
     const RUNS: std::ops::RangeInclusive<usize> = 3..=11;
     const LONG_ENOUGH: Duration = Duration::from_millis(500);
-    let mut runner = model.load(execution, threads)?;
+    let mut runner = model.load(execution, threads, 1)?;
     let descriptors = run_all(model, &mut runner, sample)?;
     let mut times: Vec<Duration> = Vec::with_capacity(*RUNS.end());
     for tensor in sample.iter().cycle().take(*RUNS.end()) {
@@ -249,7 +249,7 @@ pub(super) fn descriptors(
     threads: usize,
     sample: &[Tensor],
 ) -> Result<Vec<Descriptor>, InferenceError> {
-    run_all(model, &mut model.load(execution, threads)?, sample)
+    run_all(model, &mut model.load(execution, threads, 1)?, sample)
 }
 
 fn run_all(

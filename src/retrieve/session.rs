@@ -65,10 +65,15 @@ pub(super) struct Model {
 }
 
 impl Model {
-    /// Makes a session of so many threads.
-    pub fn load(&self, execution: Execution, threads: usize) -> Result<Runner, InferenceError> {
+    /// Makes a session of so many threads, whose runs are of at most `max_batch` pictures.
+    pub fn load(
+        &self,
+        execution: Execution,
+        threads: usize,
+        max_batch: usize,
+    ) -> Result<Runner, InferenceError> {
         let session = self
-            .builder(execution, threads)
+            .builder(execution, threads, max_batch)
             .and_then(|mut builder| builder.commit_from_file(&self.file))
             .map_err(|error| {
                 InferenceError::Load(format!("{} by {execution}: {error}", self.file.display()))
@@ -85,6 +90,7 @@ impl Model {
         &self,
         execution: Execution,
         threads: usize,
+        max_batch: usize,
     ) -> Result<SessionBuilder, ort::Error> {
         let threads = threads.max(1);
         let builder = Session::builder(&self.environment)?
@@ -92,13 +98,21 @@ impl Model {
             .with_intra_threads(threads)?
             // Threads that spin for work take the cores from decoding.
             .with_intra_op_spinning(false)?;
-        // A graph whose shapes are known is planned better.
+        // A graph whose shapes are known is planned better. The names are those of our exports and of
+        // the hub's; one that a graph does not have is passed over.
         let Input { resize, width, height, .. } = self.manifest.input;
         let builder = match resize {
             Resize::LongestEdge => builder,
             Resize::Squash | Resize::CentreCrop => builder
                 .with_dimension_override("height", i64::from(height))?
                 .with_dimension_override("width", i64::from(width))?,
+        };
+        let builder = match max_batch {
+            1 => {
+                let one = builder.with_dimension_override("batch", 1)?;
+                one.with_dimension_override("batch_size", 1)?
+            }
+            _ => builder,
         };
         match execution.registration(threads) {
             Some(provider) => Ok(builder.with_execution_providers([provider])?),
