@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino test lint format bench openapi clean
+.PHONY: help demo build assets nasm openvino test crash lint format bench openapi clean
 
 help: ## Say what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -26,6 +26,9 @@ openvino: ## Get ONNX Runtime with OpenVINO too, the faster one on many x86-64 p
 
 test: assets nasm ## Set up, build and run every test
 	$(CARGO) test --release --locked
+
+crash: assets nasm ## Kill the server at 200 random moments and hold it against what it acknowledged
+	WHEREABOUTS_CRASH_ROUNDS=200 $(CARGO) test --release --locked --test crash what_was -- --nocapture
 
 lint: ## Check the format and the lints
 	$(CARGO) fmt --check

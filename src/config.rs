@@ -34,6 +34,8 @@ pub struct Config {
     pub index: Index,
     /// Answers.
     pub localize: Localize,
+    /// How maps are measured.
+    pub confidence: Confidence,
     /// Refinement jobs.
     pub jobs: Jobs,
     /// The refiner.
@@ -70,6 +72,8 @@ pub struct Data {
     pub dir: PathBuf,
     /// sled's page cache, in bytes.
     pub db_cache_bytes: u64,
+    /// Bytes of the disk that stay free.
+    pub min_free_bytes: u64,
     /// The most changes in one commit.
     pub commit_batch: usize,
     /// Descriptions that were paid for, in bytes.
@@ -220,8 +224,22 @@ pub struct Localize {
     pub k: usize,
     /// Candidates in an answer at the most.
     pub max_k: usize,
-    /// The least similarity of a known place.
-    pub known_similarity: f32,
+    /// The least confidence of a known place.
+    pub known_confidence: f64,
+}
+
+/// `[confidence]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Confidence {
+    /// Images that are asked as if they were frames, at most.
+    pub images: usize,
+    /// Of these, how many are also refined.
+    pub refined: usize,
+    /// Images before and after one that show the same place.
+    pub place_images: usize,
+    /// The size of a place, in metres.
+    pub place_m: f64,
 }
 
 /// `[jobs]`
@@ -250,10 +268,22 @@ pub struct Jobs {
 pub struct Refine {
     /// Who refines.
     pub refiner: Refiner,
-    /// Candidates that are compared.
+    /// Candidates that `mllm` compares.
     pub candidates: usize,
+    /// Candidates that `local` compares.
+    pub local_candidates: usize,
     /// Memory for dense features, in bytes.
     pub dense_cache_bytes: usize,
+}
+
+impl Refine {
+    /// Candidates that the configured refiner compares.
+    pub fn compared(&self) -> usize {
+        match self.refiner {
+            Refiner::Mllm => self.candidates,
+            Refiner::Local | Refiner::Off => self.local_candidates,
+        }
+    }
 }
 
 /// Who refines, if anybody.
@@ -405,6 +435,7 @@ impl Config {
             ("jobs.workers", self.jobs.workers),
             ("jobs.attempts", self.jobs.attempts as usize),
             ("refine.candidates", self.refine.candidates),
+            ("refine.local_candidates", self.refine.local_candidates),
         ];
         if let Some((key, _)) = at_least_one.iter().find(|(_, value)| *value == 0) {
             return Some(format!("{key} must be at least 1"));
@@ -415,8 +446,14 @@ impl Config {
         if self.localize.max_k > 100 || self.localize.k > self.localize.max_k {
             return Some("localize.k <= localize.max_k <= 100 must hold".into());
         }
-        if self.refine.candidates > self.localize.max_k {
-            return Some("refine.candidates must not exceed localize.max_k".into());
+        if self.jobs.lease_s > 24 * 3600 {
+            return Some("jobs.lease_s must be at most a day".into());
+        }
+        if self.refine.candidates.max(self.refine.local_candidates) > self.localize.max_k {
+            return Some(
+                "refine.candidates and refine.local_candidates must not exceed localize.max_k"
+                    .into(),
+            );
         }
         if !self.model.hub.starts_with("https://") && !self.model.hub.starts_with("http://") {
             return Some("model.hub must begin with https:// or http://".into());

@@ -12,7 +12,7 @@ use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
-use crate::domain::utc_day;
+use crate::domain::{CalibrationSettings, utc_day};
 use crate::http::{AppState, HttpSettings, router};
 use crate::refine::local::{LocalMatcher, LocalSettings};
 use crate::refine::mllm::{MllmParts, MllmRefiner};
@@ -44,8 +44,13 @@ pub async fn serve(
     let drain_timeout = config.server.drain_timeout();
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
     let (service, workers) = building.await.context("the start broke off")??;
-    state.set_ready(Arc::new(service));
+    let service = Arc::new(service);
+    state.set_ready(Arc::clone(&service));
     let mut running = JoinSet::new();
+    running.spawn({
+        let shutdown = shutdown.clone();
+        async move { service.keep_calibrated(shutdown).await }
+    });
     for worker in workers {
         let shutdown = shutdown.clone();
         running.spawn(async move { worker.run(shutdown).await });
@@ -97,6 +102,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
             0 => (cores_unless(0) / 2).max(1),
             threads => threads,
         },
+        min_free_bytes: config.data.min_free_bytes,
         db_cache_bytes: config.data.db_cache_bytes,
         commit_batch: config.data.commit_batch,
         descriptions: DescriptionBounds {
@@ -140,6 +146,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
     let workers = refiner.iter().flat_map(|refiner| {
         (0..config.jobs.workers).map(|_| Worker {
             jobs: Arc::clone(&jobs),
+            maps: store.clone(),
             refiner: Arc::clone(refiner),
             metrics: Arc::clone(&metrics),
             settings: WorkerSettings {
@@ -147,6 +154,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
                 timeout: Duration::from_secs(config.jobs.timeout_s),
                 attempts: config.jobs.attempts,
                 retry_pause: Duration::from_secs(config.jobs.retry_pause_s),
+                known_confidence: config.localize.known_confidence,
             },
         })
     });
@@ -166,8 +174,15 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
         settings: ServiceSettings {
             k: config.localize.k,
             max_k: config.localize.max_k,
-            known_similarity: config.localize.known_similarity,
-            candidates: config.refine.candidates,
+            known_confidence: config.localize.known_confidence,
+            calibration: CalibrationSettings {
+                images: config.confidence.images,
+                refined: config.confidence.refined,
+                candidates: config.refine.compared(),
+                place_images: config.confidence.place_images,
+                place_m: config.confidence.place_m,
+            },
+            candidates: config.refine.compared(),
             job_queue: config.jobs.queue,
             max_wait: Duration::from_secs(config.jobs.max_wait_s),
             usage_days: config.data.usage_days,

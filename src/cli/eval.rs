@@ -38,6 +38,10 @@ pub struct Args {
     /// A folder of pictures of other places, to measure how well `known` tells them apart
     #[arg(long, value_name = "DIR")]
     unknown: Option<PathBuf>,
+    /// Leave out this share of the references, the last by name, to see what `known` is worth: their
+    /// queries should not be called known
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = share)]
+    hold_out: f64,
     /// A CSV file with the columns query,references; the references separated by spaces
     #[arg(long, value_name = "FILE", conflicts_with = "frame_tolerance")]
     ground_truth: Option<PathBuf>,
@@ -59,9 +63,9 @@ pub struct Args {
     /// Who refines its candidates: local, mllm, both, or off
     #[arg(long, value_delimiter = ',', default_value = "local")]
     refine: Vec<ConfiguredRefiner>,
-    /// Candidates that are refined
-    #[arg(short, default_value_t = 10, value_parser = clap::value_parser!(u8).range(1..=100))]
-    k: u8,
+    /// Candidates that are refined [default: as configured, which is 10 with mllm, else 20]
+    #[arg(short, value_parser = clap::value_parser!(u8).range(1..=100))]
+    k: Option<u8>,
     /// So many of the queries, chosen by chance
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     sample: Option<u32>,
@@ -71,7 +75,7 @@ pub struct Args {
     /// What the pictures show; it chooses the words of the prompts
     #[arg(long, default_value_t = Scene::Outdoor)]
     scene: Scene,
-    /// The least similarity of a known place: `auto` suggests one, a number is looked at besides
+    /// The least confidence of a known place: `auto` suggests one, a number is looked at besides
     #[arg(long, value_name = "auto|NUMBER", default_value = "auto", value_parser = known_threshold)]
     known_threshold: KnownThreshold,
     /// Compare every descriptor instead of searching a graph
@@ -107,6 +111,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         database: args.database.clone(),
         queries: args.queries.clone(),
         unknown: args.unknown.clone(),
+        hold_out: args.hold_out,
     };
     let truth = args.truth()?;
     let sampling = Sampling { size: args.sample.map(|size| size as usize), seed: args.seed };
@@ -140,8 +145,9 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         truth: truth.said(),
         model,
         execution,
-        k: usize::from(args.k),
+        k: config.refine.compared(),
         known_threshold: args.known_threshold.0,
+        known_confidence: config.localize.known_confidence,
         search: if args.exact { "exact" } else { "fast" }.into(),
     };
     let summary = Summary::new(told, &data, &found);
@@ -186,6 +192,11 @@ fn known_threshold(text: &str) -> Result<KnownThreshold, String> {
     number.map(|number| KnownThreshold(Some(number))).ok_or("it is `auto` or a number".into())
 }
 
+fn share(text: &str) -> Result<f64, String> {
+    let number = text.parse::<f64>().ok().filter(|share| (0.0..1.0).contains(share));
+    number.ok_or("it is a number from 0 to below 1".into())
+}
+
 impl Args {
     fn truth(&self) -> anyhow::Result<TruthSource> {
         if !self.threshold_m.is_finite() || self.threshold_m < 0.0 {
@@ -217,6 +228,9 @@ impl Args {
         if std::env::var_os("WHEREABOUTS_LOG__FILTER").is_none() {
             "warn".clone_into(&mut config.log.filter);
         }
+        if let Some(k) = self.k.map(usize::from) {
+            (config.refine.candidates, config.refine.local_candidates) = (k, k);
+        }
         config.jobs.workers = self.side_by_side();
         config.image.queue = config.image.queue.max(self.side_by_side());
         Ok(config)
@@ -243,7 +257,7 @@ impl Args {
 
     fn settings(&self, config: &Config) -> anyhow::Result<RunSettings> {
         Ok(RunSettings {
-            k: usize::from(self.k),
+            k: config.refine.compared(),
             search: if self.exact { SearchMode::Exact } else { SearchMode::Fast },
             scene: self.scene,
             side_by_side: self.side_by_side(),

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
+use super::confidence::Estimate;
 use super::map::display_as_written;
 use super::{ImageId, InvalidName, MapName, Ranking};
 
@@ -188,6 +189,10 @@ pub struct Job {
     pub ranking: Option<Ranking>,
     /// Why the ranking is as it is.
     pub reasoning: Option<String>,
+    /// Where the frame was probably taken, by the refined order, once there is one.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub estimate: Option<Estimate>,
     /// What it cost so far, in all attempts since it was queued or last retried.
     pub usage: Usage,
     /// What went wrong, or what a job that is queued again waits for.
@@ -211,6 +216,7 @@ impl Job {
             descriptions: Vec::new(),
             ranking: None,
             reasoning: None,
+            estimate: None,
             usage: Usage::default(),
             error: None,
         }

@@ -4,6 +4,7 @@
 //! [`Ranking`] is a permutation), so nobody downstream checks again. No I/O happens here.
 
 mod candidate;
+pub mod confidence;
 pub mod dense;
 mod descriptor;
 mod digest;
@@ -14,6 +15,7 @@ mod pose;
 
 pub use self::image::{Image, ImageId, MediaType};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
+pub use confidence::{Calibration, CalibrationSettings, Estimate, Evidence};
 pub use dense::DenseFeatures;
 pub use descriptor::{Descriptor, DescriptorError, dot};
 pub use digest::Digest;

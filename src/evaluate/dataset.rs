@@ -16,6 +16,9 @@ pub struct Folders {
     pub queries: PathBuf,
     /// Queries from places that are not in the map, if there are any.
     pub unknown: Option<PathBuf>,
+    /// The share of the references that is left out, the last by name, 0 to 1. Queries of which no true
+    /// reference is left are from places that are not in the map.
+    pub hold_out: f64,
 }
 
 /// Which of the queries are evaluated.
@@ -34,7 +37,7 @@ pub enum QueryKind {
     InMap,
     /// No true reference is known; it is left out of the recall.
     Skipped,
-    /// A place that is not in the map, from the folder of unknown places.
+    /// A place that is not in the map: from the folder of unknown places, or held out.
     Unknown,
 }
 
@@ -65,10 +68,13 @@ impl Dataset {
         source: &TruthSource,
         sampling: Sampling,
     ) -> anyhow::Result<Self> {
-        let references = pictures(&folders.database)?;
+        let mut references = pictures(&folders.database)?;
         let all = pictures(&folders.queries)?;
         let truth =
             source.read((&folders.database, &references), (&folders.queries, all.as_slice()))?;
+        let left = (references.len() as f64 * (1.0 - folders.hold_out)).round() as usize;
+        let held_out: HashSet<ImageId> =
+            references.drain(left.min(references.len())..).map(|picture| picture.id).collect();
         let size = sampling.size.unwrap_or(all.len());
         let chosen: HashSet<usize> = sample(all.len(), size, sampling.seed).into_iter().collect();
         let mut queries: Vec<EvaluatedQuery> = all
@@ -76,8 +82,14 @@ impl Dataset {
             .zip(truth)
             .enumerate()
             .filter(|(place, _)| chosen.contains(place))
-            .map(|(_, (picture, truth))| {
-                let kind = if truth.is_empty() { QueryKind::Skipped } else { QueryKind::InMap };
+            .map(|(_, (picture, mut truth))| {
+                let had = !truth.is_empty();
+                truth.retain(|reference| !held_out.contains(reference));
+                let kind = match (truth.is_empty(), had) {
+                    (false, _) => QueryKind::InMap,
+                    (true, true) => QueryKind::Unknown,
+                    (true, false) => QueryKind::Skipped,
+                };
                 EvaluatedQuery { picture, kind, truth }
             })
             .collect();

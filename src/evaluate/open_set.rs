@@ -1,4 +1,4 @@
-//! Known and unknown places: how well the similarity of the first answer tells them apart.
+//! Known and unknown places: how well the confidence in the first answer tells them apart.
 //!
 //! Two questions, two curves. *Is the first answer true?* gives the precision-recall curve of visual
 //! place recognition. *Is the place in the map at all?* gives what an operator wants of `known`:
@@ -101,9 +101,51 @@ pub fn auc(first: &[First]) -> Option<f64> {
     Some(sum / (known.len() * unknown.len()) as f64)
 }
 
+/// Confidences from which places are called known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bounds {
+    /// The service's.
+    pub service: f64,
+    /// One to look at besides.
+    pub given: Option<f64>,
+}
+
+/// What is called known from a threshold on, in shares from 0 to 1; `None` of nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Called {
+    /// The least confidence.
+    pub threshold: f64,
+    /// Of the true first answers.
+    pub right: Option<f64>,
+    /// Of the false ones to queries whose place is in the map.
+    pub wrong: Option<f64>,
+    /// Of those to queries whose place is not in the map. The promise is at most 1 − threshold.
+    pub unknown: Option<f64>,
+}
+
+impl Called {
+    fn of(first: &[First], threshold: f64) -> Self {
+        let share = |kind: fn(&First) -> bool| {
+            let (all, known) = first
+                .iter()
+                .filter(|first| kind(first))
+                .fold((0, 0), |(n, k), f| (n + 1, k + usize::from(f.score >= threshold)));
+            (all > 0).then(|| f64::from(known as u32) / f64::from(all))
+        };
+        Self {
+            threshold,
+            right: share(|first| first.right),
+            wrong: share(|first| first.in_map && !first.right),
+            unknown: share(|first| !first.in_map),
+        }
+    }
+}
+
 /// What the first answers of a method say about `known`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Knowing {
+    /// What the service calls known.
+    pub called: Called,
     /// The threshold with the best F1 of taking true answers.
     pub suggested: Option<Point>,
     /// Taking true answers at the threshold that was given.
@@ -119,12 +161,13 @@ pub struct Knowing {
 }
 
 impl Knowing {
-    /// Works it out; `given` is a threshold to look at besides.
-    pub fn of(first: &[First], given: Option<f64>) -> Self {
+    /// Works it out.
+    pub fn of(first: &[First], Bounds { service, given }: Bounds) -> Self {
         let curve = precision_recall(first);
         let unknown = first.iter().filter(|first| !first.in_map).count();
         let knowing = if unknown > 0 { knowing(first) } else { Vec::new() };
         Self {
+            called: Called::of(first, service),
             suggested: best(&curve),
             given: given.and_then(|threshold| at_threshold(&curve, threshold)),
             unknown,
@@ -175,5 +218,19 @@ mod tests {
         // Of four pairs two are in order and one is a tie, twice over 0.5.
         assert_eq!(auc(&answers), Some((1.0 + 1.0 + 0.0 + 0.5) / 4.0));
         assert_eq!(auc(&answers[..2]), None);
+    }
+
+    #[test]
+    fn what_is_called_known_is_told_by_kind() {
+        let answers = [
+            first(0.9, true, true),
+            first(0.4, true, true),
+            first(0.95, false, true),
+            first(0.1, false, true),
+            first(0.2, false, true),
+            first(0.2, false, true),
+        ];
+        let called = Called::of(&answers, 0.9);
+        assert_eq!((called.right, called.wrong, called.unknown), (Some(0.5), Some(0.25), None));
     }
 }

@@ -21,6 +21,8 @@ pub struct Outcome {
     pub digest: Digest,
     /// The references, best first.
     pub answers: Vec<Answered>,
+    /// How sure the first of them is, 0 to 1.
+    pub confidence: f32,
     /// What a refiner said of the pairs.
     pub descriptions: Vec<Description>,
     /// Why the order is as it is.
@@ -124,6 +126,7 @@ mod tests {
             query: query.parse().unwrap(),
             digest: Digest::of(query.as_bytes()),
             answers: Vec::new(),
+            confidence: 0.0,
             descriptions: Vec::new(),
             reasoning: None,
             usage: Usage::default(),

@@ -7,12 +7,14 @@ use anyhow::Context;
 use super::summary::visits;
 use super::{Dataset, MethodOutcomes, QueryKind};
 
-/// Writes one line for each answer: `query,method,rank,reference,similarity,coarse_rank,true`, where
-/// `true` is `yes` or `no`, and `skipped` or `unknown` for a query that has no true reference.
+/// Writes one line for each answer: `query,method,rank,reference,similarity,coarse_rank,true,confidence`,
+/// where `true` is `yes` or `no`, and `skipped` or `unknown` for a query that has no true reference.
+/// Only a first answer has a confidence.
 pub fn write(file: &Path, data: &Dataset, found: &[MethodOutcomes]) -> anyhow::Result<()> {
     let mut writer =
         csv::Writer::from_path(file).with_context(|| format!("cannot write {}", file.display()))?;
-    let header = ["query", "method", "rank", "reference", "similarity", "coarse_rank", "true"];
+    let header =
+        ["query", "method", "rank", "reference", "similarity", "coarse_rank", "true", "confidence"];
     writer.write_record(header)?;
     for method in found {
         let name = method.method.name();
@@ -24,6 +26,10 @@ pub fn write(file: &Path, data: &Dataset, found: &[MethodOutcomes]) -> anyhow::R
                     QueryKind::Skipped => "skipped",
                     QueryKind::Unknown => "unknown",
                 };
+                let confidence = match place {
+                    0 => format!("{:.4}", outcome.confidence),
+                    _ => String::new(),
+                };
                 writer.write_record([
                     query.picture.id.as_str(),
                     &name,
@@ -32,6 +38,7 @@ pub fn write(file: &Path, data: &Dataset, found: &[MethodOutcomes]) -> anyhow::R
                     &format!("{:.6}", answer.similarity),
                     &answer.coarse_rank.to_string(),
                     verdict,
+                    &confidence,
                 ])?;
             }
         }

@@ -14,7 +14,7 @@ use uuid::Uuid;
 use super::map::ReferenceMap;
 use super::outcome::Kept;
 use super::{Answered, Dataset, EvaluatedQuery, MethodOutcomes, Outcome, Times};
-use crate::domain::{DescriptorKind, Digest, Job, Map, RefinerKind, Scene, Usage};
+use crate::domain::{Calibration, DescriptorKind, Digest, Job, Map, RefinerKind, Scene, Usage};
 use crate::refine::{DenseKey, Progress, RefineError, Refinement, Refiner};
 use crate::retrieve::index::SearchMode;
 use crate::service::{Retrieved, Service};
@@ -93,6 +93,7 @@ impl Evaluator<'_> {
         descriptor: DescriptorKind,
     ) -> anyhow::Result<Vec<MethodOutcomes>> {
         let references = self.reference_map(&data.references, descriptor).await?;
+        let calibration = self.calibrated(&references.map).await?;
         let kinds = self.refiners.iter().map(|refiner| Some(refiner.kind()));
         let methods: Vec<Method> =
             [None].into_iter().chain(kinds).map(|refiner| Method { descriptor, refiner }).collect();
@@ -104,7 +105,7 @@ impl Evaluator<'_> {
         self.watch.begin("queries", data.queries.len());
         let mut outcomes: Vec<Vec<Outcome>> = methods.iter().map(|_| Vec::new()).collect();
         let mut asked = futures_util::stream::iter(&data.queries)
-            .map(|query| self.ask(&references.map, query, &kept))
+            .map(|query| self.ask(&references.map, &calibration, query, &kept))
             .buffered(self.settings.side_by_side);
         while let Some(found) = asked.try_next().await? {
             outcomes.iter_mut().zip(found).for_each(|(all, one)| all.push(one));
@@ -120,11 +121,12 @@ impl Evaluator<'_> {
         let RunSettings { k, search, scene, refiner_settings, work, .. } = &self.settings;
         let refined = method.refiner.map(|_| (scene, refiner_settings));
         let decides = format!(
-            "{}\n{}\n{}\n{:?}\n{k}\n{refined:?}",
+            "{}\n{}\n{}\n{:?}\n{k}\n{refined:?}\n{:?}",
             env!("CARGO_PKG_VERSION"),
             references.map.name,
             references.digest,
-            search
+            search,
+            self.service.settings.calibration
         );
         let folder = work.join("outcomes");
         std::fs::create_dir_all(&folder)
@@ -133,10 +135,19 @@ impl Evaluator<'_> {
         Kept::open(&folder.join(format!("{}-{}.jsonl", method.name(), &digest[..16])))
     }
 
+    /// What chance resemblance is like in the map. Measured anew each time: what an earlier run kept may
+    /// be of other references.
+    async fn calibrated(&self, map: &Map) -> anyhow::Result<Arc<Calibration>> {
+        let local = self.refiners.iter().find(|refiner| refiner.kind() == RefinerKind::Local);
+        self.service.calibrate(map, local.map(AsRef::as_ref)).await?;
+        Ok(self.service.maps.calibration(map).await?.unwrap_or_default())
+    }
+
     /// The outcome of each method for one query; what is kept is not worked out again.
     async fn ask(
         &self,
         map: &Map,
+        calibration: &Calibration,
         query: &EvaluatedQuery,
         kept: &[Kept],
     ) -> anyhow::Result<Vec<Outcome>> {
@@ -154,7 +165,7 @@ impl Evaluator<'_> {
             .retrieve(&map.name, &frame, wanted, self.settings.search)
             .await
             .with_context(named)?;
-        let coarse = coarse(query, digest, &retrieved);
+        let coarse = coarse(query, digest, &retrieved, calibration);
         let mut outcomes = Vec::with_capacity(kept.len());
         let record = self.record(map, digest, retrieved);
         // The refiners fetch the frame from the store; the pin keeps it there meanwhile.
@@ -165,7 +176,7 @@ impl Evaluator<'_> {
                 (None, None) => coarse.clone(),
                 (None, Some(refiner)) => {
                     let refiner = self.refiners[refiner].as_ref();
-                    self.refine(refiner, &record, &coarse).await.with_context(named)?
+                    self.refine(refiner, &record, &coarse, calibration).await.with_context(named)?
                 }
             };
             kept.keep(&outcome)?;
@@ -197,6 +208,7 @@ impl Evaluator<'_> {
         refiner: &dyn Refiner,
         record: &JobRecord,
         coarse: &Outcome,
+        calibration: &Calibration,
     ) -> anyhow::Result<Outcome> {
         let mut record = record.clone();
         record.job.refiner = refiner.kind();
@@ -207,7 +219,17 @@ impl Evaluator<'_> {
         loop {
             let start = Instant::now();
             match refiner.refine(&record, &Unheard).await {
-                Ok(refinement) => return Ok(refined(coarse, refinement, start.elapsed())),
+                Ok(refinement) => {
+                    let took = start.elapsed();
+                    let confidence = refinement.ranking.first().map_or(0.0, |first| {
+                        calibration.refined_confidence(
+                            &record.candidates,
+                            &first.image_id,
+                            refinement.evidence,
+                        )
+                    });
+                    return Ok(refined(coarse, refinement, confidence, took));
+                }
                 Err(RefineError::Later { why, after }) => bail!(
                     "{why}; what was found so far is kept: run the same command again in {} s",
                     after.as_secs()
@@ -225,8 +247,15 @@ impl Evaluator<'_> {
     }
 }
 
-fn coarse(query: &EvaluatedQuery, digest: Digest, retrieved: &Retrieved) -> Outcome {
+fn coarse(
+    query: &EvaluatedQuery,
+    digest: Digest,
+    retrieved: &Retrieved,
+    calibration: &Calibration,
+) -> Outcome {
     let times = retrieved.extraction.times;
+    let candidates = &retrieved.candidates;
+    let first = candidates.first();
     let answers = retrieved.candidates.iter().map(|candidate| Answered {
         image_id: candidate.image_id.clone(),
         similarity: candidate.similarity,
@@ -236,6 +265,8 @@ fn coarse(query: &EvaluatedQuery, digest: Digest, retrieved: &Retrieved) -> Outc
         query: query.picture.id.clone(),
         digest,
         answers: answers.collect(),
+        confidence: first
+            .map_or(0.0, |first| calibration.refined_confidence(candidates, &first.image_id, None)),
         descriptions: Vec::new(),
         reasoning: None,
         usage: Usage::default(),
@@ -250,13 +281,14 @@ fn coarse(query: &EvaluatedQuery, digest: Digest, retrieved: &Retrieved) -> Outc
 }
 
 /// The refined candidates first, those that were not refined behind them in coarse order.
-fn refined(coarse: &Outcome, refinement: Refinement, took: Duration) -> Outcome {
+fn refined(coarse: &Outcome, refinement: Refinement, confidence: f32, took: Duration) -> Outcome {
     let ranking = refinement.ranking.as_slice();
     let at = |rank: usize| coarse.answers.iter().find(|answer| answer.coarse_rank == rank);
     let first = ranking.iter().filter_map(|place| at(place.coarse_rank));
     let rest = coarse.answers.iter().filter(|answer| answer.coarse_rank > ranking.len());
     Outcome {
         answers: first.chain(rest).cloned().collect(),
+        confidence,
         times: Times { refine: ms(took), pairs: ranking.len(), ..coarse.times },
         descriptions: refinement.descriptions,
         reasoning: refinement.reasoning,

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::open_set::{First, Knowing};
+use super::open_set::{Bounds, First, Knowing};
 use super::recall::{AtK, Change, FirstTrue, change, first_true, recall};
 use super::{Dataset, EvaluatedQuery, MethodOutcomes, Outcome, QueryKind};
 use crate::domain::Usage;
@@ -40,8 +40,10 @@ pub struct Told {
     pub execution: String,
     /// Candidates that were refined.
     pub k: usize,
-    /// The least similarity of a known place, if one was given.
+    /// The least confidence of a known place, if one was given.
     pub known_threshold: Option<f64>,
+    /// From which confidence on the service calls a place known.
+    pub known_confidence: f64,
     /// `fast` (a graph where the map is large) or `exact`.
     pub search: String,
 }
@@ -65,7 +67,7 @@ pub struct MethodSummary {
     pub degraded: usize,
     /// Why the first of them is.
     pub degraded_why: Option<String>,
-    /// Telling known places from unknown ones by the similarity of the first answer.
+    /// Telling known places from unknown ones by the confidence in the first answer.
     pub known: Knowing,
 }
 
@@ -96,14 +98,14 @@ pub struct Spread {
 impl Summary {
     /// Sums up what was found. Methods come as coarse ones each followed by its refined ones.
     pub fn new(told: Told, data: &Dataset, found: &[MethodOutcomes]) -> Self {
-        let threshold = told.known_threshold;
+        let bounds = Bounds { service: told.known_confidence, given: told.known_threshold };
         let mut methods = Vec::with_capacity(found.len());
         let mut coarse = Vec::new();
         for method in found {
             let first = first_places(data, method);
             let is_coarse = method.method.refiner.is_none();
             let changed = (!is_coarse).then(|| change(&coarse, &first));
-            methods.push(summed_up(data, method, &first, changed, threshold));
+            methods.push(summed_up(data, method, &first, changed, bounds));
             if is_coarse {
                 coarse = first;
             }
@@ -143,7 +145,7 @@ pub(super) fn firsts(data: &Dataset, method: &MethodOutcomes) -> Vec<First> {
         .filter_map(|(query, outcome)| {
             let answer = outcome.answers.first()?;
             Some(First {
-                score: f64::from(answer.similarity),
+                score: f64::from(outcome.confidence),
                 right: query.truth.contains(&answer.image_id),
                 in_map: query.kind == QueryKind::InMap,
             })
@@ -156,7 +158,7 @@ fn summed_up(
     found: &MethodOutcomes,
     first: &[FirstTrue],
     change: Option<Change>,
-    threshold: Option<f64>,
+    bounds: Bounds,
 ) -> MethodSummary {
     let recall = recall(first);
     let outcomes = &found.outcomes;
@@ -179,7 +181,7 @@ fn summed_up(
         usage: outcomes.iter().fold(Usage::default(), |sum, outcome| sum + outcome.usage),
         degraded: outcomes.iter().filter(|outcome| outcome.degraded.is_some()).count(),
         degraded_why: outcomes.iter().find_map(|outcome| outcome.degraded.clone()),
-        known: Knowing::of(&firsts(data, found), threshold),
+        known: Knowing::of(&firsts(data, found), bounds),
     }
 }
 

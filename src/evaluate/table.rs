@@ -94,11 +94,25 @@ fn write_method(method: &MethodSummary, k: usize, out: &mut String) -> fmt::Resu
 
 fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
     let (name, known) = (&method.name, &method.known);
+    let called = &known.called;
+    let kinds = [
+        (called.right, "true first answers"),
+        (called.wrong, "false ones"),
+        (called.unknown, "unknown places"),
+    ];
+    let shares =
+        kinds.iter().filter_map(|(share, of)| Some(format!("{:.1} % of {of}", 100.0 * (*share)?)));
+    writeln!(
+        out,
+        "{name}: called known from a confidence of {}: {}",
+        called.threshold,
+        shares.collect::<Vec<_>>().join(", ")
+    )?;
     for (point, why) in [(&known.suggested, "best F1"), (&known.given, "as given")] {
         if let Some(point) = point {
             writeln!(
                 out,
-                "{name}: first answers of similarity {:.3} or more ({why}): {:.1} % true, {:.1} % of \
+                "{name}: first answers of confidence {:.3} or more ({why}): {:.1} % true, {:.1} % of \
                  all found",
                 point.threshold,
                 100.0 * point.precision,

@@ -48,6 +48,7 @@ fn store(dir: &std::path::Path, exact_up_to: usize) -> EmbeddedStore {
         dir: dir.to_owned(),
         index,
         index_threads: 1,
+        min_free_bytes: 0,
         db_cache_bytes: 1 << 20,
         commit_batch: 64,
         descriptions: DescriptionBounds { max_bytes: 1 << 20, max_age },
@@ -122,6 +123,7 @@ async fn answered(
         query: id(0),
         digest: Digest::of(b""),
         answers: answers.collect(),
+        confidence: 0.0,
         descriptions: Vec::new(),
         reasoning: None,
         usage: Usage::default(),
@@ -144,6 +146,7 @@ async fn summary(store: &EmbeddedStore, map: &Map, mode: SearchMode) -> Summary 
         execution: String::new(),
         k: 10,
         known_threshold: None,
+        known_confidence: 0.9,
         search: String::new(),
     };
     Summary::new(told, &dataset(), &[MethodOutcomes { method, outcomes }])

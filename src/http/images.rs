@@ -115,6 +115,7 @@ impl MetaParams {
         (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "Cannot be decoded, or a pose out of range", content_type = "application/problem+json"),
         (status = 429, body = Problem, description = "Overloaded", content_type = "application/problem+json"),
+        (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
     ))]
 pub(super) async fn add_image(
     Ready(service): Ready,

@@ -56,6 +56,7 @@ struct FrameForm {
         (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "Cannot be decoded, or k out of range", content_type = "application/problem+json"),
         (status = 429, body = Problem, description = "Overloaded", content_type = "application/problem+json"),
+        (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
     ))]
 pub(super) async fn localize(
     Ready(service): Ready,

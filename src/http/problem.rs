@@ -54,6 +54,7 @@ fn status_of(kind: ErrorKind) -> (StatusCode, &'static str, &'static str) {
             (StatusCode::UNPROCESSABLE_ENTITY, "unprocessable", "Unprocessable content")
         }
         ErrorKind::Overloaded => (StatusCode::TOO_MANY_REQUESTS, "overloaded", "Overloaded"),
+        ErrorKind::Full => (StatusCode::INSUFFICIENT_STORAGE, "disk-full", "Insufficient storage"),
         ErrorKind::Unavailable => {
             (StatusCode::SERVICE_UNAVAILABLE, "unavailable", "Service unavailable")
         }

@@ -8,10 +8,11 @@ use bytes::Bytes;
 use super::local::{LocalMatcher, PairMatch, describe, rank};
 use super::{DenseCache, DenseKey, Progress, RefineError, Refinement, Refiner};
 use crate::domain::{
-    Candidate, DenseFeatures, Description, DescriptorKind, Digest, Map, Ranking, RefinerKind, Usage,
+    Candidate, DenseFeatures, Description, DescriptorKind, Digest, Evidence, Map, Ranking,
+    RefinerKind, Usage,
 };
 use crate::retrieve::{CpuPool, ExtractError, Extractor, LoadedModels, ModelError};
-use crate::store::{BlobStore, JobRecord, MapStore};
+use crate::store::{BlobStore, JobRecord, LookAlikes, MapStore};
 
 /// Geometric matching of dense features, on this machine.
 pub struct LocalRefiner {
@@ -56,10 +57,46 @@ impl Refiner for LocalRefiner {
             .source(DenseKey { model, picture: record.query.digest })
             .await?
             .ok_or_else(|| RefineError::Hopeless("the frame is missing from the store".into()))?;
+        let Compared { present, pairs } =
+            self.compared(&map, extractor, query, &record.candidates).await?;
+        conclude(&record.candidates, &present, &pairs)
+    }
+
+    async fn chance(&self, map: &Map, asked: &LookAlikes) -> Result<Option<Evidence>, RefineError> {
+        let extractor = self.models.of(map).await.map_err(no_model)?;
+        let query = match self.maps.image(map, &asked.image_id).await? {
+            Some(image) => {
+                self.source(DenseKey { model: extractor.identity(), picture: image.digest }).await?
+            }
+            None => None,
+        };
+        let Some(query) = query else { return Ok(None) };
+        let Compared { pairs, .. } = self.compared(map, extractor, query, &asked.others).await?;
+        Ok(rank(&pairs).first().and_then(|&first| agreement(&pairs, first)))
+    }
+}
+
+/// Candidates that could be compared, and how.
+struct Compared {
+    /// Their places among the candidates.
+    present: Vec<usize>,
+    /// What they have in common with the query.
+    pairs: Vec<PairMatch>,
+}
+
+impl LocalRefiner {
+    async fn compared(
+        &self,
+        map: &Map,
+        extractor: Arc<Extractor>,
+        query: Source,
+        candidates: &[Candidate],
+    ) -> Result<Compared, RefineError> {
+        let model = extractor.identity();
         let mut present = Vec::new();
         let mut sources = Vec::new();
-        for (index, candidate) in record.candidates.iter().enumerate() {
-            if let Some(source) = self.candidate_source(&map, model, candidate).await? {
+        for (index, candidate) in candidates.iter().enumerate() {
+            if let Some(source) = self.candidate_source(map, model, candidate).await? {
                 present.push(index);
                 sources.push(source);
             }
@@ -70,11 +107,9 @@ impl Refiner for LocalRefiner {
             .run(move || compare(&extractor, &dense, &matcher, query, sources))
             .await
             .map_err(|error| RefineError::Passing(error.to_string()))??;
-        conclude(&record.candidates, &present, &pairs)
+        Ok(Compared { present, pairs })
     }
-}
 
-impl LocalRefiner {
     async fn candidate_source(
         &self,
         map: &Map,
@@ -140,7 +175,8 @@ fn conclude(
     present: &[usize],
     pairs: &[PairMatch],
 ) -> Result<Refinement, RefineError> {
-    let compared: Vec<usize> = rank(pairs).into_iter().map(|place| present[place]).collect();
+    let places = rank(pairs);
+    let compared: Vec<usize> = places.iter().map(|&place| present[place]).collect();
     let gone = (0..candidates.len()).filter(|index| !present.contains(index));
     let order: Vec<usize> = compared.iter().copied().chain(gone).collect();
     let ranking = Ranking::new(candidates, &order)
@@ -159,12 +195,19 @@ fn conclude(
             })
             .collect(),
         reasoning: reasoning(candidates, present, pairs, &compared),
+        evidence: places.first().and_then(|&first| agreement(pairs, first)),
         ranking,
         usage: Usage::default(),
         degraded: (missing > 0).then(|| {
             format!("{missing} of {} candidates were removed from the map", candidates.len())
         }),
     })
+}
+
+/// What speaks for one of the candidates that were compared.
+fn agreement(pairs: &[PairMatch], of: usize) -> Option<Evidence> {
+    let agreeing: Vec<usize> = pairs.iter().map(|pair| pair.matches.len()).collect();
+    Evidence::agreement(&agreeing, of)
 }
 
 /// One sentence on why the first is the first.

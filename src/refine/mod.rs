@@ -19,8 +19,8 @@ pub use dense_cache::{DenseCache, DenseKey};
 pub use local_refiner::LocalRefiner;
 pub use worker::{Worker, WorkerSettings};
 
-use crate::domain::{Description, Ranking, RefinerKind, Usage};
-use crate::store::{JobRecord, Step, StoreError};
+use crate::domain::{Description, Evidence, Map, Ranking, RefinerKind, Usage};
+use crate::store::{JobRecord, LookAlikes, Step, StoreError};
 
 /// Compares and orders the candidates of one job.
 #[async_trait]
@@ -41,6 +41,12 @@ pub trait Refiner: Send + Sync {
         record: &JobRecord,
         progress: &dyn Progress,
     ) -> Result<Refinement, RefineError>;
+    /// What speaks for the first of candidates that are all wrong; `None` from a refiner that measures
+    /// nothing of the kind, and for an image that is gone.
+    async fn chance(&self, map: &Map, asked: &LookAlikes) -> Result<Option<Evidence>, RefineError> {
+        let _ = (map, asked);
+        Ok(None)
+    }
 }
 
 /// Hears of the steps of a refinement.
@@ -57,6 +63,8 @@ pub struct Refinement {
     pub descriptions: Vec<Description>,
     /// The new order.
     pub ranking: Ranking,
+    /// What speaks for the first of it, if that was measured.
+    pub evidence: Option<Evidence>,
     /// Why it is so.
     pub reasoning: Option<String>,
     /// What this attempt cost.
@@ -90,9 +98,10 @@ impl From<StoreError> for RefineError {
             StoreError::NotFound(_) | StoreError::Conflict(_) | StoreError::Damaged(_) => {
                 Self::Hopeless(error.to_string())
             }
-            StoreError::QueueFull { .. } | StoreError::Failed(_) | StoreError::Superseded(_) => {
-                Self::Passing(error.to_string())
-            }
+            StoreError::QueueFull { .. }
+            | StoreError::Full { .. }
+            | StoreError::Failed(_)
+            | StoreError::Superseded(_) => Self::Passing(error.to_string()),
         }
     }
 }

@@ -9,8 +9,8 @@ use tokio::sync::broadcast::error::RecvError;
 use tokio_util::sync::CancellationToken;
 
 use super::{Progress, RefineError, Refinement, Refiner};
-use crate::domain::{Job, JobState};
-use crate::store::{Claim, JobRecord, JobStore, Release, Step, StoreError};
+use crate::domain::{Estimate, Job, JobState};
+use crate::store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
 use crate::telemetry::Metrics;
 
 /// Bounds on a worker's patience.
@@ -24,12 +24,16 @@ pub struct WorkerSettings {
     pub attempts: u32,
     /// The pause before the second try; it doubles each time.
     pub retry_pause: Duration,
+    /// The least confidence of a known place.
+    pub known_confidence: f64,
 }
 
 /// Refines one job after another.
 pub struct Worker {
     /// The queue.
     pub jobs: Arc<dyn JobStore>,
+    /// What the maps are like.
+    pub maps: Arc<dyn MapStore>,
     /// Who refines.
     pub refiner: Arc<dyn Refiner>,
     /// What is counted.
@@ -73,7 +77,10 @@ impl Worker {
         };
         let (job, claim) = (record.job.clone(), record.claim());
         match self.refine(&record, shutdown).await {
-            Ok(refinement) => self.end(claim, succeeded(job, refinement)).await?,
+            Ok(refinement) => {
+                let estimate = self.estimate(&record, &refinement).await;
+                self.end(claim, succeeded(job, refinement, estimate)).await?;
+            }
             Err(Stopped::NoLongerOurs) => {}
             Err(Stopped::ShuttingDown) => {
                 let why = "the server was stopped".to_owned();
@@ -147,6 +154,27 @@ impl Worker {
         }
     }
 
+    /// The first of the refined order, and how sure it is.
+    async fn estimate(&self, record: &JobRecord, refinement: &Refinement) -> Option<Estimate> {
+        let first = refinement.ranking.first()?;
+        let calibration = match self.maps.map(&record.job.map).await {
+            Ok(Some(map)) if map.uid == record.map_uid => self.maps.calibration(&map).await,
+            _ => Ok(None),
+        };
+        let calibration = calibration.ok().flatten().unwrap_or_default();
+        let confidence = calibration.refined_confidence(
+            &record.candidates,
+            &first.image_id,
+            refinement.evidence,
+        );
+        Some(Estimate {
+            image_id: first.image_id.clone(),
+            pose: first.pose,
+            confidence,
+            known: f64::from(confidence) >= self.settings.known_confidence,
+        })
+    }
+
     async fn end(&self, claim: Claim, job: Job) -> Result<(), StoreError> {
         self.metrics.job_ended(&job);
         self.jobs.finish(claim, job).await
@@ -175,13 +203,14 @@ fn after(pause: Duration) -> Timestamp {
     Timestamp::now().saturating_add(pause).unwrap_or(Timestamp::MAX)
 }
 
-fn succeeded(job: Job, refinement: Refinement) -> Job {
-    let Refinement { descriptions, ranking, reasoning, usage, degraded } = refinement;
+fn succeeded(job: Job, refinement: Refinement, estimate: Option<Estimate>) -> Job {
+    let Refinement { descriptions, ranking, reasoning, usage, degraded, .. } = refinement;
     Job {
         state: if degraded.is_some() { JobState::Degraded } else { JobState::Succeeded },
         finished_at: Some(Timestamp::now()),
         descriptions,
         ranking: Some(ranking),
+        estimate,
         reasoning,
         usage: job.usage + usage,
         error: degraded,

@@ -21,6 +21,8 @@ pub enum ErrorKind {
     Unprocessable,
     /// A queue is full.
     Overloaded,
+    /// The disk is full.
+    Full,
     /// The service is starting or draining.
     Unavailable,
     /// The service failed.
@@ -65,6 +67,7 @@ impl From<StoreError> for ServiceError {
             StoreError::NotFound(_) => ErrorKind::NotFound,
             StoreError::Conflict(_) | StoreError::Superseded(_) => ErrorKind::Conflict,
             StoreError::QueueFull { .. } => ErrorKind::Overloaded,
+            StoreError::Full { .. } => ErrorKind::Full,
             StoreError::Failed(_) | StoreError::Damaged(_) => ErrorKind::Internal,
         };
         let advice = match &error {

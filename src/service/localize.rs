@@ -11,7 +11,8 @@ use uuid::Uuid;
 
 use super::images::empty_body;
 use super::{ErrorKind, SUPERSEDED, Service, ServiceError};
-use crate::domain::{Candidate, Digest, ImageId, Job, JobState, Map, MapName, Pose, Priority};
+use crate::domain::confidence::COMPARED;
+use crate::domain::{Candidate, Digest, Estimate, Job, JobState, Map, MapName, Priority};
 use crate::refine::DenseKey;
 use crate::retrieve::Extraction;
 use crate::retrieve::index::SearchMode;
@@ -66,20 +67,6 @@ pub struct Answer {
     pub timing_ms: TimingMs,
 }
 
-/// The best guess of where the frame was taken.
-#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
-pub struct Estimate {
-    /// The image that shows the place.
-    pub image_id: ImageId,
-    /// Its pose, if known.
-    pub pose: Option<Pose>,
-    /// The image's cosine similarity to the frame, from 0 (none) to 1.
-    pub confidence: f32,
-    /// Whether the confidence reaches the configured bound, below which the place is probably not
-    /// in the map.
-    pub known: bool,
-}
-
 /// Where to find a job.
 #[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 pub struct JobLink {
@@ -132,7 +119,8 @@ impl Service {
             // Before any work is done: a robot that needs no job asks without one.
             return Err(StoreError::QueueFull { limit: self.settings.job_queue }.into());
         }
-        let wanted = if refined { k.max(self.settings.candidates) } else { k };
+        let compared = if refined { self.settings.candidates } else { 0 };
+        let wanted = k.max(compared).max(COMPARED);
         let Retrieved { map, model, extraction, mut candidates, searched } =
             self.retrieve(&request.map, &request.frame, wanted, SearchMode::Fast).await?;
         let kept = self.refiner.as_ref().filter(|refiner| refiner.wants_descriptor());
@@ -153,13 +141,13 @@ impl Service {
             let compared = candidates.iter().take(self.settings.candidates).cloned().collect();
             job = Some(self.submit(&map, query, compared, request.frame, request.priority).await?);
         }
+        let mut estimate = self.estimate(&map, &candidates).await?;
         candidates.truncate(k);
-        let mut estimate = candidates.first().map(|best| self.estimate(best));
         if request.refine == RefineMode::Wait
             && let Some(queued) = &mut job
         {
             *queued = self.wait_for(queued.id, self.settings.max_wait).await?;
-            estimate = self.refined_estimate(queued, &candidates).or(estimate);
+            estimate = queued.estimate.clone().or(estimate);
         }
         let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
         Ok(Answer {
@@ -221,21 +209,20 @@ impl Service {
         )))
     }
 
-    fn estimate(&self, best: &Candidate) -> Estimate {
-        Estimate {
-            image_id: best.image_id.clone(),
-            pose: best.pose,
-            confidence: best.similarity.max(0.0),
-            known: best.similarity >= self.settings.known_similarity,
-        }
-    }
-
-    /// The refined first place; only if it is among the candidates answered has it a similarity
-    /// to report.
-    fn refined_estimate(&self, job: &Job, candidates: &[Candidate]) -> Option<Estimate> {
-        let first = job.ranking.as_ref()?.first()?;
-        let best = candidates.iter().find(|candidate| candidate.image_id == first.image_id)?;
-        Some(self.estimate(best))
+    /// The first candidate, and how sure it is.
+    async fn estimate(
+        &self,
+        map: &Map,
+        candidates: &[Candidate],
+    ) -> Result<Option<Estimate>, ServiceError> {
+        let Some(first) = candidates.first() else { return Ok(None) };
+        let confidence = self.confidence(map, candidates, &first.image_id).await?;
+        Ok(Some(Estimate {
+            image_id: first.image_id.clone(),
+            pose: first.pose,
+            confidence,
+            known: f64::from(confidence) >= self.settings.known_confidence,
+        }))
     }
 
     async fn submit(

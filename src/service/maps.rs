@@ -6,7 +6,7 @@ use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::models::dimension;
-use super::{ErrorKind, Reindex, SUPERSEDED, Service, ServiceError};
+use super::{CalibrationState, ErrorKind, Reindex, SUPERSEDED, Service, ServiceError};
 use crate::domain::{DescriptorKind, Digest, Frame, Map, MapName, Precision, Scene};
 use crate::store::{IndexState, StoreError};
 
@@ -61,6 +61,10 @@ pub struct MapState {
     #[serde(default)]
     #[schema(nullable)]
     pub reindex: Option<Reindex>,
+    /// What confidence rests on; null until it is measured, a moment after images were added.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub calibration: Option<CalibrationState>,
     /// What a person wrote about it.
     pub description: Option<String>,
     /// When it was created.
@@ -188,6 +192,7 @@ impl Service {
         // Looked up after that: when a reindex has succeeded, the map shows it.
         let map = self.known_map(name).await?;
         let IndexState { images, graph, behind } = self.maps.index_state(&map).await?;
+        let calibration = self.maps.calibration(&map).await?;
         let index = match (graph, behind) {
             (false, _) => IndexKind::Exact,
             (true, true) => IndexKind::Building,
@@ -204,6 +209,7 @@ impl Service {
             dim: map.dim,
             images,
             index,
+            calibration: calibration.as_deref().map(CalibrationState::from),
             description: map.description,
             reindex,
             created_at: map.created_at,

@@ -3,6 +3,7 @@
 //! HTTP and the command line convert to and from these calls and decide nothing. A [`Service`]
 //! knows the stores by their traits alone.
 
+mod calibration;
 mod error;
 mod events;
 mod images;
@@ -15,16 +16,16 @@ mod usage;
 
 use std::sync::Arc;
 
+pub use self::calibration::CalibrationState;
 pub use self::error::{ErrorKind, ServiceError};
 pub use self::events::{JobEvent, JobStatus, PairDescribed};
 pub use self::images::{ImageMeta, ImagePage, NewImage};
 pub use self::jobs::JobPage;
-pub use self::localize::{
-    Answer, Estimate, JobLink, LocalizeRequest, RefineMode, Retrieved, TimingMs,
-};
+pub use self::localize::{Answer, JobLink, LocalizeRequest, RefineMode, Retrieved, TimingMs};
 pub use self::maps::{IndexKind, MapChange, MapState};
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
 pub use self::usage::{Today, Total, UsageReport};
+use crate::domain::CalibrationSettings;
 use crate::refine::DenseCache;
 use crate::refine::Refiner;
 use crate::retrieve::{CpuPool, LoadedModels};
@@ -38,8 +39,10 @@ pub struct ServiceSettings {
     pub k: usize,
     /// Candidates in an answer at the most.
     pub max_k: usize,
-    /// The least similarity of a known place.
-    pub known_similarity: f32,
+    /// The least confidence of a known place.
+    pub known_confidence: f64,
+    /// How maps are measured.
+    pub calibration: CalibrationSettings,
     /// Candidates that a job compares.
     pub candidates: usize,
     /// Jobs that may wait or run.

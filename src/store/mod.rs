@@ -5,6 +5,8 @@
 
 pub mod embedded;
 
+use std::sync::Arc;
+
 use async_trait::async_trait;
 use bytes::Bytes;
 use jiff::Timestamp;
@@ -14,8 +16,8 @@ use tokio::sync::broadcast;
 use uuid::Uuid;
 
 use crate::domain::{
-    Candidate, DayUsage, Description, Descriptor, Digest, Image, ImageId, Job, JobState, Map,
-    MapName, MediaType, Usage,
+    Calibration, CalibrationSettings, Candidate, DayUsage, Description, Descriptor, Digest, Image,
+    ImageId, Job, JobState, Map, MapName, MediaType, Usage,
 };
 use crate::retrieve::index::SearchMode;
 
@@ -36,6 +38,17 @@ pub enum StoreError {
     QueueFull {
         /// The bound.
         limit: usize,
+    },
+    /// The disk has less room left than is kept free.
+    #[error(
+        "the disk of the data folder is full: {free} bytes are free, and data.min_free_bytes keeps \
+         {kept} of them; make room, or delete images or maps"
+    )]
+    Full {
+        /// Bytes that are free.
+        free: u64,
+        /// The bound.
+        kept: u64,
     },
     /// The disk or the database failed.
     #[error("the store failed: {0}")]
@@ -100,6 +113,28 @@ pub trait MapStore: Send + Sync {
         k: usize,
         mode: SearchMode,
     ) -> Result<Vec<Candidate>, StoreError>;
+
+    /// Images spread over the map, each with the `k` images of other places that are most like it. See
+    /// [`CalibrationSettings`] for what is another place and how many there are.
+    async fn look_alikes(
+        &self,
+        map: &Map,
+        settings: CalibrationSettings,
+        k: usize,
+    ) -> Result<Vec<LookAlikes>, StoreError>;
+    /// What was last measured in this revision of the map. It is derived: it may be lost.
+    async fn calibration(&self, map: &Map) -> Result<Option<Arc<Calibration>>, StoreError>;
+    /// Keeps what was measured.
+    async fn put_calibration(&self, map: &Map, measured: Calibration) -> Result<(), StoreError>;
+}
+
+/// An image as if it were a frame of another place.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LookAlikes {
+    /// The image.
+    pub image_id: ImageId,
+    /// Images of other places, the most similar first.
+    pub others: Vec<Candidate>,
 }
 
 /// Where the descriptors of a map are made anew while the old ones serve.

@@ -230,6 +230,20 @@ fn places_that_are_not_in_the_map_say_what_known_is_worth() {
     assert!((0.0..=1.0).contains(&auc) && known["at_95"]["recall"].as_f64().unwrap() >= 0.95);
 }
 
+#[test]
+fn what_is_held_out_is_unknown() {
+    let folders = Folders::town(12);
+    let summary = folders.eval(&["--refine", "off", "--hold-out", "0.25"]);
+    let counts = ["queries", "unknown", "references"].map(|name| summary[name].clone());
+    assert_eq!(counts, [9, 3, 9].map(Value::from));
+    let called = &summary["methods"][0]["known"]["called"];
+    assert_eq!(called["threshold"], 0.9);
+    assert!(called["right"].is_number() && called["unknown"].is_number(), "{called}");
+    let refused = folders.command(&["--hold-out", "1"]).output().unwrap();
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("from 0 to below 1"));
+}
+
 /// Corridor or tower, where the photographs are at hand.
 fn photographs(set: &str, [database, queries]: [&str; 2], args: &[&str]) -> Option<Value> {
     let folder = data(set)?;

@@ -22,7 +22,9 @@ async fn a_map_image_finds_itself_and_all_fields_are_there() {
 
     assert_eq!(answer["estimate"]["image_id"], "place-4");
     assert_eq!(answer["estimate"]["pose"], json!({"lat": 45.004, "lon": 7.0, "heading": 90.0}));
-    assert_eq!(answer["estimate"]["known"], true);
+    // See confidence.rs.
+    assert!(answer["estimate"]["confidence"].is_number());
+    assert!(answer["estimate"]["known"].is_boolean());
     assert_eq!((&answer["map"], &answer["model"]), (&json!("m"), &json!("xfeat")));
     let job = &answer["job"];
     assert_eq!(job["href"], format!("/jobs/{}", job["id"].as_str().unwrap()));
@@ -62,4 +64,5 @@ async fn waiting_for_the_refinement_returns_an_ended_job() {
     assert_eq!(answer["job"]["state"], "succeeded");
     let job = server.get(answer["job"]["href"].as_str().unwrap()).await.expect(200);
     assert_eq!(answer["estimate"]["image_id"], job["ranking"][0]["image_id"]);
+    assert_eq!(answer["estimate"], job["estimate"]);
 }

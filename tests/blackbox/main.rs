@@ -13,6 +13,7 @@ mod support;
 
 mod bad_input;
 mod cli;
+mod confidence;
 mod demo;
 mod dinov2;
 mod durability;

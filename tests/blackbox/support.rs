@@ -34,11 +34,18 @@ impl Server {
     /// Starts a server and waits until it says that it is ready. `settings` are environment
     /// variables, such as `("WHEREABOUTS_JOBS__QUEUE", "1")`.
     pub fn start(data: &Path, settings: &[(&str, &str)]) -> Self {
+        Self::try_start(data, settings)
+            .unwrap_or_else(|log| panic!("the server did not start: {log}"))
+    }
+
+    /// The same; gives the log of a server that does not start.
+    pub fn try_start(data: &Path, settings: &[(&str, &str)]) -> Result<Self, String> {
         // reqwest has no cryptography of its own; the binary chooses the same.
         let _ = rustls::crypto::ring::default_provider().install_default();
         // Connections are not kept, so that a drain never waits for an idle one.
         let http = reqwest::Client::builder().pool_max_idle_per_host(0).build().unwrap();
-        let address_file = data.with_extension("address");
+        let address_file =
+            std::env::temp_dir().join(format!("whereabouts-{}.address", uuid::Uuid::now_v7()));
         let mut child = Command::new(BINARY)
             .args(["serve", "--listen", "127.0.0.1:0", "--data"])
             .arg(data)
@@ -53,10 +60,11 @@ impl Server {
             .spawn()
             .unwrap();
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
-        let log = Arc::new(Mutex::new(Vec::new()));
+        let log = Arc::new(Mutex::new(Vec::<String>::new()));
         loop {
             let Some(Ok(line)) = lines.next() else {
-                panic!("the server did not start: {:#?}", log.lock().unwrap());
+                child.wait().unwrap();
+                return Err(log.lock().unwrap().join("\n"));
             };
             let ready = line.contains(r#""message":"ready""#);
             log.lock().unwrap().push(line);
@@ -69,7 +77,8 @@ impl Server {
             lines.map_while(Result::ok).for_each(|line| kept.lock().unwrap().push(line));
         });
         let address = std::fs::read_to_string(&address_file).unwrap();
-        Self { child, url: format!("http://{}", address.trim()), log, http }
+        std::fs::remove_file(&address_file).unwrap();
+        Ok(Self { child, url: format!("http://{}", address.trim()), log, http })
     }
 
     pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
@@ -101,7 +110,12 @@ impl Server {
     /// A map of the first `places` places of the town.
     pub async fn town(&self, map: &str, places: usize) {
         self.put(&format!("/maps/{map}"), json!({"scene": "outdoor"})).await.expect(201);
-        for place in 0..places {
+        self.town_more(map, 0..places).await;
+    }
+
+    /// More places of the town.
+    pub async fn town_more(&self, map: &str, places: std::ops::Range<usize>) {
+        for place in places {
             let path =
                 format!("/maps/{map}/images?id=place-{place}&lat=45.{place:03}&lon=7&heading=90");
             self.post_jpeg(&path, reference(place)).await.expect(201);

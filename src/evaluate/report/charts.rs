@@ -90,7 +90,7 @@ fn draw_curves(curves: &[Vec<Point>], out: &mut String) -> fmt::Result {
     Ok(())
 }
 
-/// How many first answers of each similarity are true and how many false, with a line at `threshold`.
+/// How many first answers of each confidence are true and how many false, with a line at `threshold`.
 pub fn histogram(first: &[First], threshold: Option<f64>) -> String {
     let mut out = String::new();
     let _ = draw_histogram(first, threshold, &mut out);
@@ -113,8 +113,8 @@ fn draw_histogram(first: &[First], threshold: Option<f64>, out: &mut String) -> 
     let most = most.next_multiple_of(4) as f64;
     open(
         out,
-        "Similarity of true and false first answers",
-        ("similarity of the first answer", &|share| format!("{:.2}", low + share * span)),
+        "Confidence in true and false first answers",
+        ("confidence in the first answer", &|share| format!("{:.2}", low + share * span)),
         ("queries", &|share| format!("{:.0}", share * most)),
     )?;
     let width = (across(1.0) - across(0.0)) / BINS as f64;

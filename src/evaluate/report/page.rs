@@ -158,7 +158,7 @@ fn curves(
             method.name
         )?;
     }
-    out.push_str("Taking the most similar first answers first.</figcaption></figure>\n");
+    out.push_str("Taking the surest first answers first.</figcaption></figure>\n");
     for (method, first) in summary.methods.iter().zip(&first) {
         let suggested = method.known.suggested;
         out.push_str("<figure>");

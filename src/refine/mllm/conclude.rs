@@ -25,6 +25,7 @@ pub(super) fn conclude(
     Ok(Refinement {
         descriptions: findings.described.iter().map(|pair| pair.of(candidates)).collect(),
         ranking,
+        evidence: None,
         reasoning: verdict.map(|verdict| verdict.reasoning),
         usage: work.usage(),
         degraded: (!degraded.is_empty()).then(|| degraded.join("; ")),

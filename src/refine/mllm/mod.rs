@@ -55,9 +55,9 @@ use self::flight::Flights;
 use self::pictures::Pictures;
 use self::retry::CallError;
 use super::{Progress, RefineError, Refinement, Refiner};
-use crate::domain::{DayUsage, Map, RefinerKind, Usage, utc_day};
+use crate::domain::{DayUsage, Evidence, Map, RefinerKind, Usage, utc_day};
 use crate::retrieve::ImageLimits;
-use crate::store::{BlobStore, JobRecord, MapStore, UsageStore};
+use crate::store::{BlobStore, JobRecord, LookAlikes, MapStore, UsageStore};
 use crate::telemetry::Metrics;
 
 /// What an [`MllmRefiner`] works with.
@@ -193,6 +193,14 @@ impl Refiner for MllmRefiner {
             },
             cache: self.cache.levels(),
         })
+    }
+
+    /// Of the jobs that fall back.
+    async fn chance(&self, map: &Map, asked: &LookAlikes) -> Result<Option<Evidence>, RefineError> {
+        match &self.fallback {
+            Some(fallback) => fallback.chance(map, asked).await,
+            None => Ok(None),
+        }
     }
 
     async fn refine(

@@ -17,6 +17,8 @@ use crate::domain::Digest;
 #[derive(Clone)]
 pub(super) struct Blobs {
     dir: PathBuf,
+    /// Bytes of the disk that stay free, so that records can still be written and deleted.
+    min_free: u64,
     /// Bytes that were put and may not be referred to yet, with how many callers wait for that.
     pinned: Arc<Mutex<HashMap<Digest, usize>>>,
 }
@@ -40,9 +42,23 @@ impl Drop for Pin {
 }
 
 impl Blobs {
-    pub fn open(dir: PathBuf) -> Result<Self, StoreError> {
+    pub fn open(dir: PathBuf, min_free: u64) -> Result<Self, StoreError> {
         make_folder(&dir)?;
-        Ok(Self { dir, pinned: Arc::default() })
+        Ok(Self { dir, min_free, pinned: Arc::default() })
+    }
+
+    /// Nearly every change begins with the bytes of a picture, so this guards the whole folder.
+    fn check_room(&self, bytes: usize) -> Result<(), StoreError> {
+        let free = fs2::available_space(&self.dir).map_err(|error| {
+            StoreError::Failed(format!(
+                "cannot look at the disk of {}: {error}",
+                self.dir.display()
+            ))
+        })?;
+        if free < self.min_free.saturating_add(bytes as u64) {
+            return Err(StoreError::Full { free, kept: self.min_free });
+        }
+        Ok(())
     }
 
     /// Stores bytes durably; the pin is taken first, so that nobody removes them in between.
@@ -54,6 +70,7 @@ impl Blobs {
         if fs::metadata(&path).is_ok_and(|found| found.len() == bytes.len() as u64) {
             return Ok(pin);
         }
+        self.check_room(bytes.len())?;
         write_durably(&path, bytes).map_err(|error| {
             StoreError::Failed(format!("cannot store {}: {error}", path.display()))
         })?;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use async_trait::async_trait;
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use sled::Transactional;
 use tokio::sync::broadcast;
 use uuid::Uuid;
@@ -116,6 +116,11 @@ impl JobStore for EmbeddedStore {
         lease_until: Timestamp,
     ) -> Result<Option<JobRecord>, StoreError> {
         let inner = Arc::clone(&self.inner);
+        // Looking costs no commit, and workers look every second.
+        let looking = Arc::clone(&inner);
+        if !blocking(move || some_may_be_taken(&looking.trees, now)).await? {
+            return Ok(None);
+        }
         self.inner
             .writer
             .commit(
@@ -219,12 +224,30 @@ fn no_job(id: Uuid) -> StoreError {
     StoreError::NotFound(format!("there is no job {id}"))
 }
 
+/// No job is held or kept waiting longer than this, budgets of a day included. An entry that says so
+/// was written before the clock was set back.
+const LONGEST_LEASE: SignedDuration = SignedDuration::from_hours(25);
+
+/// Whether an entry of the queue keeps its job from being taken.
+fn is_held(lease: &[u8], now: Timestamp) -> Result<bool, StoreError> {
+    let longest = now.saturating_add(LONGEST_LEASE).unwrap_or(Timestamp::MAX);
+    Ok(decode::<Lease>(lease)?.is_some_and(|until| until > now && until <= longest))
+}
+
+fn some_may_be_taken(trees: &Trees, now: Timestamp) -> Result<bool, StoreError> {
+    for lease in trees.queue.iter().values() {
+        if !is_held(&lease.map_err(failed)?, now)? {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
 /// The first job in the queue that may be taken.
 fn next_waiting(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, StoreError> {
     for entry in trees.queue.iter() {
         let (key, lease) = entry.map_err(failed)?;
-        let held = decode::<Lease>(&lease)?.is_some_and(|until| until > now);
-        if held {
+        if is_held(&lease, now)? {
             continue;
         }
         match queued_job(&key).map(|id| trees.job(id)).transpose()?.flatten() {
@@ -258,4 +281,21 @@ fn write_job(trees: &Trees, record: &JobRecord, queue: Option<Lease>) -> Result<
             Ok(())
         })
         .map_err(transaction_failed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lease_from_before_the_clock_was_set_back_holds_nothing() {
+        let now: Timestamp = "2026-05-04T12:00:00Z".parse().unwrap();
+        let held = |until: Option<&str>| {
+            let lease: Lease = until.map(|until| until.parse().unwrap());
+            is_held(&encode(&lease).unwrap(), now).unwrap()
+        };
+        assert!(held(Some("2026-05-04T12:00:01Z")) && held(Some("2026-05-05T00:00:00Z")));
+        assert!(!held(None) && !held(Some("2026-05-04T11:59:59Z")));
+        assert!(!held(Some("2027-05-04T12:00:00Z")));
+    }
 }

@@ -4,18 +4,19 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
-use super::super::StoreError;
+use super::super::{LookAlikes, StoreError};
 use super::blobs::replace_durably;
 use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
-use crate::domain::{Candidate, ImageId, Map, Pose};
-use crate::retrieve::index::{IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
+use crate::domain::{Calibration, CalibrationSettings, Candidate, ImageId, Map, Pose};
+use crate::retrieve::index::{Found, IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
 
 pub(super) struct LiveMap {
     /// The map as stored; scene and description may change.
     map: RwLock<Map>,
     pub vectors: Arc<VectorFiles>,
     pub index: MapIndex,
+    pub calibration: KeptCalibration,
     /// The sealed graph, so that a start need not build it again.
     graph_file: PathBuf,
     entries: RwLock<Vec<Option<Entry>>>,
@@ -63,6 +64,7 @@ impl LiveMap {
             map: RwLock::new(map),
             vectors: Arc::new(vectors),
             index: MapIndex::new(index),
+            calibration: KeptCalibration::open(&folder),
             graph_file: folder.join("graph"),
             entries: RwLock::default(),
             next_slot: AtomicUsize::new(0),
@@ -150,7 +152,10 @@ impl LiveMap {
     }
 
     pub fn search(&self, query: &[f32], k: usize, mode: SearchMode) -> Vec<Candidate> {
-        let found = self.index.search(self.vectors.as_ref(), query, k, mode);
+        self.candidates(&self.index.search(self.vectors.as_ref(), query, k, mode))
+    }
+
+    fn candidates(&self, found: &[Found]) -> Vec<Candidate> {
         let entries = self.entries.read().unwrap_or_else(PoisonError::into_inner);
         found
             .iter()
@@ -165,6 +170,94 @@ impl LiveMap {
                 pose: entry.pose,
             })
             .collect()
+    }
+
+    /// Images spread over the map, each with the `k` most similar ones of other places.
+    pub fn look_alikes(&self, settings: CalibrationSettings, k: usize) -> Vec<LookAlikes> {
+        let places: Vec<Place> = {
+            let entries = self.entries.read().unwrap_or_else(PoisonError::into_inner);
+            let known = entries.iter().enumerate();
+            let known = known.filter_map(|(slot, entry)| Some((slot, entry.as_ref()?)));
+            known.map(|(slot, entry)| Place { slot, pose: entry.pose }).collect()
+        };
+        let near = settings.place_images_of(places.len());
+        let step = places.len().div_ceil(settings.images.max(1)).max(1);
+        let asked = (0..places.len()).step_by(step);
+        asked.filter_map(|at| self.look_alikes_of(&places, at, near, settings.place_m, k)).collect()
+    }
+
+    /// `None` for an image that is no longer there.
+    fn look_alikes_of(
+        &self,
+        places: &[Place],
+        at: usize,
+        near: usize,
+        metres: f64,
+        k: usize,
+    ) -> Option<LookAlikes> {
+        let asked = &places[at];
+        let of_another_place = |found: &Found| {
+            // Where it stands in the order of addition.
+            let position = places.partition_point(|place| place.slot < found.slot);
+            let pose = places.get(position).and_then(|place| place.pose);
+            let distance = asked.pose.zip(pose).and_then(|(a, b)| a.distance_m(&b));
+            position.abs_diff(at) > near && distance.is_none_or(|distance| distance > metres)
+        };
+        let mut descriptor = Vec::new();
+        self.vectors
+            .scan(asked.slot..asked.slot + 1, &mut |_, numbers| descriptor = numbers.to_vec());
+        // Twice as many, until enough of them are of other places.
+        let mut wanted = k + 2 * near + 1;
+        let others: Vec<Found> = loop {
+            let found =
+                self.index.search(self.vectors.as_ref(), &descriptor, wanted, SearchMode::Fast);
+            let all = found.len() < wanted;
+            let others: Vec<Found> = found.into_iter().filter(of_another_place).take(k).collect();
+            if others.len() == k || all {
+                break others;
+            }
+            wanted *= 2;
+        };
+        let image_id = self.entries.read().unwrap_or_else(PoisonError::into_inner);
+        let image_id = image_id.get(asked.slot)?.as_ref()?.id.clone();
+        Some(LookAlikes { image_id, others: self.candidates(&others) })
+    }
+}
+
+/// Where an image is, and where it was taken from.
+struct Place {
+    slot: usize,
+    pose: Option<Pose>,
+}
+
+/// What was last measured in the map, beside its descriptors.
+pub(super) struct KeptCalibration {
+    file: PathBuf,
+    known: RwLock<Option<Arc<Calibration>>>,
+}
+
+impl KeptCalibration {
+    /// What an earlier process measured; if it cannot be read it is measured again.
+    fn open(folder: &Path) -> Self {
+        let file = folder.join("calibration.json");
+        let known = std::fs::read(&file).ok().and_then(|json| serde_json::from_slice(&json).ok());
+        Self { file, known: RwLock::new(known) }
+    }
+
+    pub fn get(&self) -> Option<Arc<Calibration>> {
+        self.known.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    pub fn put(&self, measured: Calibration) {
+        let beside = self.file.with_extension("tmp");
+        let kept = serde_json::to_vec(&measured)
+            .map_err(std::io::Error::from)
+            .and_then(|json| replace_durably(&self.file, &beside, &json));
+        if let Err(error) = kept {
+            // The next start measures again.
+            tracing::warn!(file = %self.file.display(), %error, "a calibration cannot be kept");
+        }
+        *self.known.write().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(measured));
     }
 }
 

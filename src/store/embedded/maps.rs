@@ -8,7 +8,7 @@ use bytes::Bytes;
 use sled::Transactional;
 use uuid::Uuid;
 
-use super::super::{Added, BlobPin, BlobStore, IndexState, MapStore, StoreError};
+use super::super::{Added, BlobPin, BlobStore, IndexState, LookAlikes, MapStore, StoreError};
 use super::blobs::Blobs;
 use super::live_map::{LiveMap, folder_of};
 use super::trees::{
@@ -16,7 +16,9 @@ use super::trees::{
     transaction_failed,
 };
 use super::{EmbeddedStore, Inner, blocking};
-use crate::domain::{Candidate, Descriptor, Digest, Image, ImageId, Map, MapName};
+use crate::domain::{
+    Calibration, CalibrationSettings, Candidate, Descriptor, Digest, Image, ImageId, Map, MapName,
+};
 use crate::retrieve::index::SearchMode;
 
 /// Images removed in one transaction when a whole map goes.
@@ -262,6 +264,29 @@ impl MapStore for EmbeddedStore {
             )));
         }
         blocking(move || Ok(live.search(query.as_slice(), k, mode))).await
+    }
+
+    async fn look_alikes(
+        &self,
+        map: &Map,
+        settings: CalibrationSettings,
+        k: usize,
+    ) -> Result<Vec<LookAlikes>, StoreError> {
+        let live = self.inner.live_revision(map)?;
+        blocking(move || Ok(live.look_alikes(settings, k))).await
+    }
+
+    async fn calibration(&self, map: &Map) -> Result<Option<Arc<Calibration>>, StoreError> {
+        Ok(self.inner.live_revision(map)?.calibration.get())
+    }
+
+    async fn put_calibration(&self, map: &Map, measured: Calibration) -> Result<(), StoreError> {
+        let live = self.inner.live_revision(map)?;
+        blocking(move || {
+            live.calibration.put(measured);
+            Ok(())
+        })
+        .await
     }
 }
 

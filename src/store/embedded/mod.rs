@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! DATA/lock              held while a process uses the folder
+//! DATA/commits           the number of the last commit, to notice a database that lost some
 //! DATA/db/               sled: records of maps, images, queries and jobs
 //! DATA/descriptors/UID/  append-only segments of one map's descriptors, memory-mapped; UID-N/ from
 //!                        its Nth reindex on
@@ -18,6 +19,7 @@ mod indexer;
 mod jobs;
 mod live_map;
 mod maps;
+mod mark;
 mod segments;
 mod trees;
 mod usage;
@@ -38,6 +40,7 @@ pub use self::descriptions::DescriptionBounds;
 use self::descriptions::DescriptionUse;
 use self::indexer::Indexer;
 use self::live_map::LiveMap;
+use self::mark::CommitMark;
 use self::trees::Trees;
 use self::writer::Writer;
 use super::StoreError;
@@ -53,6 +56,8 @@ pub struct EmbeddedSettings {
     pub index: IndexSettings,
     /// Threads that build graphs.
     pub index_threads: usize,
+    /// Bytes of the disk that stay free.
+    pub min_free_bytes: u64,
     /// Memory for sled's page cache, in bytes.
     pub db_cache_bytes: u64,
     /// The most changes that are made durable together.
@@ -96,9 +101,10 @@ impl EmbeddedStore {
         make_folder(dir)?;
         let lock = lock(dir)?;
         let trees = Trees::open(&dir.join("db"), settings.db_cache_bytes)?;
+        let mark = CommitMark::open(dir, &trees)?;
         let descriptors = dir.join("descriptors");
         make_folder(&descriptors)?;
-        let blobs = Blobs::open(dir.join("images"))?;
+        let blobs = Blobs::open(dir.join("images"), settings.min_free_bytes)?;
         maps::sweep_deleted(&trees, &blobs, &descriptors)?;
         let mut loaded = BTreeMap::new();
         for map in trees.maps()? {
@@ -111,7 +117,7 @@ impl EmbeddedStore {
         usage::forget_before(&trees, today.saturating_sub(kept))?;
         let queued = trees.requeue_claimed()?;
         let inner = Inner {
-            writer: Writer::start(trees.clone(), settings.commit_batch)?,
+            writer: Writer::start(trees.clone(), mark, settings.commit_batch)?,
             indexer: Indexer::start(settings.index_threads)?,
             descriptions: DescriptionUse::load(&trees, settings.descriptions)?,
             trees,

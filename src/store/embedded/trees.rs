@@ -31,6 +31,9 @@ pub(super) struct Trees {
     pub usage: sled::Tree,
 }
 
+/// The key of the number of the last commit, in the default tree.
+const COMMITS: &[u8] = b"commits";
+
 /// An image and where its descriptor is.
 #[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 pub(super) struct StoredImage {
@@ -74,6 +77,15 @@ impl Trees {
     /// Makes every change so far durable.
     pub fn flush(&self) -> Result<(), StoreError> {
         self.db.flush().map(drop).map_err(failed)
+    }
+
+    /// The number of the last commit; 0 in a new database.
+    pub fn commit_number(&self) -> Result<u64, StoreError> {
+        Ok(get(&self.db, COMMITS)?.unwrap_or(0))
+    }
+
+    pub fn set_commit_number(&self, number: u64) -> Result<(), StoreError> {
+        put(&self.db, COMMITS, &number)
     }
 
     pub fn maps(&self) -> Result<Vec<Map>, StoreError> {

@@ -5,6 +5,7 @@ use std::thread;
 use tokio::sync::{mpsc, oneshot};
 
 use super::super::StoreError;
+use super::mark::CommitMark;
 use super::segments::VectorFiles;
 use super::trees::Trees;
 use std::sync::Arc;
@@ -27,11 +28,11 @@ pub(super) struct Touched {
 
 impl Writer {
     /// Starts the thread; it ends when the writer is dropped and the queue is empty.
-    pub fn start(trees: Trees, batch: usize) -> Result<Self, StoreError> {
+    pub fn start(trees: Trees, mark: CommitMark, batch: usize) -> Result<Self, StoreError> {
         let (queue, changes) = mpsc::channel(batch.max(1));
         thread::Builder::new()
             .name("store-writer".into())
-            .spawn(move || run(&trees, changes, batch.max(1)))
+            .spawn(move || run(&trees, mark, changes, batch.max(1)))
             .map_err(|error| StoreError::Failed(error.to_string()))?;
         Ok(Self { queue })
     }
@@ -61,7 +62,7 @@ impl Writer {
     }
 }
 
-fn run(trees: &Trees, mut changes: mpsc::Receiver<Change>, batch: usize) {
+fn run(trees: &Trees, mut mark: CommitMark, mut changes: mpsc::Receiver<Change>, batch: usize) {
     while let Some(first) = changes.blocking_recv() {
         let mut touched = Touched::default();
         let mut waiting = vec![first(trees, &mut touched)];
@@ -70,7 +71,7 @@ fn run(trees: &Trees, mut changes: mpsc::Receiver<Change>, batch: usize) {
         {
             waiting.push(change(trees, &mut touched));
         }
-        let flushed = sync(trees, &touched);
+        let flushed = sync(trees, &touched, &mut mark);
         if let Err(error) = &flushed {
             tracing::error!(%error, "changes could not be made durable");
         }
@@ -83,7 +84,10 @@ fn run(trees: &Trees, mut changes: mpsc::Receiver<Change>, batch: usize) {
     }
 }
 
-fn sync(trees: &Trees, touched: &Touched) -> Result<(), StoreError> {
+fn sync(trees: &Trees, touched: &Touched, mark: &mut CommitMark) -> Result<(), StoreError> {
     touched.vectors.iter().try_for_each(|vectors| vectors.sync())?;
-    trees.flush()
+    mark.next(trees)?;
+    trees.flush()?;
+    mark.note();
+    Ok(())
 }

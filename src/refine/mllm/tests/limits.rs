@@ -23,6 +23,7 @@ impl Refiner for Reverse {
         Ok(Refinement {
             descriptions: vec![],
             ranking: Ranking::new(&record.candidates, &order).unwrap(),
+            evidence: None,
             reasoning: None,
             usage: Usage::default(),
             degraded: None,

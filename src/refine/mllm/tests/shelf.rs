@@ -14,12 +14,12 @@ use super::super::mock_mllm::{MockMllm, Script};
 use super::super::settings::tests::defaults;
 use super::*;
 use crate::domain::{
-    Candidate, DayUsage, Descriptor, DescriptorKind, Digest, Frame, Image, ImageId, Job, Map,
-    MapName, MediaType, Precision, RefinerKind, StandIn,
+    Calibration, CalibrationSettings, Candidate, DayUsage, Descriptor, DescriptorKind, Digest,
+    Frame, Image, ImageId, Job, Map, MapName, MediaType, Precision, RefinerKind, StandIn,
 };
 use crate::retrieve::decode::encode_jpeg;
 use crate::retrieve::index::SearchMode;
-use crate::store::{Added, BlobPin, IndexState, Query, Step, StoreError};
+use crate::store::{Added, BlobPin, IndexState, LookAlikes, Query, Step, StoreError};
 
 /// The key that every call must carry.
 pub const KEY: &str = "sk-test-5c1f";
@@ -215,6 +215,23 @@ impl MapStore for Shelf {
         _: usize,
         _: SearchMode,
     ) -> Result<Vec<Candidate>, StoreError> {
+        not_here()
+    }
+
+    async fn look_alikes(
+        &self,
+        _: &Map,
+        _: CalibrationSettings,
+        _: usize,
+    ) -> Result<Vec<LookAlikes>, StoreError> {
+        not_here()
+    }
+
+    async fn calibration(&self, _: &Map) -> Result<Option<Arc<Calibration>>, StoreError> {
+        not_here()
+    }
+
+    async fn put_calibration(&self, _: &Map, _: Calibration) -> Result<(), StoreError> {
         not_here()
     }
 }

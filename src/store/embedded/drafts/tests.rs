@@ -24,6 +24,7 @@ fn settings(dir: &Path) -> EmbeddedSettings {
             max_dead_share: 0.5,
         },
         index_threads: 1,
+        min_free_bytes: 0,
         db_cache_bytes: 1 << 20,
         commit_batch: 8,
         descriptions: DescriptionBounds { max_bytes: 1 << 20, max_age: Duration::from_secs(60) },

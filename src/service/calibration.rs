@@ -1,0 +1,152 @@
+//! Measures in each map how far chance resemblance goes; see [`crate::domain::confidence`].
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use tokio_util::sync::CancellationToken;
+use utoipa::ToSchema;
+use uuid::Uuid;
+
+use super::{Service, ServiceError};
+use crate::domain::confidence::{COMPARED, Chance};
+use crate::domain::{Calibration, Candidate, Evidence, ImageId, Map};
+use crate::refine::{RefineError, Refiner};
+use crate::store::{IndexState, LookAlikes};
+
+/// How often it is looked for maps that have changed.
+const LOOK: Duration = Duration::from_millis(500);
+
+/// The pause when those who refine jobs have no time, and how often that may happen for one image.
+const PAUSE: Duration = Duration::from_millis(200);
+const PAUSES: usize = 300;
+
+/// A map is measured again when its number of images has changed by one in so many.
+const CHANGED: usize = 5;
+
+/// What confidence in a map rests on.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize, ToSchema)]
+pub struct CalibrationState {
+    /// Images that the map had when it was measured.
+    pub images: usize,
+    /// Images that were asked as if they were frames: the confidence of an answer at once is at most
+    /// n / (n + 1).
+    pub asked: usize,
+    /// Of these, how many were refined too: the same for a refined answer. Where it is 0, the
+    /// confidence of a refined answer rests on similarity.
+    pub refined: usize,
+}
+
+impl From<&Calibration> for CalibrationState {
+    fn from(known: &Calibration) -> Self {
+        Self { images: known.images, asked: known.similarity.len(), refined: known.agreement.len() }
+    }
+}
+
+impl Service {
+    /// Measures maps when their images have changed, until `shutdown`.
+    pub async fn keep_calibrated(&self, shutdown: CancellationToken) {
+        let mut seen = BTreeMap::new();
+        loop {
+            tokio::select! {
+                () = shutdown.cancelled() => return,
+                () = tokio::time::sleep(LOOK) => {}
+            }
+            let measured = tokio::select! {
+                () = shutdown.cancelled() => return,
+                measured = self.calibrate_settled(&mut seen) => measured,
+            };
+            if let Err(error) = measured {
+                // A map was removed or reindexed meanwhile; the next look sees to it.
+                tracing::debug!(%error, "a map could not be measured");
+            }
+        }
+    }
+
+    /// Measures the maps that need it and have as many images as at the last look.
+    async fn calibrate_settled(
+        &self,
+        seen: &mut BTreeMap<Uuid, usize>,
+    ) -> Result<(), ServiceError> {
+        let maps = self.maps.maps().await?;
+        seen.retain(|uid, _| maps.iter().any(|map| map.uid == *uid));
+        for map in maps {
+            let IndexState { images, .. } = self.maps.index_state(&map).await?;
+            let settled = seen.insert(map.uid, images) == Some(images);
+            if settled && self.is_due(&map, images).await? {
+                self.calibrate(&map, self.refiner.as_deref()).await?;
+            }
+        }
+        Ok(())
+    }
+
+    async fn is_due(&self, map: &Map, images: usize) -> Result<bool, ServiceError> {
+        let Some(known) = self.maps.calibration(map).await? else { return Ok(images > 1) };
+        Ok(known.settings != self.settings.calibration
+            || known.images.abs_diff(images) * CHANGED > known.images)
+    }
+
+    /// Measures a map: first by similarity, which takes a moment, then by what `refiner` says. What is
+    /// measured counts at once.
+    pub async fn calibrate(
+        &self,
+        map: &Map,
+        refiner: Option<&dyn Refiner>,
+    ) -> Result<(), ServiceError> {
+        let settings = self.settings.calibration;
+        let IndexState { images, .. } = self.maps.index_state(map).await?;
+        let asked = self.maps.look_alikes(map, settings, COMPARED.max(settings.candidates)).await?;
+        let similarity = Chance::from(values(asked.iter().filter_map(|asked| {
+            Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
+        })));
+        let mut measured = Calibration { images, settings, similarity, ..Calibration::default() };
+        self.maps.put_calibration(map, measured.clone()).await?;
+        if let Some(refiner) = refiner {
+            let step = asked.len().div_ceil(settings.refined.max(1)).max(1);
+            let mut found = Vec::new();
+            for mut asked in asked.into_iter().step_by(step) {
+                asked.others.truncate(settings.candidates);
+                found.extend(chance(refiner, map, &asked).await);
+            }
+            measured.agreement = Chance::from(values(found.into_iter()));
+        }
+        tracing::info!(
+            map = %map.name, images, asked = measured.similarity.len(),
+            refined = measured.agreement.len(), "measured what chance resemblance is like"
+        );
+        Ok(self.maps.put_calibration(map, measured).await?)
+    }
+
+    /// How sure it is that one of the candidates of a frame shows its place.
+    pub(super) async fn confidence(
+        &self,
+        map: &Map,
+        candidates: &[Candidate],
+        of: &ImageId,
+    ) -> Result<f32, ServiceError> {
+        let known = self.maps.calibration(map).await?;
+        Ok(known.map_or(0.0, |known| known.refined_confidence(candidates, of, None)))
+    }
+}
+
+fn values(evidence: impl Iterator<Item = Evidence>) -> Vec<f32> {
+    evidence
+        .map(|evidence| match evidence {
+            Evidence::Similarity(value) | Evidence::Agreement(value) => value,
+        })
+        .collect()
+}
+
+/// What speaks for the first of these, which are all wrong. Jobs go first.
+async fn chance(refiner: &dyn Refiner, map: &Map, asked: &LookAlikes) -> Option<Evidence> {
+    for _ in 0..PAUSES {
+        match refiner.chance(map, asked).await {
+            Ok(evidence) => return evidence,
+            Err(RefineError::Passing(_) | RefineError::Later { .. }) => {
+                tokio::time::sleep(PAUSE).await;
+            }
+            Err(RefineError::Hopeless(_)) => return None,
+        }
+    }
+    None
+}

@@ -1,0 +1,71 @@
+//! How far the record database has come, noted beside it.
+//!
+//! sled takes a damaged place in its log for the end of it, and goes on with what is before. That is
+//! right for the torn end of a power cut, where nothing was acknowledged, and silent loss everywhere
+//! else. So commits are numbered: the number goes into the database with every commit, and into
+//! `DATA/commits` afterwards. A database that is behind that file has lost what was acknowledged.
+
+use std::fs::File;
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use super::super::StoreError;
+use super::trees::Trees;
+
+/// The number of the last commit.
+pub(super) struct CommitMark {
+    path: PathBuf,
+    file: File,
+    number: u64,
+}
+
+impl CommitMark {
+    /// Holds the database against the file.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if the database is behind.
+    pub fn open(dir: &Path, trees: &Trees) -> Result<Self, StoreError> {
+        let path = dir.join("commits");
+        let failed = |error: io::Error| {
+            StoreError::Failed(format!("cannot use {}: {error}", path.display()))
+        };
+        let mut file = File::options()
+            .create(true)
+            .truncate(false)
+            .read(true)
+            .write(true)
+            .open(&path)
+            .map_err(failed)?;
+        let mut text = String::new();
+        file.read_to_string(&mut text).map_err(failed)?;
+        // One that was never written to its end says nothing.
+        let noted = text.trim().parse().unwrap_or(0);
+        let number = trees.commit_number()?;
+        if number < noted {
+            return Err(StoreError::Damaged(format!(
+                "{} has lost changes that were acknowledged: it ends at commit {number} of {noted}, \
+                 so its files were damaged. Restore a backup into another folder; or remove {} to go \
+                 on with what is left",
+                dir.join("db").display(),
+                path.display()
+            )));
+        }
+        Ok(Self { path, file, number })
+    }
+
+    /// Numbers the changes that are about to be made durable.
+    pub fn next(&mut self, trees: &Trees) -> Result<(), StoreError> {
+        self.number += 1;
+        trees.set_commit_number(self.number)
+    }
+
+    /// Notes that they are. It need not be on disk: a note that is late only sees less.
+    pub fn note(&mut self) {
+        let text = format!("{:020}\n", self.number);
+        let written =
+            self.file.seek(SeekFrom::Start(0)).and_then(|_| self.file.write_all(text.as_bytes()));
+        if let Err(error) = written {
+            tracing::warn!(file = %self.path.display(), %error, "a commit cannot be noted");
+        }
+    }
+}

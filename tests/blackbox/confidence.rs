@@ -1,0 +1,71 @@
+//! How sure the service says it is, and what that is worth.
+
+use std::time::Duration;
+
+use serde_json::Value;
+
+use super::support::{Server, frame, server};
+
+const PLACES: usize = 40;
+const ASKED: usize = 20;
+
+/// Waits until a map is measured as it now is.
+async fn calibrated(server: &Server, images: usize) -> Value {
+    loop {
+        let map = server.get("/maps/m").await.expect(200);
+        let calibration = &map["calibration"];
+        if calibration["images"] == images && calibration["refined"] != 0 {
+            return calibration.clone();
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// The confidence at once and after refinement, for frames of these places.
+async fn confidences(server: &Server, places: std::ops::Range<usize>) -> Vec<[f64; 2]> {
+    let mut found = Vec::new();
+    for place in places {
+        let answer = server.post_jpeg("/localize?map=m", frame(place, 0)).await.expect(200);
+        let href = answer["job"]["href"].as_str().unwrap();
+        let job = server.get(&format!("{href}?wait=60")).await.expect(200);
+        found.push([&answer, &job].map(|told| {
+            let confidence = told["estimate"]["confidence"].as_f64().unwrap();
+            assert_eq!(told["estimate"]["known"], confidence >= 0.9);
+            confidence
+        }));
+    }
+    found
+}
+
+#[tokio::test]
+async fn frames_of_the_map_are_known_and_those_from_elsewhere_are_not() {
+    let (_dir, server) = server();
+    server.town("m", PLACES).await;
+    let calibration = calibrated(&server, PLACES).await;
+    assert_eq!(calibration["asked"], PLACES);
+    let known = |answers: &[[f64; 2]], which: usize| {
+        answers.iter().filter(|answer| answer[which] >= 0.9).count()
+    };
+    let mapped = confidences(&server, 0..ASKED).await;
+    let unmapped = confidences(&server, 500..500 + ASKED).await;
+    // The promise is a tenth; twenty frames can be unlucky.
+    for which in [0, 1] {
+        assert!(known(&unmapped, which) <= 5, "{unmapped:?}");
+    }
+    assert!(known(&mapped, 1) >= ASKED * 7 / 10, "{mapped:?}");
+}
+
+#[tokio::test]
+async fn confidence_is_0_before_anything_is_measured_and_is_measured_again_when_a_map_grows() {
+    let (_dir, server) = server();
+    server.town("m", 1).await;
+    let answer = server.post_jpeg("/localize?map=m&refine=off", frame(0, 0)).await.expect(200);
+    assert_eq!(
+        (&answer["estimate"]["confidence"], &answer["estimate"]["known"]),
+        (&0.0.into(), &false.into())
+    );
+    server.town_more("m", 1..12).await;
+    calibrated(&server, 12).await;
+    server.town_more("m", 12..24).await;
+    calibrated(&server, 24).await;
+}
