@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino test crash lint format bench openapi clean
+.PHONY: help demo build assets nasm openvino test crash lint format bench load openapi clean
 
 help: ## Say what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -39,6 +39,9 @@ format: ## Format the code
 
 bench: build ## Measure all that is about speed, each against its peers; gets those, some gigabytes
 	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked --bench '*'
+
+load: build ## Offer ten times what the server can do, and check how it bears that
+	$(CARGO) bench --locked --bench overload
 
 openapi: build ## Write docs/openapi.json anew from the handlers
 	$(BINARY) openapi > docs/openapi.json

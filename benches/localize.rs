@@ -6,15 +6,16 @@
 //! `cargo bench --bench localize -- MODEL` takes another model than xfeat; WHEREABOUTS_MODEL__ASSETS
 //! says where it is, if it is not among the checkout's assets.
 
-use std::io::{BufRead, BufReader};
-use std::process::{Child, Command, Stdio};
+#[path = "support/server.rs"]
+mod server;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::Context;
 use futures_util::{TryStreamExt, stream};
 use serde_json::Value;
+use server::Server;
 use whereabouts::config::{Config, Overrides};
 use whereabouts::demo::{Town, TownSpec};
 use whereabouts::domain::DescriptorKind;
@@ -141,30 +142,7 @@ impl std::fmt::Display for Load {
     }
 }
 
-struct Server {
-    child: Child,
-    url: String,
-    http: reqwest::Client,
-}
-
 impl Server {
-    fn start(model: &str, data: &std::path::Path) -> anyhow::Result<Self> {
-        let address_file = data.join("address");
-        let mut child = Command::new(env!("CARGO_BIN_EXE_whereabouts"))
-            .args(["serve", "--model", model, "--listen", "127.0.0.1:0", "--data"])
-            .arg(data.join("data"))
-            .arg("--address-file")
-            .arg(&address_file)
-            .env("WHEREABOUTS_LOG__FORMAT", "json")
-            .stderr(Stdio::piped())
-            .spawn()?;
-        let mut log = BufReader::new(child.stderr.take().context("no log")?).lines();
-        while !log.next().context("the server ended")??.contains("\"ready\"") {}
-        std::thread::spawn(move || log.for_each(drop));
-        let address = std::fs::read_to_string(address_file)?;
-        Ok(Self { child, url: format!("http://{}", address.trim()), http: reqwest::Client::new() })
-    }
-
     /// Adds the town's images, by as many clients as `whereabouts index` has.
     async fn index(&self, town: &Town, batch: f64) -> anyhow::Result<()> {
         const CLIENTS: usize = 8;
@@ -229,12 +207,5 @@ impl Server {
             answered.iter().map(|(_, share)| share).sum::<f64>() / answered.len() as f64;
         let times = answered.into_iter().map(|(time, _)| time).collect();
         Ok(Load { times: Times::new(times, took), inference_share })
-    }
-}
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }

@@ -2,6 +2,8 @@
 //!
 //! Defaults (`deploy/whereabouts.toml`) < the file of `--config` < environment < flags.
 
+mod server;
+
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -10,10 +12,11 @@ use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
+pub use self::server::Server;
 use crate::domain::{Precision, RefinerKind};
 use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
-use crate::retrieve::{Layout, Provider, Wanted};
+use crate::retrieve::{AdmissionSettings, Layout, Provider, Wanted};
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
@@ -44,24 +47,6 @@ pub struct Config {
     pub mllm: MllmSettings,
     /// Logs.
     pub log: Log,
-}
-
-/// `[server]`
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Server {
-    /// Where to listen.
-    pub listen: SocketAddr,
-    /// The largest request body, in bytes.
-    pub body_limit_bytes: usize,
-    /// The longest request, in seconds.
-    pub request_timeout_s: u64,
-    /// The most requests in progress.
-    pub max_requests: usize,
-    /// The most event streams that are open.
-    pub max_streams: usize,
-    /// The longest drain, in seconds.
-    pub drain_timeout_s: u64,
 }
 
 /// `[data]`
@@ -192,8 +177,14 @@ pub struct Image {
     pub max_pixels: u64,
     /// Decoding threads; 0 for one a core.
     pub threads: usize,
+    /// Pictures in work at a time; 0 for as many as keep decoding and inference busy.
+    pub permits: usize,
     /// Pictures that may wait.
     pub queue: usize,
+    /// For how long, in milliseconds.
+    pub max_wait_ms: u64,
+    /// The longest Retry-After, in seconds.
+    pub max_retry_after_s: u64,
     /// Whether every pixel of a large JPEG is decoded before it is scaled down.
     pub exact: bool,
 }
@@ -248,6 +239,8 @@ pub struct Confidence {
 pub struct Jobs {
     /// Jobs that may wait or run.
     pub queue: usize,
+    /// The share of `image.queue` from which frames get no job.
+    pub shed_at: f64,
     /// Jobs refined side by side.
     pub workers: usize,
     /// The lease of a job, in seconds.
@@ -421,12 +414,20 @@ impl Config {
             ("server.body_limit_bytes", self.server.body_limit_bytes),
             ("server.max_requests", self.server.max_requests),
             ("server.max_streams", self.server.max_streams),
+            ("server.max_connections", self.server.max_connections),
+            ("server.max_headers", self.server.max_headers),
+            ("server.header_timeout_s", self.server.header_timeout_s as usize),
+            ("server.body_timeout_s", self.server.body_timeout_s as usize),
+            ("server.body_pause_s", self.server.body_pause_s as usize),
+            ("server.write_timeout_s", self.server.write_timeout_s as usize),
             ("data.usage_days", self.data.usage_days as usize),
             ("data.commit_batch", self.data.commit_batch),
             ("model.max_batch", self.model.max_batch),
             ("model.download_attempts", self.model.download_attempts as usize),
             ("model.download_stall_s", self.model.download_stall_s as usize),
             ("image.queue", self.image.queue),
+            ("image.max_wait_ms", self.image.max_wait_ms as usize),
+            ("image.max_retry_after_s", self.image.max_retry_after_s as usize),
             ("index.m", self.index.m),
             ("index.ef_construction", self.index.ef_construction),
             ("index.ef_search", self.index.ef_search),
@@ -466,6 +467,12 @@ impl Config {
         {
             return Some(why);
         }
+        if let Some(why) = self.server.contradiction() {
+            return Some(why);
+        }
+        if !(0.0..=1.0).contains(&self.jobs.shed_at) {
+            return Some("jobs.shed_at must be from 0 to 1".into());
+        }
         if self.jobs.lease_s <= self.jobs.timeout_s {
             return Some(format!(
                 "jobs.lease_s ({}) must outlast jobs.timeout_s ({}), or two workers would refine \
@@ -494,15 +501,20 @@ impl Model {
     }
 }
 
-impl Server {
-    /// The longest request.
-    pub fn request_timeout(&self) -> Duration {
-        Duration::from_secs(self.request_timeout_s)
-    }
-
-    /// The longest drain.
-    pub fn drain_timeout(&self) -> Duration {
-        Duration::from_secs(self.drain_timeout_s)
+impl Image {
+    /// Bounds on the pictures in work and waiting, where inference has this layout.
+    pub fn admission(&self, layout: Layout) -> AdmissionSettings {
+        let permits = match self.permits {
+            // Each thread decodes one, and twice as many as are inferred have been decoded.
+            0 => cores_unless(self.threads) + 2 * layout.sessions * layout.max_batch,
+            permits => permits,
+        };
+        AdmissionSettings {
+            permits,
+            queue: self.queue,
+            max_wait: Duration::from_millis(self.max_wait_ms),
+            max_retry_after: Duration::from_secs(self.max_retry_after_s),
+        }
     }
 }
 
@@ -541,6 +553,13 @@ mod tests {
     #[test]
     fn a_lease_shorter_than_the_job_is_refused() {
         let error = with_file("[jobs]\nlease_s = 10\ntimeout_s = 10").unwrap_err().to_string();
+        assert!(error.contains("must outlast"), "{error}");
+    }
+
+    #[test]
+    fn a_body_that_may_take_longer_than_its_request_is_refused() {
+        let file = "[server]\nbody_timeout_s = 30\nrequest_timeout_s = 30";
+        let error = with_file(file).unwrap_err().to_string();
         assert!(error.contains("must outlast"), "{error}");
     }
 

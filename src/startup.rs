@@ -13,12 +13,12 @@ use tokio_util::sync::CancellationToken;
 
 use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
 use crate::domain::{CalibrationSettings, utc_day};
-use crate::http::{AppState, HttpSettings, router};
+use crate::http::{AppState, Connections, HttpSettings, router};
 use crate::refine::local::{LocalMatcher, LocalSettings};
 use crate::refine::mllm::{MllmParts, MllmRefiner};
-use crate::refine::{DenseCache, LocalRefiner, Refiner, Worker, WorkerSettings};
+use crate::refine::{DenseCache, JobPace, LocalRefiner, Refiner, Worker, WorkerSettings};
 use crate::retrieve::index::IndexSettings;
-use crate::retrieve::{Assets, CpuPool, ExtractorSettings, ImageLimits};
+use crate::retrieve::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
 use crate::service::{Reindexes, Service, ServiceSettings};
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
@@ -35,12 +35,12 @@ pub async fn serve(
     let address = listener.local_addr().context("the listener has no address")?;
     let metrics = Arc::new(Metrics::new());
     let state = AppState::new(http_settings(&config), Arc::clone(&metrics));
-    let server = {
-        let (router, shutdown) = (router(state.clone()), shutdown.clone());
-        tokio::spawn(async move {
-            axum::serve(listener, router).with_graceful_shutdown(shutdown.cancelled_owned()).await
-        })
+    let connections = Connections {
+        settings: config.server.connections(),
+        router: router(state.clone()),
+        metrics: Arc::clone(&metrics),
     };
+    let server = tokio::spawn(connections.serve(listener, shutdown.clone()));
     let drain_timeout = config.server.drain_timeout();
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
     let (service, workers) = building.await.context("the start broke off")??;
@@ -67,7 +67,7 @@ pub async fn serve(
         served
     };
     match tokio::time::timeout(drain_timeout, drained).await {
-        Ok(served) => served.context("the server broke off")?.context("the server failed")?,
+        Ok(served) => served.context("the server broke off")?,
         Err(_) => tracing::warn!(
             seconds = drain_timeout.as_secs(),
             "requests were still in progress when the drain timed out"
@@ -80,6 +80,9 @@ pub async fn serve(
 fn http_settings(config: &Config) -> HttpSettings {
     HttpSettings {
         body_limit_bytes: config.server.body_limit_bytes,
+        bodies_limit_bytes: config.server.bodies_limit_bytes,
+        body_timeout: Duration::from_secs(config.server.body_timeout_s),
+        body_pause: Duration::from_secs(config.server.body_pause_s),
         request_timeout: config.server.request_timeout(),
         max_wait: Duration::from_secs(config.jobs.max_wait_s),
         max_requests: config.server.max_requests,
@@ -112,7 +115,10 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
         usage_days: config.data.usage_days,
     })?);
     let (models, why) = models(config)?;
-    let pool = CpuPool::new("frames", cores_unless(config.image.threads), config.image.queue)?;
+    let admission = config.image.admission(config.model.layout());
+    // Whoever comes to the pool has a permit, so that it need not refuse anybody.
+    let pool = CpuPool::new("frames", cores_unless(config.image.threads), admission.permits)?;
+    let job_pace = JobPace::default();
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
     let local = Arc::new(LocalRefiner {
         maps: store.clone(),
@@ -149,12 +155,14 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
             maps: store.clone(),
             refiner: Arc::clone(refiner),
             metrics: Arc::clone(&metrics),
+            pace: Arc::clone(&job_pace),
             settings: WorkerSettings {
                 lease: Duration::from_secs(config.jobs.lease_s),
                 timeout: Duration::from_secs(config.jobs.timeout_s),
                 attempts: config.jobs.attempts,
                 retry_pause: Duration::from_secs(config.jobs.retry_pause_s),
                 known_confidence: config.localize.known_confidence,
+                side_by_side: config.jobs.workers,
             },
         })
     });
@@ -167,7 +175,9 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
         jobs,
         accounts: store.clone(),
         models,
+        admission: Admission::new(admission),
         pool,
+        job_pace,
         refiner,
         dense,
         metrics,
@@ -184,6 +194,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
             },
             candidates: config.refine.compared(),
             job_queue: config.jobs.queue,
+            shed_jobs_at: config.jobs.shed_at,
             max_wait: Duration::from_secs(config.jobs.max_wait_s),
             usage_days: config.data.usage_days,
         },

@@ -1,5 +1,7 @@
 //! Logs and metrics.
 
+mod refused;
+
 use std::io::IsTerminal;
 use std::sync::atomic::AtomicU64;
 use std::time::Duration;
@@ -12,10 +14,11 @@ use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::Registry;
 use tracing_subscriber::EnvFilter;
 
+pub use self::refused::RefusedFor;
 use crate::config::{Log, LogFormat};
 use crate::domain::Job;
 use crate::refine::mllm::MllmLevels;
-use crate::retrieve::StageTimes;
+use crate::retrieve::{AdmissionLevels, StageTimes};
 
 /// Starts logging to standard error. A second call changes nothing.
 pub fn init_logs(log: &Log) -> Result<(), String> {
@@ -56,6 +59,11 @@ pub struct Metrics {
     mllm_money_today: Gauge<f64, AtomicU64>,
     map_images: Family<MapLabels, Gauge>,
     dense_cache_bytes: Gauge<f64, AtomicU64>,
+    refused: Family<RefusedLabels, Counter>,
+    permits: Gauge,
+    permits_in_use: Gauge,
+    waiting: Family<ClassLabels, Gauge>,
+    connections: Gauge,
 }
 
 /// What came of looking for a pair's description.
@@ -78,6 +86,8 @@ pub struct Levels {
     pub queued: usize,
     /// Bytes of cached dense features.
     pub dense_cache_bytes: usize,
+    /// Pictures in work and waiting.
+    pub admission: AdmissionLevels,
     /// How the refiner stands, if it asks models outside.
     pub mllm: Option<MllmLevels>,
 }
@@ -126,6 +136,16 @@ struct MapLabels {
     map: String,
 }
 
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct RefusedLabels {
+    reason: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct ClassLabels {
+    class: &'static str,
+}
+
 /// From half a millisecond to about 16 seconds.
 fn latency() -> Histogram {
     Histogram::new(exponential_buckets(0.0005, 2.0, 16))
@@ -160,6 +180,11 @@ impl Metrics {
             mllm_money_today: Gauge::default(),
             map_images: Family::default(),
             dense_cache_bytes: Gauge::default(),
+            refused: Family::default(),
+            permits: Gauge::default(),
+            permits_in_use: Gauge::default(),
+            waiting: Family::default(),
+            connections: Gauge::default(),
         };
         metrics.register();
         metrics
@@ -238,6 +263,27 @@ impl Metrics {
             "Memory held by cached dense features",
             self.dense_cache_bytes.clone(),
         );
+        registry.register(
+            "refused",
+            "Requests, jobs and connections that were refused or broken off, by reason",
+            self.refused.clone(),
+        );
+        registry.register(
+            "permits",
+            "Pictures that may be decoded and inferred at a time",
+            self.permits.clone(),
+        );
+        registry.register(
+            "permits_in_use",
+            "Pictures that are decoded and inferred",
+            self.permits_in_use.clone(),
+        );
+        registry.register(
+            "pictures_waiting",
+            "Pictures that wait for a permit, by what it is for",
+            self.waiting.clone(),
+        );
+        registry.register("connections", "Connections that are open", self.connections.clone());
     }
 
     /// Counts an answered request.
@@ -247,6 +293,21 @@ impl Metrics {
             .get_or_create(&RouteLabels { route: route.clone() })
             .observe(took.as_secs_f64());
         self.requests.get_or_create(&RequestLabels { method: method.into(), route, status }).inc();
+    }
+
+    /// Counts what was refused.
+    pub fn refused(&self, reason: RefusedFor) {
+        self.refused.get_or_create(&RefusedLabels { reason: reason.as_str() }).inc();
+    }
+
+    /// Counts a connection that was opened.
+    pub fn connection_opened(&self) {
+        self.connections.inc();
+    }
+
+    /// Counts a connection that was closed.
+    pub fn connection_closed(&self) {
+        self.connections.dec();
     }
 
     /// Counts the stages of one extraction.
@@ -304,6 +365,14 @@ impl Metrics {
         }
         self.queued_jobs.set(levels.queued as i64);
         self.dense_cache_bytes.set(levels.dense_cache_bytes as f64);
+        let AdmissionLevels { permits, in_use, localize, index, background } = levels.admission;
+        self.permits.set(permits as i64);
+        self.permits_in_use.set(in_use as i64);
+        for (class, waiting) in
+            [("localize", localize), ("index", index), ("background", background)]
+        {
+            self.waiting.get_or_create(&ClassLabels { class }).set(waiting as i64);
+        }
         if let Some(mllm) = levels.mllm {
             self.mllm_suspended.set(mllm.suspended.into());
             self.mllm_tokens_today.set(mllm.spent_today.tokens as i64);

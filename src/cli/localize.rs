@@ -47,8 +47,8 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     print_answer(&answer);
     if let Some(link) = &answer.job {
         print_job(&client.json(client.get(&link.href)).await?);
-    } else if args.refine {
-        println!("no refinement: the map is empty, or the server runs with --refiner off");
+    } else if let Some(why) = &answer.no_job {
+        println!("no refinement: {}", why.detail);
     }
     Ok(())
 }

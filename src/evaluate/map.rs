@@ -9,6 +9,7 @@ use futures_util::{StreamExt, TryStreamExt};
 
 use super::{Evaluator, PictureFile};
 use crate::domain::{DescriptorKind, Digest, ImageId, Map, MapName};
+use crate::retrieve::Demand;
 use crate::service::{ImageMeta, IndexKind, MapChange, NewImage, Service};
 
 /// The map of the references.
@@ -82,9 +83,12 @@ impl Evaluator<'_> {
             None => {}
         }
         let meta = ImageMeta { id: Some(picture.id.to_string()), ..ImageMeta::default() };
-        self.service.add_image(map, NewImage { bytes, meta }).await.with_context(|| {
-            format!("{} cannot be a reference; repair it or take it out of the folder", named())
-        })?;
+        self.service
+            .add_image(map, NewImage { bytes, meta, demand: Demand::BACKGROUND })
+            .await
+            .with_context(|| {
+                format!("{} cannot be a reference; repair it or take it out of the folder", named())
+            })?;
         Ok(digest)
     }
 }

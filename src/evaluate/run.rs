@@ -16,6 +16,7 @@ use super::outcome::Kept;
 use super::{Answered, Dataset, EvaluatedQuery, MethodOutcomes, Outcome, Times};
 use crate::domain::{Calibration, DescriptorKind, Digest, Job, Map, RefinerKind, Scene, Usage};
 use crate::refine::{DenseKey, Progress, RefineError, Refinement, Refiner};
+use crate::retrieve::Demand;
 use crate::retrieve::index::SearchMode;
 use crate::service::{Retrieved, Service};
 use crate::store::{JobRecord, Query, Step};
@@ -162,7 +163,7 @@ impl Evaluator<'_> {
         let wanted = self.settings.k.max(LEAST_ANSWERS);
         let retrieved = self
             .service
-            .retrieve(&map.name, &frame, wanted, self.settings.search)
+            .retrieve(&map.name, &frame, wanted, self.settings.search, Demand::BACKGROUND)
             .await
             .with_context(named)?;
         let coarse = coarse(query, digest, &retrieved, calibration);

@@ -8,10 +8,11 @@ use bytes::{Bytes, BytesMut};
 use futures_util::StreamExt;
 use serde::de::DeserializeOwned;
 
-use super::guard::{discard, too_large};
+use super::guard::{discard, throw_away, too_large};
 use super::problem::Problem;
 use super::state::AppState;
-use crate::service::ErrorKind;
+use crate::retrieve::Demand;
+use crate::service::{ErrorKind, Service};
 
 /// The query string.
 pub(super) struct Params<T>(pub T);
@@ -65,10 +66,18 @@ pub(super) struct PictureBody {
     pub meta: Option<Bytes>,
 }
 
-impl FromRequest<AppState> for PictureBody {
-    type Rejection = Problem;
-
-    async fn from_request(request: Request, state: &AppState) -> Result<Self, Problem> {
+impl PictureBody {
+    /// Reads a picture that there is room for; else it is refused before it has come.
+    pub async fn read(
+        request: Request,
+        state: &AppState,
+        service: &Service,
+        demand: Demand,
+    ) -> Result<Self, Problem> {
+        if let Err(refused) = service.check_admission(demand) {
+            throw_away(request);
+            return Err(refused.into());
+        }
         match body_type(request.headers())? {
             BodyType::Raw => Ok(Self { picture: whole(request, state).await?, meta: None }),
             BodyType::Form => from_form(request, state).await,

@@ -5,15 +5,18 @@ use std::time::{Duration, Instant};
 
 use axum::body::BodyDataStream;
 use axum::extract::{MatchedPath, Request, State};
-use axum::http::header::{CONNECTION, CONTENT_LENGTH};
+use axum::http::header::{CONNECTION, CONTENT_LENGTH, EXPECT};
 use axum::http::{HeaderName, HeaderValue};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt;
 
+use super::deadline::{self, Deadline};
+use super::incoming::Watch;
 use super::problem::Problem;
 use super::state::AppState;
 use crate::service::ErrorKind;
+use crate::telemetry::RefusedFor;
 
 /// The id of a request: the caller's `x-request-id`, or a fresh one.
 #[derive(Debug, Clone, Default)]
@@ -57,12 +60,18 @@ fn request_id(request: &Request) -> RequestId {
 }
 
 /// Bounds how many requests are in progress, how large they are and how long they take.
-pub(super) async fn bound(State(state): State<AppState>, request: Request, next: Next) -> Response {
+pub(super) async fn bound(
+    State(state): State<AppState>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let arrival = Instant::now();
     // An operator looks here when the server is overloaded.
     if matches!(request.uri().path(), "/livez" | "/readyz" | "/metrics") {
         return next.run(request).await;
     }
     let Ok(_permit) = Arc::clone(&state.permits).try_acquire_owned() else {
+        state.metrics.refused(RefusedFor::Requests);
         let detail = format!(
             "{} requests are in progress, the bound (server.max_requests); try again in a moment",
             state.settings.max_requests
@@ -74,12 +83,30 @@ pub(super) async fn bound(State(state): State<AppState>, request: Request, next:
     if length.and_then(|length| length.parse::<u64>().ok()).is_some_and(|n| n > limit as u64) {
         return refuse(request, ErrorKind::TooLarge, too_large(limit));
     }
-    let allowed = time_allowed(&state, &request);
-    match tokio::time::timeout(allowed, next.run(request)).await {
-        Ok(response) => response,
-        Err(_) => Problem::new(
+    let wanted_for = match deadline::allowed(request.headers()) {
+        Ok(wanted_for) => wanted_for,
+        Err(problem) => return problem.into_response(),
+    };
+    request.extensions_mut().insert(Deadline(wanted_for.map(|wait| arrival + wait)));
+    let watch = Watch::default();
+    let request = request.map(|body| watch.over(body, &state.settings, &state.bodies_memory));
+    let longest = time_allowed(&state, &request);
+    let allowed = wanted_for.map_or(longest, |wait| wait.min(longest));
+    let answered = tokio::time::timeout(allowed, next.run(request)).await;
+    watch.answered();
+    if let Some((problem, reason)) = watch.problem() {
+        state.metrics.refused(reason);
+        return hanging_up(problem);
+    }
+    match (answered, wanted_for) {
+        (Ok(response), _) => response,
+        (Err(_), Some(wait)) if wait <= longest => {
+            state.metrics.refused(RefusedFor::Deadline);
+            deadline::passed(wait).into_response()
+        }
+        (Err(_), _) => Problem::new(
             ErrorKind::Unavailable,
-            format!("the request took longer than {} s; try again", allowed.as_secs()),
+            format!("the request took longer than {} s; try again", longest.as_secs()),
         )
         .into_response(),
     }
@@ -94,11 +121,23 @@ fn time_allowed(state: &AppState, request: &Request) -> Duration {
     state.settings.request_timeout + if waits { state.settings.max_wait } else { Duration::ZERO }
 }
 
-/// Answers without reading the body. What the client is still sending is thrown away for a while,
-/// or it would see a reset connection instead of the answer.
+/// Answers without reading the body.
 fn refuse(request: Request, kind: ErrorKind, detail: String) -> Response {
-    tokio::spawn(discard(request.into_body().into_data_stream()));
-    let mut response = Problem::new(kind, detail).into_response();
+    throw_away(request);
+    hanging_up(Problem::new(kind, detail))
+}
+
+/// Gives a request up. What the client is still sending is thrown away for a while, or it would see a
+/// reset connection instead of the answer; who asks before it sends is not told to.
+pub(super) fn throw_away(request: Request) {
+    if !request.headers().contains_key(EXPECT) {
+        tokio::spawn(discard(request.into_body().into_data_stream()));
+    }
+}
+
+/// The answer after which the connection is closed.
+fn hanging_up(problem: Problem) -> Response {
+    let mut response = problem.into_response();
     response.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
     response
 }

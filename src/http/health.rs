@@ -67,6 +67,7 @@ impl crate::service::Service {
             maps,
             queued: self.jobs.queued().await?,
             dense_cache_bytes: self.dense.bytes(),
+            admission: self.admission.levels(),
             mllm: self.refiner.as_ref().and_then(|refiner| refiner.levels()),
         });
         self.metrics

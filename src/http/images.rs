@@ -1,6 +1,7 @@
 //! `/maps/{map}/images`.
 
 use axum::Json;
+use axum::extract::{Request, State};
 use axum::http::StatusCode;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::IntoResponse;
@@ -11,10 +12,12 @@ use serde_json::{Map as JsonObject, Value};
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody, Segments};
+use super::deadline::Deadline;
 use super::maps::map_name;
 use super::problem::Problem;
-use super::state::Ready;
+use super::state::{AppState, Ready};
 use crate::domain::{Image, ImageId};
+use crate::retrieve::{Class, Demand};
 use crate::service::{ErrorKind, ImageMeta, ImagePage, NewImage, ServiceError};
 use crate::store::Added;
 
@@ -100,7 +103,10 @@ impl MetaParams {
 /// Either a raw picture, with what is known about it in the query string, or a form with the parts
 /// `image` (the picture) and `meta` (JSON). The same id with the same bytes again is answered 200.
 #[utoipa::path(post, path = "/maps/{map}/images", tag = "images",
-    params(("map" = String, Path), MetaParams),
+    params(("map" = String, Path), MetaParams,
+        ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,
+        description = "How many milliseconds from its arrival the client waits for the answer. After \
+                       504 the image may be stored or not; send it again.")),
     request_body(content(
         (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"),
         (ImageForm = "multipart/form-data"),
@@ -111,18 +117,24 @@ impl MetaParams {
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
         (status = 409, body = Problem, description = "The id is taken by other bytes", content_type = "application/problem+json"),
+        (status = 408, body = Problem, description = "The body came too slowly", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
         (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "Cannot be decoded, or a pose out of range", content_type = "application/problem+json"),
-        (status = 429, body = Problem, description = "Overloaded", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 504, body = Problem, description = "X-Deadline-Ms has passed", content_type = "application/problem+json"),
         (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
     ))]
 pub(super) async fn add_image(
+    State(state): State<AppState>,
     Ready(service): Ready,
     Segments(map): Segments<String>,
     Params(params): Params<MetaParams>,
-    body: PictureBody,
+    Deadline(deadline): Deadline,
+    request: Request,
 ) -> Result<(StatusCode, Json<Image>), Problem> {
+    let demand = Demand { class: Class::Index, deadline };
+    let body = PictureBody::read(request, &state, &service, demand).await?;
     let meta = match body.meta {
         Some(_) if !params.is_empty() => {
             let detail = "say what is known about the image in the part \"meta\" or in the query \
@@ -132,7 +144,7 @@ pub(super) async fn add_image(
         Some(meta) => meta_from_part(&meta)?,
         None => params.into_meta(),
     };
-    let new = NewImage { bytes: body.picture, meta };
+    let new = NewImage { bytes: body.picture, meta, demand };
     Ok(match service.add_image(&map_name(&map)?, new).await? {
         Added::Created(image) => (StatusCode::CREATED, Json(image)),
         Added::Present(image) => (StatusCode::OK, Json(image)),
@@ -208,6 +220,7 @@ pub(super) struct ContentParams {
     params(("map" = String, Path), ("id" = String, Path), ContentParams), responses(
     (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"))),
     (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
+    (status = 429, body = Problem, description = "Overloaded, and max_edge asks for a smaller picture", content_type = "application/problem+json"),
 ))]
 pub(super) async fn image_content(
     Ready(service): Ready,

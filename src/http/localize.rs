@@ -1,14 +1,17 @@
 //! `/localize`.
 
 use axum::Json;
+use axum::extract::{Request, State};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody};
+use super::deadline::Deadline;
 use super::maps::map_name;
 use super::problem::Problem;
-use super::state::Ready;
+use super::state::{AppState, Ready};
 use crate::domain::Priority;
+use crate::retrieve::{Class, Demand};
 use crate::service::{Answer, LocalizeRequest, RefineMode};
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -41,8 +44,14 @@ struct FrameForm {
 /// Localize a frame
 ///
 /// Answers with the most similar images of the map; a job then compares the frame with each of
-/// them and orders them anew.
-#[utoipa::path(post, path = "/localize", tag = "localize", params(LocalizeParams),
+/// them and orders them anew. Under load, jobs are given up before frames: with `refine=async` the
+/// answer comes with `job: null` and a `no_job` that says why, with `refine=wait` it is 429.
+#[utoipa::path(post, path = "/localize", tag = "localize", 
+    params(LocalizeParams, ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,
+        description = "How many milliseconds from its arrival the client waits for the answer. A \
+                       request that cannot be answered in time is refused with 429 at once, and one \
+                       whose time passes is given up with 504. refine=wait then answers in time, \
+                       refined or not.")),
     request_body(content(
         (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"),
         (FrameForm = "multipart/form-data"),
@@ -52,23 +61,31 @@ struct FrameForm {
         (status = 400, body = Problem, description = "Malformed, or an empty body", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
         (status = 409, body = Problem, description = "The map's model is not installed, or is another by now", content_type = "application/problem+json"),
+        (status = 408, body = Problem, description = "The body came too slowly", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
         (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "Cannot be decoded, or k out of range", content_type = "application/problem+json"),
-        (status = 429, body = Problem, description = "Overloaded", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 504, body = Problem, description = "X-Deadline-Ms has passed", content_type = "application/problem+json"),
         (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
     ))]
 pub(super) async fn localize(
+    State(state): State<AppState>,
     Ready(service): Ready,
     Params(params): Params<LocalizeParams>,
-    body: PictureBody,
+    Deadline(deadline): Deadline,
+    request: Request,
 ) -> Result<Json<Answer>, Problem> {
+    let map = map_name(&params.map)?;
+    let demand = Demand { class: Class::Localize, deadline };
+    let body = PictureBody::read(request, &state, &service, demand).await?;
     let request = LocalizeRequest {
-        map: map_name(&params.map)?,
+        map,
         k: params.k,
         refine: params.refine,
         priority: params.priority,
         frame: body.picture,
+        deadline,
     };
     Ok(Json(service.localize(request).await?))
 }

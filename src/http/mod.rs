@@ -1,10 +1,13 @@
 //! HTTP: extract, call the service, convert. No decision about maps or frames is taken here.
 
 mod body;
+mod connections;
+mod deadline;
 mod events;
 mod guard;
 mod health;
 mod images;
+mod incoming;
 mod jobs;
 mod localize;
 mod maps;
@@ -20,6 +23,7 @@ use utoipa::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+pub use connections::{ConnectionSettings, Connections};
 pub use state::{AppState, HttpSettings};
 
 #[derive(OpenApi)]

@@ -26,6 +26,9 @@ pub(super) struct Problem {
     detail: String,
     /// The id of the request, as in the `x-request-id` header and the logs.
     request_id: String,
+    /// When it is worth trying again, in whole seconds.
+    #[serde(skip)]
+    retry_after: Option<u64>,
 }
 
 impl Problem {
@@ -37,6 +40,11 @@ impl Problem {
             status: status.as_u16(),
             detail: detail.into(),
             request_id: String::new(),
+            retry_after: match kind {
+                ErrorKind::Overloaded => Some(1),
+                ErrorKind::Unavailable => Some(2),
+                _ => None,
+            },
         }
     }
 }
@@ -55,6 +63,10 @@ fn status_of(kind: ErrorKind) -> (StatusCode, &'static str, &'static str) {
         }
         ErrorKind::Overloaded => (StatusCode::TOO_MANY_REQUESTS, "overloaded", "Overloaded"),
         ErrorKind::Full => (StatusCode::INSUFFICIENT_STORAGE, "disk-full", "Insufficient storage"),
+        ErrorKind::TooSlow => (StatusCode::REQUEST_TIMEOUT, "too-slow", "Request timeout"),
+        ErrorKind::DeadlinePassed => {
+            (StatusCode::GATEWAY_TIMEOUT, "deadline-passed", "Deadline passed")
+        }
         ErrorKind::Unavailable => {
             (StatusCode::SERVICE_UNAVAILABLE, "unavailable", "Service unavailable")
         }
@@ -66,7 +78,11 @@ fn status_of(kind: ErrorKind) -> (StatusCode, &'static str, &'static str) {
 
 impl From<ServiceError> for Problem {
     fn from(error: ServiceError) -> Self {
-        Self::new(error.kind, error.detail)
+        let mut problem = Self::new(error.kind, error.detail);
+        if let Some(pause) = error.retry_after {
+            problem.retry_after = Some(pause.as_millis().div_ceil(1000) as u64);
+        }
+        problem
     }
 }
 
@@ -89,16 +105,12 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
         tracing::error!(request_id = %id.0, status = problem.status, detail = problem.detail);
     }
     problem.request_id = id.0;
-    let retry_after = match response.status() {
-        StatusCode::TOO_MANY_REQUESTS => Some("1"),
-        StatusCode::SERVICE_UNAVAILABLE => Some("2"),
-        _ => None,
-    };
+    let retry_after = problem.retry_after;
     let mut rendered = (response.status(), Json(problem)).into_response();
     let headers = rendered.headers_mut();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
     if let Some(seconds) = retry_after {
-        headers.insert(RETRY_AFTER, HeaderValue::from_static(seconds));
+        headers.insert(RETRY_AFTER, HeaderValue::from(seconds));
     }
     if let Some(close) = response.headers_mut().remove(axum::http::header::CONNECTION) {
         headers.insert(axum::http::header::CONNECTION, close);

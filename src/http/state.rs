@@ -17,6 +17,12 @@ use crate::telemetry::Metrics;
 pub struct HttpSettings {
     /// The largest body, in bytes.
     pub body_limit_bytes: usize,
+    /// The most memory for all bodies, in bytes.
+    pub bodies_limit_bytes: usize,
+    /// The longest time that a body takes.
+    pub body_timeout: Duration,
+    /// The longest pause within a body.
+    pub body_pause: Duration,
     /// The longest request.
     pub request_timeout: Duration,
     /// By how much a request that waits for a job may take longer.
@@ -34,6 +40,7 @@ pub struct AppState {
     pub(super) metrics: Arc<Metrics>,
     pub(super) permits: Arc<Semaphore>,
     pub(super) streams: Arc<Semaphore>,
+    pub(super) bodies_memory: Arc<Semaphore>,
     service: Arc<OnceLock<Arc<Service>>>,
     draining: CancellationToken,
 }
@@ -44,6 +51,7 @@ impl AppState {
         Self {
             permits: Arc::new(Semaphore::new(settings.max_requests)),
             streams: Arc::new(Semaphore::new(settings.max_streams)),
+            bodies_memory: Arc::new(Semaphore::new(settings.bodies_limit_bytes)),
             settings: Arc::new(settings),
             metrics,
             service: Arc::default(),

@@ -11,6 +11,7 @@ mod local_refiner;
 pub mod mllm;
 mod worker;
 
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -20,7 +21,11 @@ pub use local_refiner::LocalRefiner;
 pub use worker::{Worker, WorkerSettings};
 
 use crate::domain::{Description, Evidence, Map, Ranking, RefinerKind, Usage};
+use crate::retrieve::Pace;
 use crate::store::{JobRecord, LookAlikes, Step, StoreError};
+
+/// How fast jobs are done.
+pub type JobPace = Arc<Mutex<Pace>>;
 
 /// Compares and orders the candidates of one job.
 #[async_trait]

@@ -1,14 +1,14 @@
 //! The worker: takes a job, has it refined, writes down how it ended.
 
-use std::sync::Arc;
-use std::time::Duration;
+use std::sync::{Arc, PoisonError};
+use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast::error::RecvError;
 use tokio_util::sync::CancellationToken;
 
-use super::{Progress, RefineError, Refinement, Refiner};
+use super::{JobPace, Progress, RefineError, Refinement, Refiner};
 use crate::domain::{Estimate, Job, JobState};
 use crate::store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
 use crate::telemetry::Metrics;
@@ -26,6 +26,8 @@ pub struct WorkerSettings {
     pub retry_pause: Duration,
     /// The least confidence of a known place.
     pub known_confidence: f64,
+    /// How many workers there are.
+    pub side_by_side: usize,
 }
 
 /// Refines one job after another.
@@ -38,6 +40,8 @@ pub struct Worker {
     pub refiner: Arc<dyn Refiner>,
     /// What is counted.
     pub metrics: Arc<Metrics>,
+    /// Learns how long jobs take.
+    pub pace: JobPace,
     /// Its patience.
     pub settings: WorkerSettings,
 }
@@ -75,9 +79,10 @@ impl Worker {
         let Some(record) = self.jobs.claim(Timestamp::now(), until).await? else {
             return Ok(false);
         };
-        let (job, claim) = (record.job.clone(), record.claim());
+        let (job, claim, began) = (record.job.clone(), record.claim(), Instant::now());
         match self.refine(&record, shutdown).await {
             Ok(refinement) => {
+                self.record(began.elapsed());
                 let estimate = self.estimate(&record, &refinement).await;
                 self.end(claim, succeeded(job, refinement, estimate)).await?;
             }
@@ -173,6 +178,11 @@ impl Worker {
             confidence,
             known: f64::from(confidence) >= self.settings.known_confidence,
         })
+    }
+
+    fn record(&self, took: Duration) {
+        let mut pace = self.pace.lock().unwrap_or_else(PoisonError::into_inner);
+        pace.record(took, self.settings.side_by_side);
     }
 
     async fn end(&self, claim: Claim, job: Job) -> Result<(), StoreError> {

@@ -142,6 +142,9 @@ pub enum ExtractError {
     /// The model file cannot be read or is not the one that the manifest pins.
     #[error("{0}")]
     ModelFile(String),
+    /// Nobody wanted the answer any more.
+    #[error("the caller has gone")]
+    Abandoned,
 }
 
 impl Extractor {
@@ -186,13 +189,17 @@ impl Extractor {
 
     /// Decodes a picture, runs it through the model and makes its descriptor; blocks.
     pub fn extract(&self, bytes: &[u8], kind: DescriptorKind) -> Result<Extraction, ExtractError> {
-        let Extracting { shown, inferring } = self.begin(bytes)?;
+        let Extracting { shown, inferring } = self.begin(bytes, || true)?;
         self.finish(Inferred { shown, raw: inferring.wait()? }, kind)
     }
 
     /// Decodes a picture and hands it to inference; blocks for the one, and while the queue before
-    /// the other is full.
-    pub fn begin(&self, bytes: &[u8]) -> Result<Extracting, ExtractError> {
+    /// the other is full. What is no longer `wanted` once it is decoded goes no further.
+    pub fn begin(
+        &self,
+        bytes: &[u8],
+        wanted: impl Fn() -> bool,
+    ) -> Result<Extracting, ExtractError> {
         let start = Instant::now();
         let input = &self.manifest.input;
         let needed = if self.exact_decode { Needed::All } else { preprocess::needed(input) };
@@ -200,6 +207,9 @@ impl Extractor {
         let tensor = preprocess(&pixels, (width, height), input)?;
         drop(pixels);
         let cells = self.manifest.output.cells(&tensor);
+        if !wanted() {
+            return Err(ExtractError::Abandoned);
+        }
         let decoded = Instant::now();
         let inferring = self.batcher.submit(tensor)?;
         let decode = decoded - start;

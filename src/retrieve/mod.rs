@@ -2,9 +2,11 @@
 //! descriptor to the most similar ones.
 //!
 //! `decode` → `preprocess` → `batcher` (inference) → `pooling` → `index`, in this order; the
-//! [`Extractor`] strings the first four together. Where descriptors and records are kept is the
+//! [`Extractor`] strings the first four together, for whoever has a permit of the
+//! [`Admission`]. Where descriptors and records are kept is the
 //! business of [`crate::store`].
 
+mod admission;
 mod batcher;
 mod bench;
 pub mod decode;
@@ -13,6 +15,7 @@ pub mod index;
 mod jpeg;
 mod loaded;
 pub mod manifest;
+mod pace;
 mod pool;
 pub mod pooling;
 pub mod preprocess;
@@ -20,6 +23,9 @@ mod provider;
 mod runtime;
 mod session;
 
+pub use admission::{
+    Admission, AdmissionLevels, AdmissionSettings, Class, Demand, Permit, Refusal, Refused,
+};
 pub use batcher::Layout;
 pub use bench::{Bench, BenchRow, BenchSettings, Figures};
 pub use decode::{DecodeError, ImageLimits, Needed, Picture};
@@ -28,6 +34,7 @@ pub use extractor::{
 };
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
+pub use pace::Pace;
 pub use pool::{CpuPool, Overloaded, PoolError};
 pub use provider::{Execution, LEAST_SIMILARITY, Measured, Provider, Trial, Wanted};
 pub use runtime::{AUTO, Assets, BUILT_IN_MODEL, CHOSEN, PREFERRED_MODELS, RuntimeError, WhyModel};

@@ -1,7 +1,9 @@
 //! What can go wrong in a use case, and of which kind it is.
 
+use std::time::Duration;
+
 use crate::domain::{InvalidName, PoseError};
-use crate::retrieve::{ExtractError, Overloaded};
+use crate::retrieve::{ExtractError, Overloaded, Refusal, Refused};
 use crate::store::StoreError;
 
 /// The kinds that a caller can tell apart; HTTP maps each to one status.
@@ -23,6 +25,10 @@ pub enum ErrorKind {
     Overloaded,
     /// The disk is full.
     Full,
+    /// The body came too slowly.
+    TooSlow,
+    /// The caller's deadline has passed.
+    DeadlinePassed,
     /// The service is starting or draining.
     Unavailable,
     /// The service failed.
@@ -37,12 +43,19 @@ pub struct ServiceError {
     pub kind: ErrorKind,
     /// What happened and what to do next.
     pub detail: String,
+    /// When it is worth trying again, where that is known.
+    pub retry_after: Option<Duration>,
 }
 
 impl ServiceError {
     /// An error of the given kind.
     pub fn new(kind: ErrorKind, detail: impl Into<String>) -> Self {
-        Self { kind, detail: detail.into() }
+        Self { kind, detail: detail.into(), retry_after: None }
+    }
+
+    /// The same, with when it is worth trying again.
+    pub fn retry_after(self, pause: Duration) -> Self {
+        Self { retry_after: Some(pause), ..self }
     }
 
     /// The request cannot be read.
@@ -70,17 +83,24 @@ impl From<StoreError> for ServiceError {
             StoreError::Full { .. } => ErrorKind::Full,
             StoreError::Failed(_) | StoreError::Damaged(_) => ErrorKind::Internal,
         };
-        let advice = match &error {
-            StoreError::QueueFull { .. } => "; try again later, or ask with refine=off",
-            _ => "",
-        };
-        Self::new(kind, format!("{error}{advice}"))
+        Self::new(kind, error.to_string())
     }
 }
 
 impl From<Overloaded> for ServiceError {
     fn from(error: Overloaded) -> Self {
         Self::new(ErrorKind::Overloaded, format!("{error}; try again in a moment"))
+    }
+}
+
+impl From<Refused> for ServiceError {
+    fn from(refused: Refused) -> Self {
+        let advice = match refused.reason {
+            Refusal::DeadlineTooSoon => "allow more time, or try again after Retry-After",
+            Refusal::QueueFull | Refusal::WaitTooLong => "try again after Retry-After",
+        };
+        Self::new(ErrorKind::Overloaded, format!("{refused}; {advice}"))
+            .retry_after(refused.retry_after)
     }
 }
 

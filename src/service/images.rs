@@ -6,11 +6,14 @@ use bytes::Bytes;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use tokio_util::sync::CancellationToken;
 use utoipa::ToSchema;
 
 use super::{SUPERSEDED, Service, ServiceError};
 use crate::domain::{DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose};
-use crate::retrieve::{Extraction, Extractor, decode, preprocess};
+use crate::retrieve::{
+    Class, Demand, ExtractError, Extraction, Extractor, PoolError, decode, preprocess,
+};
 use crate::store::{Added, StoreError};
 
 /// What a caller says about an image.
@@ -39,6 +42,8 @@ pub struct NewImage {
     pub bytes: Bytes,
     /// What the caller says about it.
     pub meta: ImageMeta,
+    /// How urgent it is.
+    pub demand: Demand,
 }
 
 /// Some images, by id.
@@ -61,7 +66,8 @@ impl Service {
         loop {
             let (map, extractor) = self.usable_map(map).await?;
             let meta = CheckedMeta::new(new.meta.clone(), &map)?;
-            let extraction = self.extract(&extractor, new.bytes.clone(), map.descriptor).await?;
+            let bytes = new.bytes.clone();
+            let extraction = self.extract(&extractor, bytes, map.descriptor, new.demand).await?;
             self.metrics.observe_stages(extraction.times);
             let image = Image {
                 id: meta.id.unwrap_or_else(|| ImageId::from_digest(&digest)),
@@ -127,8 +133,10 @@ impl Service {
             return Err(ServiceError::unprocessable("max_edge must be between 16 and 4096 pixels"));
         }
         let limits = self.models.limits();
+        let permit = self.admit(Demand { class: Class::Index, deadline: None }).await?;
         let jpeg = self
             .on_pool(move || {
+                let _permit = permit;
                 let picture =
                     decode::decode(&bytes, limits, decode::Needed::LongestEdge(max_edge))?;
                 let small = preprocess::shrink_to(&picture.pixels, max_edge)?;
@@ -147,29 +155,40 @@ impl Service {
         }
     }
 
+    /// Decodes a picture, runs it through the model and makes its descriptor, once there is a permit
+    /// for it. A caller who leaves stops that at the next step.
     pub(super) async fn extract(
         &self,
         extractor: &Arc<Extractor>,
         bytes: Bytes,
         kind: DescriptorKind,
+        demand: Demand,
     ) -> Result<Extraction, ServiceError> {
-        let beginning = Arc::clone(extractor);
-        let extracting = self.on_pool(move || beginning.begin(&bytes)).await?;
+        let permit = Arc::new(self.admit(demand).await?);
+        let gone = CancellationToken::new();
+        let _unless_dropped = gone.clone().drop_guard();
+        let (beginning, decoding) = (Arc::clone(extractor), Arc::clone(&permit));
+        let begin = move || {
+            // Whoever leaves now gives the permit back when the thread is free.
+            let _decoding = decoding;
+            beginning.begin(&bytes, || !gone.is_cancelled())
+        };
+        let extracting = self.on_pool(begin).await?;
         let inferred = extracting.inferred().await?;
-        // Not by the pool, which might refuse it now that nearly all is done.
+        // Not by the pool, where it would wait although nearly all is done.
         let extractor = Arc::clone(extractor);
         let finishing = tokio::task::spawn_blocking(move || extractor.finish(inferred, kind)).await;
         let extraction = finishing
             .map_err(|error| ServiceError::new(super::ErrorKind::Internal, error.to_string()))??;
+        permit.served();
         Ok(extraction)
     }
 
     async fn on_pool<T, F>(&self, work: F) -> Result<T, ServiceError>
     where
         T: Send + 'static,
-        F: FnOnce() -> Result<T, crate::retrieve::ExtractError> + Send + 'static,
+        F: FnOnce() -> Result<T, ExtractError> + Send + 'static,
     {
-        use crate::retrieve::PoolError;
         match self.pool.run(work).await {
             Ok(result) => Ok(result?),
             Err(PoolError::Overloaded(overloaded)) => Err(overloaded.into()),

@@ -1,22 +1,20 @@
 //! Localize a frame: extract, search, answer, and queue its refinement.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::images::empty_body;
-use super::{ErrorKind, SUPERSEDED, Service, ServiceError};
+use super::submit::Frame;
+use super::{NoJob, SUPERSEDED, Service, ServiceError};
 use crate::domain::confidence::COMPARED;
 use crate::domain::{Candidate, Digest, Estimate, Job, JobState, Map, MapName, Priority};
-use crate::refine::DenseKey;
-use crate::retrieve::Extraction;
 use crate::retrieve::index::SearchMode;
-use crate::store::{JobRecord, Query, StoreError};
+use crate::retrieve::{Class, Demand, Extraction};
+use crate::store::StoreError;
 
 /// What becomes of the candidates after the first answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
@@ -44,6 +42,8 @@ pub struct LocalizeRequest {
     pub priority: Priority,
     /// The bytes of the frame: JPEG, PNG or WebP.
     pub frame: Bytes,
+    /// When the caller no longer wants the answer.
+    pub deadline: Option<Instant>,
 }
 
 /// Where the frame was probably taken.
@@ -63,6 +63,10 @@ pub struct Answer {
     /// The refinement; null if there is none.
     #[schema(nullable)]
     pub job: Option<JobLink>,
+    /// Why there is no refinement, if one was asked for; else null.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub no_job: Option<NoJob>,
     /// How long the stages took.
     pub timing_ms: TimingMs,
 }
@@ -115,38 +119,44 @@ impl Service {
             return Err(empty_body());
         }
         let refined = request.refine != RefineMode::Off && self.refiner.is_some();
-        if refined && self.jobs.queued().await? >= self.settings.job_queue {
-            // Before any work is done: a robot that needs no job asks without one.
-            return Err(StoreError::QueueFull { limit: self.settings.job_queue }.into());
+        if request.refine == RefineMode::Wait {
+            // Before any work is done.
+            self.check_submission().await?;
         }
+        let demand = Demand { class: Class::Localize, deadline: request.deadline };
         let compared = if refined { self.settings.candidates } else { 0 };
         let wanted = k.max(compared).max(COMPARED);
         let Retrieved { map, model, extraction, mut candidates, searched } =
-            self.retrieve(&request.map, &request.frame, wanted, SearchMode::Fast).await?;
-        let kept = self.refiner.as_ref().filter(|refiner| refiner.wants_descriptor());
-        let descriptor = kept.map(|_| extraction.descriptor);
+            self.retrieve(&request.map, &request.frame, wanted, SearchMode::Fast, demand).await?;
 
         let query_id = Uuid::now_v7();
-        let mut job = None;
-        if refined && !candidates.is_empty() {
-            let query = Query {
-                id: query_id,
-                digest: Digest::of(&request.frame),
-                media_type: extraction.media_type,
-                created_at: Timestamp::now(),
-                descriptor,
-            };
-            let key = DenseKey { model, picture: query.digest };
-            self.dense.insert(key, Arc::new(extraction.dense));
+        let (mut job, no_job) = if request.refine == RefineMode::Off {
+            (None, None)
+        } else {
             let compared = candidates.iter().take(self.settings.candidates).cloned().collect();
-            job = Some(self.submit(&map, query, compared, request.frame, request.priority).await?);
-        }
+            let frame = Frame {
+                query_id,
+                bytes: request.frame,
+                model,
+                media_type: extraction.media_type,
+                descriptor: extraction.descriptor,
+                dense: extraction.dense,
+            };
+            match self.submit(&map, frame, compared, request.priority).await? {
+                Ok(job) => (Some(job), None),
+                Err(why) if request.refine == RefineMode::Wait && why.is_shedding() => {
+                    return Err(self.refuse_job(&why));
+                }
+                Err(why) => (None, Some(why)),
+            }
+        };
         let mut estimate = self.estimate(&map, &candidates).await?;
         candidates.truncate(k);
         if request.refine == RefineMode::Wait
             && let Some(queued) = &mut job
         {
-            *queued = self.wait_for(queued.id, self.settings.max_wait).await?;
+            let longest = Self::time_left(self.settings.max_wait, request.deadline);
+            *queued = self.wait_for(queued.id, longest).await?;
             estimate = queued.estimate.clone().or(estimate);
         }
         let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
@@ -161,6 +171,7 @@ impl Service {
                 href: format!("/jobs/{}", job.id),
                 state: job.state,
             }),
+            no_job,
             timing_ms: TimingMs {
                 decode: ms(extraction.times.decode),
                 extract: ms(extraction.times.extract),
@@ -178,11 +189,13 @@ impl Service {
         frame: &Bytes,
         k: usize,
         mode: SearchMode,
+        demand: Demand,
     ) -> Result<Retrieved, ServiceError> {
         let mut left = SUPERSEDED;
         loop {
             let (map, extractor) = self.usable_map(map).await?;
-            let extraction = self.extract(&extractor, frame.clone(), map.descriptor).await?;
+            let extraction =
+                self.extract(&extractor, frame.clone(), map.descriptor, demand).await?;
             self.metrics.observe_stages(extraction.times);
             let searching = Instant::now();
             match self.maps.search(&map, extraction.descriptor.clone(), k, mode).await {
@@ -223,34 +236,5 @@ impl Service {
             confidence,
             known: f64::from(confidence) >= self.settings.known_confidence,
         }))
-    }
-
-    async fn submit(
-        &self,
-        map: &Map,
-        query: Query,
-        candidates: Vec<Candidate>,
-        frame: Bytes,
-        priority: Priority,
-    ) -> Result<Job, ServiceError> {
-        let Some(refiner) = &self.refiner else {
-            return Err(ServiceError::new(ErrorKind::Internal, "there is no refiner"));
-        };
-        let job = Job {
-            priority,
-            ..Job::queued(map.name.clone(), query.id, refiner.kind(), query.created_at)
-        };
-        let record = JobRecord {
-            job: job.clone(),
-            map_uid: map.uid,
-            revision: map.revision,
-            query,
-            candidates,
-            claims: 0,
-        };
-        let _pin = self.blobs.put_blob(record.query.digest, frame).await?;
-        self.jobs.submit(record, self.settings.job_queue).await?;
-        self.metrics.job_submitted();
-        Ok(job)
     }
 }

@@ -3,6 +3,7 @@
 //! HTTP and the command line convert to and from these calls and decide nothing. A [`Service`]
 //! knows the stores by their traits alone.
 
+mod admission;
 mod calibration;
 mod error;
 mod events;
@@ -12,6 +13,7 @@ mod localize;
 mod maps;
 mod models;
 mod reindex;
+mod submit;
 mod usage;
 
 use std::sync::Arc;
@@ -24,11 +26,11 @@ pub use self::jobs::JobPage;
 pub use self::localize::{Answer, JobLink, LocalizeRequest, RefineMode, Retrieved, TimingMs};
 pub use self::maps::{IndexKind, MapChange, MapState};
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
+pub use self::submit::{NoJob, NoJobReason};
 pub use self::usage::{Today, Total, UsageReport};
 use crate::domain::CalibrationSettings;
-use crate::refine::DenseCache;
-use crate::refine::Refiner;
-use crate::retrieve::{CpuPool, LoadedModels};
+use crate::refine::{DenseCache, JobPace, Refiner};
+use crate::retrieve::{Admission, CpuPool, LoadedModels};
 use crate::store::{BlobStore, DraftStore, JobStore, MapStore, UsageStore};
 use crate::telemetry::Metrics;
 
@@ -47,6 +49,8 @@ pub struct ServiceSettings {
     pub candidates: usize,
     /// Jobs that may wait or run.
     pub job_queue: usize,
+    /// The share of the queue before decoding from which frames get no job.
+    pub shed_jobs_at: f64,
     /// The longest wait for a job.
     pub max_wait: std::time::Duration,
     /// For how many days it is known what was spent.
@@ -73,8 +77,12 @@ pub struct Service {
     pub accounts: Arc<dyn UsageStore>,
     /// The models in memory.
     pub models: LoadedModels,
-    /// Where decoding and inference run.
+    /// Who may have a picture decoded and inferred.
+    pub admission: Admission,
+    /// Where pictures are decoded.
     pub pool: CpuPool,
+    /// How fast jobs are done.
+    pub job_pace: JobPace,
     /// Who refines, if anybody.
     pub refiner: Option<Arc<dyn Refiner>>,
     /// Dense features that a job will need soon.

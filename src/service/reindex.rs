@@ -13,13 +13,13 @@ use uuid::Uuid;
 use super::models::dimension;
 use super::{ErrorKind, MapState, Service, ServiceError};
 use crate::domain::{Descriptor, DescriptorKind, Image, Map, MapName};
-use crate::retrieve::Extractor;
+use crate::retrieve::{Demand, Extractor};
 use crate::store::Draft;
 
 /// Images that are looked up at a time.
 const PAGE: usize = 256;
 
-/// The pause when a queue is full.
+/// The pause while there is none.
 const PAUSE: Duration = Duration::from_millis(50);
 
 /// Which descriptors to make.
@@ -229,14 +229,15 @@ impl Service {
             };
         };
         let _turn = self.reindexes.turn.acquire().await;
-        match patiently(|| self.extract(extractor, bytes.clone(), descriptor)).await {
+        // It waits for as long as anybody else does.
+        match self.extract(extractor, bytes, descriptor, Demand::BACKGROUND).await {
             Ok(extraction) => Ok(Some(extraction.descriptor)),
             Err(error) => Err(left_behind(image, &error.detail)),
         }
     }
 }
 
-/// Does it as soon as robots leave room for it.
+/// Does it as soon as there is room among the models in memory.
 async fn patiently<T, F>(work: impl Fn() -> F) -> Result<T, ServiceError>
 where
     F: Future<Output = Result<T, ServiceError>>,

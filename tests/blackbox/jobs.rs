@@ -74,7 +74,7 @@ async fn jobs_are_listed_newest_first_by_map_and_state() {
 }
 
 #[tokio::test]
-async fn a_full_job_queue_answers_429_at_once_and_localizing_without_a_job_goes_on() {
+async fn a_full_job_queue_leaves_frames_without_a_job_and_refuses_who_waits_for_one() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     server.town("m", 3).await;
@@ -83,7 +83,15 @@ async fn a_full_job_queue_answers_429_at_once_and_localizing_without_a_job_goes_
     let frames: Vec<_> = (0..8).map(|variant| frame(0, variant)).collect();
     let posts = frames.into_iter().map(|frame| server.post_jpeg("/localize?map=m", frame));
     let answers = futures_util::future::join_all(posts).await;
-    assert!(answers.iter().any(|answer| answer.status == 200));
+    let answers: Vec<Value> = answers.iter().map(|answer| answer.expect(200)).collect();
+    assert!(answers.iter().any(|answer| answer["job"]["id"].is_string()));
+    let without = answers.iter().find(|answer| answer["job"].is_null());
+    let without = without.expect("the queue never filled");
+    assert_eq!(without["no_job"]["reason"], "queue_full");
+    assert!(!without["candidates"].as_array().unwrap().is_empty());
+    let posts = (0..8).map(|variant| frame(1, variant));
+    let posts = posts.map(|frame| server.post_jpeg("/localize?map=m&refine=wait", frame));
+    let answers = futures_util::future::join_all(posts).await;
     let full = answers.iter().find(|answer| answer.status == 429).expect("the queue never filled");
     assert!(full.problem(429).contains("refine=off"));
     assert!(full.headers.contains_key("retry-after"));

@@ -28,6 +28,8 @@ mod mock_hub;
 mod mock_mllm;
 mod model_files;
 mod models;
+mod overload;
 mod real_images;
 mod reindex;
 mod service;
+mod slow_clients;

@@ -1,0 +1,165 @@
+//! Bodies as they come in: bounded by time, and all together by memory.
+
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Duration;
+
+use axum::body::{Body, BodyDataStream, HttpBody};
+use bytes::Bytes;
+use futures_util::{StreamExt, stream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::{Instant, timeout_at};
+
+use super::problem::Problem;
+use super::state::HttpSettings;
+use crate::service::ErrorKind;
+use crate::telemetry::RefusedFor;
+
+/// Watches one body. What it takes of the common memory is given back when the request is answered.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Watch {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    fault: OnceLock<Fault>,
+    memory: Mutex<Memory>,
+}
+
+/// What one body holds of the memory of all.
+#[derive(Debug, Default)]
+struct Memory {
+    held: Option<OwnedSemaphorePermit>,
+    /// Whether the request has been answered, so that what still comes is thrown away.
+    answered: bool,
+}
+
+/// Why a body was not read to its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Fault {
+    TookTooLong(Duration),
+    Paused(Duration),
+    NoMemory(usize),
+}
+
+impl std::fmt::Display for Fault {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::TookTooLong(longest) => write!(
+                f,
+                "the body took longer than {} s (server.body_timeout_s); send a smaller picture",
+                longest.as_secs()
+            ),
+            Self::Paused(longest) => write!(
+                f,
+                "nothing of the body came for {} s (server.body_pause_s); send it again in one go",
+                longest.as_secs()
+            ),
+            Self::NoMemory(most) => write!(
+                f,
+                "the bodies of all requests in progress hold {most} bytes, the bound \
+                 (server.bodies_limit_bytes); try again in a moment"
+            ),
+        }
+    }
+}
+
+impl std::error::Error for Fault {}
+
+/// The chunks of a body, and what bounds them.
+struct Chunks {
+    body: BodyDataStream,
+    watch: Watch,
+    settings: Arc<HttpSettings>,
+    memory: Arc<Semaphore>,
+    end: Instant,
+    counted: usize,
+}
+
+impl Watch {
+    /// Bounds a body. A reader hears of a fault as an error of the body; [`Self::problem`] tells
+    /// what it was, whoever read it.
+    pub fn over(&self, body: Body, settings: &Arc<HttpSettings>, memory: &Arc<Semaphore>) -> Body {
+        if body.is_end_stream() {
+            return body;
+        }
+        let chunks = Chunks {
+            body: body.into_data_stream(),
+            watch: self.clone(),
+            end: Instant::now() + settings.body_timeout,
+            settings: Arc::clone(settings),
+            memory: Arc::clone(memory),
+            counted: 0,
+        };
+        Body::from_stream(stream::unfold(chunks, |mut chunks| async {
+            let next = chunks.next().await?;
+            Some((next, chunks))
+        }))
+    }
+
+    /// What is to be answered in the place of any other answer, and what it counts as.
+    pub fn problem(&self) -> Option<(Problem, RefusedFor)> {
+        let fault = self.shared.fault.get()?;
+        let (kind, reason) = match fault {
+            Fault::TookTooLong(_) | Fault::Paused(_) => (ErrorKind::TooSlow, RefusedFor::Slow),
+            Fault::NoMemory(_) => (ErrorKind::Overloaded, RefusedFor::Bodies),
+        };
+        Some((Problem::new(kind, fault.to_string()), reason))
+    }
+
+    fn fail(&self, fault: Fault) -> axum::Error {
+        let _ = self.shared.fault.set(fault);
+        axum::Error::new(fault)
+    }
+
+    /// Takes so much of the common memory; `false` if there is no more.
+    fn hold(&self, memory: &Arc<Semaphore>, bytes: usize) -> bool {
+        let Ok(bytes) = u32::try_from(bytes) else { return false };
+        let Ok(more) = Arc::clone(memory).try_acquire_many_owned(bytes) else { return false };
+        let mut memory = self.memory();
+        if memory.answered {
+            return true;
+        }
+        match memory.held.as_mut() {
+            Some(held) => held.merge(more),
+            None => memory.held = Some(more),
+        }
+        true
+    }
+
+    /// Gives the memory back: the request has been answered.
+    pub fn answered(&self) {
+        *self.memory() = Memory { held: None, answered: true };
+    }
+
+    fn memory(&self) -> MutexGuard<'_, Memory> {
+        self.shared.memory.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Chunks {
+    async fn next(&mut self) -> Option<Result<Bytes, axum::Error>> {
+        if self.watch.shared.fault.get().is_some() {
+            return None;
+        }
+        let HttpSettings { body_timeout, body_pause, body_limit_bytes, .. } = *self.settings;
+        let pause = Instant::now() + body_pause;
+        let chunk = match timeout_at(pause.min(self.end), self.body.next()).await {
+            Ok(next) => next?,
+            Err(_) if pause < self.end => {
+                return Some(Err(self.watch.fail(Fault::Paused(body_pause))));
+            }
+            Err(_) => return Some(Err(self.watch.fail(Fault::TookTooLong(body_timeout)))),
+        };
+        let Ok(chunk) = chunk else { return Some(chunk) };
+        // Of a body that is too large no more than that is kept.
+        if self.counted <= body_limit_bytes {
+            self.counted += chunk.len();
+            if !self.watch.hold(&self.memory, chunk.len()) {
+                let most = self.settings.bodies_limit_bytes;
+                return Some(Err(self.watch.fail(Fault::NoMemory(most))));
+            }
+        }
+        Some(Ok(chunk))
+    }
+}

@@ -1,0 +1,21 @@
+//! What is asked of whoever brings a picture, before anything is done for it.
+
+use super::{Service, ServiceError};
+use crate::retrieve::{Demand, Permit, Refused};
+
+impl Service {
+    /// Whether there is room for a picture; whoever is refused need not send it.
+    pub fn check_admission(&self, demand: Demand) -> Result<(), ServiceError> {
+        self.admission.check(demand).map_err(|refused| self.counted(refused))
+    }
+
+    /// Waits for the permit to decode and infer one picture.
+    pub(super) async fn admit(&self, demand: Demand) -> Result<Permit, ServiceError> {
+        self.admission.enter(demand).await.map_err(|refused| self.counted(refused))
+    }
+
+    fn counted(&self, refused: Refused) -> ServiceError {
+        self.metrics.refused(refused.reason.into());
+        refused.into()
+    }
+}

@@ -1,0 +1,167 @@
+//! The job of a frame, or why it has none: jobs are given up before frames are refused.
+
+use std::sync::{Arc, PoisonError};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use uuid::Uuid;
+
+use super::{ErrorKind, Service, ServiceError};
+use crate::domain::{Candidate, DenseFeatures, Descriptor, Digest, Job, Map, MediaType, Priority};
+use crate::refine::DenseKey;
+use crate::store::{JobRecord, Query, StoreError};
+use crate::telemetry::RefusedFor;
+
+/// Why an answer has no job, although one was asked for.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct NoJob {
+    /// The reason, for programs.
+    pub reason: NoJobReason,
+    /// What happened and what to do next.
+    pub detail: String,
+}
+
+/// Why there is no job.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum NoJobReason {
+    /// The server refines nothing.
+    NoRefiner,
+    /// The map has no images to compare with.
+    EmptyMap,
+    /// As many jobs wait or run as may (`jobs.queue`).
+    QueueFull,
+    /// So many pictures wait that no frame gets a job (`jobs.shed_at`).
+    Overload,
+}
+
+impl NoJob {
+    fn new(reason: NoJobReason, detail: impl Into<String>) -> Self {
+        Self { reason, detail: detail.into() }
+    }
+
+    fn queue_full(limit: usize) -> Self {
+        let full = StoreError::QueueFull { limit };
+        Self::new(NoJobReason::QueueFull, format!("{full}; post a later frame for a refinement"))
+    }
+
+    /// Whether there would be a job if there were less to do.
+    pub(super) fn is_shedding(&self) -> bool {
+        matches!(self.reason, NoJobReason::QueueFull | NoJobReason::Overload)
+    }
+}
+
+/// A frame that has been localized.
+pub(super) struct Frame {
+    pub query_id: Uuid,
+    pub bytes: Bytes,
+    /// The identity of the model that looked at it.
+    pub model: Digest,
+    pub media_type: MediaType,
+    pub descriptor: Descriptor,
+    pub dense: DenseFeatures,
+}
+
+impl Service {
+    /// Refuses a caller who wants nothing but the refined answer, while frames get no job.
+    pub(super) async fn check_submission(&self) -> Result<(), ServiceError> {
+        if self.refiner.is_none() {
+            return Ok(());
+        }
+        self.obstacle().await?.map_or(Ok(()), |why| Err(self.refuse_job(&why)))
+    }
+
+    /// Queues the refinement of a frame, unless something speaks against it.
+    pub(super) async fn submit(
+        &self,
+        map: &Map,
+        frame: Frame,
+        candidates: Vec<Candidate>,
+        priority: Priority,
+    ) -> Result<Result<Job, NoJob>, ServiceError> {
+        let Some(refiner) = &self.refiner else {
+            let detail = "the server refines nothing (refine.refiner)";
+            return Ok(Err(NoJob::new(NoJobReason::NoRefiner, detail)));
+        };
+        if candidates.is_empty() {
+            let detail = "the map has no images yet; add some with `whereabouts index`";
+            return Ok(Err(NoJob::new(NoJobReason::EmptyMap, detail)));
+        }
+        if let Some(why) = self.obstacle().await? {
+            return Ok(Err(why));
+        }
+        let query = Query {
+            id: frame.query_id,
+            digest: Digest::of(&frame.bytes),
+            media_type: frame.media_type,
+            created_at: Timestamp::now(),
+            descriptor: refiner.wants_descriptor().then_some(frame.descriptor),
+        };
+        let key = DenseKey { model: frame.model, picture: query.digest };
+        self.dense.insert(key, Arc::new(frame.dense));
+        let job = Job {
+            priority,
+            ..Job::queued(map.name.clone(), query.id, refiner.kind(), query.created_at)
+        };
+        let record = JobRecord {
+            job: job.clone(),
+            map_uid: map.uid,
+            revision: map.revision,
+            query,
+            candidates,
+            claims: 0,
+        };
+        let _pin = self.blobs.put_blob(record.query.digest, frame.bytes).await?;
+        match self.jobs.submit(record, self.settings.job_queue).await {
+            Ok(()) => self.metrics.job_submitted(),
+            Err(StoreError::QueueFull { limit }) => {
+                return Ok(Err(self.counted_job(NoJob::queue_full(limit))));
+            }
+            Err(error) => return Err(error.into()),
+        }
+        Ok(Ok(job))
+    }
+
+    /// Why no job should be submitted now, if so.
+    async fn obstacle(&self) -> Result<Option<NoJob>, ServiceError> {
+        if self.jobs.queued().await? >= self.settings.job_queue {
+            return Ok(Some(self.counted_job(NoJob::queue_full(self.settings.job_queue))));
+        }
+        if self.admission.pressure() <= self.settings.shed_jobs_at {
+            return Ok(None);
+        }
+        let detail = "so many pictures wait that no frame gets a job (jobs.shed_at); post a later \
+                      frame for a refinement";
+        Ok(Some(self.counted_job(NoJob::new(NoJobReason::Overload, detail))))
+    }
+
+    fn counted_job(&self, why: NoJob) -> NoJob {
+        self.metrics.refused(RefusedFor::Jobs);
+        why
+    }
+
+    /// What a caller hears who wants nothing but the refined answer.
+    pub(super) fn refuse_job(&self, why: &NoJob) -> ServiceError {
+        let pause = match why.reason {
+            NoJobReason::QueueFull => {
+                let pace = self.job_pace.lock().unwrap_or_else(PoisonError::into_inner);
+                self.admission.within_bounds(pace.until_done(1))
+            }
+            _ => self.admission.retry_after(),
+        };
+        let detail = format!("{}, or ask with refine=async or refine=off", why.detail);
+        ServiceError::new(ErrorKind::Overloaded, detail).retry_after(pause)
+    }
+
+    /// The time that a caller's deadline leaves for waiting, no longer than `longest`.
+    pub(super) fn time_left(longest: Duration, deadline: Option<Instant>) -> Duration {
+        deadline.map_or(longest, |deadline| {
+            let left = deadline.saturating_duration_since(Instant::now());
+            // The answer has still to be made and sent.
+            longest.min(left * 9 / 10)
+        })
+    }
+}

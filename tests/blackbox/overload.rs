@@ -1,0 +1,185 @@
+//! More than the server can do: frames are refused at once, jobs and indexing before frames.
+
+use std::time::{Duration, Instant};
+
+use reqwest::Method;
+use serde_json::Value;
+use tempfile::TempDir;
+use tokio::task::JoinSet;
+
+use super::support::{Answer, Server, frame, reference};
+
+/// One picture in work, so that others wait, and time for all of them on any machine.
+const NARROW: &[(&str, &str)] = &[
+    ("WHEREABOUTS_IMAGE__PERMITS", "1"),
+    ("WHEREABOUTS_IMAGE__MAX_WAIT_MS", "600000"),
+    ("WHEREABOUTS_SERVER__REQUEST_TIMEOUT_S", "600"),
+];
+
+fn narrow(more: &[(&str, &str)]) -> (TempDir, Server) {
+    let dir = TempDir::new().unwrap();
+    let server = Server::start(dir.path(), &[NARROW, more].concat());
+    (dir, server)
+}
+
+/// Posts so many frames at once.
+fn post_all(server: &Server, path: &str, frames: usize) -> JoinSet<Answer> {
+    let bytes = frame(0, 0);
+    let requests = (0..frames).map(|_| {
+        let request = server.request(Method::POST, path).header("content-type", "image/jpeg");
+        Answer::of(request.body(bytes.clone()))
+    });
+    requests.collect()
+}
+
+async fn metric(server: &Server, name: &str) -> f64 {
+    let metrics = String::from_utf8(server.get("/metrics").await.bytes).unwrap();
+    let line = metrics.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
+    line.map_or(0.0, |value| value.parse().unwrap())
+}
+
+/// Waits until so many frames wait.
+async fn wait_for_line(server: &Server, length: f64) {
+    let start = Instant::now();
+    while metric(server, r#"whereabouts_pictures_waiting{class="localize"}"#).await < length {
+        assert!(start.elapsed() < Duration::from_secs(60), "the line stays short");
+    }
+}
+
+#[track_caller]
+fn retry_after(answer: &Answer) -> u64 {
+    answer.headers["retry-after"].to_str().unwrap().parse().unwrap()
+}
+
+#[tokio::test]
+async fn frames_beyond_the_queue_get_429_and_are_told_when_to_come_back() {
+    let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "2")]);
+    server.town("m", 2).await;
+    let answers = post_all(&server, "/localize?map=m&refine=off", 60).join_all().await;
+    let (served, refused): (Vec<_>, Vec<_>) =
+        answers.iter().partition(|answer| answer.status == 200);
+    assert!(!served.is_empty() && !refused.is_empty());
+    for answer in &refused {
+        assert!(answer.problem(429).contains("image.queue"));
+        assert!((1..=60).contains(&retry_after(answer)));
+    }
+    server.post_jpeg("/localize?map=m&refine=off", frame(0, 0)).await.expect(200);
+    let counted = metric(&server, r#"whereabouts_refused_total{reason="queue"}"#).await;
+    assert_eq!(counted, refused.len() as f64);
+    assert_eq!(metric(&server, "whereabouts_permits").await, 1.0);
+    assert_eq!(metric(&server, "whereabouts_permits_in_use").await, 0.0);
+}
+
+#[tokio::test]
+async fn a_deadline_that_cannot_be_met_is_refused_at_once_and_who_has_gone_is_not_served() {
+    const FRAMES: usize = 400;
+    let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "500")]);
+    server.town("m", 2).await;
+    let mut crowd = post_all(&server, "/localize?map=m&refine=off", FRAMES);
+    wait_for_line(&server, 200.0).await;
+    let request = server
+        .request(Method::POST, "/localize?map=m&refine=off")
+        .header("content-type", "image/jpeg")
+        .header("x-deadline-ms", "50")
+        .body(frame(1, 0));
+    let refused = Answer::of(request).await;
+    assert!(refused.problem(429).contains("X-Deadline-Ms"));
+    assert!(retry_after(&refused) >= 1);
+    crowd.shutdown().await;
+    server.post_jpeg("/localize?map=m&refine=off", frame(1, 0)).await.expect(200);
+    let served = metric(&server, r#"whereabouts_stage_seconds_count{stage="decode"}"#).await;
+    assert!(served < (FRAMES - 50) as f64, "{served} pictures were decoded");
+}
+
+#[tokio::test]
+async fn a_deadline_that_passes_answers_504_and_one_that_is_none_400() {
+    let (_dir, server) = narrow(&[]);
+    server.town("m", 2).await;
+    let post = |deadline: &str| {
+        server
+            .request(Method::POST, "/localize?map=m&refine=wait")
+            .header("content-type", "image/jpeg")
+            .header("x-deadline-ms", deadline)
+    };
+    for rubbish in ["", "soon", "0", "-1", "1.5", "1e3", "99999999999"] {
+        let answer = Answer::of(post(rubbish).body(frame(0, 0))).await;
+        assert!(answer.problem(400).contains("X-Deadline-Ms"), "{rubbish}");
+    }
+    // A body that never comes cannot be answered in time.
+    let never = futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>();
+    let answer = Answer::of(post("200").body(reqwest::Body::wrap_stream(never))).await;
+    assert!(answer.problem(504).contains("200 ms"));
+    Answer::of(post("60000").body(frame(0, 0))).await.expect(200);
+}
+
+#[tokio::test]
+async fn waiting_for_a_refinement_ends_in_time_for_the_deadline() {
+    // Nobody refines: the endpoint of the model is not there, and the job waits for it.
+    let (_dir, server) = narrow(&[
+        ("WHEREABOUTS_REFINE__REFINER", "mllm"),
+        ("WHEREABOUTS_MLLM__BASE_URL", "http://127.0.0.1:1/v1"),
+        ("WHEREABOUTS_MLLM__ON_UNAVAILABLE", "wait"),
+    ]);
+    server.town("m", 2).await;
+    let request = server
+        .request(Method::POST, "/localize?map=m&refine=wait")
+        .header("content-type", "image/jpeg")
+        .header("x-deadline-ms", "3000")
+        .body(frame(0, 0));
+    let answer = Answer::of(request).await.expect(200);
+    assert!(matches!(answer["job"]["state"].as_str(), Some("queued" | "running")), "{answer}");
+    assert!(answer["timing_ms"]["total"].as_f64().unwrap() < 3000.0, "{answer}");
+}
+
+#[tokio::test]
+async fn frames_go_without_jobs_before_any_is_refused() {
+    let settings = [("WHEREABOUTS_IMAGE__QUEUE", "200"), ("WHEREABOUTS_JOBS__SHED_AT", "0.05")];
+    let (_dir, server) = narrow(&settings);
+    server.town("m", 2).await;
+    let crowd = post_all(&server, "/localize?map=m&refine=async", 200);
+    wait_for_line(&server, 120.0).await;
+    let waits = server.post_jpeg("/localize?map=m&refine=wait", frame(0, 0)).await;
+    assert!(waits.problem(429).contains("jobs.shed_at"));
+    let answers = crowd.join_all().await;
+    let answers: Vec<Value> = answers.iter().map(|answer| answer.expect(200)).collect();
+    let without = answers.iter().filter(|answer| answer["job"].is_null());
+    let reasons: Vec<_> = without.map(|answer| &answer["no_job"]["reason"]).collect();
+    assert!(
+        !reasons.is_empty() && reasons.iter().all(|reason| *reason == "overload"),
+        "{reasons:?}"
+    );
+    let with = answers.iter().filter(|answer| answer["no_job"].is_null());
+    assert_eq!(with.count(), answers.len() - reasons.len());
+    assert!(reasons.len() < answers.len(), "nobody waits behind the last ones");
+}
+
+#[tokio::test]
+async fn indexing_makes_room_for_frames() {
+    let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "4")]);
+    server.town("m", 1).await;
+    let picture = reference(2);
+    let upload = |number: usize| {
+        let path = format!("/maps/m/images?id=more-{number}&lat=45&lon=7");
+        let request = server.request(Method::POST, &path).header("content-type", "image/jpeg");
+        Answer::of(request.body(picture.clone()))
+    };
+    let mut uploads: JoinSet<Answer> = (0..8).map(upload).collect();
+    let (mut number, mut refused) = (8, 0);
+    for _ in 0..20 {
+        let mut localizing = Box::pin(server.post_jpeg("/localize?map=m&refine=off", reference(0)));
+        let answer = loop {
+            tokio::select! {
+                answer = &mut localizing => break answer,
+                Some(upload_ended) = uploads.join_next() => {
+                    let status = upload_ended.unwrap().status.as_u16();
+                    assert!(matches!(status, 201 | 429), "{status}");
+                    refused += usize::from(status == 429);
+                    number += 1;
+                    uploads.spawn(upload(number));
+                }
+            }
+        };
+        answer.expect(200);
+    }
+    assert!(refused > 0, "the queue never filled");
+}
