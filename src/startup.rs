@@ -20,7 +20,7 @@ use crate::refine::{DenseCache, LocalRefiner, Refiner, Worker, WorkerSettings};
 use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Assets, CpuPool, ExtractorSettings, ImageLimits};
 use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
-use crate::service::{Reindexes, Service, ServiceSettings};
+use crate::service::{Janitor, Reindexes, RetentionSettings, Service, ServiceSettings};
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
 use crate::store::{JobStore, UsageStore};
 use crate::telemetry::Metrics;
@@ -41,11 +41,16 @@ pub async fn serve(
             axum::serve(listener, router).with_graceful_shutdown(shutdown.cancelled_owned()).await
         })
     };
-    let drain_timeout = config.server.drain_timeout();
+    let (drain_timeout, retention) = (config.server.drain_timeout(), retention(&config));
+    let counted = Arc::clone(&metrics);
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
     let (service, workers) = building.await.context("the start broke off")??;
+    let janitor =
+        Janitor { store: Arc::clone(&service.retention), metrics: counted, settings: retention };
     state.set_ready(Arc::new(service));
     let mut running = JoinSet::new();
+    let until = shutdown.clone();
+    running.spawn(async move { janitor.run(until).await });
     for worker in workers {
         let shutdown = shutdown.clone();
         running.spawn(async move { worker.run(shutdown).await });
@@ -82,6 +87,18 @@ fn http_settings(config: &Config) -> HttpSettings {
     }
 }
 
+fn retention(config: &Config) -> RetentionSettings {
+    let keep = Duration::from_secs(u64::from(config.jobs.keep_days) * 24 * 3600);
+    RetentionSettings {
+        keep: Some(keep).filter(|keep| !keep.is_zero()),
+        most: Some(config.jobs.keep_count).filter(|most| *most > 0),
+        settle: Duration::from_secs(config.jobs.max_wait_s),
+        pause: Duration::from_secs(config.jobs.sweep_s),
+        batch: config.jobs.sweep_batch,
+        usage_days: config.data.usage_days,
+    }
+}
+
 /// Opens the store, loads the model, and puts the service together. Blocks.
 pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec<Worker>)> {
     let store = Arc::new(EmbeddedStore::open(&EmbeddedSettings {
@@ -103,7 +120,6 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
             max_bytes: config.data.description_cache_bytes,
             max_age: Duration::from_secs(config.data.description_cache_days * 24 * 3600),
         },
-        usage_days: config.data.usage_days,
     })?);
     let (models, why) = models(config)?;
     let pool = CpuPool::new("frames", cores_unless(config.image.threads), config.image.queue)?;
@@ -155,9 +171,11 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
         maps: store.clone(),
         drafts: store.clone(),
         reindexes: Reindexes::default(),
+        exports: store.clone(),
         blobs: store.clone(),
         jobs,
         accounts: store.clone(),
+        retention: store.clone(),
         models,
         pool,
         refiner,

@@ -11,6 +11,8 @@ mod localize;
 mod maps;
 mod models;
 mod reindex;
+mod retention;
+mod transfer;
 mod usage;
 
 use std::sync::Arc;
@@ -24,11 +26,13 @@ pub use self::localize::{
 };
 pub use self::maps::{IndexKind, MapChange, MapState};
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
+pub use self::retention::{Janitor, RetentionSettings};
+pub use self::transfer::{ExportPage, ImportedImage};
 pub use self::usage::{Today, Total, UsageReport};
 use crate::refine::DenseCache;
 use crate::refine::Refiner;
 use crate::retrieve::{CpuPool, LoadedModels};
-use crate::store::{BlobStore, DraftStore, JobStore, MapStore, UsageStore};
+use crate::store::{BlobStore, DraftStore, ExportStore, JobStore, MapStore, Retention, UsageStore};
 use crate::telemetry::Metrics;
 
 /// Bounds and defaults of the use cases.
@@ -62,6 +66,8 @@ pub struct Service {
     pub drafts: Arc<dyn DraftStore>,
     /// How far that has come.
     pub reindexes: Reindexes,
+    /// Images with their descriptors.
+    pub exports: Arc<dyn ExportStore>,
     /// Image bytes.
     pub blobs: Arc<dyn BlobStore>,
     /// Jobs.
@@ -76,6 +82,8 @@ pub struct Service {
     pub refiner: Option<Arc<dyn Refiner>>,
     /// Dense features that a job will need soon.
     pub dense: Arc<DenseCache>,
+    /// Where they are all kept.
+    pub retention: Arc<dyn Retention>,
     /// What is counted.
     pub metrics: Arc<Metrics>,
     /// Bounds and defaults.

@@ -11,10 +11,12 @@
 
 mod support;
 
+mod backup;
 mod bad_input;
 mod cli;
 mod demo;
 mod dinov2;
+mod doctor;
 mod durability;
 mod eval;
 mod events;
@@ -29,4 +31,6 @@ mod model_files;
 mod models;
 mod real_images;
 mod reindex;
+mod retention;
+mod schema;
 mod service;
