@@ -6,6 +6,7 @@
 //! maps/NAME/map.json        the map, with the identity of the model that made its descriptors
 //! maps/NAME/SHA256.json     an image and its descriptor; named by the SHA-256 of these bytes
 //! maps/NAME/SHA256.jpg      the bytes of that image; named by their SHA-256
+//! maps/NAME/left-out.json   in the place of an image that could not be saved: which, and why
 //! …
 //! end.json                  what is in the archive, and the SHA-256 of all bytes before this entry
 //! ```
@@ -135,6 +136,10 @@ fn bytes_name(map: &MapName, digest: &Digest, media_type: MediaType) -> String {
         MediaType::Webp => "webp",
     };
     format!("maps/{map}/{}.{extension}", digest.hex())
+}
+
+fn left_out_name(map: &MapName) -> String {
+    format!("maps/{map}/left-out.json")
 }
 
 fn map_name(map: &MapName) -> String {

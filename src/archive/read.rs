@@ -11,8 +11,8 @@ use tar::{EntryType, Header};
 
 use super::write::{Mark, disk};
 use super::{
-    ArchiveError, ArchivedMap, BLOCK, END, End, FORMAT, MANIFEST, Manifest, VERSION, bytes_name,
-    map_name, record_name,
+    ArchiveError, ArchivedMap, BLOCK, END, End, FORMAT, LeftOut, MANIFEST, Manifest, VERSION,
+    bytes_name, left_out_name, map_name, record_name,
 };
 use crate::domain::{Digest, ImageId, Map, MapName};
 use crate::store::ExportedImage;
@@ -54,6 +54,8 @@ pub enum Item {
     Map(Map),
     /// An image with its bytes.
     Image(ExportedImage, Bytes),
+    /// An image of the map that could not be saved.
+    LeftOut(LeftOut),
     /// The last: nothing is missing, and every byte before was as it was written.
     End(End),
 }
@@ -89,6 +91,11 @@ impl<R: Read> Reader<R> {
     /// Bytes read so far.
     pub fn bytes(&self) -> u64 {
         self.bytes
+    }
+
+    /// The maps so far, with what they have so far.
+    pub(super) fn found(&self) -> &[ArchivedMap] {
+        &self.found
     }
 
     /// Where the last item ended.
@@ -144,6 +151,9 @@ impl<R: Read> Reader<R> {
             return self.map(name, &entry);
         }
         match self.current.take() {
+            Some((map, last)) if entry.name == left_out_name(&map.name) => {
+                self.left_out(map, last, &entry)
+            }
             Some((map, last)) => self.image(map, last, &entry),
             None => Err(self.misplaced(&entry.name)),
         }
@@ -165,6 +175,23 @@ impl<R: Read> Reader<R> {
         self.found.push(ArchivedMap { name, images: 0, left_out: Vec::new() });
         self.current = Some((map.clone(), None));
         Ok(Item::Map(map))
+    }
+
+    fn left_out(
+        &mut self,
+        map: Map,
+        last: Option<ImageId>,
+        entry: &Entry,
+    ) -> Result<Item, ArchiveError> {
+        let left_out: LeftOut = self.json(entry)?;
+        if last.is_some_and(|last| last >= left_out.id) {
+            return Err(self.damaged("an image is out of order"));
+        }
+        if let Some(found) = self.found.last_mut() {
+            found.left_out.push(left_out.clone());
+        }
+        self.current = Some((map, Some(left_out.id.clone())));
+        Ok(Item::LeftOut(left_out))
     }
 
     fn image(
@@ -202,13 +229,10 @@ impl<R: Read> Reader<R> {
 
     fn end(&mut self, entry: &Entry, before: Mark) -> Result<Item, ArchiveError> {
         let end: End = self.json(entry)?;
-        let same = |(found, said): (&ArchivedMap, &ArchivedMap)| {
-            (&found.name, found.images) == (&said.name, said.images)
-        };
         if (end.sha256, end.bytes, end.entries) != before.of_whole() {
             return Err(self.damaged("the checksum of the whole archive is wrong"));
         }
-        if end.maps.len() != self.found.len() || !self.found.iter().zip(&end.maps).all(same) {
+        if end.maps != self.found {
             return Err(self.damaged("it does not hold what its end says"));
         }
         let mut rest = Vec::new();

@@ -46,7 +46,13 @@ fn image(id: &str) -> (ExportedImage, Bytes) {
 }
 
 fn archived(name: &str, images: usize) -> ArchivedMap {
-    ArchivedMap { name: name.parse().unwrap(), images, left_out: vec![] }
+    let left_out = if name == "a" { vec![left_out()] } else { vec![] };
+    ArchivedMap { name: name.parse().unwrap(), images, left_out }
+}
+
+/// Between the images of the map a.
+fn left_out() -> LeftOut {
+    LeftOut { id: "1-damaged".parse().unwrap(), why: "damaged".into() }
 }
 
 fn names(names: &[&str]) -> Vec<MapName> {
@@ -64,6 +70,7 @@ fn write(dir: &TempDir) -> PathBuf {
     let mut writer = Writer::begin(&path, &Manifest::new(names(&["a", "b"]))).unwrap();
     writer.map(&map("a")).unwrap();
     add(&mut writer, "a", "1");
+    writer.left_out(&"a".parse().unwrap(), &left_out()).unwrap();
     add(&mut writer, "a", "2");
     writer.map(&map("b")).unwrap();
     add(&mut writer, "b", "1");
@@ -90,7 +97,7 @@ fn what_was_written_is_read() {
         _ => None,
     });
     assert_eq!(images.collect::<Vec<_>>(), [image("1"), image("2"), image("1")]);
-    assert!(matches!(items.last(), Some(Item::End(end)) if end.entries == 9));
+    assert!(matches!(items.last(), Some(Item::End(end)) if end.entries == 10));
 }
 
 #[test]
@@ -126,13 +133,17 @@ fn an_archive_that_was_cut_anywhere_is_refused_and_can_be_gone_on_with() {
             continue;
         };
         let last = resumed.last.as_ref().map(ImageId::as_str);
-        let begun: Vec<_> = resumed.maps.iter().map(|(map, _)| map.name.as_str()).collect();
+        let begun: Vec<_> = resumed.maps.iter().map(|map| map.name.as_str()).collect();
         if begun.is_empty() {
             writer.map(&map("a")).unwrap();
         }
         if begun.len() < 2 {
-            for id in ["1", "2"].into_iter().filter(|id| last.is_none_or(|last| *id > last)) {
-                add(&mut writer, "a", id);
+            let rest = ["1", "1-damaged", "2"].into_iter();
+            for id in rest.filter(|id| last.is_none_or(|last| *id > last)) {
+                match id {
+                    "1-damaged" => writer.left_out(&"a".parse().unwrap(), &left_out()).unwrap(),
+                    id => add(&mut writer, "a", id),
+                }
             }
             writer.map(&map("b")).unwrap();
         }
@@ -140,7 +151,7 @@ fn an_archive_that_was_cut_anywhere_is_refused_and_can_be_gone_on_with() {
             add(&mut writer, "b", "1");
         }
         writer.finish(vec![archived("a", 2), archived("b", 1)]).unwrap();
-        assert_eq!(read(&path).unwrap().len(), 7);
+        assert_eq!(read(&path).unwrap().len(), 8);
     }
 }
 
@@ -159,12 +170,13 @@ fn a_map_is_taken_back() {
     let mut writer = Writer::begin(&path, &Manifest::new(names(&["a", "b"]))).unwrap();
     writer.map(&map("a")).unwrap();
     add(&mut writer, "a", "1");
+    writer.left_out(&"a".parse().unwrap(), &left_out()).unwrap();
     let mark = writer.mark();
     writer.map(&map("b")).unwrap();
     add(&mut writer, "b", "1");
     writer.go_back(&mark).unwrap();
     writer.finish(vec![archived("a", 1)]).unwrap();
-    assert_eq!(read(&path).unwrap().len(), 4);
+    assert_eq!(read(&path).unwrap().len(), 5);
 }
 
 /// A tar file of these entries, made by the library itself.

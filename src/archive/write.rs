@@ -11,8 +11,8 @@ use tar::{EntryType, Header};
 
 use super::read::{Item, Reader};
 use super::{
-    ArchiveError, ArchivedMap, BLOCK, END, End, MANIFEST, Manifest, bytes_name, map_name,
-    record_name,
+    ArchiveError, ArchivedMap, BLOCK, END, End, LeftOut, MANIFEST, Manifest, bytes_name,
+    left_out_name, map_name, record_name,
 };
 use crate::domain::{Digest, ImageId, Map, MapName};
 use crate::store::ExportedImage;
@@ -37,9 +37,11 @@ pub struct Mark {
 /// How far an interrupted backup had come.
 #[derive(Default)]
 pub struct Resumed {
-    /// The maps that were begun, each with its images so far; the last one may have more.
-    pub maps: Vec<(Map, usize)>,
-    /// The last image of the last map.
+    /// The maps that were begun, with their images so far; the last one may have more.
+    pub maps: Vec<ArchivedMap>,
+    /// The last map, as its server described it, and its last image.
+    pub map: Option<Map>,
+    /// See `map`.
     pub last: Option<ImageId>,
     /// Where the last map begins.
     pub begins: Option<Mark>,
@@ -84,19 +86,15 @@ impl Writer {
         while let Ok(Some(item)) = reader.next_item() {
             match item {
                 Item::Map(map) => {
-                    resumed.maps.push((map, 0));
-                    resumed.last = None;
+                    (resumed.map, resumed.last) = (Some(map), None);
                     resumed.begins = Some(mark);
                 }
-                Item::Image(image, _) => {
-                    if let Some((_, images)) = resumed.maps.last_mut() {
-                        *images += 1;
-                    }
-                    resumed.last = Some(image.image.id);
-                }
+                Item::Image(image, _) => resumed.last = Some(image.image.id),
+                Item::LeftOut(left_out) => resumed.last = Some(left_out.id),
                 Item::Manifest(_) | Item::End(_) => break,
             }
             mark = reader.mark();
+            resumed.maps = reader.found().to_vec();
         }
         let file = File::options().write(true).open(&partial).map_err(disk("write", &partial))?;
         let (file, made_at) = (BufWriter::new(file), seconds(&manifest));
@@ -138,6 +136,11 @@ impl Writer {
         self.entry(&record_name(map, &Digest::of(&record)), &record)?;
         let digest = &image.image.digest;
         self.entry(&bytes_name(map, digest, image.image.media_type), bytes)
+    }
+
+    /// Says that an image of a map could not be saved.
+    pub fn left_out(&mut self, map: &MapName, left_out: &LeftOut) -> Result<(), ArchiveError> {
+        self.json(&left_out_name(map), left_out)
     }
 
     /// Ends the archive and puts it in its place, for good.

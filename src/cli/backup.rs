@@ -72,7 +72,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let states = states(&client, &args.maps).await?;
     let names: Vec<MapName> = states.iter().map(|map| map.name.clone()).collect();
     let (writer, resumed) = writer(&args, &names)?;
-    let continued = resumed.maps.iter().map(|(_, images)| images).sum();
+    let continued = resumed.maps.iter().map(|map| map.images).sum();
     let total = states.iter().map(|map| map.images).sum();
     let progress = Progress::new("images", total);
     progress.at(continued, total);
@@ -124,7 +124,7 @@ fn writer(args: &Args, names: &[MapName]) -> anyhow::Result<(Writer, Resumed)> {
     if !args.anew
         && let Some((writer, manifest, resumed)) = Writer::go_on(&args.file, names)?
     {
-        let images: usize = resumed.maps.iter().map(|(_, images)| images).sum();
+        let images: usize = resumed.maps.iter().map(|map| map.images).sum();
         eprintln!(
             "going on with the backup of {}, which has {images} images (--anew begins anew)",
             manifest.created_at
@@ -151,22 +151,17 @@ impl Backup {
         names: &[MapName],
         mut resumed: Resumed,
     ) -> anyhow::Result<(Vec<ArchivedMap>, Vec<MapName>)> {
+        // The last one may have more images than the archive has.
         let last = resumed.maps.pop();
-        let whole = |(map, images): (Map, usize)| ArchivedMap {
-            name: map.name,
-            images,
-            left_out: Vec::new(),
-        };
-        let mut maps: Vec<ArchivedMap> = resumed.maps.into_iter().map(whole).collect();
-        let mut gone = Vec::new();
-        let begun = last.as_ref().and_then(|(map, _)| names.iter().position(|n| *n == map.name));
-        let mut going_on = last.zip(resumed.begins).map(|((map, images), begins)| Saving {
+        let begun = last.as_ref().and_then(|last| names.iter().position(|n| *n == last.name));
+        let mut going_on = last.zip(resumed.begins).map(|(last, begins)| Saving {
             begins,
-            map: Some(map),
-            images,
+            map: resumed.map,
+            images: last.images,
             last: resumed.last,
-            left_out: Vec::new(),
+            left_out: last.left_out,
         });
+        let (mut maps, mut gone) = (resumed.maps, Vec::new());
         for name in &names[begun.unwrap_or(0)..] {
             let saving = going_on.take().unwrap_or_else(|| Saving::new(self.writer.mark()));
             match self.map(name, saving).await? {
@@ -242,7 +237,9 @@ impl Backup {
                 Fetched::Gone => {}
                 Fetched::Broken(why) => {
                     self.progress.say(&format!("{name}: {}: {why}", image.image.id));
-                    saving.left_out.push(LeftOut { id: image.image.id, why });
+                    let left_out = LeftOut { id: image.image.id, why };
+                    self.writer.left_out(name, &left_out)?;
+                    saving.left_out.push(left_out);
                 }
             }
             self.progress.step();

@@ -183,7 +183,7 @@ impl Restore {
                     let (client, target) = (self.client.clone(), Arc::clone(target));
                     sending.push(async move { send(&client, &target, image, bytes).await });
                 }
-                Item::Manifest(_) | Item::End(_) => {}
+                Item::Manifest(_) | Item::LeftOut(_) | Item::End(_) => {}
             }
         }
         while let Some(sent) = sending.next().await {
