@@ -81,7 +81,6 @@ fn settings(dir: &Path, commit_batch: usize) -> EmbeddedSettings {
             max_bytes: 1 << 28,
             max_age: Duration::from_secs(86_400),
         },
-        usage_days: 1,
     }
 }
 

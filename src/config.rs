@@ -253,6 +253,14 @@ pub struct Jobs {
     pub retry_pause_s: u64,
     /// The longest wait of a caller, in seconds.
     pub max_wait_s: u64,
+    /// How long a job is kept after it has ended, in days; 0: for ever.
+    pub keep_days: u32,
+    /// The most jobs that have ended; 0: any number.
+    pub keep_count: usize,
+    /// The pause between two looks for jobs to remove, in seconds.
+    pub sweep_s: u64,
+    /// The most jobs removed in one change.
+    pub sweep_batch: usize,
 }
 
 /// `[refine]`
@@ -435,6 +443,8 @@ impl Config {
             ("jobs.queue", self.jobs.queue),
             ("jobs.workers", self.jobs.workers),
             ("jobs.attempts", self.jobs.attempts as usize),
+            ("jobs.sweep_s", self.jobs.sweep_s as usize),
+            ("jobs.sweep_batch", self.jobs.sweep_batch),
             ("refine.candidates", self.refine.candidates),
             ("refine.local_candidates", self.refine.local_candidates),
         ];

@@ -9,6 +9,7 @@
 //! | [`store`] | what must outlive the process |
 //! | [`service`] | the use cases: the one meaning behind HTTP and the command line |
 //! | [`evaluate`] | how often the service is right on two folders: layouts, recall, reports |
+//! | [`archive`] | the file of `whereabouts backup`: written, continued, read with suspicion |
 //! | [`http`] | axum: extract, call the service, convert |
 //! | [`cli`] | one file for each command |
 //! | [`demo`] | a procedural town, to try it all on |
@@ -17,6 +18,7 @@
 //! Dependencies point one way: `cli, http, evaluate → service → retrieve, refine, store → domain`. Only
 //! [`startup`] sees everything.
 
+pub mod archive;
 pub mod cli;
 pub mod config;
 pub mod demo;

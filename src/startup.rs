@@ -20,7 +20,7 @@ use crate::refine::{DenseCache, JobPace, LocalRefiner, Refiner, Worker, WorkerSe
 use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
-use crate::service::{Reindexes, Service, ServiceSettings};
+use crate::service::{Janitor, Reindexes, RetentionSettings, Service, ServiceSettings};
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
 use crate::store::{JobStore, UsageStore};
 use crate::telemetry::Metrics;
@@ -41,16 +41,19 @@ pub async fn serve(
         metrics: Arc::clone(&metrics),
     };
     let server = tokio::spawn(connections.serve(listener, shutdown.clone()));
-    let drain_timeout = config.server.drain_timeout();
+    let (drain_timeout, retention) = (config.server.drain_timeout(), retention(&config));
+    let counted = Arc::clone(&metrics);
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
     let (service, workers) = building.await.context("the start broke off")??;
+    let janitor =
+        Janitor { store: Arc::clone(&service.retention), metrics: counted, settings: retention };
     let service = Arc::new(service);
     state.set_ready(Arc::clone(&service));
     let mut running = JoinSet::new();
-    running.spawn({
-        let shutdown = shutdown.clone();
-        async move { service.keep_calibrated(shutdown).await }
-    });
+    let until = shutdown.clone();
+    running.spawn(async move { janitor.run(until).await });
+    let until = shutdown.clone();
+    running.spawn(async move { service.keep_calibrated(until).await });
     for worker in workers {
         let shutdown = shutdown.clone();
         running.spawn(async move { worker.run(shutdown).await });
@@ -90,6 +93,18 @@ fn http_settings(config: &Config) -> HttpSettings {
     }
 }
 
+fn retention(config: &Config) -> RetentionSettings {
+    let keep = Duration::from_secs(u64::from(config.jobs.keep_days) * 24 * 3600);
+    RetentionSettings {
+        keep: Some(keep).filter(|keep| !keep.is_zero()),
+        most: Some(config.jobs.keep_count).filter(|most| *most > 0),
+        settle: Duration::from_secs(config.jobs.max_wait_s),
+        pause: Duration::from_secs(config.jobs.sweep_s),
+        batch: config.jobs.sweep_batch,
+        usage_days: config.data.usage_days,
+    }
+}
+
 /// Opens the store, loads the model, and puts the service together. Blocks.
 pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec<Worker>)> {
     let store = Arc::new(EmbeddedStore::open(&EmbeddedSettings {
@@ -112,7 +127,6 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
             max_bytes: config.data.description_cache_bytes,
             max_age: Duration::from_secs(config.data.description_cache_days * 24 * 3600),
         },
-        usage_days: config.data.usage_days,
     })?);
     let (models, why) = models(config)?;
     let admission = config.image.admission(config.model.layout());
@@ -171,9 +185,11 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
         maps: store.clone(),
         drafts: store.clone(),
         reindexes: Reindexes::default(),
+        exports: store.clone(),
         blobs: store.clone(),
         jobs,
         accounts: store.clone(),
+        retention: store.clone(),
         models,
         admission: Admission::new(admission),
         pool,

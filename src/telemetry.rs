@@ -19,6 +19,7 @@ use crate::config::{Log, LogFormat};
 use crate::domain::Job;
 use crate::refine::mllm::MllmLevels;
 use crate::retrieve::{AdmissionLevels, StageTimes};
+use crate::store::RemovedJobs;
 
 /// Starts logging to standard error. A second call changes nothing.
 pub fn init_logs(log: &Log) -> Result<(), String> {
@@ -48,6 +49,9 @@ pub struct Metrics {
     job_seconds: Family<RefinerLabels, Histogram, fn() -> Histogram>,
     queued_jobs: Gauge,
     submitted_jobs: Counter,
+    removed_jobs: Family<RemovedLabels, Counter>,
+    removed_frame_bytes: Counter,
+    db_bytes: Gauge,
     model_calls: Family<RefinerLabels, Counter>,
     cached_descriptions: Family<RefinerLabels, Counter>,
     tokens: Family<TokenLabels, Counter>,
@@ -84,6 +88,8 @@ pub struct Levels {
     pub maps: Vec<(String, usize)>,
     /// Jobs that wait or run.
     pub queued: usize,
+    /// Bytes of the database's files.
+    pub db_bytes: u64,
     /// Bytes of cached dense features.
     pub dense_cache_bytes: usize,
     /// Pictures in work and waiting.
@@ -113,6 +119,11 @@ struct StageLabels {
 struct JobLabels {
     refiner: &'static str,
     state: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct RemovedLabels {
+    why: &'static str,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
@@ -169,6 +180,9 @@ impl Metrics {
             job_seconds: Family::new_with_constructor(latency),
             queued_jobs: Gauge::default(),
             submitted_jobs: Counter::default(),
+            removed_jobs: Family::default(),
+            removed_frame_bytes: Counter::default(),
+            db_bytes: Gauge::default(),
             model_calls: Family::default(),
             cached_descriptions: Family::default(),
             tokens: Family::default(),
@@ -211,6 +225,17 @@ impl Metrics {
             self.job_seconds.clone(),
         );
         registry.register("jobs_queued", "Jobs that wait or run", self.queued_jobs.clone());
+        registry.register(
+            "jobs_removed",
+            "Ended jobs that were removed, because of their age or of their number (count)",
+            self.removed_jobs.clone(),
+        );
+        registry.register(
+            "frame_bytes_removed",
+            "Bytes of frames removed with their jobs",
+            self.removed_frame_bytes.clone(),
+        );
+        registry.register("db_bytes", "Bytes of the database's files", self.db_bytes.clone());
         registry.register(
             "model_calls",
             "Calls to a model outside, by jobs that ended",
@@ -328,6 +353,14 @@ impl Metrics {
         self.submitted_jobs.inc();
     }
 
+    /// Counts jobs that had their time.
+    pub fn jobs_removed(&self, removed: &RemovedJobs) {
+        for (why, jobs) in [("age", removed.by_age), ("count", removed.by_count)] {
+            self.removed_jobs.get_or_create(&RemovedLabels { why }).inc_by(jobs as u64);
+        }
+        self.removed_frame_bytes.inc_by(removed.bytes);
+    }
+
     /// Counts an ended job.
     pub fn job_ended(&self, job: &Job) {
         let refiner = job.refiner.as_str();
@@ -364,6 +397,7 @@ impl Metrics {
             self.map_images.get_or_create(&labels).set(*images as i64);
         }
         self.queued_jobs.set(levels.queued as i64);
+        self.db_bytes.set(levels.db_bytes as i64);
         self.dense_cache_bytes.set(levels.dense_cache_bytes as f64);
         let AdmissionLevels { permits, in_use, localize, index, background } = levels.admission;
         self.permits.set(permits as i64);

@@ -73,12 +73,23 @@ impl Client {
         &self,
         make: impl Fn() -> anyhow::Result<RequestBuilder>,
     ) -> anyhow::Result<Response> {
+        let response = self.answer_patiently(make).await?;
+        match response.status().is_success() {
+            true => Ok(response),
+            false => Err(explained(response).await),
+        }
+    }
+
+    /// As [`Self::send_patiently`], with an answer of any other status.
+    pub async fn answer_patiently(
+        &self,
+        make: impl Fn() -> anyhow::Result<RequestBuilder>,
+    ) -> anyhow::Result<Response> {
         for _ in 0..PATIENCE {
             let response = make()?.send().await.map_err(|error| self.unreachable(error))?;
             match response.status() {
                 StatusCode::TOO_MANY_REQUESTS => tokio::time::sleep(retry_after(&response)).await,
-                status if status.is_success() => return Ok(response),
-                _ => return Err(explained(response).await),
+                _ => return Ok(response),
             }
         }
         bail!("the server stayed overloaded")
@@ -114,7 +125,8 @@ fn retry_after(response: &Response) -> Duration {
     Duration::from_secs(u64::min(seconds, 30))
 }
 
-async fn explained(response: Response) -> anyhow::Error {
+/// What the server says went wrong.
+pub async fn explained(response: Response) -> anyhow::Error {
     #[derive(Deserialize)]
     struct Problem {
         title: String,

@@ -1,8 +1,10 @@
 //! The command line: one file for each command. Client commands talk to a server.
 
+mod backup;
 mod client;
 mod config;
 mod demo;
+mod doctor;
 mod eval;
 mod healthcheck;
 mod index;
@@ -11,6 +13,7 @@ mod localize;
 mod model;
 mod openapi;
 mod progress;
+mod restore;
 mod serve;
 
 use std::future::Future;
@@ -42,6 +45,12 @@ enum Command {
     Demo(demo::Args),
     /// Say how often the service is right on a folder of references and a folder of queries
     Eval(Box<eval::Args>),
+    /// Save maps of a server to one file, descriptors and pictures included
+    Backup(backup::Args),
+    /// Bring the maps of a backup to a server
+    Restore(restore::Args),
+    /// Say what is in a data folder, and whether it is in order
+    Doctor(doctor::Args),
     /// Print the settings in force, or every setting with its default
     Config(config::Args),
     /// Print the OpenAPI description
@@ -63,6 +72,9 @@ impl Cli {
             Command::Model(args) => block_on(model::run(args)),
             Command::Demo(args) => block_on(demo::run(args)),
             Command::Eval(args) => block_on(eval::run(*args)),
+            Command::Backup(args) => block_on(backup::run(args)),
+            Command::Restore(args) => block_on(restore::run(args)),
+            Command::Doctor(args) => doctor::run(args),
             Command::Config(args) => config::run(&args),
             Command::Openapi => openapi::run(),
             Command::Healthcheck(args) => block_on(healthcheck::run(args)),

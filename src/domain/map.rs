@@ -140,7 +140,7 @@ display_as_written!(DescriptorKind { Gem => "gem", Cls => "cls" });
 display_as_written!(Frame { Wgs84 => "wgs84", Metric => "metric" });
 
 /// A map as it is stored.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Map {
     /// Tells this map from an earlier, deleted one of the same name.
     pub uid: Uuid,
@@ -156,6 +156,7 @@ pub struct Map {
     pub model: String,
     /// The digest of that model's weights and of how they are fed and pooled: descriptors of another
     /// do not mix with them.
+    #[schema(value_type = String)]
     pub model_digest: Digest,
     /// The arithmetic that the model runs in.
     #[serde(default)]
@@ -170,6 +171,18 @@ pub struct Map {
     pub description: Option<String>,
     /// When it was created.
     pub created_at: Timestamp,
+}
+
+impl Map {
+    /// Whether the descriptors of another map would fit among those of this one: they are of the same
+    /// model, run and pooled alike.
+    pub fn is_like(&self, other: &Self) -> bool {
+        self.model == other.model
+            && self.model_digest == other.model_digest
+            && self.precision == other.precision
+            && self.descriptor == other.descriptor
+            && self.dim == other.dim
+    }
 }
 
 #[cfg(test)]

@@ -52,7 +52,6 @@ fn store(dir: &std::path::Path, exact_up_to: usize) -> EmbeddedStore {
         db_cache_bytes: 1 << 20,
         commit_batch: 64,
         descriptions: DescriptionBounds { max_bytes: 1 << 20, max_age },
-        usage_days: 1,
     })
     .unwrap()
 }

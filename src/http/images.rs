@@ -174,9 +174,9 @@ fn meta_from_part(part: &Bytes) -> Result<ImageMeta, Problem> {
 #[serde(deny_unknown_fields)]
 pub(super) struct PageParams {
     /// `next_cursor` of the page before.
-    cursor: Option<String>,
+    pub cursor: Option<String>,
     /// Images in a page, 1 to 1000; 100 by default.
-    limit: Option<usize>,
+    pub limit: Option<usize>,
 }
 
 /// List the images of a map, by id
@@ -251,6 +251,6 @@ pub(super) async fn delete_image(
     Ok(StatusCode::NO_CONTENT)
 }
 
-fn image_id(text: &str) -> Result<ImageId, Problem> {
+pub(super) fn image_id(text: &str) -> Result<ImageId, Problem> {
     Ok(text.parse().map_err(ServiceError::from)?)
 }

@@ -13,6 +13,7 @@ mod localize;
 mod maps;
 mod problem;
 mod state;
+mod transfer;
 mod usage;
 
 use axum::Router;
@@ -55,6 +56,8 @@ fn described() -> OpenApiRouter<AppState> {
         .routes(routes!(maps::list_maps))
         .routes(routes!(maps::get_map, maps::put_map, maps::delete_map))
         .routes(routes!(maps::reindex))
+        .routes(routes!(transfer::export))
+        .routes(routes!(transfer::import_map, transfer::import_image))
         .routes(routes!(images::list_images, images::add_image))
         .routes(routes!(images::get_image, images::delete_image))
         .routes(routes!(images::image_content))

@@ -10,6 +10,7 @@ use tokio::sync::broadcast::error::RecvError;
 use utoipa::ToSchema;
 use uuid::Uuid;
 
+use super::jobs::no_job;
 use super::{Service, ServiceError};
 use crate::domain::{Description, ImageId, Job, JobState};
 use crate::store::{JobRecord, JobStore};
@@ -64,7 +65,7 @@ impl Service {
         };
         match self.jobs.job(id).await? {
             Some(record) => follower.look_at(record),
-            None => return Err(ServiceError::not_found(format!("there is no job {id}"))),
+            None => return Err(no_job(id)),
         }
         Ok(stream::unfold(follower, |mut follower| async {
             follower.next().await.map(|event| (event, follower))

@@ -209,18 +209,23 @@ struct CheckedMeta {
 
 impl CheckedMeta {
     fn new(meta: ImageMeta, map: &Map) -> Result<Self, ServiceError> {
-        let too_many = meta.tags.len() > 32;
-        if too_many || meta.tags.iter().any(|tag| tag.is_empty() || tag.chars().count() > 64) {
-            return Err(ServiceError::unprocessable(
-                "an image has at most 32 tags, each of 1 to 64 characters",
-            ));
-        }
+        check_tags(&meta.tags)?;
         Ok(Self {
             id: meta.id.map(|id| id.parse()).transpose()?,
             pose: meta.pose.map(|pose| Pose::from_json(map.frame, pose)).transpose()?,
             captured_at: meta.captured_at,
             tags: meta.tags,
         })
+    }
+}
+
+pub(super) fn check_tags(tags: &[String]) -> Result<(), ServiceError> {
+    let misfit = |tag: &String| tag.is_empty() || tag.chars().count() > 64;
+    match tags.len() > 32 || tags.iter().any(misfit) {
+        true => Err(ServiceError::unprocessable(
+            "an image has at most 32 tags, each of 1 to 64 characters",
+        )),
+        false => Ok(()),
     }
 }
 

@@ -81,9 +81,16 @@ impl Service {
     async fn known_job(&self, id: Uuid) -> Result<Job, ServiceError> {
         match self.jobs.job(id).await? {
             Some(record) => Ok(record.job),
-            None => Err(ServiceError::not_found(format!("there is no job {id}"))),
+            None => Err(no_job(id)),
         }
     }
+}
+
+pub(super) fn no_job(id: Uuid) -> ServiceError {
+    ServiceError::not_found(format!(
+        "there is no job {id}; one that has ended is removed in time (jobs.keep_days, \
+         jobs.keep_count)"
+    ))
 }
 
 /// The next job that changes; `None` if notices were lost, any of which may have been the one.

@@ -13,7 +13,9 @@ mod localize;
 mod maps;
 mod models;
 mod reindex;
+mod retention;
 mod submit;
+mod transfer;
 mod usage;
 
 use std::sync::Arc;
@@ -26,12 +28,14 @@ pub use self::jobs::JobPage;
 pub use self::localize::{Answer, JobLink, LocalizeRequest, RefineMode, Retrieved, TimingMs};
 pub use self::maps::{IndexKind, MapChange, MapState};
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
+pub use self::retention::{Janitor, RetentionSettings};
 pub use self::submit::{NoJob, NoJobReason};
+pub use self::transfer::{ExportPage, ImportedImage};
 pub use self::usage::{Today, Total, UsageReport};
 use crate::domain::CalibrationSettings;
 use crate::refine::{DenseCache, JobPace, Refiner};
 use crate::retrieve::{Admission, CpuPool, LoadedModels};
-use crate::store::{BlobStore, DraftStore, JobStore, MapStore, UsageStore};
+use crate::store::{BlobStore, DraftStore, ExportStore, JobStore, MapStore, Retention, UsageStore};
 use crate::telemetry::Metrics;
 
 /// Bounds and defaults of the use cases.
@@ -69,6 +73,8 @@ pub struct Service {
     pub drafts: Arc<dyn DraftStore>,
     /// How far that has come.
     pub reindexes: Reindexes,
+    /// Images with their descriptors.
+    pub exports: Arc<dyn ExportStore>,
     /// Image bytes.
     pub blobs: Arc<dyn BlobStore>,
     /// Jobs.
@@ -87,6 +93,8 @@ pub struct Service {
     pub refiner: Option<Arc<dyn Refiner>>,
     /// Dense features that a job will need soon.
     pub dense: Arc<DenseCache>,
+    /// Where they are all kept.
+    pub retention: Arc<dyn Retention>,
     /// What is counted.
     pub metrics: Arc<Metrics>,
     /// Bounds and defaults.

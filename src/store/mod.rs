@@ -13,6 +13,7 @@ use jiff::Timestamp;
 use jiff::civil::Date;
 use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
+use utoipa::ToSchema;
 use uuid::Uuid;
 
 use crate::domain::{
@@ -135,6 +136,29 @@ pub struct LookAlikes {
     pub image_id: ImageId,
     /// Images of other places, the most similar first.
     pub others: Vec<Candidate>,
+}
+
+/// An image with its descriptor, as it goes from one store to another.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ExportedImage {
+    /// The image.
+    pub image: Image,
+    /// Base64 of its numbers: 32-bit floats, little-endian. Null if what is stored is damaged.
+    #[schema(value_type = Option<String>)]
+    pub descriptor: Option<Descriptor>,
+}
+
+/// Images with their descriptors.
+#[async_trait]
+pub trait ExportStore: Send + Sync {
+    /// Images by id, those after `after`, at most `limit`; [`StoreError::Superseded`] if the map has
+    /// other descriptors than the caller knows.
+    async fn export(
+        &self,
+        map: &Map,
+        after: Option<&ImageId>,
+        limit: usize,
+    ) -> Result<Vec<ExportedImage>, StoreError>;
 }
 
 /// Where the descriptors of a map are made anew while the old ones serve.
@@ -330,4 +354,52 @@ pub trait UsageStore: Send + Sync {
     async fn add_usage(&self, spent: DayUsage) -> Result<(), StoreError>;
     /// What was spent from that day on, by day and map, oldest first.
     async fn usage(&self, from: Date) -> Result<Vec<DayUsage>, StoreError>;
+}
+
+/// Which of the jobs that have ended are kept. A job is removed with its query and its frame.
+#[derive(Debug, Clone, Copy)]
+pub struct KeepJobs {
+    /// Only those that ended since then, if it is given.
+    pub since: Option<Timestamp>,
+    /// Only so many, if it is given; the first to end go first.
+    pub most: Option<usize>,
+    /// All that ended after this moment, whatever the two above say.
+    pub settled: Timestamp,
+}
+
+/// What was removed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct RemovedJobs {
+    /// Jobs that ended too long ago.
+    pub by_age: usize,
+    /// Jobs of which there were too many.
+    pub by_count: usize,
+    /// Bytes of frames that nothing refers to any more.
+    pub bytes: u64,
+}
+
+impl RemovedJobs {
+    /// Jobs removed.
+    pub fn jobs(&self) -> usize {
+        self.by_age + self.by_count
+    }
+}
+
+impl std::ops::AddAssign for RemovedJobs {
+    fn add_assign(&mut self, other: Self) {
+        self.by_age += other.by_age;
+        self.by_count += other.by_count;
+        self.bytes += other.bytes;
+    }
+}
+
+/// Forgetting what has had its time.
+#[async_trait]
+pub trait Retention: Send + Sync {
+    /// Removes jobs that are not to be kept, at most `batch` of them, so that no change waits long.
+    async fn remove_ended(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError>;
+    /// Forgets what was spent before that day.
+    async fn forget_usage(&self, before: Date) -> Result<(), StoreError>;
+    /// Bytes of the database's files.
+    async fn db_bytes(&self) -> Result<u64, StoreError>;
 }

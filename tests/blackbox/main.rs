@@ -11,11 +11,13 @@
 
 mod support;
 
+mod backup;
 mod bad_input;
 mod cli;
 mod confidence;
 mod demo;
 mod dinov2;
+mod doctor;
 mod durability;
 mod eval;
 mod events;
@@ -31,5 +33,7 @@ mod models;
 mod overload;
 mod real_images;
 mod reindex;
+mod retention;
+mod schema;
 mod service;
 mod slow_clients;

@@ -85,22 +85,33 @@ impl Blobs {
         }
     }
 
-    /// Removes bytes that nobody needs any more. What cannot be removed stays as rubbish, which
-    /// harms nobody.
-    pub fn remove_unreferenced(&self, digest: &Digest, trees: &Trees) {
+    /// Removes bytes that nobody needs any more, and says how many. What cannot be removed stays as
+    /// rubbish, which harms nobody.
+    pub fn remove_unreferenced(&self, digest: &Digest, trees: &Trees) -> u64 {
         let pinned = self.pinned.lock().unwrap_or_else(PoisonError::into_inner);
         if pinned.contains_key(digest) || !trees.is_unreferenced(digest) {
-            return;
+            return 0;
         }
-        if let Err(error) = fs::remove_file(self.path(digest)) {
-            tracing::warn!(%digest, %error, "cannot remove image bytes");
+        let path = self.path(digest);
+        let bytes = fs::metadata(&path).map_or(0, |found| found.len());
+        match fs::remove_file(&path) {
+            Ok(()) => bytes,
+            Err(error) => {
+                tracing::warn!(%digest, %error, "cannot remove image bytes");
+                0
+            }
         }
     }
 
     fn path(&self, digest: &Digest) -> PathBuf {
-        let hex = digest.hex();
-        self.dir.join(&hex[..2]).join(&hex[2..])
+        path_of(&self.dir, digest)
     }
+}
+
+/// Where bytes of that digest are, in the folder of all.
+pub(super) fn path_of(dir: &Path, digest: &Digest) -> PathBuf {
+    let hex = digest.hex();
+    dir.join(&hex[..2]).join(&hex[2..])
 }
 
 fn write_durably(path: &Path, bytes: &[u8]) -> io::Result<()> {

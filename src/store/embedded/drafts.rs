@@ -5,7 +5,7 @@
 //! thread, and only while no image has a slot beyond the mark.
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;
 
 use std::fs::File;
 use std::path::PathBuf;

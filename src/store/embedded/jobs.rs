@@ -14,8 +14,8 @@ use uuid::Uuid;
 
 use super::super::{Claim, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
 use super::trees::{
-    BlobOwner, Lease, Trees, blob_ref_key, decode, encode, failed, put, queue_key, queued_job,
-    transaction_failed,
+    BlobOwner, Lease, Trees, blob_ref_key, decode, encode, ended_key, failed, put, queue_key,
+    queued_job, transaction_failed,
 };
 use super::{EmbeddedStore, blocking};
 use crate::domain::{Job, JobState, Usage};
@@ -37,10 +37,16 @@ impl EmbeddedStore {
                 },
                 move |(before, job)| {
                     match (before.is_final(), job.state.is_final()) {
-                        (false, true) => inner.queued.fetch_sub(1, Ordering::Relaxed),
-                        (true, false) => inner.queued.fetch_add(1, Ordering::Relaxed),
-                        _ => 0,
-                    };
+                        (false, true) => {
+                            inner.queued.fetch_sub(1, Ordering::Relaxed);
+                            inner.ended.fetch_add(1, Ordering::Relaxed);
+                        }
+                        (true, false) => {
+                            inner.queued.fetch_add(1, Ordering::Relaxed);
+                            inner.ended.fetch_sub(1, Ordering::Relaxed);
+                        }
+                        _ => {}
+                    }
                     let _ = inner.changes.send(id);
                 },
             )
@@ -131,7 +137,7 @@ impl JobStore for EmbeddedStore {
                     record.job.started_at.get_or_insert(now);
                     record.job.attempts += 1;
                     record.claims += 1;
-                    write_job(trees, &record, Some(Some(lease_until)))?;
+                    write_job(trees, &record, Place::Queue(Some(lease_until)))?;
                     Ok(Some(record))
                 },
                 move |claimed: &Option<JobRecord>| {
@@ -163,7 +169,7 @@ impl JobStore for EmbeddedStore {
                 if !release.counts {
                     record.job.attempts = record.job.attempts.saturating_sub(1);
                 }
-                write_job(trees, &record, Some(release.not_before))?;
+                write_job(trees, &record, Place::Queue(release.not_before))?;
             }
             Ok(record)
         })
@@ -175,7 +181,7 @@ impl JobStore for EmbeddedStore {
         self.change(claim.job, move |trees, mut record| {
             if record.is_held_by(claim) {
                 record.job = job;
-                write_job(trees, &record, None)?;
+                write_job(trees, &record, Place::Ended(ended_at(&record.job)))?;
             }
             Ok(record)
         })
@@ -188,7 +194,7 @@ impl JobStore for EmbeddedStore {
             if !record.job.state.is_final() {
                 record.job.state = JobState::Cancelled;
                 record.job.finished_at = Some(Timestamp::now());
-                write_job(trees, &record, None)?;
+                write_job(trees, &record, Place::Ended(ended_at(&record.job)))?;
             }
             Ok(record)
         })
@@ -197,7 +203,7 @@ impl JobStore for EmbeddedStore {
 
     async fn retry(&self, id: Uuid) -> Result<Job, StoreError> {
         self.change(id, move |trees, mut record| {
-            let job = &mut record.job;
+            let (ended, job) = (ended_at(&record.job), &mut record.job);
             match job.state {
                 JobState::Failed | JobState::Cancelled | JobState::Degraded => {}
                 state => {
@@ -209,7 +215,7 @@ impl JobStore for EmbeddedStore {
             job.state = JobState::Queued;
             (job.attempts, job.usage, job.finished_at, job.error) =
                 (0, Usage::default(), None, None);
-            write_job(trees, &record, Some(None))?;
+            write_job(trees, &record, Place::Again { ended })?;
             Ok(record)
         })
         .await
@@ -263,21 +269,46 @@ fn next_waiting(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, Stor
 fn insert_job(trees: &Trees, record: &JobRecord) -> Result<(), StoreError> {
     let reference = blob_ref_key(&record.query.digest, &BlobOwner::Query(record.query.id));
     put(&trees.blob_refs, &reference, &())?;
-    write_job(trees, record, Some(None))
+    write_job(trees, record, Place::Queue(None))
 }
 
-/// Writes a job and its place in the queue: a lease, or `None` to take it out.
-fn write_job(trees: &Trees, record: &JobRecord, queue: Option<Lease>) -> Result<(), StoreError> {
-    let (key, place) = (record.job.id.as_bytes(), queue_key(&record.job));
+/// Where a job is listed.
+enum Place {
+    /// In the queue.
+    Queue(Lease),
+    /// In the queue again, after it had ended.
+    Again { ended: Timestamp },
+    /// Among those that have ended, by when that was.
+    Ended(Timestamp),
+}
+
+/// When a job ended that has ended.
+pub(super) fn ended_at(job: &Job) -> Timestamp {
+    job.finished_at.unwrap_or(job.created_at)
+}
+
+/// Writes a job and its place.
+fn write_job(trees: &Trees, record: &JobRecord, place: Place) -> Result<(), StoreError> {
+    let (key, in_queue) = (record.job.id.as_bytes(), queue_key(&record.job));
     let value = encode(record)?;
-    let lease = queue.map(|lease| encode(&lease)).transpose()?;
-    (&trees.jobs, &trees.queue)
-        .transaction(|(jobs, queue)| {
+    let (lease, gone, end) = match place {
+        Place::Queue(lease) => (Some(encode(&lease)?), None, None),
+        Place::Again { ended } => (Some(encode(&Lease::None)?), Some(ended), None),
+        Place::Ended(at) => (None, None, Some(at)),
+    };
+    (&trees.jobs, &trees.queue, &trees.ended)
+        .transaction(|(jobs, queue, ended)| {
             jobs.insert(key, value.as_slice())?;
             match &lease {
-                Some(lease) => queue.insert(&place, lease.as_slice())?,
-                None => queue.remove(&place)?,
+                Some(lease) => queue.insert(&in_queue, lease.as_slice())?,
+                None => queue.remove(&in_queue)?,
             };
+            if let Some(at) = gone {
+                ended.remove(&ended_key(at, record.job.id))?;
+            }
+            if let Some(at) = end {
+                ended.insert(&ended_key(at, record.job.id), &[] as &[u8])?;
+            }
             Ok(())
         })
         .map_err(transaction_failed)

@@ -6,7 +6,7 @@
 //! `DATA/commits` afterwards. A database that is behind that file has lost what was acknowledged.
 
 use std::fs::File;
-use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use super::super::StoreError;
@@ -25,31 +25,13 @@ impl CommitMark {
     /// # Errors
     /// [`StoreError::Damaged`] if the database is behind.
     pub fn open(dir: &Path, trees: &Trees) -> Result<Self, StoreError> {
-        let path = dir.join("commits");
-        let failed = |error: io::Error| {
-            StoreError::Failed(format!("cannot use {}: {error}", path.display()))
-        };
-        let mut file = File::options()
-            .create(true)
-            .truncate(false)
-            .read(true)
-            .write(true)
-            .open(&path)
-            .map_err(failed)?;
-        let mut text = String::new();
-        file.read_to_string(&mut text).map_err(failed)?;
-        // One that was never written to its end says nothing.
-        let noted = text.trim().parse().unwrap_or(0);
         let number = trees.commit_number()?;
-        if number < noted {
-            return Err(StoreError::Damaged(format!(
-                "{} has lost changes that were acknowledged: it ends at commit {number} of {noted}, \
-                 so its files were damaged. Restore a backup into another folder; or remove {} to go \
-                 on with what is left",
-                dir.join("db").display(),
-                path.display()
-            )));
+        if let Some(lost) = lost(dir, trees)? {
+            return Err(StoreError::Damaged(lost));
         }
+        let path = dir.join("commits");
+        let file = File::options().create(true).truncate(false).write(true).open(&path);
+        let file = file.map_err(|error| cannot_use(&path, &error))?;
         Ok(Self { path, file, number })
     }
 
@@ -68,4 +50,30 @@ impl CommitMark {
             tracing::warn!(file = %self.path.display(), %error, "a commit cannot be noted");
         }
     }
+}
+
+/// Says what a database has lost, if it has.
+pub(super) fn lost(dir: &Path, trees: &Trees) -> Result<Option<String>, StoreError> {
+    let path = dir.join("commits");
+    let text = match std::fs::read_to_string(&path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(cannot_use(&path, &error)),
+    };
+    // One that was never written to its end says nothing.
+    let noted = text.trim().parse().unwrap_or(0);
+    let number = trees.commit_number()?;
+    Ok((number < noted).then(|| {
+        format!(
+            "{} has lost changes that were acknowledged: it ends at commit {number} of {noted}, so its \
+             files were damaged. Restore a backup into another folder; or remove {} to go on with what \
+             is left",
+            dir.join("db").display(),
+            path.display()
+        )
+    }))
+}
+
+fn cannot_use(path: &Path, error: &io::Error) -> StoreError {
+    StoreError::Failed(format!("cannot use {}: {error}", path.display()))
 }

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! DATA/lock              held while a process uses the folder
+//! DATA/version           the version of what follows (`schema.rs`)
 //! DATA/commits           the number of the last commit, to notice a database that lost some
 //! DATA/db/               sled: records of maps, images, queries and jobs
 //! DATA/descriptors/UID/  append-only segments of one map's descriptors, memory-mapped; UID-N/ from
@@ -13,13 +14,18 @@
 //! The graph of a map is derived from its segments and is built in the background.
 
 mod blobs;
+mod compact;
 mod descriptions;
+mod doctor;
 mod drafts;
+mod export;
 mod indexer;
 mod jobs;
 mod live_map;
 mod maps;
 mod mark;
+mod retention;
+mod schema;
 mod segments;
 mod trees;
 mod usage;
@@ -31,20 +37,21 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, PoisonError, RwLock};
 
-use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
 use self::blobs::Blobs;
+pub use self::compact::{Compacted, compact};
 pub use self::descriptions::DescriptionBounds;
 use self::descriptions::DescriptionUse;
+pub use self::doctor::{Examination, Finding, MapReport, Report, Sizes, examine};
 use self::indexer::Indexer;
 use self::live_map::LiveMap;
 use self::mark::CommitMark;
 use self::trees::Trees;
 use self::writer::Writer;
 use super::StoreError;
-use crate::domain::{MapName, utc_day};
+use crate::domain::MapName;
 use crate::retrieve::index::IndexSettings;
 
 /// How the embedded store works.
@@ -64,8 +71,6 @@ pub struct EmbeddedSettings {
     pub commit_batch: usize,
     /// Bounds of the cache of descriptions.
     pub descriptions: DescriptionBounds,
-    /// For how many days it is known what was spent.
-    pub usage_days: u32,
 }
 
 /// The embedded store; clones share it.
@@ -84,7 +89,9 @@ struct Inner {
     indexer: Indexer,
     index: IndexSettings,
     descriptors: PathBuf,
+    /// Jobs that wait or run, and jobs that have ended.
     queued: AtomicUsize,
+    ended: AtomicUsize,
     descriptions: DescriptionUse,
     changes: broadcast::Sender<Uuid>,
     /// Held, never read: the lock ends with the file handle.
@@ -100,6 +107,8 @@ impl EmbeddedStore {
         let dir = &settings.dir;
         make_folder(dir)?;
         let lock = lock(dir)?;
+        schema::bring_up_to_date(dir)?;
+        compact::settle(dir)?;
         let trees = Trees::open(&dir.join("db"), settings.db_cache_bytes)?;
         let mark = CommitMark::open(dir, &trees)?;
         let descriptors = dir.join("descriptors");
@@ -112,10 +121,8 @@ impl EmbeddedStore {
             let live = LiveMap::load(map, &descriptors, settings.index, &trees)?;
             loaded.insert(name, Arc::new(live));
         }
-        let kept = SignedDuration::from_hours(24 * i64::from(settings.usage_days));
-        let today = utc_day(Timestamp::now());
-        usage::forget_before(&trees, today.saturating_sub(kept))?;
         let queued = trees.requeue_claimed()?;
+        let ended = trees.ended.len();
         let inner = Inner {
             writer: Writer::start(trees.clone(), mark, settings.commit_batch)?,
             indexer: Indexer::start(settings.index_threads)?,
@@ -127,6 +134,7 @@ impl EmbeddedStore {
             index: settings.index,
             descriptors,
             queued: AtomicUsize::new(queued),
+            ended: AtomicUsize::new(ended),
             changes: broadcast::channel(CHANGES_KEPT).0,
             _lock: lock,
         };
@@ -144,6 +152,15 @@ fn make_folder(path: &Path) -> Result<(), StoreError> {
             path.display()
         ))
     })
+}
+
+/// A folder that is to be looked at, not made.
+fn check_folder(dir: &Path) -> Result<(), StoreError> {
+    if dir.is_dir() {
+        return Ok(());
+    }
+    let dir = dir.display();
+    Err(StoreError::NotFound(format!("there is no data folder {dir}; name one with --data")))
 }
 
 fn lock(dir: &Path) -> Result<File, StoreError> {

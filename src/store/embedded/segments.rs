@@ -19,6 +19,7 @@ use std::sync::{Arc, PoisonError, RwLock};
 use memmap2::Mmap;
 
 use super::super::StoreError;
+use crate::domain::Descriptor;
 use crate::retrieve::index::Vectors;
 
 const MAGIC: &[u8; 8] = b"WHEREVEC";
@@ -102,6 +103,16 @@ impl VectorFiles {
             header[8..] == (slot as u64).to_le_bytes()
                 && header[..4] == checksum(&header[8..], vector).to_le_bytes()
         })
+    }
+
+    /// The descriptor of `slot`; `None` unless it is what was written there.
+    pub fn read(&self, slot: usize) -> Option<Descriptor> {
+        if !self.is_intact(slot) {
+            return None;
+        }
+        let segment = self.segment(slot / ROWS)?;
+        let numbers: &[f32] = bytemuck::cast_slice(self.row(&segment, slot).1);
+        Descriptor::stored(numbers.to_vec()).ok()
     }
 
     fn grow(&self) -> Result<(), StoreError> {

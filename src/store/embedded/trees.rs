@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use jiff::Timestamp;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use uuid::Uuid;
@@ -23,6 +24,8 @@ pub(super) struct Trees {
     pub jobs: sled::Tree,
     /// Place in the queue → when its lease ends ([`Lease`]), for jobs that have not ended.
     pub queue: sled::Tree,
+    /// When a job ended, and its id → nothing, for jobs that have ended.
+    pub ended: sled::Tree,
     /// Cache key → description of a pair.
     pub descriptions: sled::Tree,
     /// Map uid, query id → a frame whose pairs were described.
@@ -43,7 +46,7 @@ pub(super) struct StoredImage {
 
 /// Until when nobody may take a job: it is held, or is not to be tried before. `None` while it
 /// waits.
-pub(super) type Lease = Option<jiff::Timestamp>;
+pub(super) type Lease = Option<Timestamp>;
 
 /// Who needs the bytes of a blob.
 pub(super) enum BlobOwner<'a> {
@@ -67,11 +70,22 @@ impl Trees {
             blob_refs: tree("blob_refs")?,
             jobs: tree("jobs")?,
             queue: tree("queue")?,
+            ended: tree("ended")?,
             descriptions: tree("descriptions")?,
             frames: tree("frames")?,
             usage: tree("usage")?,
             db,
         })
+    }
+
+    /// Every tree that has a name.
+    pub fn all(&self) -> Result<Vec<sled::Tree>, StoreError> {
+        self.db.tree_names().iter().map(|name| self.tree(name)).collect()
+    }
+
+    /// The tree of that name; made if it is not there.
+    pub fn tree(&self, name: &[u8]) -> Result<sled::Tree, StoreError> {
+        self.db.open_tree(name).map_err(failed)
     }
 
     /// Makes every change so far durable.
@@ -150,24 +164,21 @@ impl Trees {
         for key in self.queue.iter().keys() {
             let key = key.map_err(failed)?;
             waiting += 1;
-            // Before there were priorities, a job's place was its id.
-            let before = Uuid::from_slice(&key).ok();
-            let job = before.or_else(|| queued_job(&key));
-            let Some(mut record) = job.map(|id| self.job(id)).transpose()?.flatten() else {
-                continue;
-            };
+            let job = queued_job(&key).map(|id| self.job(id)).transpose()?.flatten();
+            let Some(mut record) = job else { continue };
             if record.job.state == JobState::Running {
                 record.job.state = JobState::Queued;
                 put(&self.jobs, record.job.id.as_bytes(), &record)?;
                 put(&self.queue, &key, &Lease::None)?;
             }
-            if before.is_some() {
-                put(&self.queue, &queue_key(&record.job), &Lease::None)?;
-                self.queue.remove(&key).map_err(failed)?;
-            }
         }
         self.flush()?;
         Ok(waiting)
+    }
+
+    /// Bytes of the database's files.
+    pub fn bytes(&self) -> Result<u64, StoreError> {
+        self.db.size_on_disk().map_err(failed)
     }
 }
 
@@ -186,6 +197,20 @@ pub(super) fn queue_key(job: &Job) -> [u8; 17] {
 /// The job at a place in the queue.
 pub(super) fn queued_job(key: &[u8]) -> Option<Uuid> {
     Uuid::from_slice(key.get(1..)?).ok()
+}
+
+/// A job's place among those that have ended: sorted by when that was, in milliseconds since 1970.
+pub(super) fn ended_key(at: Timestamp, job: Uuid) -> [u8; 24] {
+    let mut key = [0; 24];
+    key[..8].copy_from_slice(&at.as_millisecond().max(0).to_be_bytes());
+    key[8..].copy_from_slice(job.as_bytes());
+    key
+}
+
+/// When a job ended, and which, from its place.
+pub(super) fn ended_job(key: &[u8]) -> Option<(Timestamp, Uuid)> {
+    let (at, job) = key.split_first_chunk::<8>()?;
+    Some((Timestamp::from_millisecond(i64::from_be_bytes(*at)).ok()?, Uuid::from_slice(job).ok()?))
 }
 
 pub(super) fn image_key(map_uid: Uuid, id: &ImageId) -> Vec<u8> {
@@ -243,47 +268,5 @@ pub(super) fn transaction_failed(error: sled::transaction::TransactionError<()>)
             StoreError::Failed("a transaction was given up".into())
         }
         sled::transaction::TransactionError::Storage(error) => failed(error),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use jiff::Timestamp;
-
-    use super::*;
-    use crate::domain::{MediaType, RefinerKind};
-    use crate::store::Query;
-
-    #[test]
-    fn a_job_that_was_queued_before_there_were_priorities_keeps_its_place() {
-        let dir = tempfile::tempdir().unwrap();
-        let trees = Trees::open(dir.path(), 1 << 20).unwrap();
-        let (now, query) = (Timestamp::now(), Uuid::now_v7());
-        let mut job = Job::queued("m".parse().unwrap(), query, RefinerKind::Local, now);
-        job.state = JobState::Running;
-        let digest = Digest::of(b"frame");
-        let query = Query {
-            id: query,
-            digest,
-            media_type: MediaType::Jpeg,
-            created_at: now,
-            descriptor: None,
-        };
-        let record = JobRecord {
-            job: job.clone(),
-            map_uid: Uuid::nil(),
-            revision: 0,
-            query,
-            candidates: vec![],
-            claims: 0,
-        };
-        put(&trees.jobs, job.id.as_bytes(), &record).unwrap();
-        put(&trees.queue, job.id.as_bytes(), &Some(now)).unwrap();
-        for _ in 0..2 {
-            assert_eq!(trees.requeue_claimed().unwrap(), 1);
-            let keys: Vec<_> = trees.queue.iter().keys().map(Result::unwrap).collect();
-            assert_eq!(keys, [queue_key(&job)]);
-            assert_eq!(trees.job(job.id).unwrap().unwrap().job.state, JobState::Queued);
-        }
     }
 }

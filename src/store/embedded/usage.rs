@@ -6,17 +6,9 @@ use async_trait::async_trait;
 use jiff::civil::Date;
 
 use super::super::{StoreError, UsageStore};
-use super::trees::{Trees, decode, failed, get, put};
+use super::trees::{decode, failed, get, put};
 use super::{EmbeddedStore, blocking};
 use crate::domain::DayUsage;
-
-/// Removes what is older than `first`.
-pub(super) fn forget_before(trees: &Trees, first: Date) -> Result<(), StoreError> {
-    for key in trees.usage.range(..first.to_string().into_bytes()).keys() {
-        trees.usage.remove(key.map_err(failed)?).map_err(failed)?;
-    }
-    Ok(())
-}
 
 /// Sorted by day: dates are written with four, two and two digits.
 fn key(of: &DayUsage) -> Vec<u8> {

@@ -13,7 +13,7 @@ use crate::domain::{
 use crate::retrieve::index::{IndexSettings, SearchMode};
 use crate::store::{Draft, DraftStore, MapStore, StoreError};
 
-fn settings(dir: &Path) -> EmbeddedSettings {
+pub fn settings(dir: &Path) -> EmbeddedSettings {
     EmbeddedSettings {
         dir: dir.to_owned(),
         index: IndexSettings {
@@ -28,7 +28,6 @@ fn settings(dir: &Path) -> EmbeddedSettings {
         db_cache_bytes: 1 << 20,
         commit_batch: 8,
         descriptions: DescriptionBounds { max_bytes: 1 << 20, max_age: Duration::from_secs(60) },
-        usage_days: 1,
     }
 }
 

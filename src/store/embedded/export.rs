@@ -1,0 +1,33 @@
+//! Images with their descriptors, for another store.
+
+use std::sync::Arc;
+
+use async_trait::async_trait;
+
+use super::super::{ExportStore, ExportedImage, StoreError};
+use super::trees::StoredImage;
+use super::{EmbeddedStore, blocking};
+use crate::domain::{ImageId, Map};
+
+#[async_trait]
+impl ExportStore for EmbeddedStore {
+    async fn export(
+        &self,
+        map: &Map,
+        after: Option<&ImageId>,
+        limit: usize,
+    ) -> Result<Vec<ExportedImage>, StoreError> {
+        let live = self.inner.live_revision(map)?;
+        let (inner, uid, after) = (Arc::clone(&self.inner), map.uid, after.cloned());
+        blocking(move || {
+            let images = inner.trees.images_after(uid, after.as_ref()).take(limit);
+            images
+                .map(|stored| {
+                    let StoredImage { image, slot } = stored?;
+                    Ok(ExportedImage { image, descriptor: live.vectors.read(slot) })
+                })
+                .collect()
+        })
+        .await
+    }
+}

@@ -1,0 +1,300 @@
+//! The version of a data folder, and the steps that bring an older one up to date.
+//!
+//! The version is in a file of its own, `DATA/version`, because it has to be known before the database
+//! is opened: opening it writes to it, and a later version may keep its records elsewhere. A folder
+//! with a database and without that file is of version 1.
+//!
+//! | version | what is new |
+//! |---|---|
+//! | 1 | |
+//! | 2 | a place in the queue begins with the job's priority; ended jobs are listed by when they ended |
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use uuid::Uuid;
+use walkdir::WalkDir;
+
+use super::super::StoreError;
+use super::blobs::replace_durably;
+use super::jobs::ended_at;
+use super::trees::{Lease, Trees, decode, ended_key, failed, put, queue_key};
+use crate::store::JobRecord;
+
+const FILE: &str = "version";
+
+/// From each version to the next, the first from version 1.
+const STEPS: &[Step] = &[Step { changes: &["db"], apply: list_jobs_by_place }];
+
+/// From one version to the next.
+struct Step {
+    /// What it changes, below the data folder; copied first.
+    changes: &'static [&'static str],
+    /// Does it. A step that broke off is taken again, from wherever it came to.
+    apply: fn(&Path) -> Result<(), StoreError>,
+}
+
+/// The version that this program reads and writes.
+pub(super) fn newest() -> u32 {
+    STEPS.len() as u32 + 1
+}
+
+/// Brings the data folder to this program's version, or refuses it. Call it under the lock.
+pub(super) fn bring_up_to_date(dir: &Path) -> Result<(), StoreError> {
+    migrate(dir, STEPS)
+}
+
+/// The version of the data folder; `None` if there is nothing in it yet.
+pub(super) fn version_of(dir: &Path) -> Result<Option<u32>, StoreError> {
+    let path = dir.join(FILE);
+    match fs::read_to_string(&path) {
+        Ok(text) => match text.trim().parse() {
+            Ok(version) if version > 0 => Ok(Some(version)),
+            _ => Err(StoreError::Damaged(format!(
+                "{} holds no version; put the data folder back from a copy, or make a new one and \
+                 `whereabouts restore` a backup",
+                path.display()
+            ))),
+        },
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            Ok(dir.join("db").is_dir().then_some(1))
+        }
+        Err(error) => Err(cannot("read", &path, &error)),
+    }
+}
+
+/// Where the step to `version` keeps what it found.
+pub(super) fn copy_before(dir: &Path, version: u32) -> PathBuf {
+    dir.join(format!("before-version-{version}"))
+}
+
+/// Why a folder of a later version is left alone, and what to do.
+pub(super) fn too_new(dir: &Path, version: u32, newest: u32) -> String {
+    format!(
+        "the data folder {} is of version {version}, and this program knows versions up to {newest}: \
+         a later whereabouts has used it. Run that one; or back up from it with `whereabouts backup` \
+         and restore into a new folder of this one",
+        dir.display()
+    )
+}
+
+fn migrate(dir: &Path, steps: &[Step]) -> Result<(), StoreError> {
+    let newest = steps.len() as u32 + 1;
+    let Some(mut version) = version_of(dir)? else { return write_version(dir, newest) };
+    if version > newest {
+        return Err(StoreError::Conflict(too_new(dir, version, newest)));
+    }
+    for step in &steps[version as usize - 1..] {
+        let copy = copy_before(dir, version + 1);
+        tracing::info!(
+            folder = %dir.display(), from = version, to = version + 1, copy = %copy.display(),
+            "the data folder is brought to a newer version"
+        );
+        keep_copy(dir, step.changes, &copy)?;
+        (step.apply)(dir)?;
+        version += 1;
+        write_version(dir, version)?;
+        tracing::info!(
+            copy = %copy.display(),
+            "done; the copy may be deleted once the server has been seen to work"
+        );
+    }
+    if !dir.join(FILE).is_file() {
+        write_version(dir, version)?;
+    }
+    Ok(())
+}
+
+fn write_version(dir: &Path, version: u32) -> Result<(), StoreError> {
+    let path = dir.join(FILE);
+    replace_durably(&path, &path.with_extension("tmp"), format!("{version}\n").as_bytes())
+        .and_then(|()| File::open(dir)?.sync_all())
+        .map_err(|error| cannot("write", &path, &error))
+}
+
+/// Copies what a step changes. A copy that is there was made by a step that broke off, before it
+/// changed anything.
+fn keep_copy(dir: &Path, changes: &[&str], copy: &Path) -> Result<(), StoreError> {
+    if copy.is_dir() {
+        return Ok(());
+    }
+    let growing = copy.with_extension("tmp");
+    let made = || -> io::Result<()> {
+        if growing.exists() {
+            fs::remove_dir_all(&growing)?;
+        }
+        fs::create_dir_all(&growing)?;
+        for change in changes {
+            copy_folder(&dir.join(change), &growing.join(change))?;
+        }
+        fs::rename(&growing, copy)?;
+        File::open(dir)?.sync_all()
+    };
+    made().map_err(|error| {
+        StoreError::Failed(format!(
+            "the data folder cannot be brought to a newer version, because what changes cannot be \
+             copied to {}: {error}; make room there and start again, nothing was changed",
+            copy.display()
+        ))
+    })
+}
+
+fn copy_folder(from: &Path, to: &Path) -> io::Result<()> {
+    for entry in WalkDir::new(from) {
+        let entry = entry?;
+        let target = to.join(entry.path().strip_prefix(from).map_err(io::Error::other)?);
+        if entry.file_type().is_dir() {
+            fs::create_dir_all(&target)?;
+        } else {
+            fs::copy(entry.path(), &target)?;
+            File::open(&target)?.sync_all()?;
+        }
+    }
+    Ok(())
+}
+
+fn cannot(what: &str, path: &Path, error: &io::Error) -> StoreError {
+    StoreError::Failed(format!("cannot {what} {}: {error}", path.display()))
+}
+
+/// To version 2.
+fn list_jobs_by_place(dir: &Path) -> Result<(), StoreError> {
+    const CACHE_BYTES: u64 = 64 << 20;
+    let trees = Trees::open(&dir.join("db"), CACHE_BYTES)?;
+    for entry in trees.jobs.iter() {
+        let (key, value) = entry.map_err(failed)?;
+        let record: JobRecord = decode(&value)?;
+        if record.job.state.is_final() {
+            let place = ended_key(ended_at(&record.job), record.job.id);
+            trees.ended.insert(place, &[]).map_err(failed)?;
+        } else if trees.queue.contains_key(&key).map_err(failed)? {
+            put(&trees.queue, &queue_key(&record.job), &Lease::None)?;
+        }
+    }
+    for key in trees.queue.iter().keys() {
+        let key = key.map_err(failed)?;
+        if Uuid::from_slice(&key).is_ok() {
+            trees.queue.remove(&key).map_err(failed)?;
+        }
+    }
+    trees.flush()
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+
+    use super::*;
+    use crate::domain::{Digest, Job, JobState, MediaType, RefinerKind};
+    use crate::store::Query;
+
+    fn first(dir: &Path) -> Result<(), StoreError> {
+        fs::write(dir.join("db/records"), "two").map_err(|error| cannot("write", dir, &error))
+    }
+
+    fn second(dir: &Path) -> Result<(), StoreError> {
+        let records = fs::read_to_string(dir.join("db/records")).unwrap();
+        match dir.join("db/stop").exists() {
+            true => Err(StoreError::Failed("pulled the plug".into())),
+            false => fs::write(dir.join("db/records"), records + ", three")
+                .map_err(|error| cannot("write", dir, &error)),
+        }
+    }
+
+    const TWO: &[Step] =
+        &[Step { changes: &["db"], apply: first }, Step { changes: &["db"], apply: second }];
+
+    fn folder() -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        fs::create_dir(dir.path().join("db")).unwrap();
+        fs::write(dir.path().join("db/records"), "one").unwrap();
+        dir
+    }
+
+    fn read(dir: &Path, file: &str) -> String {
+        fs::read_to_string(dir.join(file)).unwrap()
+    }
+
+    #[test]
+    fn an_older_folder_is_brought_up_step_by_step_with_a_copy_before_each() {
+        let dir = folder();
+        migrate(dir.path(), TWO).unwrap();
+        assert_eq!(read(dir.path(), "db/records"), "two, three");
+        assert_eq!(read(dir.path(), "before-version-2/db/records"), "one");
+        assert_eq!(read(dir.path(), "before-version-3/db/records"), "two");
+        assert_eq!(read(dir.path(), FILE), "3\n");
+        migrate(dir.path(), TWO).unwrap();
+        assert_eq!(read(dir.path(), "db/records"), "two, three");
+    }
+
+    #[test]
+    fn a_step_that_broke_off_is_taken_again_and_its_copy_stays_as_it_was() {
+        let dir = folder();
+        fs::write(dir.path().join("db/stop"), "").unwrap();
+        assert!(migrate(dir.path(), TWO).is_err());
+        assert_eq!(version_of(dir.path()).unwrap(), Some(2));
+        // As if the step had got that far.
+        fs::write(dir.path().join("db/records"), "half").unwrap();
+        fs::remove_file(dir.path().join("db/stop")).unwrap();
+        migrate(dir.path(), TWO).unwrap();
+        assert_eq!(read(dir.path(), "before-version-3/db/records"), "two");
+        assert_eq!(read(dir.path(), "db/records"), "half, three");
+    }
+
+    #[test]
+    fn a_newer_folder_is_refused_and_left_alone() {
+        let dir = folder();
+        fs::write(dir.path().join(FILE), "4\n").unwrap();
+        let error = migrate(dir.path(), TWO).unwrap_err().to_string();
+        assert!(error.contains("version 4") && error.contains("up to 3"), "{error}");
+        assert_eq!(read(dir.path(), "db/records"), "one");
+        fs::write(dir.path().join(FILE), "many").unwrap();
+        assert!(matches!(migrate(dir.path(), TWO), Err(StoreError::Damaged(_))));
+    }
+
+    #[test]
+    fn a_new_folder_has_the_newest_version() {
+        let dir = tempfile::tempdir().unwrap();
+        migrate(dir.path(), TWO).unwrap();
+        assert_eq!(version_of(dir.path()).unwrap(), Some(3));
+        assert!(!copy_before(dir.path(), 2).exists());
+    }
+
+    #[test]
+    fn a_job_that_was_queued_before_there_were_priorities_keeps_its_place() {
+        let dir = tempfile::tempdir().unwrap();
+        let record = |state| {
+            let now = Timestamp::now();
+            let id = Uuid::now_v7();
+            let query = Query {
+                id,
+                digest: Digest::of(b"frame"),
+                media_type: MediaType::Jpeg,
+                created_at: now,
+                descriptor: None,
+            };
+            let job = Job::queued("m".parse().unwrap(), id, RefinerKind::Local, now);
+            let job = Job { state, finished_at: state.is_final().then_some(now), ..job };
+            let (map_uid, candidates) = (Uuid::nil(), vec![]);
+            JobRecord { job, map_uid, revision: 0, query, candidates, claims: 0 }
+        };
+        let (waiting, ended) = (record(JobState::Running), record(JobState::Failed));
+        let trees = Trees::open(&dir.path().join("db"), 1 << 20).unwrap();
+        for record in [&waiting, &ended] {
+            put(&trees.jobs, record.job.id.as_bytes(), record).unwrap();
+        }
+        put(&trees.queue, waiting.job.id.as_bytes(), &Some(Timestamp::now())).unwrap();
+        trees.flush().unwrap();
+        drop(trees);
+        bring_up_to_date(dir.path()).unwrap();
+        let trees = Trees::open(&dir.path().join("db"), 1 << 20).unwrap();
+        let keys = |tree: &sled::Tree| -> Vec<Vec<u8>> {
+            tree.iter().keys().map(|key| key.unwrap().to_vec()).collect()
+        };
+        assert_eq!(keys(&trees.queue), [queue_key(&waiting.job)]);
+        let at = ended.job.finished_at.unwrap();
+        assert_eq!(keys(&trees.ended), [ended_key(at, ended.job.id)]);
+        assert!(copy_before(dir.path(), 2).join("db").is_dir());
+    }
+}

@@ -1,0 +1,46 @@
+//! The version of the data folder.
+
+use std::fs;
+use std::process::Command;
+
+use tempfile::TempDir;
+
+use super::support::{BINARY, Server, frame, reference};
+
+#[tokio::test]
+async fn a_folder_without_a_version_is_copied_and_brought_up_to_date() {
+    let dir = TempDir::new().unwrap();
+    let server = Server::start(dir.path(), &[]);
+    server.town("m", 3).await;
+    let answer = server.post_jpeg("/localize?map=m", frame(1, 0)).await.expect(200);
+    let href = answer["job"]["href"].as_str().unwrap().to_owned();
+    server.get(&format!("{href}?wait=30")).await.expect(200);
+    assert!(server.terminate().success());
+    let version = dir.path().join("version");
+    assert_eq!(fs::read_to_string(&version).unwrap(), "2\n");
+    fs::remove_file(&version).unwrap();
+
+    let server = Server::start(dir.path(), &[]);
+    assert!(server.log().contains("the data folder is brought to a newer version"));
+    assert!(server.log().contains("the copy may be deleted"));
+    assert_eq!(fs::read_to_string(&version).unwrap(), "2\n");
+    assert!(dir.path().join("before-version-2/db").is_dir());
+    assert_eq!(server.get(&href).await.expect(200)["state"], "succeeded");
+    let answer = server.post_jpeg("/localize?map=m&k=1", reference(2)).await.expect(200);
+    assert_eq!(answer["candidates"][0]["image_id"], "place-2");
+}
+
+#[tokio::test]
+async fn a_newer_folder_is_refused_with_what_to_do() {
+    let dir = TempDir::new().unwrap();
+    assert!(Server::start(dir.path(), &[]).terminate().success());
+    fs::write(dir.path().join("version"), "3\n").unwrap();
+    let refused = Command::new(BINARY)
+        .args(["serve", "--listen", "127.0.0.1:0", "--data"])
+        .arg(dir.path())
+        .output()
+        .unwrap();
+    assert_eq!(refused.status.code(), Some(1));
+    let why = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(why.contains("is of version 3") && why.contains("whereabouts backup"), "{why}");
+}
