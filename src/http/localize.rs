@@ -67,7 +67,6 @@ struct FrameForm {
         (status = 422, body = Problem, description = "Cannot be decoded, or k out of range", content_type = "application/problem+json"),
         (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
         (status = 504, body = Problem, description = "X-Deadline-Ms has passed", content_type = "application/problem+json"),
-        (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
     ))]
 pub(super) async fn localize(
     State(state): State<AppState>,

@@ -36,6 +36,8 @@ pub enum NoJobReason {
     QueueFull,
     /// So many pictures wait that no frame gets a job (`jobs.shed_at`).
     Overload,
+    /// The disk has no room for the frame (`data.min_free_bytes`).
+    DiskFull,
 }
 
 impl NoJob {
@@ -114,7 +116,14 @@ impl Service {
             candidates,
             claims: 0,
         };
-        let _pin = self.blobs.put_blob(record.query.digest, frame.bytes).await?;
+        let _pin = match self.blobs.put_blob(record.query.digest, frame.bytes).await {
+            Ok(pin) => pin,
+            Err(full @ StoreError::Full { .. }) => {
+                let why = NoJob::new(NoJobReason::DiskFull, full.to_string());
+                return Ok(Err(self.counted_job(why)));
+            }
+            Err(error) => return Err(error.into()),
+        };
         match self.jobs.submit(record, self.settings.job_queue).await {
             Ok(()) => self.metrics.job_submitted(),
             Err(StoreError::QueueFull { limit }) => {

@@ -123,6 +123,10 @@ async fn a_full_disk_is_said_and_what_was_acknowledged_is_kept() {
     assert!(why.contains("disk") && stored > 3, "{stored}: {why}");
     // It still answers.
     assert_eq!(first_of(&server, 2).await, "place-2");
+    let mut frame = reference(1);
+    frame.resize(200_000, 0);
+    let answer = server.post_jpeg("/localize?map=m", frame).await.expect(200);
+    assert_eq!(answer["no_job"]["reason"], "disk_full", "{answer}");
     server.kill();
     let server = Server::start(&disk.data(), &[little]);
     assert_eq!(server.get("/maps/m").await.expect(200)["images"], stored);
