@@ -143,14 +143,15 @@ async fn a_full_disk_is_said_and_what_was_acknowledged_is_kept() {
 #[tokio::test]
 async fn a_read_only_folder_is_refused_with_the_reason() {
     let Some(disk) = SmallDisk::mount(64) else { return };
-    let server = Server::start(&disk.data(), &[]);
+    let settings = [("WHEREABOUTS_DATA__MIN_FREE_BYTES", "0")];
+    let server = Server::start(&disk.data(), &settings);
     server.town("m", 3).await;
     server.kill();
     disk.read_only(true);
-    let Err(said) = Server::try_start(&disk.data(), &[]) else { panic!("it cannot write") };
+    let Err(said) = Server::try_start(&disk.data(), &settings) else { panic!("it cannot write") };
     assert!(said.contains("ead-only"), "{said}");
     disk.read_only(false);
-    let server = Server::start(&disk.data(), &[]);
+    let server = Server::start(&disk.data(), &settings);
     assert_eq!(server.get("/maps/m").await.expect(200)["images"], 3);
     server.post_jpeg("/maps/m/images?id=late", reference(9)).await.expect(201);
 }

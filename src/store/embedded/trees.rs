@@ -258,7 +258,14 @@ pub(super) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, StoreError>
 }
 
 pub(super) fn failed(error: sled::Error) -> StoreError {
-    StoreError::Failed(error.to_string())
+    match error {
+        sled::Error::Corruption { .. } => StoreError::Damaged(
+            "the files of the record database do not fit together; restore a backup into another \
+             folder"
+                .into(),
+        ),
+        error => StoreError::Failed(error.to_string()),
+    }
 }
 
 /// What a transaction that never aborts on its own account returns when it fails.
