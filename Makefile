@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino test crash lint format bench load openapi clean
+.PHONY: help demo build assets nasm openvino test crash fuzz lint format bench load openapi clean
 
 help: ## Say what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -29,6 +29,9 @@ test: assets nasm ## Set up, build and run every test
 
 crash: assets nasm ## Kill the server at 200 random moments and hold it against what it acknowledged
 	WHEREABOUTS_CRASH_ROUNDS=200 $(CARGO) test --release --locked --test crash what_was -- --nocapture
+
+fuzz: assets nasm ## Run a million mutated inputs through everything that reads what others wrote
+	WHEREABOUTS_FUZZ_RUNS=130000 $(CARGO) test --release --locked --test fuzz -- --nocapture
 
 lint: ## Check the format and the lints
 	$(CARGO) fmt --check

@@ -45,6 +45,7 @@ use jiff::tz::TimeZone;
 pub use budget::Spent;
 pub use cache::{CacheLevels, CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame};
 pub use prompts::PROMPT_VERSION;
+pub use reason::{AnswerError, Labels, Verdict};
 pub use secret::Secret;
 pub use settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError, OnUnavailable};
 

@@ -1,0 +1,207 @@
+//! Inputs that are whole.
+
+use std::io::Cursor;
+use std::ops::Range;
+
+use bytes::Bytes;
+use exif::experimental::Writer as ExifWriter;
+use exif::{Field, In, Rational, Tag, Value};
+use image::codecs::jpeg::JpegEncoder;
+use image::{ImageFormat, RgbImage};
+use jiff::Timestamp;
+use rayon::ThreadPoolBuilder;
+use uuid::Uuid;
+use whereabouts::archive::{ArchivedMap, LeftOut, Manifest, Writer};
+use whereabouts::demo::{Town, TownSpec};
+use whereabouts::domain::{
+    Descriptor, DescriptorKind, Digest, Frame, Image, Map, MediaType, Precision, Scene,
+};
+use whereabouts::retrieve::index::{IndexSettings, MapIndex, Vectors};
+use whereabouts::store::ExportedImage;
+
+pub fn pictures() -> Vec<Vec<u8>> {
+    let town = Town::new(TownSpec { seed: 3, places: 2, width: 96, height: 64 });
+    let pixels: RgbImage = town.reference(0).image;
+    let mut jpeg = Vec::new();
+    JpegEncoder::new_with_quality(&mut jpeg, 80).encode_image(&pixels).unwrap();
+    let encoded = |format: ImageFormat| {
+        let mut bytes = Cursor::new(Vec::new());
+        pixels.write_to(&mut bytes, format).unwrap();
+        bytes.into_inner()
+    };
+    let turned = with_exif(&jpeg, &exif_of([oriented(6)].as_slice()));
+    vec![jpeg, turned, encoded(ImageFormat::Png), encoded(ImageFormat::WebP)]
+}
+
+pub fn manifests() -> Vec<Vec<u8>> {
+    let tokens = r#"
+        name = "tokens"
+        revision = "1"
+        licence = "MIT"
+        [input]
+        name = "pixel_values"
+        width = 224
+        height = 224
+        resize = "centre_crop"
+        interpolation = "bicubic"
+        multiple = 14
+        mean = [0.485, 0.456, 0.406]
+        std = [0.229, 0.224, 0.225]
+        [output]
+        features = "last_hidden_state"
+        layout = "tokens"
+        stride = 14
+        channels = 384
+        registers = 0
+        [pooling]
+        p = 3.0
+    "#;
+    let xfeat = include_str!("../../deploy/models/xfeat.toml");
+    let whole =
+        [xfeat, tokens].into_iter().filter(|text| super::targets::manifest(text.as_bytes()));
+    let whole: Vec<Vec<u8>> = whole.map(|text| text.as_bytes().to_vec()).collect();
+    assert!(!whole.is_empty());
+    whole
+}
+
+struct Rows(Vec<Vec<f32>>);
+
+impl Vectors for Rows {
+    fn dim(&self) -> usize {
+        8
+    }
+
+    fn scan(&self, slots: Range<usize>, visit: &mut dyn FnMut(usize, &[f32])) {
+        slots.for_each(|slot| visit(slot, &self.0[slot]));
+    }
+}
+
+pub fn graphs() -> Vec<Vec<u8>> {
+    let settings = IndexSettings {
+        exact_up_to: 0,
+        m: 4,
+        ef_construction: 20,
+        ef_search: 20,
+        max_dead_share: 1.0,
+    };
+    let row = |slot: usize| {
+        let numbers =
+            (0..8).map(|axis| ((slot * 7 + axis * 3) % 11) as f32 - 5.0 + slot as f32 * 0.01);
+        Descriptor::normalised(numbers.collect()).unwrap().as_slice().to_vec()
+    };
+    let rows = Rows((0..60).map(row).collect());
+    let index = MapIndex::new(settings);
+    (0..60).for_each(|slot| index.add(slot));
+    let threads = ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let mut sealed = None;
+    while index.has_work() {
+        sealed = index.catch_up(&rows, 64, &threads).or(sealed);
+    }
+    vec![sealed.unwrap().to_bytes()]
+}
+
+pub fn archives() -> Vec<Vec<u8>> {
+    let dir = tempfile::TempDir::new().unwrap();
+    let path = dir.path().join("backup.tar");
+    let map = Map {
+        uid: Uuid::nil(),
+        name: "a".parse().unwrap(),
+        scene: Scene::Outdoor,
+        descriptor: DescriptorKind::Gem,
+        frame: Frame::Wgs84,
+        model: "m".into(),
+        model_digest: Digest::of(b"m"),
+        precision: Precision::Full,
+        dim: 2,
+        revision: 0,
+        description: None,
+        created_at: Timestamp::UNIX_EPOCH,
+    };
+    let bytes = Bytes::from_static(b"picture");
+    let image = Image {
+        id: "1".parse().unwrap(),
+        digest: Digest::of(&bytes),
+        pose: None,
+        captured_at: None,
+        tags: vec![],
+        media_type: MediaType::Jpeg,
+        width: 1,
+        height: 1,
+        created_at: Timestamp::UNIX_EPOCH,
+    };
+    let descriptor = Some(Descriptor::normalised(vec![1.0, 2.0]).unwrap());
+    let left_out = LeftOut { id: "2".parse().unwrap(), why: "damaged".into() };
+    let mut writer = Writer::begin(&path, &Manifest::new(vec![map.name.clone()])).unwrap();
+    writer.map(&map).unwrap();
+    writer.image(&map.name, &ExportedImage { image, descriptor }, &bytes).unwrap();
+    writer.left_out(&map.name, &left_out).unwrap();
+    let archived = ArchivedMap { name: map.name, images: 1, left_out: vec![left_out] };
+    writer.finish(vec![archived]).unwrap();
+    vec![std::fs::read(path).unwrap()]
+}
+
+fn texts(all: &[&str]) -> Vec<Vec<u8>> {
+    all.iter().map(|text| text.as_bytes().to_vec()).collect()
+}
+
+pub fn poses() -> Vec<Vec<u8>> {
+    texts(&[
+        "file,lat,lon,alt,heading\na.jpg,45.1,7.2,240.5,359.9\nb.jpg,-45,179.999,,\n",
+        "file,x,y,z,qx,qy,qz,qw\na.jpg,1.5,-2,0,0,0,0.7071068,0.7071068\nb.jpg,1e3,2,,,,,\n",
+        r#"{"lat": 45.0, "lon": 7.0, "alt": 240.0, "heading": 90.0}"#,
+        r#"{"x": 1.0, "y": -2.5, "z": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}"#,
+    ])
+}
+
+pub fn truths() -> Vec<Vec<u8>> {
+    texts(&[
+        "query,references\na.jpg,a.jpg b.jpg\nb.jpg,\nc.jpg,c.jpg\n",
+        "query,references\n\"a.jpg\",\"b.jpg\"\n",
+    ])
+}
+
+pub fn answers() -> Vec<Vec<u8>> {
+    texts(&[
+        r#"{"reasoning": "the sign", "ranking": ["C", "A", "B"]}"#,
+        "Some words.\n```json\n{\"reasoning\": \"\", \"ranking\": [\"J\", \"a\", \" B \"]}\n```\nMore.",
+        "I think {not this} but {\"ranking\": [\"B\"]}",
+    ])
+}
+
+pub fn exif() -> Vec<Vec<u8>> {
+    let degrees = |whole: u32| {
+        Value::Rational(
+            [(whole, 1), (30, 1), (1234, 100)].map(|(num, denom)| Rational { num, denom }).into(),
+        )
+    };
+    let text = |letter: &str| Value::Ascii(vec![letter.as_bytes().to_vec()]);
+    let fields = [
+        (Tag::GPSLatitudeRef, text("S")),
+        (Tag::GPSLatitude, degrees(45)),
+        (Tag::GPSLongitudeRef, text("E")),
+        (Tag::GPSLongitude, degrees(7)),
+        (Tag::GPSAltitude, Value::Rational(vec![Rational { num: 2405, denom: 10 }])),
+    ]
+    .map(|(tag, value)| Field { tag, ifd_num: In::PRIMARY, value });
+    let pictures = pictures();
+    vec![with_exif(&pictures[0], &exif_of(&fields))]
+}
+
+fn oriented(turn: u16) -> Field {
+    Field { tag: Tag::Orientation, ifd_num: In::PRIMARY, value: Value::Short(vec![turn]) }
+}
+
+fn exif_of(fields: &[Field]) -> Vec<u8> {
+    let mut writer = ExifWriter::new();
+    fields.iter().for_each(|field| writer.push_field(field));
+    let mut bytes = Cursor::new(Vec::new());
+    writer.write(&mut bytes, false).unwrap();
+    bytes.into_inner()
+}
+
+/// A JPEG with an EXIF segment behind its first marker.
+fn with_exif(jpeg: &[u8], exif: &[u8]) -> Vec<u8> {
+    let length = (exif.len() + 8) as u16;
+    let head = [&[0xFF, 0xE1][..], &length.to_be_bytes(), b"Exif\0\0", exif].concat();
+    [&jpeg[..2], &head, &jpeg[2..]].concat()
+}

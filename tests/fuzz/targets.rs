@@ -1,0 +1,115 @@
+//! Readers of what others wrote. Each says whether it accepted its input, and checks what it promises of
+//! what it accepts.
+
+use std::collections::HashSet;
+use std::io::Cursor;
+use std::path::Path;
+
+use serde_json::Value;
+use whereabouts::archive::{Item, Reader};
+use whereabouts::domain::{Frame, Pose};
+use whereabouts::evaluate::{PictureFile, PoseSource, TruthSource};
+use whereabouts::refine::mllm::Labels;
+use whereabouts::retrieve::ImageLimits;
+use whereabouts::retrieve::decode::{Needed, decode};
+use whereabouts::retrieve::index::SealedGraph;
+use whereabouts::retrieve::manifest::Manifest;
+
+const LIMITS: ImageLimits = ImageLimits { max_pixels: 1 << 16 };
+
+pub fn picture(bytes: &[u8]) -> bool {
+    let all = decode(bytes, LIMITS, Needed::All);
+    let some = decode(bytes, LIMITS, Needed::Size(16, 16));
+    assert_eq!(all.is_ok(), some.is_ok());
+    let Ok(picture) = all else { return false };
+    let (width, height) = picture.pixels.dimensions();
+    assert!(u64::from(width) * u64::from(height) <= LIMITS.max_pixels);
+    true
+}
+
+pub fn manifest(bytes: &[u8]) -> bool {
+    let Ok(text) = std::str::from_utf8(bytes) else { return false };
+    let Ok(manifest) = Manifest::parse(text, Path::new("manifest.toml")) else { return false };
+    let again = manifest.to_toml().unwrap();
+    Manifest::parse(&again, Path::new("manifest.toml")).unwrap();
+    true
+}
+
+pub fn graph(bytes: &[u8]) -> bool {
+    let Ok(graph) = SealedGraph::from_bytes(bytes) else { return false };
+    assert!(graph.to_bytes().len() <= bytes.len());
+    true
+}
+
+pub fn archive(bytes: &[u8]) -> bool {
+    let mut reader = Reader::new(Cursor::new(bytes));
+    loop {
+        match reader.next_item() {
+            Ok(Some(Item::End(_))) => return true,
+            Ok(Some(_)) => {}
+            Ok(None) | Err(_) => return false,
+        }
+    }
+}
+
+fn pictures() -> Vec<PictureFile> {
+    let names = ["a.jpg", "b.jpg", "c.jpg"];
+    names.map(|name| PictureFile { file: name.into(), id: name.parse().unwrap() }).into()
+}
+
+/// A file that a reader can be pointed at.
+fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), bytes).unwrap();
+    file
+}
+
+pub fn poses(bytes: &[u8]) -> bool {
+    if let Ok(value) = serde_json::from_slice::<Value>(bytes) {
+        let posed =
+            [Frame::Wgs84, Frame::Metric].map(|frame| Pose::from_json(frame, value.clone()));
+        let posed: Vec<Pose> = posed.into_iter().flatten().collect();
+        posed.iter().for_each(usable);
+        return !posed.is_empty();
+    }
+    let file = file(bytes);
+    match PoseSource::find(Path::new("."), Some(file.path()), &pictures()) {
+        Ok(PoseSource::Csv { poses, .. }) => {
+            poses.values().for_each(usable);
+            true
+        }
+        Ok(_) | Err(_) => false,
+    }
+}
+
+/// It is in its ranges, so that distances from it are numbers.
+fn usable(pose: &Pose) {
+    assert!(pose.distance_m(pose).unwrap().abs() < 1e-3, "{pose:?}");
+}
+
+pub fn exif(bytes: &[u8]) -> bool {
+    match PoseSource::Exif.pose("a", bytes) {
+        Ok(Some(pose)) => {
+            usable(&pose);
+            true
+        }
+        Ok(None) | Err(_) => false,
+    }
+}
+
+pub fn truth(bytes: &[u8]) -> bool {
+    let (file, pictures) = (file(bytes), pictures());
+    let folder = (Path::new("."), pictures.as_slice());
+    TruthSource::Csv(file.path().to_owned()).read(folder, folder).is_ok()
+}
+
+pub fn answer(bytes: &[u8]) -> bool {
+    const CANDIDATES: usize = 10;
+    let text = String::from_utf8_lossy(bytes);
+    let labels = Labels::new((0..CANDIDATES).collect(), None);
+    let Ok(verdict) = labels.read(&text) else { return false };
+    let once: HashSet<usize> = verdict.order.iter().copied().collect();
+    assert!(once.len() == CANDIDATES && verdict.order.len() == CANDIDATES);
+    assert!(once.iter().all(|&index| index < CANDIDATES));
+    true
+}
