@@ -36,8 +36,11 @@ pub fn pictures() -> Vec<Vec<u8>> {
 pub fn manifests() -> Vec<Vec<u8>> {
     let tokens = r#"
         name = "tokens"
-        revision = "1"
-        licence = "MIT"
+        description = "A transformer."
+        file = "model.onnx"
+        sha256 = "a67c47cd670a0656d665192ad1b42d0ff479f7a2d50ea9d9aa9ce72b99672808"
+        licence = "Apache-2.0"
+        source = "nowhere"
         [input]
         name = "pixel_values"
         width = 224
@@ -50,18 +53,15 @@ pub fn manifests() -> Vec<Vec<u8>> {
         [output]
         features = "last_hidden_state"
         layout = "tokens"
-        stride = 14
         channels = 384
+        stride = 14
         registers = 0
+        cls = true
         [pooling]
-        p = 3.0
+        gem_p = 3.0
     "#;
     let xfeat = include_str!("../../deploy/models/xfeat.toml");
-    let whole =
-        [xfeat, tokens].into_iter().filter(|text| super::targets::manifest(text.as_bytes()));
-    let whole: Vec<Vec<u8>> = whole.map(|text| text.as_bytes().to_vec()).collect();
-    assert!(!whole.is_empty());
-    whole
+    texts(&[xfeat, tokens])
 }
 
 struct Rows(Vec<Vec<f32>>);
