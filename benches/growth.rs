@@ -34,6 +34,7 @@ const KEPT: usize = 1000;
 const FRAME_BYTES: usize = 20_000;
 const PICTURE_BYTES: usize = 40_000;
 const DIM: usize = 576;
+const EXACT_UP_TO: usize = 5000;
 const SIDE_BY_SIDE: usize = 64;
 
 fn main() {
@@ -49,7 +50,7 @@ fn settings(dir: &Path) -> EmbeddedSettings {
     EmbeddedSettings {
         dir: dir.to_owned(),
         index: IndexSettings {
-            exact_up_to: 5000,
+            exact_up_to: EXACT_UP_TO,
             m: 16,
             ef_construction: 200,
             ef_search: 96,
@@ -221,7 +222,10 @@ async fn map_of(images: usize) {
     let start = Instant::now();
     each.buffer_unordered(SIDE_BY_SIDE).for_each(async |()| {}).await;
     let took = start.elapsed().as_secs_f64();
-    while store.index_state(&map).await.unwrap().behind {
+    // Until the graph is sealed and written.
+    let graph = |file: walkdir::DirEntry| file.file_name() == "graph";
+    let files = || walkdir::WalkDir::new(dir.path()).into_iter().filter_map(Result::ok);
+    while images > EXACT_UP_TO && !files().any(graph) {
         tokio::time::sleep(Duration::from_millis(100)).await;
     }
     let grown = memory().into_iter().zip(before).map(|(after, before)| after - before);
@@ -233,8 +237,6 @@ async fn map_of(images: usize) {
         grown[0] / images as f64,
         grown[1] / images as f64
     );
-    drop(store);
-    let store = open(dir.path());
     drop(store);
     let report = loop {
         match examine(dir.path(), Examination::default()) {
