@@ -93,7 +93,7 @@ mod tests {
     fn fill(dir: &Path, records: u32) -> Trees {
         let trees = Trees::open(&dir.join("db"), 1 << 20).unwrap();
         for number in 0..records {
-            put(&trees.jobs, &number.to_be_bytes(), &"x".repeat(2000)).unwrap();
+            put(&trees.frames, &number.to_be_bytes(), &"x".repeat(2000)).unwrap();
         }
         trees.flush().unwrap();
         trees
@@ -104,14 +104,14 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let trees = fill(dir.path(), 5000);
         for number in 10..5000_u32 {
-            trees.jobs.remove(number.to_be_bytes()).unwrap();
+            trees.frames.remove(number.to_be_bytes()).unwrap();
         }
         trees.flush().unwrap();
         drop(trees);
         let compacted = compact(dir.path()).unwrap();
         assert!(compacted.bytes_after * 4 < compacted.bytes_before, "{compacted:?}");
         let trees = Trees::open(&dir.path().join("db"), 1 << 20).unwrap();
-        assert_eq!(trees.jobs.len(), 10);
+        assert_eq!(trees.frames.len(), 10);
         assert!(!dir.path().join("db.before-compact").exists());
     }
 
@@ -123,7 +123,7 @@ mod tests {
         fs::create_dir(&fresh).unwrap();
         fs::rename(&db, &old).unwrap();
         settle(dir.path()).unwrap();
-        assert_eq!(Trees::open(&db, 1 << 20).unwrap().jobs.len(), 3);
+        assert_eq!(Trees::open(&db, 1 << 20).unwrap().frames.len(), 3);
         assert!(!fresh.exists() && !old.exists());
     }
 }
