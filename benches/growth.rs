@@ -57,6 +57,7 @@ fn settings(dir: &Path) -> EmbeddedSettings {
             max_dead_share: 0.3,
         },
         index_threads: 1,
+        min_free_bytes: 0,
         db_cache_bytes: 64 << 20,
         commit_batch: 256,
         descriptions: DescriptionBounds {

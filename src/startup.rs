@@ -44,7 +44,7 @@ pub async fn serve(
     let (drain_timeout, retention) = (config.server.drain_timeout(), retention(&config));
     let counted = Arc::clone(&metrics);
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
-    let (service, workers) = building.await.context("the start broke off")??;
+    let Parts { service, workers, pools } = building.await.context("the start broke off")??;
     let janitor =
         Janitor { store: Arc::clone(&service.retention), metrics: counted, settings: retention };
     let service = Arc::new(service);
@@ -76,6 +76,8 @@ pub async fn serve(
             "requests were still in progress when the drain timed out"
         ),
     }
+    let idle = move || pools.iter().for_each(|pool| pool.wait_until_idle(drain_timeout));
+    tokio::task::spawn_blocking(idle).await.context("the end broke off")?;
     tracing::info!("stopped");
     Ok(())
 }
@@ -105,8 +107,18 @@ fn retention(config: &Config) -> RetentionSettings {
     }
 }
 
+/// What a server is made of.
+pub struct Parts {
+    /// The use cases.
+    pub service: Service,
+    /// Those who refine jobs.
+    pub workers: Vec<Worker>,
+    /// Whoever decodes, infers and compares; to be waited for before the process ends.
+    pub pools: [CpuPool; 2],
+}
+
 /// Opens the store, loads the model, and puts the service together. Blocks.
-pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service, Vec<Worker>)> {
+pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     let store = Arc::new(EmbeddedStore::open(&EmbeddedSettings {
         dir: config.data.dir.clone(),
         index: IndexSettings {
@@ -133,13 +145,15 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
     let pool = CpuPool::new("frames", cores_unless(config.image.threads), admission.permits)?;
     let job_pace = JobPace::default();
+    let refining = CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?;
+    let pools = [pool.clone(), refining.clone()];
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
     let local = Arc::new(LocalRefiner {
         maps: store.clone(),
         blobs: store.clone(),
         models: models.clone(),
         dense: Arc::clone(&dense),
-        pool: CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?,
+        pool: refining,
         matcher: LocalMatcher::new(LocalSettings::default()),
     });
     let refiner: Option<Arc<dyn Refiner>> = match config.refine.refiner {
@@ -219,7 +233,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<(Service,
     tracing::info!(model, %why, "the model of maps that name none");
     service.models.manifest(model)?;
     Handle::current().block_on(service.installed_model(model))?;
-    Ok((service, workers))
+    Ok(Parts { service, workers, pools })
 }
 
 /// No model yet, and why the default one is what it is.

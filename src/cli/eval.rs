@@ -170,10 +170,10 @@ async fn open(config: Config) -> anyhow::Result<Arc<Service>> {
     let work = config.data.dir.clone();
     let building =
         tokio::task::spawn_blocking(move || startup::build(&config, Arc::new(Metrics::new())));
-    let (service, _) = building
+    let parts = building
         .await?
         .with_context(|| format!("the work folder is {} (--work)", work.display()))?;
-    Ok(Arc::new(service))
+    Ok(Arc::new(parts.service))
 }
 
 fn write(file: &Path, bytes: &[u8]) -> anyhow::Result<()> {

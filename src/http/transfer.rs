@@ -1,6 +1,7 @@
 //! `/maps/{map}/export` and `/maps/{map}/import`: what `whereabouts backup` and `restore` speak.
 
 use axum::Json;
+use axum::extract::{Request, State};
 use axum::http::StatusCode;
 use utoipa::ToSchema;
 
@@ -8,8 +9,9 @@ use super::body::{JsonBody, Params, PictureBody, Segments};
 use super::images::{PageParams, image_id};
 use super::maps::map_name;
 use super::problem::Problem;
-use super::state::Ready;
+use super::state::{AppState, Ready};
 use crate::domain::{Image, Map};
+use crate::retrieve::{Class, Demand};
 use crate::service::{ErrorKind, ExportPage, ImportedImage, MapState};
 use crate::store::Added;
 
@@ -77,18 +79,23 @@ pub(super) struct ImportForm {
         (status = 409, body = Problem, description = "The id is taken by other bytes, or the map has other descriptors", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "The bytes are not those of the digest, or a value is out of range", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
     ))]
 pub(super) async fn import_image(
+    State(state): State<AppState>,
     Ready(service): Ready,
     Segments(map): Segments<String>,
-    body: PictureBody,
+    request: Request,
 ) -> Result<(StatusCode, Json<Image>), Problem> {
+    let demand = Demand { class: Class::Index, deadline: None };
+    let body = PictureBody::read(request, &state, &service, demand).await?;
     let meta = body.meta.unwrap_or_default();
     let from: ImportedImage = serde_json::from_slice(&meta).map_err(|error| {
         let detail = format!("the part \"meta\" is not the JSON expected: {error}");
         Problem::new(ErrorKind::Malformed, detail)
     })?;
-    Ok(match service.import_image(&map_name(&map)?, from, body.picture).await? {
+    Ok(match service.import_image(&map_name(&map)?, from, body.picture, demand).await? {
         Added::Created(image) => (StatusCode::CREATED, Json(image)),
         Added::Present(image) => (StatusCode::OK, Json(image)),
     })

@@ -1,8 +1,9 @@
 //! A fixed number of threads for work that would block the async runtime, with a bounded queue.
 
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
+use std::time::Duration;
 
 use tokio::sync::oneshot;
 
@@ -15,6 +16,22 @@ type Work = Box<dyn FnOnce() + Send>;
 #[derive(Debug, Clone)]
 pub struct CpuPool {
     queue: SyncSender<Work>,
+    running: Arc<Running>,
+}
+
+/// How much work is being done at the moment.
+#[derive(Debug, Default)]
+struct Running {
+    count: Mutex<usize>,
+    /// Told when a piece of work has ended.
+    ended: Condvar,
+}
+
+impl Running {
+    fn change(&self, change: impl FnOnce(&mut usize)) {
+        change(&mut self.count.lock().unwrap_or_else(PoisonError::into_inner));
+        self.ended.notify_all();
+    }
 }
 
 /// The queue is full.
@@ -38,13 +55,14 @@ impl CpuPool {
     pub fn new(name: &str, threads: usize, queue: usize) -> std::io::Result<Self> {
         let (sender, receiver) = sync_channel::<Work>(queue);
         let receiver = Arc::new(Mutex::new(receiver));
+        let running = Arc::new(Running::default());
         for index in 0..threads.max(1) {
-            let receiver = Arc::clone(&receiver);
+            let (receiver, running) = (Arc::clone(&receiver), Arc::clone(&running));
             thread::Builder::new()
                 .name(format!("{name}-{index}"))
-                .spawn(move || run_all(&receiver))?;
+                .spawn(move || run_all(&receiver, &running))?;
         }
-        Ok(Self { queue: sender })
+        Ok(Self { queue: sender, running })
     }
 
     /// Runs `work` on one of the threads and waits for what it returns.
@@ -65,16 +83,25 @@ impl CpuPool {
         })?;
         result.await.map_err(|_| PoolError::BrokeOff)
     }
+
+    /// Blocks until no work is being done, but no longer than `longest`. A process that ends while a
+    /// library of another language works is ended by that library, and not with its own exit code.
+    pub fn wait_until_idle(&self, longest: Duration) {
+        let count = self.running.count.lock().unwrap_or_else(PoisonError::into_inner);
+        let _ = self.running.ended.wait_timeout_while(count, longest, |count| *count > 0);
+    }
 }
 
-fn run_all(receiver: &Mutex<Receiver<Work>>) {
+fn run_all(receiver: &Mutex<Receiver<Work>>, running: &Running) {
     loop {
         let next = receiver.lock().unwrap_or_else(PoisonError::into_inner).recv();
         let Ok(work) = next else { return };
+        running.change(|count| *count += 1);
         // A panic in one piece of work must not take the thread from all the others.
         if std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).is_err() {
             tracing::error!("work on a pool thread panicked; its caller was told");
         }
+        running.change(|count| *count -= 1);
     }
 }
 
@@ -112,5 +139,25 @@ mod tests {
         let pool = CpuPool::new("test", 1, 4).unwrap();
         assert_eq!(pool.run(|| -> u8 { panic!("on purpose") }).await, Err(PoolError::BrokeOff));
         assert_eq!(pool.run(|| 7).await, Ok(7));
+    }
+
+    #[tokio::test]
+    async fn idle_is_when_work_has_ended_even_if_its_caller_has_gone() {
+        let pool = CpuPool::new("test", 1, 4).unwrap();
+        let (started, has_started) = oneshot::channel();
+        let (release, wait) = mpsc::channel::<()>();
+        let mut work = Box::pin(pool.run(move || {
+            let _ = started.send(());
+            wait.recv().is_ok()
+        }));
+        assert!(futures_util::poll!(&mut work).is_pending());
+        has_started.await.unwrap();
+        drop(work);
+        let waiting = pool.clone();
+        let idle = thread::spawn(move || waiting.wait_until_idle(Duration::from_secs(60)));
+        assert!(!idle.is_finished());
+        release.send(()).unwrap();
+        idle.join().unwrap();
+        assert_eq!(*pool.running.count.lock().unwrap(), 0);
     }
 }

@@ -11,7 +11,7 @@ use super::images::empty_body;
 use super::submit::Frame;
 use super::{NoJob, SUPERSEDED, Service, ServiceError};
 use crate::domain::confidence::COMPARED;
-use crate::domain::{Candidate, Digest, Estimate, Job, JobState, Map, MapName, Priority};
+use crate::domain::{Candidate, Digest, Estimate, JobState, Map, MapName, Priority};
 use crate::retrieve::index::SearchMode;
 use crate::retrieve::{Class, Demand, Extraction};
 use crate::store::StoreError;

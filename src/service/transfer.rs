@@ -8,6 +8,7 @@ use uuid::Uuid;
 use super::images::{check_tags, page_size};
 use super::{ErrorKind, MapState, SUPERSEDED, Service, ServiceError};
 use crate::domain::{Digest, Image, ImageId, Map, MapName, MediaType};
+use crate::retrieve::Demand;
 use crate::store::{Added, ExportedImage, StoreError};
 
 /// The most numbers in a descriptor that comes from elsewhere.
@@ -99,6 +100,7 @@ impl Service {
         name: &MapName,
         from: ImportedImage,
         bytes: Bytes,
+        demand: Demand,
     ) -> Result<Added, ServiceError> {
         let ImportedImage { map: source, image: ExportedImage { image, descriptor } } = from;
         let map = self.known_map(name).await?;
@@ -118,7 +120,7 @@ impl Service {
             }
             None => {
                 let (_, extractor) = self.usable_map(name).await?;
-                self.extract(&extractor, bytes.clone(), map.descriptor).await?.descriptor
+                self.extract(&extractor, bytes.clone(), map.descriptor, demand).await?.descriptor
             }
         };
         let _pin = self.blobs.put_blob(image.digest, bytes).await?;

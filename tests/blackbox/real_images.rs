@@ -91,11 +91,11 @@ async fn evaluate(set: &str, references: &str, queries: &str) -> Option<(Recall,
 }
 
 #[tokio::test]
-async fn refinement_in_the_corridor_reaches_85_percent() {
+async fn refinement_in_the_corridor_reaches_90_percent() {
     let Some((before, after)) = evaluate("corridor", "ref", "query").await else { return };
     assert!(before.at[0] >= 60.0 && before.at[2] >= 90.0, "{before:?}");
-    assert!(after.at[0] >= 85.0, "{after:?}");
-    assert!((after.at[2] - before.at[2]).abs() < 1e-9, "the same ten, in another order");
+    assert!(after.at[0] >= 90.0, "{after:?}");
+    assert!(after.at[2] >= before.at[2], "{before:?} {after:?}");
 }
 
 #[tokio::test]
