@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino test crash fuzz lint format bench load openapi clean
+.PHONY: help demo build assets nasm openvino test crash fuzz lint format bench load soak openapi clean
 
 help: ## Say what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -41,10 +41,14 @@ format: ## Format the code
 	$(CARGO) fmt
 
 bench: build ## Measure all that is about speed, each against its peers; gets those, some gigabytes
-	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked --bench '*'
+	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked --bench preprocess --bench inference \
+		--bench search --bench localize --bench refine --bench mllm --bench store --bench town
 
 load: build ## Offer ten times what the server can do, and check how it bears that
 	$(CARGO) bench --locked --bench overload
+
+soak: build ## Mixed traffic for ten minutes, then what has grown
+	$(CARGO) bench --locked --bench soak
 
 openapi: build ## Write docs/openapi.json anew from the handlers
 	$(BINARY) openapi > docs/openapi.json

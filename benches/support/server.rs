@@ -13,7 +13,13 @@ pub struct Server {
 }
 
 impl Server {
+    #[allow(dead_code, reason = "not every benchmark needs both")]
     pub fn start(model: &str, data: &Path) -> anyhow::Result<Self> {
+        Self::start_with(model, data, &[])
+    }
+
+    /// `settings` are environment variables.
+    pub fn start_with(model: &str, data: &Path, settings: &[(&str, &str)]) -> anyhow::Result<Self> {
         let address_file = data.join("address");
         let mut child = Command::new(env!("CARGO_BIN_EXE_whereabouts"))
             .args(["serve", "--model", model, "--listen", "127.0.0.1:0", "--data"])
@@ -21,6 +27,7 @@ impl Server {
             .arg("--address-file")
             .arg(&address_file)
             .env("WHEREABOUTS_LOG__FORMAT", "json")
+            .envs(settings.iter().copied())
             .stderr(Stdio::piped())
             .spawn()?;
         let mut log = BufReader::new(child.stderr.take().context("no log")?).lines();

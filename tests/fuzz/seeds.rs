@@ -59,6 +59,8 @@ pub fn manifests() -> Vec<Vec<u8>> {
         cls = true
         [pooling]
         gem_p = 3.0
+        grid = [1, 1]
+        dimension = 384
     "#;
     let xfeat = include_str!("../../deploy/models/xfeat.toml");
     texts(&[xfeat, tokens])

@@ -114,6 +114,9 @@ fn label(mut number: usize) -> String {
     }
 }
 
+/// Braces at which an answer may begin.
+const MOST_BRACES: usize = 1000;
+
 /// The answer, wherever it is: the whole text, the inside of a fence, the last JSON object in the
 /// text, or a last line `RANKING: A, B, C`.
 fn find(answer: &str) -> Option<AnswerJson> {
@@ -122,12 +125,14 @@ fn find(answer: &str) -> Option<AnswerJson> {
         let (_, after) = text.rsplit_once("```json")?;
         Some(after.split_once("```").map_or(after, |(inside, _)| inside))
     };
-    let object = || text.get(text.find('{')?..=text.rfind('}')?);
+    // The first object that is an answer, whatever stands around it.
+    let object = || {
+        text.match_indices('{').take(MOST_BRACES).find_map(|(at, _)| {
+            serde_json::Deserializer::from_str(&text[at..]).into_iter().next()?.ok()
+        })
+    };
     let parse = |text: &str| serde_json::from_str::<AnswerJson>(text.trim()).ok();
-    parse(text)
-        .or_else(|| fenced().and_then(parse))
-        .or_else(|| object().and_then(parse))
-        .or_else(|| last_line(text))
+    parse(text).or_else(|| fenced().and_then(parse)).or_else(object).or_else(|| last_line(text))
 }
 
 fn last_line(text: &str) -> Option<AnswerJson> {
@@ -163,6 +168,7 @@ mod tests {
             json.to_owned(),
             format!("Here it is:\n```json\n{json}\n```\nDone."),
             format!("I think {json} is right"),
+            format!("Not {{this}}, but {json}, as {{said}}"),
             "a sign\nRANKING: C, A, D, B".to_owned(),
             "a sign\n**Ranking:** C > A > D > B.".to_owned(),
         ] {
