@@ -31,7 +31,7 @@ crash: assets nasm ## Kill the server at 200 random moments and hold it against 
 	WHEREABOUTS_CRASH_ROUNDS=200 $(CARGO) test --release --locked --test crash what_was -- --nocapture
 
 fuzz: assets nasm ## Run a million mutated inputs through everything that reads what others wrote
-	WHEREABOUTS_FUZZ_RUNS=130000 $(CARGO) test --release --locked --test fuzz -- --nocapture
+	WHEREABOUTS_FUZZ_RUNS=120000 $(CARGO) test --release --locked --test fuzz -- --nocapture
 
 lint: ## Check the format and the lints
 	$(CARGO) fmt --check

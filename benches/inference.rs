@@ -14,12 +14,13 @@ use whereabouts::retrieve::{Assets, Bench, BenchRow, BenchSettings, Layout, Want
 
 const MODEL: &str = "dinov2-small";
 const SIZE: usize = 224;
+/// Pictures in a run; the arguments may say others.
 const BATCHES: [usize; 3] = [1, 4, 8];
 const SECONDS: f64 = 1.5;
 const PEERS: [&str; 3] = ["onnxruntime", "openvino-latency", "openvino-throughput"];
 /// The machine's speed changes with the moment: all are measured in turn, some times over, and what
 /// counts is the median of the ratios of each round.
-const ROUNDS: usize = 5;
+const ROUNDS: usize = 4;
 
 #[derive(Debug, Clone, Copy)]
 struct Measured {
@@ -38,7 +39,8 @@ fn main() -> anyhow::Result<()> {
     let execution = fastest(&run_ours(&bench, Wanted::default(), threads, 1)?)?.execution;
     let wanted =
         Wanted { provider: Some(execution.provider), precision: Some(execution.precision) };
-    for batch in BATCHES {
+    let asked: Vec<usize> = std::env::args().filter_map(|argument| argument.parse().ok()).collect();
+    for batch in if asked.is_empty() { BATCHES.to_vec() } else { asked } {
         println!("\nbatch {batch}; whereabouts by {execution}");
         let (mut more, mut longer) = (Vec::new(), Vec::new());
         for _ in 0..ROUNDS {
@@ -48,8 +50,9 @@ fn main() -> anyhow::Result<()> {
             let alone = rows.iter().filter_map(|row| Some(row.right()?.alone)).min();
             let alone = alone.context("no descriptors were right")?.as_secs_f64() * 1e3;
             print!(
-                "  whereabouts {:.1}/s ({} side by side, {:.0} % of GEMM), alone {alone:.1} ms",
+                "  whereabouts {:.1}/s (runs of {}, {} side by side, {:.0} % of GEMM), alone {alone:.1} ms",
                 figures.per_second,
+                most.layout.max_batch,
                 most.layout.sessions,
                 100.0 * figures.per_second * flop / figures.peak
             );
@@ -78,14 +81,17 @@ fn median(mut numbers: Vec<f64>) -> f64 {
     numbers[numbers.len() / 2]
 }
 
-/// One picture after another, and side by side.
+/// One run after another and side by side, of one picture and of the whole batch: as a server does that
+/// is configured by `whereabouts model bench --write`.
 fn run_ours(
     bench: &Bench,
     wanted: Wanted,
     threads: usize,
     max_batch: usize,
 ) -> anyhow::Result<Vec<BenchRow>> {
-    let layouts = [1, threads].map(|sessions| Layout { threads, sessions, max_batch }).to_vec();
+    let batches = if max_batch == 1 { vec![1] } else { vec![1, max_batch] };
+    let layout = |max_batch| [1, threads].map(|sessions| Layout { threads, sessions, max_batch });
+    let layouts = batches.into_iter().flat_map(layout).collect();
     let duration = Duration::from_secs_f64(SECONDS);
     Ok(bench.run(&BenchSettings { wanted, layouts, duration }, |_| {})?)
 }

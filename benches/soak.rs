@@ -83,7 +83,7 @@ async fn soak(
     frames: &Arc<Vec<Bytes>>,
     length: Duration,
 ) -> anyhow::Result<bool> {
-    let http = reqwest::Client::new();
+    let http = server.http.clone();
     let url = server.url.clone();
     let put = http.put(format!("{url}/maps/soak")).json(&serde_json::json!({}));
     put.send().await?.error_for_status()?;

@@ -80,7 +80,7 @@ impl PictureBody {
         }
         match body_type(request.headers())? {
             BodyType::Raw => Ok(Self { picture: whole(request, state).await?, meta: None }),
-            BodyType::Form => from_form(request, state).await,
+            BodyType::Form => from_form(request, state.settings.body_limit_bytes).await,
         }
     }
 }
@@ -107,10 +107,10 @@ fn body_type(headers: &HeaderMap) -> Result<BodyType, Problem> {
     }
 }
 
-async fn from_form(request: Request, state: &AppState) -> Result<PictureBody, Problem> {
-    let limit = state.settings.body_limit_bytes;
+/// Reads a form of at most `limit` bytes; the router bounds them.
+pub(super) async fn from_form(request: Request, limit: usize) -> Result<PictureBody, Problem> {
     let malformed = |detail: String| Problem::new(ErrorKind::Malformed, detail);
-    let mut form = Multipart::from_request(request, state)
+    let mut form = Multipart::from_request(request, &())
         .await
         .map_err(|rejection| malformed(rejection.body_text()))?;
     let unreadable = |error: axum::extract::multipart::MultipartError| match error.status() {

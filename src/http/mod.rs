@@ -94,3 +94,8 @@ pub fn router(state: AppState) -> Router {
         .layer(from_fn_with_state(state.clone(), guard::observe))
         .with_state(state)
 }
+
+/// Whether a request is a form that an upload can be: a part `image`, and perhaps one `meta`.
+pub async fn is_picture_form(request: axum::extract::Request) -> bool {
+    body::from_form(request, usize::MAX).await.is_ok()
+}

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
+use exif::{Field, In, Rational, Tag};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -44,11 +45,15 @@ impl Folders {
     }
 
     fn command(&self, args: &[&str]) -> Command {
+        self.command_by("xfeat", args)
+    }
+
+    fn command_by(&self, model: &str, args: &[&str]) -> Command {
         let mut command = Command::new(BINARY);
         command
             .current_dir(self.dir.path())
             .args(["eval", "--database", "database", "--queries", "queries", "--work", "work"])
-            .args(["--model", "xfeat", "--json"])
+            .args(["--json", "--model", model])
             .args(args)
             .env("WHEREABOUTS_MODEL__ASSETS", Path::new(env!("CARGO_MANIFEST_DIR")).join("assets"))
             .env("WHEREABOUTS_MODEL__THREADS", "1");
@@ -228,6 +233,71 @@ fn places_that_are_not_in_the_map_say_what_known_is_worth() {
     let known = &summary["methods"][0]["known"];
     let auc = known["auc"].as_f64().unwrap();
     assert!((0.0..=1.0).contains(&auc) && known["at_95"]["recall"].as_f64().unwrap() >= 0.95);
+}
+
+/// A JPEG that says in its EXIF block where it was taken.
+fn with_gps(jpeg: &[u8], lat: f64, lon: f64) -> Vec<u8> {
+    let degrees = |angle: f64| {
+        let part =
+            |value: f64, denom: u32| Rational { num: (value * f64::from(denom)) as u32, denom };
+        let minutes = angle.fract() * 60.0;
+        let parts =
+            [part(angle.trunc(), 1), part(minutes.trunc(), 1), part(minutes.fract() * 60.0, 1000)];
+        exif::Value::Rational(parts.into())
+    };
+    let text = |letter: &str| exif::Value::Ascii(vec![letter.into()]);
+    let fields = [
+        (Tag::GPSLatitudeRef, text("N")),
+        (Tag::GPSLatitude, degrees(lat)),
+        (Tag::GPSLongitudeRef, text("E")),
+        (Tag::GPSLongitude, degrees(lon)),
+    ]
+    .map(|(tag, value)| Field { tag, ifd_num: In::PRIMARY, value });
+    let mut writer = exif::experimental::Writer::new();
+    fields.iter().for_each(|field| writer.push_field(field));
+    let mut tiff = std::io::Cursor::new(Vec::new());
+    writer.write(&mut tiff, false).unwrap();
+    let tiff = tiff.into_inner();
+    let length = (tiff.len() + 8) as u16;
+    let segment = [&[0xFF, 0xE1][..], &length.to_be_bytes(), b"Exif\0\0", &tiff].concat();
+    [&jpeg[..2], &segment, &jpeg[2..]].concat()
+}
+
+#[test]
+fn positions_come_from_the_pictures_themselves() {
+    let folders = Folders::new();
+    for place in 0..6 {
+        // 0.001° of latitude are 111 m.
+        let lat = 45.0 + 0.001 * place as f64;
+        let image = with_gps(&reference(place), lat, 7.0);
+        folders.write(&format!("database/{place}.jpg"), image);
+        // 16 m to the east.
+        let query = with_gps(&frame(place, 0), lat, 7.0002);
+        folders.write(&format!("queries/{place}.jpg"), query);
+    }
+    let near = folders.eval(&["--refine", "off", "--threshold-m", "25"]);
+    assert_eq!((&near["queries"], &near["skipped"]), (&6.into(), &0.into()));
+    assert_eq!(recalls(&near)[0][2], 100.0);
+    let refused = folders.refused(&["--refine", "off", "--threshold-m", "10"]);
+    assert!(refused.contains("none of the 6 queries has a true reference"), "{refused}");
+}
+
+#[test]
+fn both_descriptors_of_a_transformer_are_evaluated() {
+    let folders = Folders::town(5);
+    let model = folders.path("assets/models/tiny-tokens");
+    std::fs::create_dir_all(&model).unwrap();
+    let fixture = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/models/tiny-tokens");
+    for file in ["manifest.toml", "model.onnx"] {
+        std::fs::copy(fixture.join(file), model.join(file)).unwrap();
+    }
+    let args = ["--descriptor", "gem,cls", "--refine", "local"];
+    let mut command = folders.command_by("tiny-tokens", &args);
+    command.env("WHEREABOUTS_MODEL__ASSETS", folders.path("assets"));
+    let summary = json(&command.output().unwrap());
+    assert_eq!(names(&summary), ["gem", "gem+local", "cls", "cls+local"]);
+    // Weights by chance describe badly, but five places leave no more than five answers.
+    assert!(recalls(&summary).iter().all(|at| at[1] == 100.0), "{summary}");
 }
 
 #[test]

@@ -107,6 +107,11 @@ fn ground_truths() {
 }
 
 #[test]
+fn forms() {
+    fuzz("forms", seeds::forms(), targets::form);
+}
+
+#[test]
 fn answers_of_language_models() {
     fuzz("answers", seeds::answers(), targets::answer);
 }

@@ -142,6 +142,15 @@ pub fn archives() -> Vec<Vec<u8>> {
     vec![std::fs::read(path).unwrap()]
 }
 
+pub fn forms() -> Vec<Vec<u8>> {
+    texts(&[
+        "--XX\r\nContent-Disposition: form-data; name=\"image\"; filename=\"a.jpg\"\r\n\
+         Content-Type: image/jpeg\r\n\r\nbytes\r\n--XX\r\nContent-Disposition: form-data; \
+         name=\"meta\"\r\n\r\n{\"id\": \"a\"}\r\n--XX--\r\n",
+        "--XX\r\nContent-Disposition: form-data; name=\"image\"\r\n\r\n\r\n--XX--\r\n",
+    ])
+}
+
 fn texts(all: &[&str]) -> Vec<Vec<u8>> {
     all.iter().map(|text| text.as_bytes().to_vec()).collect()
 }

@@ -5,10 +5,14 @@ use std::collections::HashSet;
 use std::io::Cursor;
 use std::path::Path;
 
+use axum::body::Body;
+use axum::http::Request;
 use serde_json::Value;
+use tokio::runtime::{Builder, Runtime};
 use whereabouts::archive::{Item, Reader};
 use whereabouts::domain::{Frame, Pose};
 use whereabouts::evaluate::{PictureFile, PoseSource, TruthSource};
+use whereabouts::http::is_picture_form;
 use whereabouts::refine::mllm::Labels;
 use whereabouts::retrieve::ImageLimits;
 use whereabouts::retrieve::decode::{Needed, decode};
@@ -112,4 +116,15 @@ pub fn answer(bytes: &[u8]) -> bool {
     assert!(once.len() == CANDIDATES && verdict.order.len() == CANDIDATES);
     assert!(once.iter().all(|&index| index < CANDIDATES));
     true
+}
+
+pub fn form(bytes: &[u8]) -> bool {
+    thread_local! {
+        static RUNTIME: Runtime = Builder::new_current_thread().build().unwrap();
+    }
+    let request = Request::post("/maps/m/images")
+        .header("content-type", "multipart/form-data; boundary=XX")
+        .body(Body::from(bytes.to_vec()))
+        .unwrap();
+    RUNTIME.with(|runtime| runtime.block_on(is_picture_form(request)))
 }
