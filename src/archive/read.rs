@@ -129,8 +129,8 @@ impl<R: Read> Reader<R> {
         }
         if manifest.version != VERSION {
             return refuse(&format!(
-                "it is of version {}, and this program reads version {VERSION}; restore it with the \
-                 whereabouts that made it ({}), or a later one",
+                "it is of version {}, and this program reads version {VERSION}; restore it with \
+                 the whereabouts that made it ({}), or a later one",
                 manifest.version, manifest.made_by
             ));
         }

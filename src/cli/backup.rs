@@ -80,7 +80,8 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         Backup { client, writer, progress, concurrency: usize::from(args.concurrency) };
     let (maps, gone) = backup.maps(&names, resumed).await.with_context(|| {
         format!(
-            "the backup is not whole; {} keeps what was saved, and the same command goes on from there",
+            "the backup is not whole; {} keeps what was saved, and the same command goes on from \
+             there",
             growing(&args.file).display()
         )
     })?;
@@ -198,7 +199,8 @@ impl Backup {
                 Some(map) if (map.uid, map.revision) == (page.map.uid, page.map.revision) => {}
                 Some(_) if beginnings < BEGINNINGS => {
                     self.progress.say(&format!(
-                        "{name} was reindexed or made anew meanwhile; it is saved from its beginning"
+                        "{name} was reindexed or made anew meanwhile, so it is saved from its \
+                         beginning"
                     ));
                     self.writer.go_back(&saving.begins)?;
                     saving = Saving::new(saving.begins);

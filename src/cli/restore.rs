@@ -87,7 +87,10 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     restored.with_context(|| {
         let so_far: Vec<_> = restore.done.iter().map(said).collect();
         let so_far = if so_far.is_empty() { "none".to_owned() } else { so_far.join(", ") };
-        format!("not all is restored; on the server are these images: {so_far}. The same command adds the rest")
+        format!(
+            "not all is restored; on the server are these images: {so_far}. The same command adds \
+             the rest"
+        )
     })?;
     let seconds = start.elapsed().as_secs_f64();
     report(&Outcome { file: args.file, maps: restore.done, seconds }, args.json)
@@ -305,8 +308,8 @@ fn report(outcome: &Outcome, json: bool) -> anyhow::Result<()> {
     match outcome.maps.iter().map(|map| map.conflicts.len()).sum() {
         0 => Ok(()),
         images => bail!(
-            "{images} images were not restored: their ids are taken by other pictures; remove those, \
-             or restore under another name with --as"
+            "{images} images were not restored: their ids are taken by other pictures; remove \
+             those, or restore under another name with --as"
         ),
     }
 }

@@ -17,7 +17,8 @@ impl Doctor<'_> {
                 Err(error) => {
                     self.report.problem(
                         format!("the record of a job is lost: {error}"),
-                        "nothing else depends on it; restore a backup into a new folder to be rid of it",
+                        "nothing else depends on it; restore a backup into a new folder to be rid of \
+                         it",
                     );
                     continue;
                 }

@@ -75,7 +75,7 @@ pub(super) fn look(report: &mut Report) {
     if free < LITTLE_ROOM {
         report.problem(
             format!("only {:.0} MB are free on the disk", free as f64 / 1e6),
-            "make room: what cannot be written is refused with 500",
+            "make room: what cannot be written is refused with 507",
         );
     }
 }
