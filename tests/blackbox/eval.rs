@@ -323,6 +323,9 @@ fn photographs(set: &str, [database, queries]: [&str; 2], args: &[&str]) -> Opti
         .args([work.path(), Path::new("--database"), &folder.join(database)])
         .args([Path::new("--queries"), &folder.join(queries)])
         .args(args)
+        // Each run has a folder of its own, and would choose for itself who runs the model.
+        .env("WHEREABOUTS_MODEL__PROVIDER", "cpu")
+        .env("WHEREABOUTS_MODEL__PRECISION", "full")
         // A graph, however small the map.
         .env("WHEREABOUTS_INDEX__EXACT_UP_TO", "0")
         .env("WHEREABOUTS_MODEL__THREADS", "1")
