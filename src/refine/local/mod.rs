@@ -137,7 +137,8 @@ impl LocalMatcher {
         query: &DenseFeatures,
         candidate: &DenseFeatures,
     ) -> Result<PairMatch, LocalError> {
-        let mutual = mutual::find(query, candidate, self.settings.min_similarity)?;
+        let least = self.settings.min_similarity;
+        let mutual = mutual::find(query, candidate, least, &mut Vec::new())?;
         let votes = Votes::count(std::slice::from_ref(&mutual), self.settings.vote_temperature);
         Ok(self.judge(query, candidate, &mutual, &votes, 0))
     }
@@ -152,9 +153,11 @@ impl LocalMatcher {
         query: &DenseFeatures,
         candidates: &[&DenseFeatures],
     ) -> Result<Vec<PairMatch>, LocalError> {
+        let mut scratch = Vec::new();
+        let least = self.settings.min_similarity;
         let mutuals: Vec<Mutual> = candidates
             .iter()
-            .map(|candidate| mutual::find(query, candidate, self.settings.min_similarity))
+            .map(|candidate| mutual::find(query, candidate, least, &mut scratch))
             .collect::<Result<_, _>>()?;
         let votes = Votes::count(&mutuals, self.settings.vote_temperature);
         let rivals = candidates.len().saturating_sub(1);

@@ -4,6 +4,7 @@
 
 use super::{LocalError, Match};
 use crate::domain::dense::DenseFeatures;
+use multiversion::multiversion;
 use ndarray::{ArrayView2, ArrayViewMut2, linalg::general_mat_mul};
 
 /// Similarities worked out at a time, a megabyte: they are still in the second-level cache when they
@@ -61,10 +62,13 @@ fn centre(features: &DenseFeatures, cell: usize) -> [f32; 2] {
 ///
 /// A candidate cell is given away once: where several query cells tie for it, as in a repeated
 /// pattern, the first has it.
+///
+/// `scratch` has room for similarities, so that not every pair asks for memory of its own.
 pub(super) fn find(
     query: &DenseFeatures,
     candidate: &DenseFeatures,
     min_similarity: f32,
+    scratch: &mut Vec<f32>,
 ) -> Result<Mutual, LocalError> {
     let channels = query.channels();
     if channels != candidate.channels() {
@@ -74,12 +78,12 @@ pub(super) fn find(
     let candidate_cells = ArrayView2::from_shape((theirs, channels), candidate.cells())?;
 
     let block_rows = (BLOCK / theirs.max(1)).clamp(1, query.len());
-    let mut similarities = vec![0.0; block_rows * theirs];
+    scratch.resize(block_rows * theirs, 0.0);
     let mut nearest = Vec::with_capacity(query.len());
     let mut best_of_column = vec![f32::NEG_INFINITY; theirs];
     for cells in query.cells().chunks(block_rows * channels) {
         let rows = cells.len() / channels;
-        let block = &mut similarities[..rows * theirs];
+        let block = &mut scratch[..rows * theirs];
         general_mat_mul(
             1.0,
             &ArrayView2::from_shape((rows, channels), cells)?,
@@ -88,8 +92,8 @@ pub(super) fn find(
             &mut ArrayViewMut2::from_shape((rows, theirs), &mut *block)?,
         );
         for (cell, row) in cells.chunks_exact(channels).zip(block.chunks_exact(theirs)) {
-            raise(&mut best_of_column, row);
-            nearest.push(if cell.iter().any(|x| *x != 0.0) { highest(row) } else { None });
+            let found = highest(row, &mut best_of_column);
+            nearest.push(found.filter(|_| cell.iter().any(|x| *x != 0.0)));
         }
     }
     Ok(keep_mutual(&nearest, &best_of_column, min_similarity))
@@ -120,34 +124,58 @@ fn keep_mutual(
 
 /// The larger of two numbers; the second where the first is not a number. Unlike `f32::max` this is
 /// one machine instruction.
+#[inline(always)]
 fn larger(candidate: f32, current: f32) -> f32 {
     if candidate > current { candidate } else { current }
 }
 
-fn raise(best: &mut [f32], row: &[f32]) {
-    for (best, &x) in best.iter_mut().zip(row) {
-        *best = larger(x, *best);
-    }
+/// The first place of the highest number of a row; `None` if it holds no finite number. Raises the
+/// maxima of the columns to the row.
+fn highest(row: &[f32], best_of_column: &mut [f32]) -> Option<(usize, f32)> {
+    let best = raise(row, best_of_column);
+    if best.is_finite() { Some((place_of(best, row)?, best)) } else { None }
 }
 
-/// The first place of the highest number of a row; `None` if it holds no finite number.
-fn highest(row: &[f32]) -> Option<(usize, f32)> {
-    let mut lanes = [f32::NEG_INFINITY; LANES];
-    let chunks = row.chunks_exact(LANES);
-    let rest = chunks.remainder();
-    for chunk in chunks {
-        raise(&mut lanes, chunk);
+/// Raises the maxima of the columns to a row; gives the highest number of the row.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2+fma", "aarch64+neon"))]
+fn raise(row: &[f32], best_of_column: &mut [f32]) -> f32 {
+    let mut highest = [f32::NEG_INFINITY; LANES];
+    let (chunks, rest) = row.as_chunks::<LANES>();
+    let (columns, columns_rest) = best_of_column.as_chunks_mut::<LANES>();
+    // Indices, because adapters of iterators are not always compiled into their caller.
+    for chunk in 0..chunks.len().min(columns.len()) {
+        let (numbers, best) = (&chunks[chunk], &mut columns[chunk]);
+        for lane in 0..LANES {
+            best[lane] = larger(numbers[lane], best[lane]);
+            highest[lane] = larger(numbers[lane], highest[lane]);
+        }
     }
-    raise(&mut lanes, rest);
-    let best = lanes.into_iter().fold(f32::NEG_INFINITY, |best, x| larger(x, best));
-    let chunk = row.chunks(LANES).position(|chunk| holds(chunk, best))?;
-    let place = row[chunk * LANES..].iter().position(|&x| x == best)?;
-    best.is_finite().then_some((chunk * LANES + place, best))
+    for place in 0..rest.len().min(columns_rest.len()) {
+        columns_rest[place] = larger(rest[place], columns_rest[place]);
+        highest[place] = larger(rest[place], highest[place]);
+    }
+    let mut best = f32::NEG_INFINITY;
+    for number in highest {
+        best = larger(number, best);
+    }
+    best
 }
 
-/// `contains`, but without stopping early, so that whole chunks are compared at once.
-fn holds(chunk: &[f32], number: f32) -> bool {
-    chunk.iter().fold(false, |held, &x| held | (x == number))
+/// The first place of a number that a row holds.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2+fma", "aarch64+neon"))]
+fn place_of(number: f32, row: &[f32]) -> Option<usize> {
+    let (chunks, rest) = row.as_chunks::<LANES>();
+    for (index, chunk) in chunks.iter().enumerate() {
+        // Without stopping early, so that a whole chunk is compared at once.
+        let mut held = false;
+        for candidate in chunk {
+            held |= *candidate == number;
+        }
+        if held {
+            return chunk.iter().position(|x| *x == number).map(|lane| index * LANES + lane);
+        }
+    }
+    rest.iter().position(|x| *x == number).map(|place| chunks.len() * LANES + place)
 }
 
 #[cfg(test)]
@@ -159,15 +187,19 @@ mod tests {
         for place in 0..37 {
             let mut row = vec![-0.5; 37];
             row[place] = 0.25;
-            assert_eq!(highest(&row), Some((place, 0.25)));
+            let mut columns = vec![0.0; 37];
+            assert_eq!(highest(&row, &mut columns), Some((place, 0.25)));
+            assert_eq!(columns.iter().position(|best| *best == 0.25), Some(place));
+            assert_eq!(columns.iter().sum::<f32>(), 0.25);
         }
     }
 
     #[test]
     fn numbers_that_are_not_numbers_are_never_the_highest() {
-        assert_eq!(highest(&[f32::NAN, -0.5, f32::NAN]), Some((1, -0.5)));
-        assert_eq!(highest(&[f32::NAN; 20]), None);
-        assert_eq!(highest(&[]), None);
+        let of = |row: &[f32]| highest(row, &mut vec![-1.0; row.len()]);
+        assert_eq!(of(&[f32::NAN, -0.5, f32::NAN]), Some((1, -0.5)));
+        assert_eq!(of(&[f32::NAN; 20]), None);
+        assert_eq!(of(&[]), None);
     }
 
     #[test]
