@@ -7,9 +7,9 @@ use crate::domain::dense::DenseFeatures;
 use multiversion::multiversion;
 use ndarray::{ArrayView2, ArrayViewMut2, linalg::general_mat_mul};
 
-/// Similarities worked out at a time, a megabyte: they are still in the second-level cache when they
-/// are scanned, and the candidate is not packed anew for the product too often.
-const BLOCK: usize = 1 << 18;
+/// Similarities worked out at a time, eight megabytes: all of a pair of usual pictures, so that the
+/// candidate is packed once for the product.
+const BLOCK: usize = 1 << 21;
 
 /// Running maxima kept side by side, so that the compiler can use vector registers.
 const LANES: usize = 16;
