@@ -105,6 +105,8 @@ pub struct Calibration {
     pub images: usize,
     /// The settings it was measured with.
     pub settings: CalibrationSettings,
+    /// Whether all of it was measured; else that was broken off, or goes on.
+    pub complete: bool,
     /// Of [`Evidence::Similarity`].
     pub similarity: Chance,
     /// Of [`Evidence::Agreement`]; empty until it is measured, and where there is no refiner.
@@ -171,6 +173,14 @@ pub struct Estimate {
     /// Whether the confidence reaches the configured bound, below which the place is perhaps not in
     /// the map.
     pub known: bool,
+}
+
+impl Estimate {
+    /// The guess that this image shows the place; known from a confidence of `known_from` on.
+    pub fn new(image_id: &ImageId, pose: Option<Pose>, confidence: f32, known_from: f64) -> Self {
+        let known = f64::from(confidence) >= known_from;
+        Self { image_id: image_id.clone(), pose, confidence, known }
+    }
 }
 
 #[cfg(test)]

@@ -172,12 +172,8 @@ impl Worker {
             &first.image_id,
             refinement.evidence,
         );
-        Some(Estimate {
-            image_id: first.image_id.clone(),
-            pose: first.pose,
-            confidence,
-            known: f64::from(confidence) >= self.settings.known_confidence,
-        })
+        let known_from = self.settings.known_confidence;
+        Some(Estimate::new(&first.image_id, first.pose, confidence, known_from))
     }
 
     fn record(&self, took: Duration) {

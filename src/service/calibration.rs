@@ -10,7 +10,7 @@ use uuid::Uuid;
 
 use super::{Service, ServiceError};
 use crate::domain::confidence::{COMPARED, Chance};
-use crate::domain::{Calibration, Candidate, Evidence, ImageId, Map};
+use crate::domain::{Calibration, Evidence, Map};
 use crate::refine::{RefineError, Refiner};
 use crate::store::{IndexState, LookAlikes};
 
@@ -82,7 +82,8 @@ impl Service {
 
     async fn is_due(&self, map: &Map, images: usize) -> Result<bool, ServiceError> {
         let Some(known) = self.maps.calibration(map).await? else { return Ok(images > 1) };
-        Ok(known.settings != self.settings.calibration
+        Ok(!known.complete
+            || known.settings != self.settings.calibration
             || known.images.abs_diff(images) * CHANGED > known.images)
     }
 
@@ -110,22 +111,12 @@ impl Service {
             }
             measured.agreement = Chance::from(values(found.into_iter()));
         }
+        measured.complete = true;
         tracing::info!(
             map = %map.name, images, asked = measured.similarity.len(),
             refined = measured.agreement.len(), "measured what chance resemblance is like"
         );
         Ok(self.maps.put_calibration(map, measured).await?)
-    }
-
-    /// How sure it is that one of the candidates of a frame shows its place.
-    pub(super) async fn confidence(
-        &self,
-        map: &Map,
-        candidates: &[Candidate],
-        of: &ImageId,
-    ) -> Result<f32, ServiceError> {
-        let known = self.maps.calibration(map).await?;
-        Ok(known.map_or(0.0, |known| known.refined_confidence(candidates, of, None)))
     }
 }
 

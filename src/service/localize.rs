@@ -229,12 +229,9 @@ impl Service {
         candidates: &[Candidate],
     ) -> Result<Option<Estimate>, ServiceError> {
         let Some(first) = candidates.first() else { return Ok(None) };
-        let confidence = self.confidence(map, candidates, &first.image_id).await?;
-        Ok(Some(Estimate {
-            image_id: first.image_id.clone(),
-            pose: first.pose,
-            confidence,
-            known: f64::from(confidence) >= self.settings.known_confidence,
-        }))
+        let calibration = self.maps.calibration(map).await?.unwrap_or_default();
+        let confidence = calibration.refined_confidence(candidates, &first.image_id, None);
+        let known_from = self.settings.known_confidence;
+        Ok(Some(Estimate::new(&first.image_id, first.pose, confidence, known_from)))
     }
 }

@@ -123,7 +123,8 @@ pub trait MapStore: Send + Sync {
         settings: CalibrationSettings,
         k: usize,
     ) -> Result<Vec<LookAlikes>, StoreError>;
-    /// What was last measured in this revision of the map. It is derived: it may be lost.
+    /// What was last measured in this revision of the map, while it is the one that serves. It is
+    /// derived: it may be lost.
     async fn calibration(&self, map: &Map) -> Result<Option<Arc<Calibration>>, StoreError>;
     /// Keeps what was measured.
     async fn put_calibration(&self, map: &Map, measured: Calibration) -> Result<(), StoreError>;

@@ -277,7 +277,8 @@ impl MapStore for EmbeddedStore {
     }
 
     async fn calibration(&self, map: &Map) -> Result<Option<Arc<Calibration>>, StoreError> {
-        Ok(self.inner.live_revision(map)?.calibration.get())
+        // What was measured in a map that is gone, or has other descriptors by now, is gone with it.
+        Ok(self.inner.live_revision(map).ok().and_then(|live| live.calibration.get()))
     }
 
     async fn put_calibration(&self, map: &Map, measured: Calibration) -> Result<(), StoreError> {
