@@ -15,7 +15,7 @@ use whereabouts::retrieve::decode::encode_jpeg;
 use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits};
 
 const CANDIDATES: usize = 20;
-const ROUNDS: usize = 15;
+const ROUNDS: usize = 30;
 const LIMITS: ImageLimits = ImageLimits { max_pixels: 10_000_000 };
 
 fn main() -> anyhow::Result<()> {

@@ -1,7 +1,8 @@
 //! The `local` refiner: says how a query and its candidates agree, region by region, without a
 //! language model.
 //!
-//! Four steps, one file each. `mutual` finds the cells of two pictures that choose each other;
+//! Four steps, one file each. `mutual` finds the cells of two pictures that choose each other, among
+//! what `nearest` found;
 //! `agreement` keeps those whose surroundings moved the same way; `votes` lets each remaining
 //! cell of the query share one vote among the candidates, so that what every candidate shows counts
 //! for little; `motion` fits one motion to what is left. [`describe`] puts the outcome of a pair
@@ -13,6 +14,7 @@ mod agreement;
 mod describe;
 mod motion;
 mod mutual;
+mod nearest;
 mod rank;
 mod votes;
 
@@ -25,6 +27,7 @@ pub use rank::rank;
 
 use crate::domain::dense::DenseFeatures;
 use mutual::Mutual;
+use nearest::Nearest;
 use votes::Votes;
 
 /// What the matcher takes for agreement. The defaults are those measured for XFeat; all lengths are
@@ -98,20 +101,14 @@ pub struct PairMatch {
     pub score: f32,
 }
 
-/// Why two pictures could not be compared.
-#[derive(Debug, thiserror::Error, PartialEq)]
-pub enum LocalError {
-    /// The features come from different models.
-    #[error("a query of {query} channels cannot be matched with a candidate of {candidate}")]
-    Channels {
-        /// Numbers in a cell of the query.
-        query: usize,
-        /// Numbers in a cell of the candidate.
-        candidate: usize,
-    },
-    /// The cells do not fill the grid they claim; never true of constructed features.
-    #[error("dense features do not fill their grid")]
-    Grid(#[from] ndarray::ShapeError),
+/// Why two pictures could not be compared: their features come from different models.
+#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+#[error("a query of {query} channels cannot be matched with a candidate of {candidate}")]
+pub struct LocalError {
+    /// Numbers in a cell of the query.
+    pub query: usize,
+    /// Numbers in a cell of the candidate.
+    pub candidate: usize,
 }
 
 /// Compares the dense features of a query with those of its candidates.
@@ -131,14 +128,14 @@ impl LocalMatcher {
     /// Compares a query with one candidate alone: every agreeing region gives it a full vote.
     ///
     /// # Errors
-    /// [`LocalError::Channels`] when the features come from different models.
+    /// [`LocalError`] when the features come from different models.
     pub fn compare(
         &self,
         query: &DenseFeatures,
         candidate: &DenseFeatures,
     ) -> Result<PairMatch, LocalError> {
         let least = self.settings.min_similarity;
-        let mutual = mutual::find(query, candidate, least, &mut Vec::new())?;
+        let mutual = mutual::find(query, candidate, least, &mut Nearest::default())?;
         let votes = Votes::count(std::slice::from_ref(&mutual), self.settings.vote_temperature);
         Ok(self.judge(query, candidate, &mutual, &votes, 0))
     }
@@ -147,17 +144,17 @@ impl LocalMatcher {
     /// the same order. Costs one matrix product of the two feature maps for each pair.
     ///
     /// # Errors
-    /// [`LocalError::Channels`] when any two of the features come from different models.
+    /// [`LocalError`] when any two of the features come from different models.
     pub fn compare_all(
         &self,
         query: &DenseFeatures,
         candidates: &[&DenseFeatures],
     ) -> Result<Vec<PairMatch>, LocalError> {
-        let mut scratch = Vec::new();
+        let mut nearest = Nearest::default();
         let least = self.settings.min_similarity;
         let mutuals: Vec<Mutual> = candidates
             .iter()
-            .map(|candidate| mutual::find(query, candidate, least, &mut scratch))
+            .map(|candidate| mutual::find(query, candidate, least, &mut nearest))
             .collect::<Result<_, _>>()?;
         let votes = Votes::count(&mutuals, self.settings.vote_temperature);
         let rivals = candidates.len().saturating_sub(1);

@@ -47,7 +47,10 @@ impl Motion {
 
     /// Where a point of the query lies in the candidate.
     pub fn apply(&self, point: [f32; 2]) -> [f32; 2] {
-        self.matrix.map(|[a, b, c]| a * point[0] + b * point[1] + c)
+        // Written out: a closure for each row would be called once for each match and proposal.
+        let [[a, b, c], [d, e, f]] = self.matrix;
+        let [x, y] = point;
+        [a * x + b * y + c, d * x + e * y + f]
     }
 
     /// How far the picture's centre moved, `[x, y]` in fractions of the edges; positive is right
@@ -82,7 +85,8 @@ impl Motion {
     /// How well it explains a match: 1 on the spot, 0 from `tolerance` on.
     fn explains(&self, found: &Match, tolerance: [f32; 2]) -> f32 {
         let at = self.apply(found.query);
-        let [x, y] = [0, 1].map(|axis| (at[axis] - found.candidate[axis]) / tolerance[axis]);
+        let x = (at[0] - found.candidate[0]) / tolerance[0];
+        let y = (at[1] - found.candidate[1]) / tolerance[1];
         let inside = (1.0 - x * x - y * y).max(0.0);
         inside * inside
     }
@@ -115,11 +119,10 @@ fn propose(matches: &[Match], weights: &[f32], tolerance: [f32; 2], aspect: f32)
             let shift = [0, 1]
                 .map(|axis| proposer.candidate[axis] - 0.5 - scale * (proposer.query[axis] - 0.5));
             let motion = Motion::scaled(scale, shift, aspect);
-            let backing: f32 = matches
-                .iter()
-                .zip(weights)
-                .map(|(found, weight)| weight * motion.explains(found, tolerance))
-                .sum();
+            let mut backing = 0.0;
+            for (found, weight) in matches.iter().zip(weights) {
+                backing += weight * motion.explains(found, tolerance);
+            }
             if backing > best.0 {
                 best = (backing, motion);
             }
@@ -141,7 +144,7 @@ fn improve(
     for (found, weight) in matches.iter().zip(weights) {
         let weight = weight * motion.explains(found, tolerance);
         let at = motion.apply(found.query);
-        let error = [0, 1].map(|axis| found.candidate[axis] - at[axis]);
+        let error = [found.candidate[0] - at[0], found.candidate[1] - at[1]];
         let basis = [found.query[0] - 0.5, found.query[1] - 0.5, 1.0];
         for i in 0..3 {
             for j in 0..3 {

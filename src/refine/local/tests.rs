@@ -192,7 +192,7 @@ fn a_single_cell_is_compared_without_a_neighbourhood() {
 fn features_of_different_models_are_an_error() {
     let query = features(2, 2, vec![1.0; 4 * 8]);
     let candidate = features(2, 2, vec![1.0; 4 * 9]);
-    let expected = LocalError::Channels { query: 8, candidate: 9 };
+    let expected = LocalError { query: 8, candidate: 9 };
     let matcher = LocalMatcher::default();
     assert_eq!(matcher.compare(&query, &candidate), Err(expected));
     assert!(matcher.compare_all(&query, &[&query, &candidate]).is_err());
