@@ -34,8 +34,7 @@ Not done: half precision; checkpoints in several files; checkpoints of training
 (a teacher or a student, or blocks in chunks); position embeddings of another grid than 37×37; and
 the manifest has no word for a pooled output, so the service pools `last_hidden_state` itself and
 ignores what --pool adds. The weights of dinov2-…-giant, 4.5 GB, do not fit into one ONNX file: they
-go to `model.onnx.data` beside it. The manifest's digest covers `model.onnx`, which holds a digest
-of the weights for that reason; nothing compares that one with the file.
+go to `model.onnx.data` beside it, which the manifest names and `whereabouts model add` takes along.
 
 How close it comes to PyTorch is at the top of check_dinov2.py.
 """
@@ -80,7 +79,7 @@ file = "model.onnx"
 sha256 = "{sha256}"
 licence = "Apache-2.0"
 source = "{source}"
-
+{data}
 [input]
 name = "pixel_values"
 width = {width}
@@ -631,12 +630,12 @@ def export(folder: Path, name: str, weights: Weights, source: str, choices: dict
     variant = VARIANTS[name.partition("-random")[0]]
     folder.mkdir(parents=True, exist_ok=True)
     files = {file: folder / f".{file}.{os.getpid()}" for file in ("model.onnx.data", "model.onnx")}
-    data_file, model_file = files.values()
+    written_data, model_file = files.values()
     large = 4 * sum(int(np.prod(shape)) for shape in shapes(variant).values()) > LARGEST_FILE
     try:
         if large:
-            with data_file.open("wb") as data:
-                model = build_model(variant, weights, data=data, **choices)
+            with written_data.open("wb") as stream:
+                model = build_model(variant, weights, data=stream, **choices)
         else:
             model = build_model(variant, weights, **choices)
             onnx.checker.check_model(model, full_check=True)
@@ -649,14 +648,20 @@ def export(folder: Path, name: str, weights: Weights, source: str, choices: dict
             written.unlink(missing_ok=True)
     if large:
         onnx.checker.check_model(str(folder / "model.onnx"), full_check=True)
-    manifest = describe(variant, name, source, choices, folder / "model.onnx")
+    data = folder / "model.onnx.data" if large else None
+    manifest = describe(variant, name, source, choices, folder / "model.onnx", data)
     (folder / "manifest.toml").write_text(manifest, encoding="utf-8")
 
 
 def describe(
-    variant: Variant, name: str, source: str, choices: dict[str, Any], model: Path
+    variant: Variant,
+    name: str,
+    source: str,
+    choices: dict[str, Any],
+    model: Path,
+    data: Path | None,
 ) -> str:
-    """The manifest."""
+    """The manifest of `model`, whose weights are in `data` if they do not fit into it."""
     by_size = variant.registers or choices["position"] == "hub"
     way = "by size" if by_size else "as the authors' code does"
     description = f"DINOv2 {variant.title}; its position embedding is stretched {way}."
@@ -668,14 +673,21 @@ def describe(
     return MANIFEST.format(
         name=name,
         description=description,
-        sha256=hashlib.sha256(model.read_bytes()).hexdigest(),
+        sha256=digest(model),
         source=json.dumps(source, ensure_ascii=False)[1:-1],  # TOML escapes as JSON does
+        data=f'\n[data]\nfile = "{data.name}"\nsha256 = "{digest(data)}"\n' if data else "",
         width=width,
         height=height,
         channels=variant.channels,
         registers=variant.registers,
         gem_p=GEM_P,
     )
+
+
+def digest(file: Path) -> str:
+    """Its SHA-256 in hexadecimal digits."""
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def size_of(text: str) -> list[int]:

@@ -104,9 +104,15 @@ impl Entry {
         &self.manifest.name
     }
 
-    /// Where the file is on `hub`.
-    pub fn address(&self, hub: &str) -> String {
-        let Self { repository, revision, path, .. } = self;
+    /// Where one of its files is on `hub`. The ONNX file may have another name there; what is beside
+    /// it is named in it and has the same.
+    pub fn address(&self, hub: &str, file: &Path) -> String {
+        let Self { repository, revision, path, manifest, .. } = self;
+        let path = match path.rsplit_once('/') {
+            _ if file == manifest.file => path.clone(),
+            Some((folder, _)) => format!("{folder}/{}", file.display()),
+            None => file.display().to_string(),
+        };
         format!("{}/{repository}/resolve/{revision}/{path}", hub.trim_end_matches('/'))
     }
 }
@@ -146,8 +152,12 @@ mod tests {
         let catalogue = Catalogue::built_in().unwrap();
         let large = catalogue.find("dinov2-large").unwrap();
         assert_eq!(
-            large.address("https://mirror.example/hub/"),
+            large.address("https://mirror.example/hub/", &large.manifest.file),
             "https://mirror.example/hub/onnx-community/dinov2-large/resolve/main/onnx/model.onnx"
+        );
+        assert_eq!(
+            large.address("https://mirror.example/hub", Path::new("model.onnx_data")),
+            "https://mirror.example/hub/onnx-community/dinov2-large/resolve/main/onnx/model.onnx_data"
         );
     }
 

@@ -2,6 +2,7 @@
 
 use std::fs::{self, File, TryLockError};
 use std::io;
+use std::iter;
 use std::path::{Path, PathBuf};
 
 use super::catalogue::Entry;
@@ -25,9 +26,9 @@ pub enum Pulled {
     Installed {
         /// Its folder.
         folder: PathBuf,
-        /// The digest of its file.
-        digest: Digest,
-        /// Whether the catalogue pins that digest; if not, it is recorded in the manifest.
+        /// The digests of its files, the ONNX file first.
+        digests: Vec<Digest>,
+        /// Whether the catalogue pins them; if not, they are recorded in the manifest.
         pinned: bool,
         /// What was wrong with the model that was there before, if one was.
         replaced: Option<String>,
@@ -45,8 +46,8 @@ pub enum Added {
         folder: PathBuf,
         /// The model's name.
         name: String,
-        /// The digest of its file.
-        digest: Digest,
+        /// The digests of its files, the ONNX file first.
+        digests: Vec<Digest>,
     },
 }
 
@@ -55,9 +56,9 @@ pub enum Added {
 pub struct Verdict {
     /// What its manifest says.
     pub manifest: Manifest,
-    /// The digest of its file.
-    pub digest: Digest,
-    /// The size of its file.
+    /// The digests of its files, the ONNX file first.
+    pub digests: Vec<Digest>,
+    /// The size of its files together.
     pub bytes: u64,
 }
 
@@ -131,7 +132,7 @@ impl ModelsFolder {
         entry: &Entry,
         hub: &str,
         settings: DownloadSettings,
-        on_progress: impl FnMut(Progress),
+        mut on_progress: impl FnMut(Progress),
     ) -> Result<Pulled, InstallError> {
         let name = entry.name();
         let _lock = self.lock(name)?;
@@ -144,17 +145,21 @@ impl ModelsFolder {
             },
         };
         let mut manifest = entry.manifest.clone();
-        let file = self.partial(name, &manifest.file.display());
-        let url = entry.address(hub);
-        let download = Download { url: &url, to: &file, pinned: manifest.sha256, settings };
-        let digest = download.run(on_progress).await?;
-        let pinned = manifest.sha256.replace(digest).is_some();
-        let folder = self.place(&manifest, entry.licence_note.as_deref(), &file)?;
-        Ok(Pulled::Installed { folder, digest, pinned, replaced })
+        let mut digests = Vec::new();
+        for (file, pinned) in entry.manifest.files() {
+            let url = entry.address(hub, file);
+            let to = self.partial(name, &file.display());
+            let download = Download { url: &url, to: &to, pinned, settings };
+            digests.push(download.run(&mut on_progress).await?);
+        }
+        let pinned = manifest.files().all(|(_, pinned)| pinned.is_some());
+        manifest.pin(&digests);
+        let folder = self.place(&manifest, entry.licence_note.as_deref())?;
+        Ok(Pulled::Installed { folder, digests, pinned, replaced })
     }
 
-    /// Copies an ONNX file and its manifest under `name`, or the name in the manifest. The
-    /// digest is recorded in the installed manifest.
+    /// Copies an ONNX file, the file of weights beside it where the manifest names one, and the manifest
+    /// under `name`, or the name in the manifest. The digests are recorded in the installed manifest.
     pub fn add(
         &self,
         file: &Path,
@@ -168,31 +173,35 @@ impl ModelsFolder {
         }
         let name = manifest.name.clone();
         let _lock = self.lock(&name)?;
-        let (digest, _) = digest_of(file)?;
-        if let Some(pinned) = manifest.sha256.filter(|pinned| *pinned != digest) {
-            let remedy = format!("give the file that {} is for", source.display());
-            return Err(InstallError::Damaged {
-                file: file.to_owned(),
-                got: digest,
-                pinned,
-                remedy,
-            });
+        let data = manifest.data.as_ref().map(|data| file.with_file_name(&data.file));
+        let given: Vec<PathBuf> = iter::once(file.to_owned()).chain(data).collect();
+        let mut digests = Vec::new();
+        for (file, (_, pinned)) in given.iter().zip(manifest.files()) {
+            let (got, _) = digest_of(file)?;
+            if let Some(pinned) = pinned.filter(|pinned| *pinned != got) {
+                let remedy = format!("give the file that {} is for", source.display());
+                return Err(InstallError::Damaged { file: file.clone(), got, pinned, remedy });
+            }
+            digests.push(got);
         }
         let target = self.models.join(&name);
         if target.exists() {
             return match verify(&target) {
-                Ok(verdict) if verdict.digest == digest => Ok(Added::Present(target)),
+                Ok(verdict) if verdict.digests == digests => Ok(Added::Present(target)),
                 _ => Err(InstallError::Taken(target)),
             };
         }
-        let copy = self.partial(&name, &manifest.file.display());
-        fs::copy(file, &copy).map_err(disk("copy the model to", &copy))?;
-        // What was copied is what was hashed, or the file changed in between.
-        let (copied, _) = digest_of(&copy)?;
-        File::open(&copy).and_then(|file| file.sync_all()).map_err(disk("sync", &copy))?;
-        manifest.sha256 = Some(copied);
-        let folder = self.place(&manifest, None, &copy)?;
-        Ok(Added::Installed { folder, name, digest: copied })
+        digests.clear();
+        for (file, (installed, _)) in given.iter().zip(manifest.files()) {
+            let copy = self.partial(&name, &installed.display());
+            fs::copy(file, &copy).map_err(disk("copy the model to", &copy))?;
+            // What was copied is what was hashed, or the file changed in between.
+            digests.push(digest_of(&copy)?.0);
+            File::open(&copy).and_then(|file| file.sync_all()).map_err(disk("sync", &copy))?;
+        }
+        manifest.pin(&digests);
+        let folder = self.place(&manifest, None)?;
+        Ok(Added::Installed { folder, name, digests })
     }
 
     /// Chooses the model that `auto` stands for; `None` leaves it to the order of preference.
@@ -215,8 +224,11 @@ impl ModelsFolder {
             Ok(verdict) => verdict,
             Err(error) => return Some(error.to_string()),
         };
-        let pinned = entry.manifest.sha256.filter(|pinned| *pinned != verdict.digest)?;
-        Some(format!("it was {}, but the catalogue pins {pinned}", verdict.digest))
+        let mut pins = entry.manifest.files().zip(&verdict.digests);
+        pins.find_map(|((file, pinned), was)| {
+            let pinned = pinned.filter(|pinned| pinned != was)?;
+            Some(format!("{} was {was}, but the catalogue pins {pinned}", file.display()))
+        })
     }
 
     fn lock(&self, name: &str) -> Result<File, InstallError> {
@@ -240,12 +252,12 @@ impl ModelsFolder {
         self.models.join(".partial").join(format!("{name}-{what}"))
     }
 
-    /// Puts a finished model file, which is durable, and its manifest in place as one folder.
+    /// Puts a model's finished partial files, which are durable, and its manifest in place as one
+    /// folder.
     fn place(
         &self,
         manifest: &Manifest,
         licence_note: Option<&str>,
-        file: &Path,
     ) -> Result<PathBuf, InstallError> {
         let staged = self.partial(&manifest.name, &"new");
         let old = self.partial(&manifest.name, &"old");
@@ -258,7 +270,10 @@ impl ModelsFolder {
             let text = format!("{}: {}\n\n{note}\n", manifest.name, manifest.licence);
             write_durably(&staged.join("LICENCE"), &text)?;
         }
-        fs::rename(file, staged.join(&manifest.file)).map_err(disk("move", file))?;
+        for (file, _) in manifest.files() {
+            let partial = self.partial(&manifest.name, &file.display());
+            fs::rename(&partial, staged.join(file)).map_err(disk("move", &partial))?;
+        }
         sync_folder(&staged)?;
         if target.exists() {
             fs::rename(&target, &old).map_err(disk("move", &target))?;
@@ -270,18 +285,21 @@ impl ModelsFolder {
     }
 }
 
-/// Hashes the file of an installed model and compares it with the manifest.
+/// Hashes the files of an installed model and compares them with the manifest.
 pub fn verify(folder: &Path) -> Result<Verdict, InstallError> {
     let manifest = Manifest::read(&folder.join(MANIFEST))?;
-    let file = folder.join(&manifest.file);
-    let (digest, bytes) = digest_of(&file)?;
-    match manifest.sha256 {
-        Some(pinned) if pinned != digest => {
+    let (mut digests, mut bytes) = (Vec::new(), 0);
+    for (file, pinned) in manifest.files() {
+        let file = folder.join(file);
+        let (got, size) = digest_of(&file)?;
+        if let Some(pinned) = pinned.filter(|pinned| *pinned != got) {
             let remedy = "install it again".to_owned();
-            Err(InstallError::Damaged { file, got: digest, pinned, remedy })
+            return Err(InstallError::Damaged { file, got, pinned, remedy });
         }
-        _ => Ok(Verdict { manifest, digest, bytes }),
+        digests.push(got);
+        bytes += size;
     }
+    Ok(Verdict { manifest, digests, bytes })
 }
 
 fn is_name(name: &str) -> bool {
@@ -330,11 +348,12 @@ mod tests {
         let assets = tempfile::tempdir().unwrap();
         let folder = ModelsFolder::open(assets.path()).unwrap();
         let add = |name| folder.add(&fixture("model.onnx"), &fixture(MANIFEST), name);
-        let Added::Installed { folder: placed, digest, .. } = add(Some("mine")).unwrap() else {
+        let Added::Installed { folder: placed, digests, .. } = add(Some("mine")).unwrap() else {
             panic!("it was not there before");
         };
         let verdict = verify(&placed).unwrap();
-        assert_eq!((verdict.digest, verdict.manifest.sha256), (digest, Some(digest)));
+        assert_eq!(verdict.digests, digests);
+        assert_eq!(verdict.manifest.sha256, digests.first().copied());
         assert_eq!(verdict.manifest.name, "mine");
         assert_eq!(Assets::locate(Some(assets.path())).model("mine").unwrap(), placed);
         assert!(matches!(add(Some("mine")).unwrap(), Added::Present(_)));
@@ -356,6 +375,32 @@ mod tests {
         let unpinned: Vec<_> = text.lines().filter(|line| !line.starts_with("sha256")).collect();
         fs::write(&manifest, unpinned.join("\n")).unwrap();
         assert!(matches!(folder.add(&other, &manifest, None), Err(InstallError::Taken(_))));
+    }
+
+    #[test]
+    fn weights_in_a_file_of_their_own_are_added_and_checked() {
+        let (assets, given) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let folder = ModelsFolder::open(assets.path()).unwrap();
+        let (file, manifest) = (given.path().join("model.onnx"), given.path().join("given.toml"));
+        fs::copy(fixture("model.onnx"), &file).unwrap();
+        let text = fs::read_to_string(fixture(MANIFEST)).unwrap();
+        let data = "[data]\nfile = \"model.onnx.data\"\n[input]";
+        fs::write(&manifest, text.replace("[input]", data)).unwrap();
+        let missing = folder.add(&file, &manifest, None).unwrap_err().to_string();
+        assert!(missing.contains("model.onnx.data"), "{missing}");
+
+        fs::write(given.path().join("model.onnx.data"), "weights").unwrap();
+        let Added::Installed { folder: placed, digests, .. } =
+            folder.add(&file, &manifest, None).unwrap()
+        else {
+            panic!("it was not there before");
+        };
+        assert_eq!(digests[1], Digest::of(b"weights"));
+        assert_eq!(verify(&placed).unwrap().digests, digests);
+        fs::write(placed.join("model.onnx.data"), "weight5").unwrap();
+        assert!(matches!(verify(&placed), Err(InstallError::Damaged { .. })));
+        fs::write(given.path().join("model.onnx.data"), "others").unwrap();
+        assert!(matches!(folder.add(&file, &manifest, None), Err(InstallError::Taken(_))));
     }
 
     #[test]

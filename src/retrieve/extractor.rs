@@ -262,7 +262,7 @@ impl Opened {
         let folder = assets.model(name)?;
         let manifest = Arc::new(Manifest::read(&folder.join(MANIFEST))?);
         let file = folder.join(&manifest.file);
-        let digest = manifest.digest(checked_digest(&file, &manifest)?);
+        let digest = manifest.digest(&checked_digests(&folder, &manifest)?);
         Ok(Self { model: Model { environment, file, manifest }, digest })
     }
 }
@@ -314,19 +314,24 @@ pub(super) fn sample(input: &Input) -> Result<Vec<Tensor>, ExtractError> {
     Ok(tensors.collect::<Result<_, _>>()?)
 }
 
-fn checked_digest(file: &Path, manifest: &Manifest) -> Result<Digest, ExtractError> {
-    let (digest, _) = file_digest(file).map_err(|error| {
-        ExtractError::ModelFile(format!(
-            "cannot read {}: {error}; `make build` puts the built-in model in place",
-            file.display()
-        ))
-    })?;
-    match manifest.sha256 {
-        Some(pinned) if pinned != digest => Err(ExtractError::ModelFile(format!(
-            "{} is {digest}, but its manifest pins {pinned}; `whereabouts model verify` says how \
-             to put it right",
-            file.display()
-        ))),
-        _ => Ok(digest),
-    }
+/// The digests of a model's files, which are those that its manifest pins.
+fn checked_digests(folder: &Path, manifest: &Manifest) -> Result<Vec<Digest>, ExtractError> {
+    let checked = manifest.files().map(|(file, pinned)| {
+        let file = folder.join(file);
+        let (digest, _) = file_digest(&file).map_err(|error| {
+            ExtractError::ModelFile(format!(
+                "cannot read {}: {error}; `make build` puts the built-in model in place",
+                file.display()
+            ))
+        })?;
+        match pinned {
+            Some(pinned) if pinned != digest => Err(ExtractError::ModelFile(format!(
+                "{} is {digest}, but its manifest pins {pinned}; `whereabouts model verify` says \
+                 how to put it right",
+                file.display()
+            ))),
+            _ => Ok(digest),
+        }
+    });
+    checked.collect()
 }

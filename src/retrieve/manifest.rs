@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::{self, Read};
+use std::iter;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -30,12 +31,26 @@ pub struct Manifest {
     pub licence: String,
     /// Where the weights come from.
     pub source: String,
+    /// The weights, where they are not in the ONNX file, which holds two gigabytes at most.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub data: Option<DataFile>,
     /// What goes in.
     pub input: Input,
     /// What comes out.
     pub output: Output,
     /// How the output becomes a descriptor.
     pub pooling: Pooling,
+}
+
+/// A file of weights beside the ONNX file, which names it.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DataFile {
+    /// Its name; the one that the ONNX file has for it.
+    pub file: PathBuf,
+    /// The digest that it must have, if pinned.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sha256: Option<Digest>,
 }
 
 /// All in a manifest that decides a descriptor.
@@ -47,9 +62,24 @@ struct Deciding<'a> {
 }
 
 impl Manifest {
-    /// The digest of all that decides a descriptor: the file of weights, whose digest is `file`, and
-    /// how it is fed and pooled. What a manifest says to people does not count.
-    pub fn digest(&self, file: Digest) -> Digest {
+    /// The files of the model and the digests that are pinned, the ONNX file first.
+    pub fn files(&self) -> impl Iterator<Item = (&Path, Option<Digest>)> {
+        let data = self.data.as_ref().map(|data| (data.file.as_path(), data.sha256));
+        iter::once((self.file.as_path(), self.sha256)).chain(data)
+    }
+
+    /// Pins the digests of [`files`](Self::files), in their order.
+    pub fn pin(&mut self, digests: &[Digest]) {
+        self.sha256 = digests.first().copied().or(self.sha256);
+        if let (Some(data), Some(digest)) = (&mut self.data, digests.get(1)) {
+            data.sha256 = Some(*digest);
+        }
+    }
+
+    /// The digest of all that decides a descriptor: the files of weights, whose digests are `files`, and
+    /// how they are fed and pooled. What a manifest says to people does not count.
+    pub fn digest(&self, files: &[Digest]) -> Digest {
+        let file = files.iter().map(Digest::to_string).collect::<Vec<_>>().join("\n");
         let Self { input, output, pooling, .. } = self;
         // Structs of numbers, words and lists of these can always be written as TOML.
         let text = toml::to_string(&Deciding { input, output, pooling }).unwrap_or_default();
@@ -240,8 +270,12 @@ impl Manifest {
         const MOST_CHANNELS: usize = 1 << 14;
         let (input, output, pooling) = (&self.input, &self.output, &self.pooling);
         let [rows, columns] = pooling.grid;
-        if self.file.components().count() != 1 || self.file.file_name().is_none() {
+        let plain = |file: &Path| file.components().count() == 1 && file.file_name().is_some();
+        if !self.files().all(|(file, _)| plain(file) && file != Path::new(MANIFEST)) {
             return Some("file must be a plain file name beside the manifest".into());
+        }
+        if self.data.as_ref().is_some_and(|data| data.file == self.file) {
+            return Some("data.file must be another file than file".into());
         }
         if input.multiple == 0 || output.stride == 0 {
             return Some("input.multiple and output.stride must be at least 1".into());
@@ -308,6 +342,8 @@ mod tests {
             ("dimension = 576", "dimension = 64", "dimension"),
             ("width = 320", "width = 321", "width"),
             ("file = \"model.onnx\"", "file = \"../model.onnx\"", "file"),
+            ("[input]", "[data]\nfile = \"../weights\"\n[input]", "file"),
+            ("[input]", "[data]\nfile = \"model.onnx\"\n[input]", "data.file"),
             ("gem_p = 3.0", "gem_p = 0.0", "gem_p"),
             ("cls = false", "cls = true", "CLS"),
         ] {
@@ -322,13 +358,13 @@ mod tests {
         let digest = |from: &str, to: &str| {
             let text = XFEAT.replace(from, to);
             assert!(from.is_empty() || text != XFEAT, "{from}");
-            parse(&text).unwrap().digest(file)
+            parse(&text).unwrap().digest(&[file])
         };
         let plain = digest("", "");
         assert_eq!(digest("licence = \"Apache-2.0\"", "licence = \"other\""), plain);
         assert_ne!(digest("gem_p = 3.0", "gem_p = 4.0"), plain);
         assert_ne!(digest("width = 320", "width = 640"), plain);
-        assert_ne!(parse(XFEAT).unwrap().digest(Digest::of(b"others")), plain);
+        assert_ne!(parse(XFEAT).unwrap().digest(&[Digest::of(b"others")]), plain);
     }
 
     #[test]

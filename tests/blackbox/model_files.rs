@@ -162,6 +162,23 @@ async fn a_model_is_pulled_once_and_then_served() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn weights_in_a_file_of_their_own_come_with_the_model() {
+    let data = "[model.manifest.data]\nfile = \"weights.bin\"\n[input]";
+    let bench = Bench::with(|manifest| manifest.replace("[input]", data));
+    let cut = Trouble::CutAfter(1000);
+    let hub = hub(&[Trouble::None, cut]).await;
+    pull(&bench, &hub).await.good();
+    let asked = hub.asked();
+    assert_eq!(asked[..2], ["/lab/tiny/resolve/v1/model.onnx", "/lab/tiny/resolve/v1/weights.bin"]);
+    bench.tiny_is_installed();
+    let weights = bench.models().join("tiny/weights.bin");
+    std::fs::write(&weights, "others").unwrap();
+    bench.run(&hub.url, &["verify", "tiny"]).bad(&["model pull tiny"]);
+    assert!(pull(&bench, &hub).await.good().contains("replaced"));
+    bench.tiny_is_installed();
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_line_that_breaks_is_continued_and_no_byte_is_sent_twice() {
     let bench = Bench::new();
     let hub =

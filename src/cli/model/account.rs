@@ -1,7 +1,7 @@
 //! What the actions that only look say.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow, bail};
 use indicatif::DecimalBytes;
@@ -9,7 +9,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::Place;
-use crate::domain::DescriptorKind;
+use crate::domain::{DescriptorKind, Digest};
 use crate::models::{self, InstallError};
 use crate::retrieve::{AUTO, BUILT_IN_MODEL, MANIFEST, Manifest};
 
@@ -116,10 +116,13 @@ pub fn show(place: &Place, name: &str, json: bool) -> anyhow::Result<()> {
         }
     };
     let bytes = match &folder {
-        Some(folder) => folder.join(&manifest.file).metadata().ok().map(|file| file.len()),
+        Some(folder) => {
+            let size = |file: &Path| Some(folder.join(file).metadata().ok()?.len());
+            manifest.files().map(|(file, _)| size(file)).sum()
+        }
         None => entry.and_then(|entry| entry.bytes),
     };
-    let address = entry.map(|entry| entry.address(&place.config.model.hub));
+    let address = entry.map(|entry| entry.address(&place.config.model.hub, &manifest.file));
     if json {
         let shown = json!({
             "name": name, "installed": folder.is_some(), "folder": folder, "bytes": bytes,
@@ -163,11 +166,19 @@ struct Check {
 impl Check {
     fn of(name: String, folder: PathBuf) -> Self {
         let (ok, pinned, detail) = match models::verify(&folder) {
-            Ok(verdict) => (true, verdict.manifest.sha256.is_some(), verdict.digest.to_string()),
+            Ok(verdict) => {
+                let pinned = verdict.manifest.files().all(|(_, pinned)| pinned.is_some());
+                (true, pinned, words(&verdict.digests))
+            }
             Err(error) => (false, matches!(error, InstallError::Damaged { .. }), error.to_string()),
         };
         Self { name, ok, folder, pinned, detail }
     }
+}
+
+/// The digests of a model's files.
+pub fn words(digests: &[Digest]) -> String {
+    digests.iter().map(Digest::to_string).collect::<Vec<_>>().join(" and ")
 }
 
 /// Hashes one model or all again; a bad one is an error.

@@ -101,9 +101,9 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
                 Added::Present(folder) => {
                     println!("{}: this file is installed already", folder.display());
                 }
-                Added::Installed { folder, name, digest } => {
+                Added::Installed { folder, name, digests } => {
                     println!("{name}: installed in {}", folder.display());
-                    println!("  {digest}, recorded in its manifest");
+                    println!("  {}, recorded in its manifest", account::words(&digests));
                     println!("  run it with `whereabouts serve --model {name}`");
                     println!("  or make it the default with `whereabouts model use {name}`");
                 }
@@ -182,15 +182,16 @@ async fn pull(place: &Place, name: &str) -> anyhow::Result<()> {
         Pulled::Present(folder) => {
             println!("{name}: installed already and whole, in {}", folder.display());
         }
-        Pulled::Installed { folder, digest, pinned, replaced } => {
+        Pulled::Installed { folder, digests, pinned, replaced } => {
             if let Some(fault) = replaced {
                 println!("{name}: replaced the model that was there: {fault}");
             }
             println!("{name}: installed in {}", folder.display());
+            let digests = account::words(&digests);
             match pinned {
-                true => println!("  {digest}, as the catalogue pins it"),
+                true => println!("  {digests}, as the catalogue pins it"),
                 false => println!(
-                    "  {digest}, recorded in its manifest: the catalogue pins none, so this first \
+                    "  {digests}, recorded in its manifest: the catalogue pins none, so this first \
                      download was taken as it came"
                 ),
             }
