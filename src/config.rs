@@ -17,6 +17,7 @@ use crate::domain::{Precision, RefinerKind};
 use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
 use crate::retrieve::{AdmissionSettings, Layout, Provider, Wanted};
+use crate::service::TrackSettings;
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
@@ -39,6 +40,8 @@ pub struct Config {
     pub localize: Localize,
     /// How maps are measured.
     pub confidence: Confidence,
+    /// The frames of one robot, one after another.
+    pub track: TrackSettings,
     /// Refinement jobs.
     pub jobs: Jobs,
     /// The refiner.
@@ -477,7 +480,7 @@ impl Config {
         {
             return Some(why);
         }
-        if let Some(why) = self.server.contradiction() {
+        if let Some(why) = self.server.contradiction().or_else(|| self.track.contradiction()) {
             return Some(why);
         }
         if !(0.0..=1.0).contains(&self.jobs.shed_at) {

@@ -20,7 +20,7 @@ use crate::refine::{DenseCache, JobPace, LocalRefiner, Refiner, Worker, WorkerSe
 use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
-use crate::service::{Janitor, Reindexes, RetentionSettings, Service, ServiceSettings};
+use crate::service::{Janitor, Reindexes, RetentionSettings, Service, ServiceSettings, Tracks};
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
 use crate::store::{JobStore, UsageStore};
 use crate::telemetry::Metrics;
@@ -199,6 +199,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         maps: store.clone(),
         drafts: store.clone(),
         reindexes: Reindexes::default(),
+        tracks: Tracks::new(config.track.clone()),
         exports: store.clone(),
         blobs: store.clone(),
         jobs,

@@ -91,6 +91,12 @@ impl Chance {
         self.0.is_empty()
     }
 
+    /// Their mean; `None` of nothing.
+    pub fn mean(&self) -> Option<f32> {
+        let sum: f32 = self.0.iter().sum();
+        (!self.is_empty()).then(|| sum / self.len() as f32)
+    }
+
     /// c = #{x < e} / (n + 1), 0 to below 1.
     fn confidence(&self, evidence: f32) -> f32 {
         let below = self.0.partition_point(|value| *value < evidence);

@@ -2,6 +2,7 @@
 
 use axum::Json;
 use axum::extract::{Request, State};
+use jiff::Timestamp;
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -12,7 +13,7 @@ use super::problem::Problem;
 use super::state::{AppState, Ready};
 use crate::domain::Priority;
 use crate::retrieve::{Class, Demand};
-use crate::service::{Answer, LocalizeRequest, RefineMode};
+use crate::service::{Answer, LocalizeRequest, RefineMode, ServiceError, TrackStep};
 
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
@@ -30,6 +31,29 @@ pub(super) struct LocalizeParams {
     /// when nothing else waits (`low`).
     #[serde(default)]
     priority: Priority,
+    /// The frames of one robot, one after another: an id of its own choice, 1 to 64 letters, digits, `-`,
+    /// `_`, `.` and `:`. The answer then says in `track` where the robot is, given all of them. The
+    /// map's images need poses; a track is forgotten when no frame comes for a while.
+    track: Option<String>,
+    /// When the frame was taken (RFC 3339), of a frame with `track`; by default now.
+    captured_at: Option<Timestamp>,
+    /// The metres that the robot has come since the frame before, by its odometry, of a frame with
+    /// `track`; without it, it can have come as far as its greatest speed (`track.max_speed_m_s`) allows.
+    moved_m: Option<f64>,
+}
+
+impl LocalizeParams {
+    fn step(&mut self) -> Result<Option<TrackStep>, ServiceError> {
+        match self.track.take() {
+            Some(id) => TrackStep::new(id, self.captured_at, self.moved_m).map(Some),
+            None if self.captured_at.is_some() || self.moved_m.is_some() => {
+                Err(ServiceError::unprocessable(
+                    "captured_at and moved_m are of a frame with track; name the track too",
+                ))
+            }
+            None => Ok(None),
+        }
+    }
 }
 
 /// The form of a frame.
@@ -64,18 +88,19 @@ struct FrameForm {
         (status = 408, body = Problem, description = "The body came too slowly", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
         (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
-        (status = 422, body = Problem, description = "Cannot be decoded, or k out of range", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "Cannot be decoded, k or a parameter of the track out of range, or a track in a map without poses", content_type = "application/problem+json"),
         (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
         (status = 504, body = Problem, description = "X-Deadline-Ms has passed", content_type = "application/problem+json"),
     ))]
 pub(super) async fn localize(
     State(state): State<AppState>,
     Ready(service): Ready,
-    Params(params): Params<LocalizeParams>,
+    Params(mut params): Params<LocalizeParams>,
     Deadline(deadline): Deadline,
     request: Request,
 ) -> Result<Json<Answer>, Problem> {
     let map = map_name(&params.map)?;
+    let track = params.step()?;
     let demand = Demand { class: Class::Localize, deadline };
     let body = PictureBody::read(request, &state, &service, demand).await?;
     let request = LocalizeRequest {
@@ -85,6 +110,7 @@ pub(super) async fn localize(
         priority: params.priority,
         frame: body.picture,
         deadline,
+        track,
     };
     Ok(Json(service.localize(request).await?))
 }

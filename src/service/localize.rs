@@ -9,9 +9,9 @@ use uuid::Uuid;
 
 use super::images::empty_body;
 use super::submit::Frame;
-use super::{NoJob, SUPERSEDED, Service, ServiceError};
+use super::{NoJob, SUPERSEDED, Service, ServiceError, TrackEstimate, TrackStep};
 use crate::domain::confidence::COMPARED;
-use crate::domain::{Candidate, Digest, Estimate, JobState, Map, MapName, Priority};
+use crate::domain::{Calibration, Candidate, Digest, Estimate, JobState, Map, MapName, Priority};
 use crate::retrieve::index::SearchMode;
 use crate::retrieve::{Class, Demand, Extraction};
 use crate::store::StoreError;
@@ -44,6 +44,8 @@ pub struct LocalizeRequest {
     pub frame: Bytes,
     /// When the caller no longer wants the answer.
     pub deadline: Option<Instant>,
+    /// Which track the frame belongs to, if any.
+    pub track: Option<TrackStep>,
 }
 
 /// Where the frame was probably taken.
@@ -60,6 +62,10 @@ pub struct Answer {
     /// The best guess; null in an empty map.
     #[schema(nullable)]
     pub estimate: Option<Estimate>,
+    /// Where the robot is, given all frames of its track; null for a frame of none.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub track: Option<TrackEstimate>,
     /// The refinement; null if there is none.
     #[schema(nullable)]
     pub job: Option<JobLink>,
@@ -125,10 +131,16 @@ impl Service {
         }
         let demand = Demand { class: Class::Localize, deadline: request.deadline };
         let compared = if refined { self.settings.candidates } else { 0 };
-        let wanted = k.max(compared).max(COMPARED);
+        let followed = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
+        let wanted = k.max(compared).max(COMPARED).max(followed);
         let Retrieved { map, model, extraction, mut candidates, searched } =
             self.retrieve(&request.map, &request.frame, wanted, SearchMode::Fast, demand).await?;
 
+        let calibration = self.maps.calibration(&map).await?.unwrap_or_default();
+        let track = match request.track {
+            Some(step) => Some(self.follow(&map, step, &candidates, &calibration).await?),
+            None => None,
+        };
         let query_id = Uuid::now_v7();
         let (mut job, no_job) = if request.refine == RefineMode::Off {
             (None, None)
@@ -150,7 +162,7 @@ impl Service {
                 Err(why) => (None, Some(why)),
             }
         };
-        let mut estimate = self.estimate(&map, &candidates).await?;
+        let mut estimate = self.estimate(&candidates, &calibration);
         candidates.truncate(k);
         if request.refine == RefineMode::Wait
             && let Some(queued) = &mut job
@@ -166,6 +178,7 @@ impl Service {
             model: map.model,
             candidates,
             estimate,
+            track,
             job: job.map(|job| JobLink {
                 id: job.id,
                 href: format!("/jobs/{}", job.id),
@@ -223,15 +236,10 @@ impl Service {
     }
 
     /// The first candidate, and how sure it is.
-    async fn estimate(
-        &self,
-        map: &Map,
-        candidates: &[Candidate],
-    ) -> Result<Option<Estimate>, ServiceError> {
-        let Some(first) = candidates.first() else { return Ok(None) };
-        let calibration = self.maps.calibration(map).await?.unwrap_or_default();
+    fn estimate(&self, candidates: &[Candidate], calibration: &Calibration) -> Option<Estimate> {
+        let first = candidates.first()?;
         let confidence = calibration.refined_confidence(candidates, &first.image_id, None);
         let known_from = self.settings.known_confidence;
-        Ok(Some(Estimate::new(&first.image_id, first.pose, confidence, known_from)))
+        Some(Estimate::new(&first.image_id, first.pose, confidence, known_from))
     }
 }

@@ -191,7 +191,7 @@ impl Service {
         let reindex = self.reindexes.of(self.known_map(name).await?.uid);
         // Looked up after that: when a reindex has succeeded, the map shows it.
         let map = self.known_map(name).await?;
-        let IndexState { images, graph, behind } = self.maps.index_state(&map).await?;
+        let IndexState { images, graph, behind, .. } = self.maps.index_state(&map).await?;
         let calibration = self.maps.calibration(&map).await?;
         let index = match (graph, behind) {
             (false, _) => IndexKind::Exact,

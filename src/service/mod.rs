@@ -15,6 +15,7 @@ mod models;
 mod reindex;
 mod retention;
 mod submit;
+mod track;
 mod transfer;
 mod usage;
 
@@ -30,6 +31,7 @@ pub use self::maps::{IndexKind, MapChange, MapState};
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
 pub use self::retention::{Janitor, RetentionSettings};
 pub use self::submit::{NoJob, NoJobReason};
+pub use self::track::{TrackEstimate, TrackSettings, TrackStep, Tracks};
 pub use self::transfer::{ExportPage, ImportedImage};
 pub use self::usage::{Today, Total, UsageReport};
 use crate::domain::CalibrationSettings;
@@ -73,6 +75,8 @@ pub struct Service {
     pub drafts: Arc<dyn DraftStore>,
     /// How far that has come.
     pub reindexes: Reindexes,
+    /// The frames of each robot, one after another.
+    pub tracks: Tracks,
     /// Images with their descriptors.
     pub exports: Arc<dyn ExportStore>,
     /// Image bytes.

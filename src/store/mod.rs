@@ -18,7 +18,7 @@ use uuid::Uuid;
 
 use crate::domain::{
     Calibration, CalibrationSettings, Candidate, DayUsage, Description, Descriptor, Digest, Image,
-    ImageId, Job, JobState, Map, MapName, MediaType, Usage,
+    ImageId, Job, JobState, Map, MapName, MediaType, Pose, Usage,
 };
 use crate::retrieve::index::SearchMode;
 
@@ -102,6 +102,8 @@ pub trait MapStore: Send + Sync {
         after: Option<&ImageId>,
         limit: usize,
     ) -> Result<Vec<Image>, StoreError>;
+    /// The images that have a pose, in the order of their addition.
+    async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError>;
     /// Removes an image; `false` if there was none.
     async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError>;
 
@@ -195,6 +197,8 @@ pub struct IndexState {
     pub graph: bool,
     /// Whether images wait to be put into the graph; they are searched exactly.
     pub behind: bool,
+    /// How often images were added and removed since the store was opened.
+    pub changes: u64,
 }
 
 /// Image bytes, by digest.

@@ -37,3 +37,4 @@ mod retention;
 mod schema;
 mod service;
 mod slow_clients;
+mod track;

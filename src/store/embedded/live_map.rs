@@ -1,7 +1,7 @@
 //! One map in memory: which slot is which image, and its index.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
 use super::super::{LookAlikes, StoreError};
@@ -22,6 +22,8 @@ pub(super) struct LiveMap {
     entries: RwLock<Vec<Option<Entry>>>,
     /// The slot of the next image. Only the writer thread moves it.
     next_slot: AtomicUsize,
+    /// How often images were added and removed.
+    changes: AtomicU64,
 }
 
 /// What an answer says about an image, kept in memory so that a search reads no record.
@@ -68,6 +70,7 @@ impl LiveMap {
             graph_file: folder.join("graph"),
             entries: RwLock::default(),
             next_slot: AtomicUsize::new(0),
+            changes: AtomicU64::new(0),
         })
     }
 
@@ -139,6 +142,7 @@ impl LiveMap {
         }
         entries[stored.slot] = Some(Entry { id: stored.image.id.clone(), pose: stored.image.pose });
         drop(entries);
+        self.changes.fetch_add(1, Ordering::Relaxed);
         self.index.add(stored.slot);
     }
 
@@ -149,6 +153,18 @@ impl LiveMap {
         if let Some(entry) = entries.get_mut(slot) {
             *entry = None;
         }
+        self.changes.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// How often images were added and removed since the map was loaded.
+    pub fn changes(&self) -> u64 {
+        self.changes.load(Ordering::Relaxed)
+    }
+
+    /// The images that have a pose, in the order of their addition.
+    pub fn positions(&self) -> Vec<(ImageId, Pose)> {
+        let entries = self.entries.read().unwrap_or_else(PoisonError::into_inner);
+        entries.iter().flatten().filter_map(|entry| Some((entry.id.clone(), entry.pose?))).collect()
     }
 
     pub fn search(&self, query: &[f32], k: usize, mode: SearchMode) -> Vec<Candidate> {

@@ -18,6 +18,7 @@ use super::trees::{
 use super::{EmbeddedStore, Inner, blocking};
 use crate::domain::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Digest, Image, ImageId, Map, MapName,
+    Pose,
 };
 use crate::retrieve::index::SearchMode;
 
@@ -164,6 +165,7 @@ impl MapStore for EmbeddedStore {
             images: live.index.len(),
             graph: live.index.graphed() > 0,
             behind: live.index.is_behind(),
+            changes: live.changes(),
         })
     }
 
@@ -220,6 +222,10 @@ impl MapStore for EmbeddedStore {
             images.map(|stored| Ok(stored?.image)).collect()
         })
         .await
+    }
+
+    async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
+        Ok(self.inner.live(map)?.positions())
     }
 
     async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {

@@ -15,7 +15,7 @@ use super::super::settings::tests::defaults;
 use super::*;
 use crate::domain::{
     Calibration, CalibrationSettings, Candidate, DayUsage, Descriptor, DescriptorKind, Digest,
-    Frame, Image, ImageId, Job, Map, MapName, MediaType, Precision, RefinerKind, StandIn,
+    Frame, Image, ImageId, Job, Map, MapName, MediaType, Pose, Precision, RefinerKind, StandIn,
 };
 use crate::retrieve::decode::encode_jpeg;
 use crate::retrieve::index::SearchMode;
@@ -201,6 +201,10 @@ impl MapStore for Shelf {
         _: Option<&ImageId>,
         _: usize,
     ) -> Result<Vec<Image>, StoreError> {
+        not_here()
+    }
+
+    async fn positions(&self, _: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
         not_here()
     }
 
