@@ -1,0 +1,96 @@
+#!/usr/bin/env bash
+# Checks the examples and the load tests against a binary:
+#
+#     check.sh BINARY VENV
+#
+# VENV is a folder for a Python environment with the tools (check-requirements.txt); it is made if it is not
+# there. Takes about a minute once it is. Ends with 1 if anything fails.
+set -euo pipefail
+
+if [ $# -ne 2 ]; then
+    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/examples-venv" >&2
+    exit 2
+fi
+if [ ! -x "$1" ]; then
+    echo "$1 is not a program; \`make build\` makes target/release/whereabouts" >&2
+    exit 2
+fi
+binary=$(realpath "$1")
+venv=$(realpath -m "$2")
+cd "$(dirname "$0")"
+load=$(realpath ../tests/load)
+
+step() {
+    echo
+    echo "== $*"
+}
+
+if [ ! -e "$venv/complete" ]; then
+    step "an environment with the tools, in $venv"
+    python3 -m venv "$venv"
+    "$venv/bin/pip" install --quiet --disable-pip-version-check -r python/requirements.txt -r check-requirements.txt
+    touch "$venv/complete"
+fi
+export PATH=$venv/bin:$PATH PYTHONDONTWRITEBYTECODE=1
+
+step ruff
+ruff check --no-cache .
+
+step "mypy --strict"
+types=(mypy --strict --python-version 3.10 --cache-dir "$venv/mypy-cache")
+(cd python && "${types[@]}" whereabouts_client.py index_and_localize.py test_client.py)
+(cd ros2 && "${types[@]}" localizer.py test_localizer.py)
+# Of ROS there are no types here.
+(cd ros2 && "${types[@]}" --ignore-missing-imports --allow-subclassing-any whereabouts_node.py)
+
+step shellcheck
+shellcheck -x ./*.sh "$load"/*.sh
+
+step "tests of the localizer of the ROS 2 node"
+(cd ros2 && timeout 60 python -m unittest)
+
+step "tests of the Python client"
+(cd python && WHEREABOUTS_BIN=$binary timeout 120 python -m unittest)
+
+scratch=$(mktemp -d)
+server=
+finish() {
+    if [ -n "$server" ]; then
+        kill "$server" 2> /dev/null || true
+        wait "$server" 2> /dev/null || true
+    fi
+    rm -rf "$scratch"
+}
+trap finish EXIT
+
+step "a server with a small town"
+if ! "$binary" demo --offline --json --places 6 --out "$scratch/town" > "$scratch/log" 2>&1; then
+    cat "$scratch/log" >&2
+    exit 1
+fi
+"$binary" serve --data "$scratch/data" --listen 127.0.0.1:0 --address-file "$scratch/address" \
+    > "$scratch/log" 2>&1 &
+server=$!
+for _ in $(seq 300); do
+    if [ -s "$scratch/address" ] || ! kill -0 "$server" 2> /dev/null; then break; fi
+    sleep 0.1
+done
+if [ ! -s "$scratch/address" ]; then
+    echo "the server did not start:" >&2
+    cat "$scratch/log" >&2
+    exit 1
+fi
+url=http://$(cat "$scratch/address")
+(cd python && python index_and_localize.py --server "$url" --map town "$scratch/town/map" "$scratch/town/frames")
+
+step curl.sh
+./curl.sh "$url" "$scratch/town/frames" > "$scratch/curl" || { cat "$scratch/curl" >&2; exit 1; }
+tail -n 1 "$scratch/curl"
+
+step localize.sh
+"$load/localize.sh" "$url" town "$scratch/town/frames" 2 20
+
+step jobs.sh
+"$load/jobs.sh" "$url" town "$scratch/town/frames" 2 10
+
+step "all is well"

@@ -1,0 +1,1 @@
+../python/whereabouts_client.py

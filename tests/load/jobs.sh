@@ -1,0 +1,126 @@
+#!/usr/bin/env bash
+# Localizes frames with refine=async, several at a time, then waits for their jobs, and says how fast both
+# went:
+#
+#     jobs.sh URL MAP FOLDER [CLIENTS] [REQUESTS]
+#
+# WAIT_S is how long to wait for all jobs, in seconds; the default is 300. Ends with 1 if any answer is other
+# than 200 or 429, or any job does not succeed in that time.
+set -euo pipefail
+# shellcheck source-path=SCRIPTDIR source=summary.sh
+. "$(dirname "$0")/summary.sh"
+
+usage="usage: $0 URL MAP FOLDER [CLIENTS] [REQUESTS]"
+if [ $# -lt 3 ]; then
+    echo "$usage" >&2
+    exit 2
+fi
+url=$1 map=$2 folder=$3
+url=${url%/}
+clients=${4:-4} requests=${5:-100}
+wait_s=${WAIT_S:-300}
+frames=()
+key=${WHEREABOUTS_API_KEY:+Authorization: Bearer $WHEREABOUTS_API_KEY}
+read_frames "$folder"
+scratch=$(mktemp -d)
+trap 'rm -rf "$scratch"' EXIT
+
+post_configuration() {
+    local number
+    for ((number = 0; number < requests; number++)); do
+        if [ "$number" -gt 0 ]; then echo next; fi
+        cat << END
+url = "$url/localize?map=$map&refine=async"
+request = POST
+upload-file = "${frames[number % ${#frames[@]}]}"
+header = "Content-Type: image/jpeg"
+header = "Expect:"
+header = "$key"
+max-time = 120
+output = "$scratch/answer-$number"
+write-out = "%{http_code} %{time_total}\n"
+END
+    done
+}
+
+# Asks for the jobs whose ids are in a file; each answer goes to job-ID.
+job_configuration() {
+    local id separator=
+    while read -r id; do
+        printf '%s' "$separator"
+        separator=$'next\n'
+        cat << END
+url = "$url/jobs/$id?wait=10"
+header = "$key"
+max-time = 60
+output = "$scratch/job-$id"
+write-out = "%{http_code} %{time_total}\n"
+END
+    done < "$1"
+}
+
+start=$(now)
+post_configuration | in_parallel "$clients" > "$scratch/posts"
+echo "POST /localize (refine=async), $requests frames by $clients clients"
+summary "$scratch/posts" "$(between "$start" "$(now)")"
+
+# Not every frame has a job: under load the service gives up jobs before frames.
+sed -nE 's/.*"job":\{"id":"([^"]*)".*/\1/p' "$scratch"/answer-* | awk 1 > "$scratch/ids"
+made=$(wc -l < "$scratch/ids")
+cp "$scratch/ids" "$scratch/open"
+: > "$scratch/gets"
+waiting=$(now)
+while [ -s "$scratch/open" ]; do
+    if awk -v waited="$(between "$waiting" "$(now)")" -v most="$wait_s" 'BEGIN { exit !(waited > most) }'; then
+        break
+    fi
+    job_configuration "$scratch/open" | in_parallel "$clients" >> "$scratch/gets"
+    while read -r id; do
+        grep -qE '"state":"(succeeded|degraded|failed|cancelled)"' "$scratch/job-$id" 2> /dev/null || echo "$id"
+    done < "$scratch/open" > "$scratch/still"
+    mv "$scratch/still" "$scratch/open"
+done
+ended=$(now)
+echo
+echo "GET /jobs/{id}?wait=10, $made jobs by $clients clients; $((requests - made)) frames without a job"
+summary "$scratch/gets" "$(between "$waiting" "$ended")"
+
+# Each job's state, and the seconds from when it was queued to its end.
+while read -r id; do
+    cat "$scratch/job-$id" 2> /dev/null || true
+    echo
+done < "$scratch/ids" | awk '
+    function field(name,  found) {
+        if (!match($0, "\"" name "\":\"[^\"]*\"")) return ""
+        found = substr($0, RSTART, RLENGTH)
+        sub(/^"[^"]*":"/, "", found)
+        sub(/"$/, "", found)
+        return found
+    }
+    # Seconds since a day long past; days by the Gregorian calendar.
+    function seconds(moment,  p, y, m) {
+        split(moment, p, /[-T:Z]/)
+        y = p[1]; m = p[2]
+        if (m < 3) { y--; m += 12 }
+        return (365 * y + int(y / 4) - int(y / 100) + int(y / 400) + int((153 * m - 457) / 5) + p[3]) * 86400 \
+            + p[4] * 3600 + p[5] * 60 + p[6]
+    }
+    {
+        state = field("state")
+        if (state == "") state = "unanswered"
+        if (field("finished_at") == "") print state, "-"
+        else printf "%s %.4f\n", state, seconds(field("finished_at")) - seconds(field("created_at"))
+    }' > "$scratch/ends"
+echo
+echo "jobs from being queued to their end"
+awk '{ count[$1]++ } END { for (state in count) printf "%-13s %d\n", state, count[state] }' "$scratch/ends" | sort
+awk '$1 == "succeeded" { print 200, $2 }' "$scratch/ends" > "$scratch/lasted"
+summary "$scratch/lasted" "$(between "$start" "$ended")" | sed -e '/^status/d' -e 's/^200 a second /jobs a second/'
+
+acceptable "$scratch/posts"
+if [ "$made" -eq 0 ]; then
+    echo "no frame had a job; does the server refine (refine.refiner), and has the map images?" >&2
+    exit 1
+fi
+acceptable "$scratch/gets"
+! grep -qv '^succeeded ' "$scratch/ends"
