@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino test crash fuzz lint format bench load soak openapi clean
+.PHONY: help demo build assets nasm openvino test conformance examples crash fuzz lint format bench load soak openapi clean
 
 help: ## Say what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -26,6 +26,14 @@ openvino: ## Get ONNX Runtime with OpenVINO too, the faster one on many x86-64 p
 
 test: assets nasm ## Set up, build and run every test
 	$(CARGO) test --release --locked
+	tests/api/conformance.sh $(BINARY) target/api-venv
+	examples/check.sh $(BINARY) target/examples-venv
+
+conformance: build ## Hold the server against its own description with thousands of made-up requests
+	tests/api/conformance.sh $(BINARY) target/api-venv 150
+
+examples: build ## Check the clients, the calls in curl and the load tests against the service
+	examples/check.sh $(BINARY) target/examples-venv
 
 crash: assets nasm ## Kill the server at 200 random moments and hold it against what it acknowledged
 	WHEREABOUTS_CRASH_ROUNDS=200 $(CARGO) test --release --locked --test crash what_was -- --nocapture

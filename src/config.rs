@@ -36,6 +36,8 @@ pub struct Config {
     pub image: Image,
     /// Search.
     pub index: Index,
+    /// Who may ask.
+    pub auth: Auth,
     /// Answers.
     pub localize: Localize,
     /// How maps are measured.
@@ -210,6 +212,26 @@ pub struct Index {
     pub max_dead_share: f32,
 }
 
+/// `[auth]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Auth {
+    /// Whether callers need a key.
+    pub keys: KeysWanted,
+}
+
+/// Whether callers need a key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum KeysWanted {
+    /// Unless the server listens on loopback.
+    Auto,
+    /// Always.
+    Required,
+    /// Never: whoever reaches the server may do everything.
+    Off,
+}
+
 /// `[localize]`
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -348,6 +370,8 @@ pub struct Overrides {
     refine: Option<serde_json::Value>,
     #[serde(skip_serializing_if = "Option::is_none")]
     mllm: Option<serde_json::Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    auth: Option<serde_json::Value>,
 }
 
 impl Overrides {
@@ -372,6 +396,12 @@ impl Overrides {
     /// Sets `[refine] refiner`.
     pub fn refiner(mut self, refiner: Option<Refiner>) -> Self {
         self.refine = refiner.map(|refiner| serde_json::json!({ "refiner": refiner }));
+        self
+    }
+
+    /// Sets `[auth] keys` to off.
+    pub fn no_keys(mut self, off: bool) -> Self {
+        self.auth = off.then(|| serde_json::json!({ "keys": KeysWanted::Off }));
         self
     }
 
@@ -417,6 +447,15 @@ impl Config {
         match config.contradiction() {
             Some(why) => Err(ConfigError::Contradiction(why)),
             None => Ok(config),
+        }
+    }
+
+    /// Whether callers need a key.
+    pub fn keys_required(&self) -> bool {
+        match self.auth.keys {
+            KeysWanted::Auto => !self.server.listen.ip().is_loopback(),
+            KeysWanted::Required => true,
+            KeysWanted::Off => false,
         }
     }
 

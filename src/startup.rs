@@ -20,7 +20,9 @@ use crate::refine::{DenseCache, JobPace, LocalRefiner, Refiner, Worker, WorkerSe
 use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
-use crate::service::{Janitor, Reindexes, RetentionSettings, Service, ServiceSettings, Tracks};
+use crate::service::{
+    Janitor, Keys, Reindexes, RetentionSettings, Service, ServiceSettings, Tracks,
+};
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
 use crate::store::{JobStore, UsageStore};
 use crate::telemetry::Metrics;
@@ -39,7 +41,9 @@ pub async fn serve(
         settings: config.server.connections(),
         router: router(state.clone()),
         metrics: Arc::clone(&metrics),
+        tls: config.server.tls()?.map(Arc::new),
     };
+    let encrypted = connections.tls.is_some();
     let server = tokio::spawn(connections.serve(listener, shutdown.clone()));
     let (drain_timeout, retention) = (config.server.drain_timeout(), retention(&config));
     let counted = Arc::clone(&metrics);
@@ -59,7 +63,7 @@ pub async fn serve(
         running.spawn(async move { worker.run(shutdown).await });
     }
     on_ready(address)?;
-    tracing::info!(%address, "ready");
+    tracing::info!(%address, tls = encrypted, "ready");
 
     shutdown.cancelled().await;
     tracing::info!("draining");
@@ -92,6 +96,7 @@ fn http_settings(config: &Config) -> HttpSettings {
         max_wait: Duration::from_secs(config.jobs.max_wait_s),
         max_requests: config.server.max_requests,
         max_streams: config.server.max_streams,
+        keys_required: config.keys_required(),
     }
 }
 
@@ -117,9 +122,9 @@ pub struct Parts {
     pub pools: [CpuPool; 2],
 }
 
-/// Opens the store, loads the model, and puts the service together. Blocks.
-pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
-    let store = Arc::new(EmbeddedStore::open(&EmbeddedSettings {
+/// Opens the embedded store, which belongs to one process. Blocks.
+pub fn store(config: &Config) -> anyhow::Result<EmbeddedStore> {
+    Ok(EmbeddedStore::open(&EmbeddedSettings {
         dir: config.data.dir.clone(),
         index: IndexSettings {
             exact_up_to: config.index.exact_up_to,
@@ -139,7 +144,12 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             max_bytes: config.data.description_cache_bytes,
             max_age: Duration::from_secs(config.data.description_cache_days * 24 * 3600),
         },
-    })?);
+    })?)
+}
+
+/// Opens the store, loads the model, and puts the service together. Blocks.
+pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
+    let store = Arc::new(store(config)?);
     let (models, why) = models(config)?;
     let admission = config.image.admission(config.model.layout());
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
@@ -195,7 +205,10 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         })
     });
     let workers = workers.collect();
+    let keys = Handle::current().block_on(Keys::load(store.clone()))?;
+    check_keys(config, &keys)?;
     let service = Service {
+        keys,
         maps: store.clone(),
         drafts: store.clone(),
         reindexes: Reindexes::default(),
@@ -235,6 +248,28 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     service.models.manifest(model)?;
     Handle::current().block_on(service.installed_model(model))?;
     Ok(Parts { service, workers, pools })
+}
+
+/// Says whether callers need a key; a server that nobody could use does not start.
+fn check_keys(config: &Config, keys: &Keys) -> anyhow::Result<()> {
+    let listen = config.server.listen;
+    match (config.keys_required(), keys.any_valid()) {
+        (true, true) => tracing::info!("callers need a key"),
+        (true, false) => anyhow::bail!(
+            "callers of {listen} need a key, and there is none: make the first with `whereabouts keys \
+             create --data {} --role admin --name NAME`, or start with --no-keys if whoever reaches the \
+             server may do everything",
+            config.data.dir.display()
+        ),
+        (false, _) if listen.ip().is_loopback() => {
+            tracing::info!("callers need no key, as the server listens on loopback only");
+        }
+        (false, _) => tracing::warn!(
+            "NO KEYS: whoever reaches {listen} may read, change and delete everything; leave --no-keys out \
+             (auth.keys) to ask for keys"
+        ),
+    }
+    Ok(())
 }
 
 /// No model yet, and why the default one is what it is.

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, bail};
+use reqwest::header::{AUTHORIZATION, HeaderMap, HeaderValue};
 use reqwest::{RequestBuilder, Response, StatusCode};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -14,6 +15,9 @@ pub struct ServerArg {
     #[arg(long, env = "WHEREABOUTS_SERVER", default_value = "http://127.0.0.1:8080")]
     #[arg(value_name = "URL")]
     pub server: String,
+    /// The API key, where the server asks for one
+    #[arg(long, env = "WHEREABOUTS_API_KEY", hide_env_values = true, value_name = "KEY")]
+    pub api_key: Option<String>,
 }
 
 /// Talks to one server. Clones share its connections.
@@ -28,7 +32,15 @@ const PATIENCE: usize = 60;
 
 impl Client {
     pub fn new(server: &ServerArg) -> anyhow::Result<Self> {
+        let mut headers = HeaderMap::new();
+        if let Some(key) = &server.api_key {
+            let mut bearer = HeaderValue::from_str(&format!("Bearer {}", key.trim()))
+                .map_err(|_| anyhow!("WHEREABOUTS_API_KEY is no key: one begins with \"wab_\""))?;
+            bearer.set_sensitive(true);
+            headers.insert(AUTHORIZATION, bearer);
+        }
         let http = reqwest::Client::builder()
+            .default_headers(headers)
             .timeout(Duration::from_secs(180))
             .build()
             .context("cannot start an HTTP client")?;
@@ -37,6 +49,10 @@ impl Client {
 
     pub fn get(&self, path: &str) -> RequestBuilder {
         self.http.get(format!("{}{path}", self.base))
+    }
+
+    pub fn delete(&self, path: &str) -> RequestBuilder {
+        self.http.delete(format!("{}{path}", self.base))
     }
 
     pub fn put(&self, path: &str) -> RequestBuilder {

@@ -9,6 +9,7 @@ mod eval;
 mod healthcheck;
 mod index;
 mod jobs;
+mod keys;
 mod localize;
 mod model;
 mod openapi;
@@ -39,6 +40,8 @@ enum Command {
     Localize(localize::Args),
     /// List jobs on a server, or show one
     Jobs(jobs::Args),
+    /// Make, list and revoke API keys
+    Keys(keys::Args),
     /// Install models, check them, and choose the one to use
     Model(model::Args),
     /// Build a town, index it, localize frames in it, and print what happened
@@ -69,6 +72,7 @@ impl Cli {
             Command::Index(args) => block_on(index::run(args)),
             Command::Localize(args) => block_on(localize::run(args)),
             Command::Jobs(args) => block_on(jobs::run(args)),
+            Command::Keys(args) => block_on(keys::run(args)),
             Command::Model(args) => block_on(model::run(args)),
             Command::Demo(args) => block_on(demo::run(args)),
             Command::Eval(args) => block_on(eval::run(*args)),

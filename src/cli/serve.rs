@@ -32,6 +32,9 @@ pub struct Args {
     /// Who refines the candidates
     #[arg(long)]
     refiner: Option<Refiner>,
+    /// Ask nobody for a key, whatever the server listens on: whoever reaches it may do everything
+    #[arg(long)]
+    no_keys: bool,
     /// A server that speaks the OpenAI chat-completions format, for --refiner mllm; its key comes
     /// from WHEREABOUTS_MLLM__API_KEY
     #[arg(long, value_name = "URL")]
@@ -44,6 +47,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         .data(args.data)
         .model(args.model)
         .refiner(args.refiner)
+        .no_keys(args.no_keys)
         .mllm_base_url(args.mllm_base_url);
     let config = Config::load(args.config.as_deref(), &flags)?;
     telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;

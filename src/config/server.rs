@@ -1,11 +1,12 @@
 //! `[server]`: where it listens, and what bounds its clients.
 
 use std::net::SocketAddr;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::http::ConnectionSettings;
+use crate::http::{ConnectionSettings, Tls, TlsError};
 
 /// `[server]`
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -13,6 +14,10 @@ use crate::http::ConnectionSettings;
 pub struct Server {
     /// Where to listen.
     pub listen: SocketAddr,
+    /// The certificates in PEM, the server's first; empty for none.
+    pub tls_certificate: PathBuf,
+    /// Their key in PEM; empty for none.
+    pub tls_key: PathBuf,
     /// The largest request body, in bytes.
     pub body_limit_bytes: usize,
     /// The most memory for all bodies, in bytes.
@@ -43,6 +48,9 @@ pub struct Server {
 
 impl Server {
     pub(super) fn contradiction(&self) -> Option<String> {
+        if self.tls_certificate.as_os_str().is_empty() != self.tls_key.as_os_str().is_empty() {
+            return Some("server.tls_certificate and server.tls_key go together".into());
+        }
         if self.max_header_bytes < 8192 {
             return Some("server.max_header_bytes must be at least 8192".into());
         }
@@ -68,6 +76,12 @@ impl Server {
             max_headers: self.max_headers,
             write_timeout: Duration::from_secs(self.write_timeout_s),
         }
+    }
+
+    /// The certificate, if there is one.
+    pub fn tls(&self) -> Result<Option<Tls>, TlsError> {
+        let given = !self.tls_certificate.as_os_str().is_empty();
+        given.then(|| Tls::load(&self.tls_certificate, &self.tls_key)).transpose()
     }
 
     /// The longest request.

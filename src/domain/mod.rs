@@ -10,6 +10,7 @@ mod descriptor;
 mod digest;
 mod image;
 mod job;
+mod key;
 mod map;
 mod pose;
 
@@ -22,6 +23,7 @@ pub use digest::Digest;
 pub use job::{
     DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage, utc_day,
 };
+pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use map::{DescriptorKind, Frame, Map, MapName, Precision, Scene};
 pub use pose::{GeographicPose, MetricPose, Pose, PoseError};
 

@@ -1,6 +1,7 @@
 //! Connections: how many, how long one may stay silent, and how they end.
 
 mod slots;
+mod tls;
 mod writes;
 
 use std::convert::Infallible;
@@ -15,13 +16,15 @@ use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
-use tokio::io::AsyncWriteExt;
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
+use tokio_rustls::server::TlsStream;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tower::ServiceExt;
 
 use self::slots::{Slot, Slots};
+pub use self::tls::{Tls, TlsError};
 use self::writes::TimedWrites;
 use crate::telemetry::{Metrics, RefusedFor};
 
@@ -48,6 +51,8 @@ pub struct Connections {
     pub router: Router,
     /// What is counted.
     pub metrics: Arc<Metrics>,
+    /// The certificate, where connections are encrypted.
+    pub tls: Option<Arc<Tls>>,
 }
 
 impl Connections {
@@ -55,6 +60,10 @@ impl Connections {
     pub async fn serve(self, listener: TcpListener, shutdown: CancellationToken) {
         let (this, open) = (Arc::new(self), TaskTracker::new());
         let slots = Slots::new(this.settings.most);
+        if let Some(tls) = this.tls.clone() {
+            let shutdown = shutdown.clone();
+            open.spawn(async move { tls.follow(shutdown).await });
+        }
         while let Some(stream) = shutdown.run_until_cancelled(accept(&listener)).await {
             let Some(slot) = slots.take() else {
                 this.metrics.refused(RefusedFor::Connections);
@@ -79,7 +88,44 @@ impl Connections {
     async fn serve_one(&self, stream: TcpStream, slot: &Slot, shutdown: CancellationToken) {
         // An answer should not wait for the acknowledgement of the one before.
         let _ = stream.set_nodelay(true);
-        let io = TokioIo::new(TimedWrites::new(stream, self.settings.write_timeout));
+        let Some(tls) = &self.tls else {
+            let plain = TimedWrites::new(stream, self.settings.write_timeout);
+            return self.talk(plain, slot, shutdown).await;
+        };
+        let shaken = tokio::time::timeout(self.settings.header_timeout, self.encrypt(tls, stream));
+        match shaken.await {
+            Ok(Ok(encrypted)) => self.talk(encrypted, slot, shutdown).await,
+            Ok(Err(error)) => tracing::debug!(%error, "a connection was not encrypted"),
+            Err(_) => self.metrics.refused(RefusedFor::Slow),
+        }
+    }
+
+    /// Shakes hands. Who speaks without TLS is told so.
+    async fn encrypt(
+        &self,
+        tls: &Tls,
+        stream: TcpStream,
+    ) -> std::io::Result<TlsStream<TimedWrites>> {
+        const HANDSHAKE: u8 = 22;
+        let mut first = [0];
+        if stream.peek(&mut first).await? == 1 && first != [HANDSHAKE] {
+            let detail = "this port speaks HTTPS; begin the address with https://";
+            let answer = bare("400 Bad Request", "malformed", "Malformed request", detail);
+            let mut plain = TimedWrites::new(stream, self.settings.write_timeout);
+            plain.write_all(answer.as_bytes()).await?;
+            return Err(ErrorKind::InvalidData.into());
+        }
+        tls.acceptor().accept(TimedWrites::new(stream, self.settings.write_timeout)).await
+    }
+
+    /// Answers the requests of a connection, one after another.
+    async fn talk<S: AsyncRead + AsyncWrite + Unpin>(
+        &self,
+        stream: S,
+        slot: &Slot,
+        shutdown: CancellationToken,
+    ) {
+        let io = TokioIo::new(stream);
         let answer = |request: hyper::Request<Incoming>| {
             slot.request_began();
             let router = self.router.clone();

@@ -1,4 +1,4 @@
-//! `/jobs/{id}/events`: a job as it goes on, as server-sent events.
+//! `/jobs/{id}/events` and `/events`: a job as it goes on, and all of them, as server-sent events.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,12 +6,16 @@ use std::time::Duration;
 use axum::extract::State;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::{Stream, StreamExt};
+use serde::Deserialize;
+use tokio::sync::OwnedSemaphorePermit;
+use utoipa::IntoParams;
 
-use super::body::Segments;
+use super::body::{Params, Segments};
 use super::jobs::job_id;
+use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
-use crate::service::{ErrorKind, JobEvent};
+use crate::service::{AnyJobEvent, ErrorKind, JobEvent};
 
 /// A comment is sent after so long without an event, so that nothing on the way hangs up.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -32,14 +36,7 @@ pub(super) async fn follow_job(
     Ready(service): Ready,
     Segments(id): Segments<String>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
-    let Ok(permit) = Arc::clone(&state.streams).try_acquire_owned() else {
-        let detail = format!(
-            "{} event streams are open, the bound (server.max_streams); ask with \
-             GET /jobs/{{id}}?wait= instead",
-            state.settings.max_streams
-        );
-        return Err(Problem::new(ErrorKind::Overloaded, detail));
-    };
+    let permit = permit(&state)?;
     let events = service.follow_job(job_id(&id)?).await?.map(move |event| {
         // Given back when the stream ends or the client has gone.
         let _permit = &permit;
@@ -52,4 +49,52 @@ pub(super) async fn follow_job(
     // A drain does not wait for jobs that nobody may finish before the next start.
     let events = events.take_until(state.draining().cancelled_owned());
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
+}
+
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct FollowParams {
+    /// Only jobs of this map.
+    map: Option<String>,
+}
+
+/// Follow all jobs
+///
+/// Server-sent events, from now on and without an end: `job` with a `JobChange` whenever a job has come
+/// further or has ended, and `missed` with a `Missed` when changes came faster than they were taken. Ask
+/// for the list of jobs after the stream is open, and again after `missed`.
+#[utoipa::path(get, path = "/events", tag = "jobs", params(FollowParams), responses(
+    (status = 200, body = String, content_type = "text/event-stream"),
+    (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+    (status = 429, body = Problem, description = "Too many streams are open", content_type = "application/problem+json"),
+))]
+pub(super) async fn follow_jobs(
+    State(state): State<AppState>,
+    Ready(service): Ready,
+    Params(params): Params<FollowParams>,
+) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
+    let map = params.map.as_deref().map(map_name).transpose()?;
+    let permit = permit(&state)?;
+    let events = service.follow_jobs(map).map(move |event| {
+        let _permit = &permit;
+        match event {
+            AnyJobEvent::Changed(change) => Event::default().event("job").json_data(change),
+            AnyJobEvent::Missed(missed) => Event::default().event("missed").json_data(missed),
+        }
+    });
+    let events = events.take_until(state.draining().cancelled_owned());
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
+}
+
+/// The right to one of the streams that may be open.
+fn permit(state: &AppState) -> Result<OwnedSemaphorePermit, Problem> {
+    Arc::clone(&state.streams).try_acquire_owned().map_err(|_| {
+        let detail = format!(
+            "{} event streams are open, the bound (server.max_streams); ask with GET /jobs or \
+             GET /jobs/{{id}}?wait= instead",
+            state.settings.max_streams
+        );
+        Problem::new(ErrorKind::Overloaded, detail)
+    })
 }

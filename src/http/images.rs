@@ -184,6 +184,7 @@ pub(super) struct PageParams {
     params(("map" = String, Path), PageParams), responses(
     (status = 200, body = ImagePage),
     (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "limit is out of range", content_type = "application/problem+json"),
 ))]
 pub(super) async fn list_images(
     Ready(service): Ready,
@@ -220,6 +221,7 @@ pub(super) struct ContentParams {
     params(("map" = String, Path), ("id" = String, Path), ContentParams), responses(
     (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"))),
     (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "max_edge is out of range", content_type = "application/problem+json"),
     (status = 429, body = Problem, description = "Overloaded, and max_edge asks for a smaller picture", content_type = "application/problem+json"),
 ))]
 pub(super) async fn image_content(

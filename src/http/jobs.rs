@@ -33,6 +33,7 @@ pub(super) struct ListParams {
 #[utoipa::path(get, path = "/jobs", tag = "jobs", params(ListParams), responses(
     (status = 200, body = JobPage),
     (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "limit is out of range", content_type = "application/problem+json"),
 ))]
 pub(super) async fn list_jobs(
     Ready(service): Ready,

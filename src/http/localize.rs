@@ -67,8 +67,8 @@ struct FrameForm {
 
 /// Localize a frame
 ///
-/// Answers with the most similar images of the map; a job then compares the frame with each of
-/// them and orders them anew. Under load, jobs are given up before frames: with `refine=async` the
+/// Answers with the most similar images of the map; a job then compares the frame with the first of them,
+/// `refine.local_candidates` or `refine.candidates` whatever `k` is, and orders those anew. Under load, jobs are given up before frames: with `refine=async` the
 /// answer comes with `job: null` and a `no_job` that says why, with `refine=wait` it is 429.
 #[utoipa::path(post, path = "/localize", tag = "localize", 
     params(LocalizeParams, ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,

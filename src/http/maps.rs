@@ -1,7 +1,7 @@
 //! `/maps`.
 
-use axum::Json;
 use axum::http::StatusCode;
+use axum::{Extension, Json};
 use serde::Serialize;
 use utoipa::ToSchema;
 
@@ -9,7 +9,7 @@ use super::body::{JsonBody, Segments};
 use super::problem::Problem;
 use super::state::Ready;
 use crate::domain::MapName;
-use crate::service::{MapChange, MapState, ReindexRequest};
+use crate::service::{Caller, MapChange, MapState, ReindexRequest};
 
 /// All maps.
 #[derive(Debug, Serialize, ToSchema)]
@@ -23,12 +23,19 @@ pub(super) fn map_name(text: &str) -> Result<MapName, Problem> {
 }
 
 /// List the maps
+///
+/// Those that the caller's key is for.
 #[utoipa::path(get, path = "/maps", tag = "maps", responses(
     (status = 200, body = MapList),
     (status = 503, body = Problem, description = "Starting", content_type = "application/problem+json"),
 ))]
-pub(super) async fn list_maps(Ready(service): Ready) -> Result<Json<MapList>, Problem> {
-    Ok(Json(MapList { maps: service.list_maps().await? }))
+pub(super) async fn list_maps(
+    Ready(service): Ready,
+    Extension(caller): Extension<Caller>,
+) -> Result<Json<MapList>, Problem> {
+    let mut maps = service.list_maps().await?;
+    maps.retain(|map| caller.may_use(&map.name));
+    Ok(Json(MapList { maps }))
 }
 
 /// One map

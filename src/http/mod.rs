@@ -1,14 +1,17 @@
 //! HTTP: extract, call the service, convert. No decision about maps or frames is taken here.
 
+mod auth;
 mod body;
 mod connections;
 mod deadline;
+mod description;
 mod events;
 mod guard;
 mod health;
 mod images;
 mod incoming;
 mod jobs;
+mod keys;
 mod localize;
 mod maps;
 mod problem;
@@ -24,7 +27,7 @@ use utoipa::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-pub use connections::{ConnectionSettings, Connections};
+pub use connections::{ConnectionSettings, Connections, Tls, TlsError};
 pub use state::{AppState, HttpSettings};
 
 #[derive(OpenApi)]
@@ -38,7 +41,10 @@ pub use state::{AppState, HttpSettings};
     ),
     components(schemas(
         problem::Problem,
+        crate::service::JobChange,
         crate::service::JobStatus,
+        crate::service::Missed,
+        crate::service::RefineMode,
         crate::service::PairDescribed
     )),
     tags(
@@ -46,6 +52,7 @@ pub use state::{AppState, HttpSettings};
         (name = "images", description = "Reference images with their poses"),
         (name = "localize", description = "From a frame to candidates"),
         (name = "jobs", description = "Refinements of the candidates"),
+        (name = "keys", description = "API keys, where the server asks for them"),
         (name = "service", description = "Health, metrics and this description")
     )
 )]
@@ -67,7 +74,10 @@ fn described() -> OpenApiRouter<AppState> {
         .routes(routes!(jobs::cancel_job))
         .routes(routes!(jobs::retry_job))
         .routes(routes!(events::follow_job))
+        .routes(routes!(events::follow_jobs))
         .routes(routes!(usage::usage))
+        .routes(routes!(keys::create_key, keys::list_keys))
+        .routes(routes!(keys::revoke_key))
         .routes(routes!(health::livez))
         .routes(routes!(health::readyz))
         .routes(routes!(health::metrics))
@@ -75,12 +85,13 @@ fn described() -> OpenApiRouter<AppState> {
 
 /// The OpenAPI 3.1 description, generated from the handlers.
 pub fn openapi() -> utoipa::openapi::OpenApi {
-    described().into_openapi()
+    description::completed(described().into_openapi())
 }
 
 /// All routes with what guards them.
 pub fn router(state: AppState) -> Router {
     let (router, description) = described().split_for_parts();
+    let description = description::completed(description);
     router
         .route("/openapi.json", axum::routing::get(move || health::openapi_json(description)))
         .route("/docs", axum::routing::get(health::docs))
@@ -89,6 +100,7 @@ pub fn router(state: AppState) -> Router {
         .method_not_allowed_fallback(problem::no_such_method)
         .layer(DefaultBodyLimit::max(state.settings.body_limit_bytes))
         .layer(CatchPanicLayer::custom(problem::panicked))
+        .layer(from_fn_with_state(state.clone(), auth::admit))
         .layer(from_fn_with_state(state.clone(), guard::bound))
         .layer(from_fn(problem::render))
         .layer(from_fn_with_state(state.clone(), guard::observe))
@@ -98,4 +110,35 @@ pub fn router(state: AppState) -> Router {
 /// Whether a request is a form that an upload can be: a part `image`, and perhaps one `meta`.
 pub async fn is_picture_form(request: axum::extract::Request) -> bool {
     body::from_form(request, usize::MAX).await.is_ok()
+}
+
+#[cfg(test)]
+mod tests {
+    /// All that a description refers to.
+    fn references(value: &serde_json::Value, found: &mut Vec<String>) {
+        match value {
+            serde_json::Value::Object(fields) => {
+                if let Some(reference) = fields.get("$ref").and_then(|value| value.as_str()) {
+                    found.push(reference.to_owned());
+                }
+                fields.values().for_each(|value| references(value, found));
+            }
+            serde_json::Value::Array(items) => {
+                items.iter().for_each(|value| references(value, found));
+            }
+            _ => {}
+        }
+    }
+
+    #[test]
+    fn the_description_refers_to_nothing_that_is_not_there() {
+        let description = serde_json::to_value(super::openapi()).unwrap();
+        let mut found = Vec::new();
+        references(&description, &mut found);
+        assert!(found.len() > 100);
+        for reference in found {
+            let place = reference.strip_prefix('#').unwrap();
+            assert!(description.pointer(place).is_some(), "{reference}");
+        }
+    }
 }

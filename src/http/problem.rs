@@ -52,6 +52,8 @@ impl Problem {
 fn status_of(kind: ErrorKind) -> (StatusCode, &'static str, &'static str) {
     match kind {
         ErrorKind::Malformed => (StatusCode::BAD_REQUEST, "malformed", "Malformed request"),
+        ErrorKind::Unauthorized => (StatusCode::UNAUTHORIZED, "unauthorized", "Unauthorized"),
+        ErrorKind::Forbidden => (StatusCode::FORBIDDEN, "forbidden", "Forbidden"),
         ErrorKind::NotFound => (StatusCode::NOT_FOUND, "not-found", "Not found"),
         ErrorKind::Conflict => (StatusCode::CONFLICT, "conflict", "Conflict"),
         ErrorKind::TooLarge => (StatusCode::PAYLOAD_TOO_LARGE, "too-large", "Body too large"),
@@ -112,9 +114,8 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
     if let Some(seconds) = retry_after {
         headers.insert(RETRY_AFTER, HeaderValue::from(seconds));
     }
-    if let Some(close) = response.headers_mut().remove(axum::http::header::CONNECTION) {
-        headers.insert(axum::http::header::CONNECTION, close);
-    }
+    // What was said beside the body: that the connection closes, what is left to a key.
+    headers.extend(std::mem::take(response.headers_mut()));
     rendered
 }
 

@@ -31,6 +31,8 @@ pub struct HttpSettings {
     pub max_requests: usize,
     /// The most event streams that are open.
     pub max_streams: usize,
+    /// Whether callers need a key.
+    pub keys_required: bool,
 }
 
 /// Shared by all handlers; clones share it.

@@ -23,6 +23,7 @@ use crate::store::Added;
     params(("map" = String, Path), PageParams), responses(
     (status = 200, body = ExportPage),
     (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "limit is out of range", content_type = "application/problem+json"),
 ))]
 pub(super) async fn export(
     Ready(service): Ready,
@@ -78,6 +79,7 @@ pub(super) struct ImportForm {
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
         (status = 409, body = Problem, description = "The id is taken by other bytes, or the map has other descriptors", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
+        (status = 415, body = Problem, description = "Not a form", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "The bytes are not those of the digest, or a value is out of range", content_type = "application/problem+json"),
         (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
         (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),

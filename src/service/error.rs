@@ -11,6 +11,10 @@ use crate::store::StoreError;
 pub enum ErrorKind {
     /// The request cannot be read.
     Malformed,
+    /// It is not known who asks.
+    Unauthorized,
+    /// Who asks may not do this.
+    Forbidden,
     /// There is no such thing.
     NotFound,
     /// It contradicts what is stored.

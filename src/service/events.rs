@@ -1,6 +1,7 @@
-//! A job as it goes on: every change of its state, every pair as it is described, and its end.
+//! A job as it goes on: every change of its state, every pair as it is described, and its end; and all jobs
+//! in short.
 
-use std::collections::{HashSet, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
 use futures_util::{Stream, stream};
@@ -12,7 +13,7 @@ use uuid::Uuid;
 
 use super::jobs::no_job;
 use super::{Service, ServiceError};
-use crate::domain::{Description, ImageId, Job, JobState};
+use crate::domain::{Description, ImageId, Job, JobState, MapName};
 use crate::store::{JobRecord, JobStore};
 
 /// Something that happened to a job.
@@ -48,7 +49,58 @@ pub struct PairDescribed {
     pub description: Description,
 }
 
+/// A job has come further, or has ended.
+#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
+pub struct JobChange {
+    /// The job.
+    pub id: Uuid,
+    /// Its map.
+    pub map: MapName,
+    /// Its state.
+    pub state: JobState,
+    /// How often a worker has taken it.
+    pub attempts: u32,
+    /// Pairs described so far.
+    pub described: usize,
+    /// Pairs of the job.
+    pub of: usize,
+    /// What went wrong, or what it waits for.
+    pub error: Option<String>,
+}
+
+/// Changes that were not told, because they came faster than they were taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ToSchema)]
+pub struct Missed {
+    /// How many. `GET /jobs` says how the jobs are now.
+    pub changes: u64,
+}
+
+/// Something that happened to any job.
+#[derive(Debug, Clone, PartialEq)]
+pub enum AnyJobEvent {
+    /// A job has come further, or has ended.
+    Changed(JobChange),
+    /// Some of that was not told.
+    Missed(Missed),
+}
+
 impl Service {
+    /// What happens from now on to the jobs of a map, or of all. Never ends by itself.
+    pub fn follow_jobs(
+        &self,
+        map: Option<MapName>,
+    ) -> impl Stream<Item = AnyJobEvent> + Send + use<> {
+        let follower = AllFollower {
+            changes: self.jobs.changes(),
+            jobs: Arc::clone(&self.jobs),
+            map,
+            told: HashMap::new(),
+        };
+        stream::unfold(follower, |mut follower| async {
+            follower.next().await.map(|event| (event, follower))
+        })
+    }
+
     /// What has happened to a job, and then what happens to it until it has ended.
     pub async fn follow_job(
         &self,
@@ -70,6 +122,58 @@ impl Service {
         Ok(stream::unfold(follower, |mut follower| async {
             follower.next().await.map(|event| (event, follower))
         }))
+    }
+}
+
+/// Follows all jobs.
+struct AllFollower {
+    jobs: Arc<dyn JobStore>,
+    changes: Receiver<Uuid>,
+    map: Option<MapName>,
+    /// What was last told of jobs that have not ended: state, attempts, pairs.
+    told: HashMap<Uuid, (JobState, u32, usize)>,
+}
+
+impl AllFollower {
+    async fn next(&mut self) -> Option<AnyJobEvent> {
+        loop {
+            let id = match self.changes.recv().await {
+                Ok(id) => id,
+                Err(RecvError::Lagged(changes)) => {
+                    // What was told of some is old by now.
+                    self.told.clear();
+                    return Some(AnyJobEvent::Missed(Missed { changes }));
+                }
+                Err(RecvError::Closed) => return None,
+            };
+            let record = match self.jobs.job(id).await {
+                Ok(Some(record)) => record,
+                // It was removed, as ended jobs are after a while.
+                Ok(None) => continue,
+                Err(error) => {
+                    tracing::error!(job = %id, %error, "a job that is followed cannot be read");
+                    return None;
+                }
+            };
+            let JobRecord { job, candidates, .. } = record;
+            let now = (job.state, job.attempts, job.descriptions.len());
+            let before = match job.state.is_final() {
+                true => self.told.remove(&id),
+                false => self.told.insert(id, now),
+            };
+            let wanted = self.map.as_ref().is_none_or(|map| *map == job.map);
+            if wanted && before != Some(now) {
+                return Some(AnyJobEvent::Changed(JobChange {
+                    id,
+                    map: job.map,
+                    state: job.state,
+                    attempts: job.attempts,
+                    described: job.descriptions.len(),
+                    of: candidates.len(),
+                    error: job.error,
+                }));
+            }
+        }
     }
 }
 

@@ -9,6 +9,7 @@ mod error;
 mod events;
 mod images;
 mod jobs;
+mod keys;
 mod localize;
 mod maps;
 mod models;
@@ -23,9 +24,10 @@ use std::sync::Arc;
 
 pub use self::calibration::CalibrationState;
 pub use self::error::{ErrorKind, ServiceError};
-pub use self::events::{JobEvent, JobStatus, PairDescribed};
+pub use self::events::{AnyJobEvent, JobChange, JobEvent, JobStatus, Missed, PairDescribed};
 pub use self::images::{ImageMeta, ImagePage, NewImage};
 pub use self::jobs::JobPage;
+pub use self::keys::{Allowance, Allowances, Caller, Keys, MadeKey, NewKey};
 pub use self::localize::{Answer, JobLink, LocalizeRequest, RefineMode, Retrieved, TimingMs};
 pub use self::maps::{IndexKind, MapChange, MapState};
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
@@ -85,6 +87,8 @@ pub struct Service {
     pub jobs: Arc<dyn JobStore>,
     /// What calls to models outside have cost.
     pub accounts: Arc<dyn UsageStore>,
+    /// API keys.
+    pub keys: Keys,
     /// The models in memory.
     pub models: LoadedModels,
     /// Who may have a picture decoded and inferred.

@@ -18,7 +18,7 @@ use uuid::Uuid;
 
 use crate::domain::{
     Calibration, CalibrationSettings, Candidate, DayUsage, Description, Descriptor, Digest, Image,
-    ImageId, Job, JobState, Map, MapName, MediaType, Pose, Usage,
+    ImageId, Job, JobState, Map, MapName, MediaType, Pose, StoredKey, Usage,
 };
 use crate::retrieve::index::SearchMode;
 
@@ -359,6 +359,15 @@ pub trait UsageStore: Send + Sync {
     async fn add_usage(&self, spent: DayUsage) -> Result<(), StoreError>;
     /// What was spent from that day on, by day and map, oldest first.
     async fn usage(&self, from: Date) -> Result<Vec<DayUsage>, StoreError>;
+}
+
+/// API keys.
+#[async_trait]
+pub trait KeyStore: Send + Sync {
+    /// Stores a key, in the place of one of the same id.
+    async fn put_key(&self, key: StoredKey) -> Result<(), StoreError>;
+    /// All keys, in no order.
+    async fn keys(&self) -> Result<Vec<StoredKey>, StoreError>;
 }
 
 /// Which of the jobs that have ended are kept. A job is removed with its query and its frame.

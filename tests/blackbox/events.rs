@@ -90,3 +90,39 @@ async fn streams_are_bounded_and_end_with_the_server() {
     assert!(began.elapsed() < Duration::from_secs(10), "the drain waited for the stream");
     assert!(events(&rest.await.unwrap()).iter().all(|(name, _)| name != "end"));
 }
+
+#[tokio::test]
+async fn all_jobs_are_followed_and_those_of_a_map() {
+    let dir = TempDir::new().unwrap();
+    let server = Server::start(dir.path(), &[]);
+    server.town("m", 3).await;
+    server.town("n", 3).await;
+    let follow = async |path: &str| server.request(Method::GET, path).send().await.unwrap();
+    let (all, of_map) = (follow("/events").await, follow("/events?map=m").await);
+    let mut expected = Vec::new();
+    for map in ["m", "n", "m"] {
+        let path = format!("/localize?map={map}");
+        let job = server.post_jpeg(&path, frame(0, 0)).await.expect(200)["job"].clone();
+        let (id, href) = (job["id"].as_str().unwrap(), job["href"].as_str().unwrap());
+        server.get(&format!("{href}?wait=60")).await.expect(200);
+        expected.push((id.to_owned(), map));
+    }
+    // A drain ends the streams.
+    assert!(server.terminate().success());
+    let (all, of_map) = (all.bytes().await.unwrap(), of_map.bytes().await.unwrap());
+    for (stream, maps) in [(&all, &["m", "n"][..]), (&of_map, &["m"][..])] {
+        let told = events(stream);
+        assert!(told.iter().all(|(name, _)| name == "job"), "{told:?}");
+        let ended = told.iter().filter(|(_, job)| job["state"] == "succeeded");
+        let ended: Vec<(String, &str)> = ended
+            .map(|(_, job)| (job["id"].as_str().unwrap().to_owned(), job["map"].as_str().unwrap()))
+            .collect();
+        let of_maps = expected.iter().filter(|(_, map)| maps.contains(map)).cloned();
+        assert_eq!(ended, of_maps.collect::<Vec<_>>());
+        for pair in told.windows(2) {
+            assert_ne!(pair[0], pair[1], "told twice");
+        }
+        let running = told.iter().any(|(_, job)| job["state"] == "running" && job["of"] == 3);
+        assert!(running, "{told:?}");
+    }
+}

@@ -157,7 +157,7 @@ impl Server {
         }));
         match ready.await {
             Ok(address) => {
-                let address = ServerArg { server: format!("http://{address}") };
+                let address = ServerArg { server: format!("http://{address}"), api_key: None };
                 Ok(Self { address, shutdown, running })
             }
             Err(_) => match running.await? {

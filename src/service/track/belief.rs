@@ -228,7 +228,7 @@ mod tests {
         let mut moved = before.to_vec();
         if let Some(motion) = motion {
             moved = vec![settings.jump / n as f64; n];
-            for i in 0..n {
+            for (i, held) in before.iter().enumerate() {
                 let weight = |j: usize| {
                     let d = 10.0 * i.abs_diff(j) as f64;
                     let off = match motion {
@@ -238,8 +238,8 @@ mod tests {
                     if off.abs() > TAIL { 0.0 } else { (-0.5 * off * off).exp() }
                 };
                 let sum: f64 = (0..n).map(weight).sum();
-                for j in 0..n {
-                    moved[j] += (1.0 - settings.jump) * before[i] * weight(j) / sum;
+                for (j, part) in moved.iter_mut().enumerate() {
+                    *part += (1.0 - settings.jump) * held * weight(j) / sum;
                 }
             }
         }

@@ -21,6 +21,7 @@ mod drafts;
 mod export;
 mod indexer;
 mod jobs;
+mod keys;
 mod live_map;
 mod maps;
 mod mark;

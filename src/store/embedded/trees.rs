@@ -32,6 +32,8 @@ pub(super) struct Trees {
     pub frames: sled::Tree,
     /// Day, map → what was spent.
     pub usage: sled::Tree,
+    /// Id → API key.
+    pub keys: sled::Tree,
 }
 
 /// The key of the number of the last commit, in the default tree.
@@ -74,6 +76,7 @@ impl Trees {
             descriptions: tree("descriptions")?,
             frames: tree("frames")?,
             usage: tree("usage")?,
+            keys: tree("keys")?,
             db,
         })
     }

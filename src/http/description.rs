@@ -1,0 +1,72 @@
+//! What holds for many calls, added to the description of each.
+
+use axum::http::Method;
+use utoipa::openapi::path::Operation;
+use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
+use utoipa::openapi::{ContentBuilder, OpenApi, Ref, RefOr, Response, ResponseBuilder};
+
+use super::auth::{Access, access};
+
+/// The name of the security scheme.
+const KEY: &str = "key";
+
+/// Adds to every call what can be said of it without knowing what it does: who may make it, and how it can
+/// fail.
+pub(super) fn completed(mut description: OpenApi) -> OpenApi {
+    let scheme = HttpBuilder::new().scheme(HttpAuthScheme::Bearer).description(Some(
+        "An API key, made by `whereabouts keys create`. A server that listens on loopback only asks for none \
+         unless it is set to.",
+    ));
+    let components = description.components.get_or_insert_default();
+    components.add_security_scheme(KEY, SecurityScheme::Http(scheme.build()));
+    for (route, item) in &mut description.paths.paths {
+        let operations = [
+            (Method::GET, &mut item.get),
+            (Method::PUT, &mut item.put),
+            (Method::POST, &mut item.post),
+            (Method::DELETE, &mut item.delete),
+        ];
+        for (method, operation) in operations {
+            if let Some(operation) = operation
+                && let Some(Access::Role(role)) = access(&method, route)
+            {
+                complete(operation, role.as_str());
+            }
+        }
+    }
+    description
+}
+
+fn complete(operation: &mut Operation, role: &str) {
+    let scopes: [&str; 0] = [];
+    operation.security = Some(vec![SecurityRequirement::new(KEY, scopes)]);
+    let note = format!("Takes the role `{role}`, where the server asks for keys.");
+    operation.description = Some(match operation.description.take() {
+        Some(text) => format!("{text}\n\n{note}"),
+        None => note,
+    });
+    let malformed = operation.parameters.as_ref().is_some_and(|parameters| !parameters.is_empty());
+    let has_body = operation.request_body.is_some();
+    for (applies, status, text) in [
+        (malformed, "400", "Malformed"),
+        (true, "401", "No key, or one that is unknown, revoked or expired"),
+        (true, "403", "The key has not the role, or is not for the map"),
+        (has_body, "408", "The body came too slowly"),
+        (has_body, "413", "Too large"),
+        (true, "429", "Overloaded, or the key has used up what it may ask for in a minute"),
+        (true, "500", "A defect, or a disk that fails; the server's log has more"),
+        (true, "503", "Starting, or it took too long; Retry-After says when to try again"),
+    ] {
+        if applies {
+            let responses = &mut operation.responses.responses;
+            responses.entry(status.into()).or_insert_with(|| problem(text));
+        }
+    }
+}
+
+fn problem(text: &str) -> RefOr<Response> {
+    let schema = Ref::from_schema_name("Problem");
+    let content = ContentBuilder::new().schema(Some(schema)).build();
+    let response = ResponseBuilder::new().description(text);
+    response.content("application/problem+json", content).build().into()
+}

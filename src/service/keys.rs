@@ -1,0 +1,398 @@
+//! API keys: making, listing and revoking them, and who a token belongs to.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::time::{Duration, Instant};
+
+use jiff::{SignedDuration, Timestamp};
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::{ErrorKind, ServiceError};
+use crate::domain::{ApiKey, KeyLimits, MapName, Role, StoredKey, Token};
+use crate::store::KeyStore;
+
+/// A bucket of a key fills up in this time.
+const WINDOW: Duration = Duration::from_secs(60);
+
+/// The most keys, revoked ones included: they are all held in memory.
+const MOST_KEYS: usize = 10_000;
+
+/// The longest name of a key, in bytes.
+const MOST_NAME_BYTES: usize = 100;
+
+/// A key that is wanted.
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct NewKey {
+    /// What people call it, 1 to 100 bytes.
+    pub name: String,
+    /// What its holder may do.
+    pub role: Role,
+    /// In which maps, which need not be there yet; in all, if there is none.
+    #[serde(default)]
+    pub maps: Vec<MapName>,
+    /// How often.
+    #[serde(default)]
+    pub limits: KeyLimits,
+    /// For how many days, 1 to 36500; null for ever.
+    #[serde(default)]
+    #[schema(nullable, minimum = 1, maximum = 36500)]
+    pub expires_days: Option<u32>,
+}
+
+/// A key that was made.
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
+pub struct MadeKey {
+    /// The key, to be sent as `Authorization: Bearer …`. It is shown this once.
+    pub token: String,
+    /// What is known of it.
+    pub key: ApiKey,
+}
+
+/// Who asks.
+#[derive(Debug, Clone)]
+pub enum Caller {
+    /// Keys are off: everybody may do everything.
+    Anybody,
+    /// The holder of a key.
+    Holder(Arc<ApiKey>),
+}
+
+impl Caller {
+    /// Whether the caller may do what takes that role.
+    pub fn is(&self, role: Role) -> bool {
+        match self {
+            Self::Anybody => true,
+            Self::Holder(key) => key.role >= role,
+        }
+    }
+
+    /// Whether the caller may use that map.
+    pub fn may_use(&self, map: &MapName) -> bool {
+        match self {
+            Self::Anybody => true,
+            Self::Holder(key) => key.may_use(map),
+        }
+    }
+
+    /// Whether the caller may use some maps only.
+    pub fn is_limited(&self) -> bool {
+        matches!(self, Self::Holder(key) if !key.maps.is_empty())
+    }
+}
+
+/// What is left to a key, of one of its limits.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Allowance {
+    /// The limit.
+    pub limit: u64,
+    /// What is left of it.
+    pub remaining: u64,
+    /// When all of it is there again.
+    pub reset: Duration,
+}
+
+/// What is left to a key.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Allowances {
+    /// Of requests.
+    pub requests: Option<Allowance>,
+    /// Of bytes.
+    pub bytes: Option<Allowance>,
+}
+
+/// All keys, and what each has asked for lately.
+pub struct Keys {
+    store: Arc<dyn KeyStore>,
+    known: RwLock<HashMap<String, StoredKey>>,
+    buckets: Mutex<HashMap<String, Buckets>>,
+}
+
+#[derive(Debug, Default)]
+struct Buckets {
+    requests: Option<Bucket>,
+    bytes: Option<Bucket>,
+}
+
+/// What is left at a moment; below zero after a body that was larger than what was left.
+#[derive(Debug, Clone, Copy)]
+struct Bucket {
+    left: f64,
+    at: Instant,
+}
+
+impl Bucket {
+    fn filled(bucket: Option<Self>, limit: f64, now: Instant) -> Self {
+        let Some(known) = bucket else { return Self { left: limit, at: now } };
+        let passed = now.duration_since(known.at).as_secs_f64() / WINDOW.as_secs_f64();
+        Self { left: (known.left + passed * limit).min(limit), at: now }
+    }
+
+    fn allowance(self, limit: f64) -> Allowance {
+        let missing = (limit - self.left) / limit;
+        Allowance {
+            limit: limit as u64,
+            remaining: self.left.max(0.0) as u64,
+            reset: WINDOW.mul_f64(missing.max(0.0)),
+        }
+    }
+}
+
+impl Keys {
+    /// The keys of a store.
+    pub async fn load(store: Arc<dyn KeyStore>) -> Result<Self, ServiceError> {
+        let known = store.keys().await?;
+        let known = known.into_iter().map(|stored| (stored.key.id.clone(), stored)).collect();
+        Ok(Self { store, known: RwLock::new(known), buckets: Mutex::default() })
+    }
+
+    /// Makes a key. What comes back is the only place where its token is.
+    pub async fn create(&self, wanted: NewKey) -> Result<MadeKey, ServiceError> {
+        let NewKey { name, role, mut maps, limits, expires_days } = wanted;
+        let printable = !name.chars().any(char::is_control);
+        if !(1..=MOST_NAME_BYTES).contains(&name.trim().len()) || !printable {
+            let detail = format!("a key's name must have 1 to {MOST_NAME_BYTES} printable bytes");
+            return Err(ServiceError::unprocessable(detail));
+        }
+        if limits.requests_per_minute == Some(0) || limits.bytes_per_minute == Some(0) {
+            let detail =
+                "a limit of 0 allows nothing; revoke the key instead, or leave the limit out";
+            return Err(ServiceError::unprocessable(detail));
+        }
+        if expires_days.is_some_and(|days| !(1..=36_500).contains(&days)) {
+            return Err(ServiceError::unprocessable("expires_days must be 1 to 36500"));
+        }
+        if self.read().len() >= MOST_KEYS {
+            let detail = format!("there are {MOST_KEYS} keys, revoked ones included: the most");
+            return Err(ServiceError::new(ErrorKind::Conflict, detail));
+        }
+        maps.sort();
+        maps.dedup();
+        let token = random_token()?;
+        let created_at = Timestamp::now();
+        let expires_at = expires_days
+            .map(|days| created_at.checked_add(SignedDuration::from_hours(i64::from(days) * 24)))
+            .transpose()
+            .map_err(|error| ServiceError::unprocessable(format!("expires_days: {error}")))?;
+        let key = ApiKey {
+            id: token.id().to_owned(),
+            name: name.trim().to_owned(),
+            role,
+            maps,
+            limits,
+            created_at,
+            expires_at,
+            revoked_at: None,
+        };
+        self.keep(StoredKey { key: key.clone(), digest: token.digest() }).await?;
+        Ok(MadeKey { token: token.reveal().to_owned(), key })
+    }
+
+    /// All keys, the newest first.
+    pub fn list(&self) -> Vec<ApiKey> {
+        let mut keys: Vec<_> = self.read().values().map(|stored| stored.key.clone()).collect();
+        keys.sort_by(|a, b| b.created_at.cmp(&a.created_at).then_with(|| a.id.cmp(&b.id)));
+        keys
+    }
+
+    /// Ends a key for good; from the moment this returns nobody gets in with it.
+    pub async fn revoke(&self, id: &str) -> Result<ApiKey, ServiceError> {
+        let Some(mut stored) = self.read().get(id).cloned() else {
+            let detail = "there is no such key; `whereabouts keys list` shows those there are";
+            return Err(ServiceError::new(ErrorKind::NotFound, detail));
+        };
+        if stored.key.revoked_at.is_none() {
+            stored.key.revoked_at = Some(Timestamp::now());
+            self.keep(stored.clone()).await?;
+        }
+        Ok(stored.key)
+    }
+
+    /// Whether there is a key that lets somebody in.
+    pub fn any_valid(&self) -> bool {
+        let now = Timestamp::now();
+        self.read().values().any(|stored| stored.key.is_valid(now))
+    }
+
+    /// Whose token this is.
+    pub fn holder(&self, token: &Token) -> Result<Arc<ApiKey>, ServiceError> {
+        let known = self.read().get(token.id()).cloned();
+        // An id that is unknown takes as long as one that is known.
+        let is_right = match &known {
+            Some(stored) => stored.is(token),
+            None => token.digest() == crate::domain::Digest::of(b""),
+        };
+        match known.filter(|_| is_right) {
+            None => Err(ServiceError::new(ErrorKind::Unauthorized, "the key is unknown")),
+            Some(StoredKey { key, .. }) if key.is_valid(Timestamp::now()) => Ok(Arc::new(key)),
+            Some(StoredKey { key, .. }) => {
+                let why = if key.revoked_at.is_some() { "was revoked" } else { "has expired" };
+                let detail = format!("the key {} {why}; ask an admin for another", key.id);
+                Err(ServiceError::new(ErrorKind::Unauthorized, detail))
+            }
+        }
+    }
+
+    /// Takes a request from what is left to a key.
+    pub fn take_request(&self, key: &ApiKey) -> (Allowances, Result<(), ServiceError>) {
+        let now = Instant::now();
+        let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
+        let of_key = buckets.entry(key.id.clone()).or_default();
+        let mut allowances = Allowances::default();
+        let mut refused = None;
+        if let Some(limit) = key.limits.bytes_per_minute.map(|limit| limit as f64) {
+            let bucket = Bucket::filled(of_key.bytes, limit, now);
+            of_key.bytes = Some(bucket);
+            allowances.bytes = Some(bucket.allowance(limit));
+            if bucket.left <= 0.0 {
+                let pause = WINDOW.mul_f64((1.0 - bucket.left).max(1.0) / limit);
+                refused = Some((pause, format!("{limit} bytes")));
+            }
+        }
+        if let Some(limit) = key.limits.requests_per_minute.map(f64::from) {
+            let mut bucket = Bucket::filled(of_key.requests, limit, now);
+            if bucket.left < 1.0 {
+                let pause = WINDOW.mul_f64((1.0 - bucket.left) / limit);
+                refused = Some((pause, format!("{limit} requests")));
+            } else if refused.is_none() {
+                bucket.left -= 1.0;
+            }
+            of_key.requests = Some(bucket);
+            allowances.requests = Some(bucket.allowance(limit));
+        }
+        let Some((pause, what)) = refused else { return (allowances, Ok(())) };
+        let detail = format!(
+            "the key {} has used up its {what} a minute; wait as Retry-After says, or have an admin make \
+             one with another limit",
+            key.id
+        );
+        let error = ServiceError::new(ErrorKind::Overloaded, detail).retry_after(pause);
+        (allowances, Err(error))
+    }
+
+    /// Takes bytes that have come from what is left to a key.
+    pub fn take_bytes(&self, key: &ApiKey, bytes: usize) {
+        let Some(limit) = key.limits.bytes_per_minute else { return };
+        let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
+        let of_key = buckets.entry(key.id.clone()).or_default();
+        let bucket = Bucket::filled(of_key.bytes, limit as f64, Instant::now());
+        of_key.bytes = Some(Bucket { left: bucket.left - bytes as f64, ..bucket });
+    }
+
+    async fn keep(&self, stored: StoredKey) -> Result<(), ServiceError> {
+        self.store.put_key(stored.clone()).await?;
+        let mut known = self.known.write().unwrap_or_else(PoisonError::into_inner);
+        known.insert(stored.key.id.clone(), stored);
+        Ok(())
+    }
+
+    fn read(&self) -> std::sync::RwLockReadGuard<'_, HashMap<String, StoredKey>> {
+        self.known.read().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn random_token() -> Result<Token, ServiceError> {
+    let mut random = [0; 38];
+    let source = rustls::crypto::ring::default_provider().secure_random;
+    match source.fill(&mut random) {
+        Ok(()) => Ok(Token::new(&random)),
+        Err(_) => {
+            let detail = "the system gives no random numbers; the key was not made";
+            Err(ServiceError::new(ErrorKind::Internal, detail))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::StoreError;
+    use async_trait::async_trait;
+
+    #[derive(Default)]
+    struct Drawer(Mutex<Vec<StoredKey>>);
+
+    #[async_trait]
+    impl KeyStore for Drawer {
+        async fn put_key(&self, key: StoredKey) -> Result<(), StoreError> {
+            let mut kept = self.0.lock().unwrap();
+            kept.retain(|other| other.key.id != key.key.id);
+            kept.push(key);
+            Ok(())
+        }
+
+        async fn keys(&self) -> Result<Vec<StoredKey>, StoreError> {
+            Ok(self.0.lock().unwrap().clone())
+        }
+    }
+
+    fn wanted(role: Role, limits: KeyLimits) -> NewKey {
+        NewKey { name: "n".into(), role, maps: Vec::new(), limits, expires_days: Some(1) }
+    }
+
+    #[tokio::test]
+    async fn a_key_is_known_by_its_token_alone_until_it_is_revoked_and_after_a_restart() {
+        let store = Arc::new(Drawer::default());
+        let keys = Keys::load(store.clone()).await.unwrap();
+        assert!(!keys.any_valid());
+        let made = keys.create(wanted(Role::Robot, KeyLimits::default())).await.unwrap();
+        let token: Token = made.token.parse().unwrap();
+        assert_eq!(keys.holder(&token).unwrap().id, made.key.id);
+        let kept = serde_json::to_string(&*store.0.lock().unwrap()).unwrap();
+        assert!(!kept.contains(&made.token[17..]), "the secret is stored");
+
+        let mut other = made.token.clone();
+        other.replace_range(80..81, if made.token.ends_with('0') { "1" } else { "0" });
+        assert!(keys.holder(&other.parse().unwrap()).is_err());
+        let again = Keys::load(store).await.unwrap();
+        assert!(again.any_valid() && again.holder(&token).is_ok());
+        again.revoke(&made.key.id).await.unwrap();
+        assert!(again.holder(&token).unwrap_err().detail.contains("revoked"));
+        assert!(!again.any_valid());
+        assert_eq!(again.revoke("000000000000").await.unwrap_err().kind, ErrorKind::NotFound);
+    }
+
+    #[tokio::test]
+    async fn a_limit_is_kept_and_says_when_to_come_again() {
+        let keys = Keys::load(Arc::new(Drawer::default())).await.unwrap();
+        let limits = KeyLimits { requests_per_minute: Some(3), bytes_per_minute: Some(1000) };
+        let key = keys.create(wanted(Role::Robot, limits)).await.unwrap().key;
+        for left in [2, 1, 0] {
+            let (allowances, taken) = keys.take_request(&key);
+            taken.unwrap();
+            assert_eq!(allowances.requests.unwrap().remaining, left);
+        }
+        let refused = keys.take_request(&key).1.unwrap_err();
+        assert_eq!(refused.kind, ErrorKind::Overloaded);
+        let pause = refused.retry_after.unwrap().as_secs_f64();
+        assert!((15.0..=20.0).contains(&pause), "{pause}");
+
+        let limits = KeyLimits { requests_per_minute: None, ..limits };
+        let key = keys.create(wanted(Role::Robot, limits)).await.unwrap().key;
+        keys.take_request(&key).1.unwrap();
+        keys.take_bytes(&key, 3000);
+        let (allowances, refused) = keys.take_request(&key);
+        assert_eq!(allowances.bytes.unwrap().remaining, 0);
+        let pause = refused.unwrap_err().retry_after.unwrap().as_secs_f64();
+        assert!((115.0..=121.0).contains(&pause), "{pause}");
+    }
+
+    #[tokio::test]
+    async fn a_key_that_cannot_be_is_refused() {
+        let keys = Keys::load(Arc::new(Drawer::default())).await.unwrap();
+        let plain = wanted(Role::Admin, KeyLimits::default());
+        for bad in [
+            NewKey { name: " ".into(), ..plain.clone() },
+            NewKey { name: "a\nb".into(), ..plain.clone() },
+            NewKey { name: "n".repeat(101), ..plain.clone() },
+            NewKey { expires_days: Some(0), ..plain.clone() },
+            NewKey {
+                limits: KeyLimits { requests_per_minute: Some(0), bytes_per_minute: None },
+                ..plain.clone()
+            },
+        ] {
+            assert_eq!(keys.create(bad).await.unwrap_err().kind, ErrorKind::Unprocessable);
+        }
+    }
+}

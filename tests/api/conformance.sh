@@ -1,0 +1,61 @@
+#!/usr/bin/env bash
+# Holds the server against its own description with schemathesis: no status that is not described, no answer
+# of another shape, no server error. Requests are made up from the description, right ones and wrong ones.
+#
+#     conformance.sh BINARY VENV [EXAMPLES]
+#
+# VENV is a folder for a Python environment with schemathesis (requirements.txt); it is made if it is not
+# there. EXAMPLES is how many requests are made up for each call, beside those that cover its parameters one
+# by one; 5 unless told otherwise. Ends with 1 if anything is not as described.
+set -euo pipefail
+
+if [ $# -lt 2 ] || [ $# -gt 3 ]; then
+    echo "usage: $0 BINARY VENV [EXAMPLES], such as: $0 target/release/whereabouts target/api-venv" >&2
+    exit 2
+fi
+binary=$(realpath "$1")
+venv=$(realpath -m "$2")
+examples=${3:-5}
+cd "$(dirname "$0")"
+
+if [ ! -e "$venv/complete" ]; then
+    python3 -m venv "$venv"
+    "$venv/bin/pip" install --quiet --disable-pip-version-check -r requirements.txt
+    touch "$venv/complete"
+fi
+
+scratch=$(mktemp -d)
+server=
+finish() {
+    if [ -n "$server" ]; then
+        kill "$server" 2> /dev/null || true
+        wait "$server" 2> /dev/null || true
+    fi
+    rm -rf "$scratch"
+}
+trap finish EXIT
+WHEREABOUTS_MODEL__NAME=xfeat "$binary" serve --data "$scratch/data" --listen 127.0.0.1:0 \
+    --address-file "$scratch/address" > "$scratch/log" 2>&1 &
+server=$!
+for _ in $(seq 300); do
+    if [ -s "$scratch/address" ] || ! kill -0 "$server" 2> /dev/null; then break; fi
+    sleep 0.1
+done
+if [ ! -s "$scratch/address" ]; then
+    echo "the server did not start:" >&2
+    cat "$scratch/log" >&2
+    exit 1
+fi
+url=http://$(cat "$scratch/address")
+curl --silent --fail --output /dev/null -X PUT "$url/maps/town" -H 'Content-Type: application/json' \
+    -d '{"scene": "outdoor"}'
+
+# The stream of all jobs has no end.
+(cd "$scratch" && "$venv/bin/schemathesis" --config-file "$OLDPWD/schemathesis.toml" run "$url/openapi.json" \
+    --exclude-path /events --max-examples "$examples" --seed 1 --workers 2 --phases examples,coverage,fuzzing \
+    --checks not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance \
+    --continue-on-failure --no-shrink --warnings off --request-timeout 60)
+if grep -q panicked "$scratch/log"; then
+    grep panicked "$scratch/log" >&2
+    exit 1
+fi
