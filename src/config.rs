@@ -44,6 +44,8 @@ pub struct Config {
     pub confidence: Confidence,
     /// The frames of one robot, one after another.
     pub track: TrackSettings,
+    /// Requests that may be sent again.
+    pub idempotency: Idempotency,
     /// Refinement jobs.
     pub jobs: Jobs,
     /// The refiner.
@@ -230,6 +232,16 @@ pub enum KeysWanted {
     Required,
     /// Never: whoever reaches the server may do everything.
     Off,
+}
+
+/// `[idempotency]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Idempotency {
+    /// For how many hours an answer is given again.
+    pub keep_hours: u32,
+    /// How many answers are kept.
+    pub max: usize,
 }
 
 /// `[localize]`

@@ -10,6 +10,7 @@ use tokio::net::TcpListener;
 use tokio::runtime::Handle;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
 
 use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
 use crate::domain::{CalibrationSettings, utc_day};
@@ -21,7 +22,7 @@ use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
 use crate::service::{
-    Janitor, Keys, Reindexes, RetentionSettings, Service, ServiceSettings, Tracks,
+    Janitor, Keys, OnceSettings, Reindexes, RetentionSettings, Service, ServiceSettings, Tracks,
 };
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
 use crate::store::{JobStore, UsageStore};
@@ -49,8 +50,12 @@ pub async fn serve(
     let counted = Arc::clone(&metrics);
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
     let Parts { service, workers, pools } = building.await.context("the start broke off")??;
-    let janitor =
-        Janitor { store: Arc::clone(&service.retention), metrics: counted, settings: retention };
+    let janitor = Janitor {
+        store: Arc::clone(&service.retention),
+        answers: Arc::clone(&service.answers),
+        metrics: counted,
+        settings: retention,
+    };
     let service = Arc::new(service);
     state.set_ready(Arc::clone(&service));
     let mut running = JoinSet::new();
@@ -109,6 +114,14 @@ fn retention(config: &Config) -> RetentionSettings {
         pause: Duration::from_secs(config.jobs.sweep_s),
         batch: config.jobs.sweep_batch,
         usage_days: config.data.usage_days,
+        once: once(config),
+    }
+}
+
+fn once(config: &Config) -> OnceSettings {
+    OnceSettings {
+        keep: Duration::from_secs(u64::from(config.idempotency.keep_hours) * 3600),
+        most: config.idempotency.max,
     }
 }
 
@@ -209,6 +222,8 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     check_keys(config, &keys)?;
     let service = Service {
         keys,
+        answers: store.clone(),
+        process: Uuid::now_v7(),
         maps: store.clone(),
         drafts: store.clone(),
         reindexes: Reindexes::default(),
@@ -241,6 +256,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             shed_jobs_at: config.jobs.shed_at,
             max_wait: Duration::from_secs(config.jobs.max_wait_s),
             usage_days: config.data.usage_days,
+            once: once(config),
         },
     };
     let model = service.models.default_model();

@@ -13,10 +13,11 @@ use serde::de::DeserializeOwned;
 pub struct ServerArg {
     /// The server
     #[arg(long, env = "WHEREABOUTS_SERVER", default_value = "http://127.0.0.1:8080")]
-    #[arg(value_name = "URL")]
+    #[arg(value_name = "URL", global = true)]
     pub server: String,
     /// The API key, where the server asks for one
     #[arg(long, env = "WHEREABOUTS_API_KEY", hide_env_values = true, value_name = "KEY")]
+    #[arg(global = true)]
     pub api_key: Option<String>,
 }
 

@@ -3,13 +3,13 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::Subcommand;
 use serde::Deserialize;
 
 use super::client::{Client, ServerArg};
 use crate::config::{Config, Overrides};
-use crate::domain::{ApiKey, KeyLimits, MapName, Role};
+use crate::domain::{ApiKey, KeyLimits, MapName, Role, Token};
 use crate::service::{Keys, MadeKey, NewKey};
 use crate::startup;
 
@@ -58,7 +58,8 @@ enum Action {
     List,
     /// End a key for good
     Revoke {
-        /// Its id: the middle part of the key
+        /// Its id, the middle part of the key; or the key
+        #[arg(value_parser = key_id)]
         id: String,
     },
 }
@@ -80,6 +81,13 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         Some(data) => {
             let flags = Overrides::default().data(Some(data));
             let config = Config::load(args.config.as_deref(), &flags)?;
+            let new = !config.data.dir.join("version").exists();
+            if new && !matches!(args.action, Action::Create { .. }) {
+                bail!(
+                    "{} is no data folder; only the first key makes one",
+                    config.data.dir.display()
+                );
+            }
             let opening = tokio::task::spawn_blocking(move || startup::store(&config));
             let store = opening.await.context("the folder could not be opened")?.context(
                 "while its server runs, leave --data out, so that the server is asked over HTTP",
@@ -149,6 +157,20 @@ impl Place {
             Self::Server(client) => client.json(client.delete(&format!("/keys/{id}"))).await,
         }
     }
+}
+
+/// The id of a key, which goes into an address.
+fn key_id(text: &str) -> Result<String, String> {
+    if let Ok(token) = text.parse::<Token>() {
+        return Ok(token.id().to_owned());
+    }
+    let is_id = text.len() == Token::ID && text.bytes().all(|byte| byte.is_ascii_hexdigit());
+    is_id.then(|| text.to_owned()).ok_or_else(|| {
+        format!(
+            "a key's id has {} hexadecimal digits; `whereabouts keys list` shows them",
+            Token::ID
+        )
+    })
 }
 
 fn print(keys: &[ApiKey]) {

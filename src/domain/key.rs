@@ -99,8 +99,10 @@ impl StoredKey {
 pub struct Token(String);
 
 impl Token {
-    const PREFIX: &str = "wab_";
-    const ID: usize = 12;
+    /// What every key begins with.
+    pub const PREFIX: &str = "wab_";
+    /// Characters of its id.
+    pub const ID: usize = 12;
     const SECRET: usize = 64;
 
     /// The token of 38 random bytes.

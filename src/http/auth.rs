@@ -78,28 +78,45 @@ pub(super) async fn admit(
         Err(error) => return refuse(request, error),
     };
     let caller = Caller::Holder(Arc::clone(&key));
-    if !caller.is(role) {
-        let detail = format!(
-            "this takes the role {role}, and the key {} has the role {}; ask an admin for another key",
-            key.id, key.role
-        );
-        return refuse(request, ServiceError::new(ErrorKind::Forbidden, detail));
-    }
+    let changes = !matches!(*request.method(), Method::GET | Method::HEAD);
+    let audited = changes && route.as_deref() != Some("/localize");
+    let mut audited = audited.then(|| Audited::of(&request, &key));
     let (allowances, taken) = service.keys.take_request(&key);
     let checked = match taken {
+        Ok(()) if !caller.is(role) => Err(ServiceError::new(
+            ErrorKind::Forbidden,
+            format!(
+                "this takes the role {role}, and the key {} has the role {}; ask an admin for another key",
+                key.id, key.role
+            ),
+        )),
         Ok(()) => may_use_maps(&service, &caller, &mut request, route.as_deref()).await,
         Err(error) => Err(error),
     };
     let mut response = match checked {
-        Err(error) => refuse(request, error),
+        Err(error) => {
+            let response = refuse(request, error);
+            audited.iter_mut().for_each(|audited| audited.answered(&response));
+            response
+        }
         Ok(()) => {
             request.extensions_mut().insert(caller);
-            let audited = (role == Role::Admin).then(|| Audited::of(&request, &key));
-            let response = next.run(counted(request, &service, &key)).await;
-            if let Some(audited) = audited {
-                audited.log(&response);
+            // What an admin has begun is done, and written down, though the admin has gone.
+            let to_the_end =
+                audited.is_some() && (role == Role::Admin || request.method() == Method::DELETE);
+            let request = counted(request, &service, &key);
+            let doing = async move {
+                let response = next.run(request).await;
+                audited.iter_mut().for_each(|audited| audited.answered(&response));
+                response
+            };
+            match to_the_end {
+                false => doing.await,
+                true => tokio::spawn(doing).await.unwrap_or_else(|_| {
+                    let detail = "the request hit a defect of the server; see its log";
+                    Problem::new(ErrorKind::Internal, detail).into_response()
+                }),
             }
-            response
         }
     };
     tell(&allowances, response.headers_mut());
@@ -154,7 +171,8 @@ async fn may_use_maps(
             None => return Ok(()),
             Some(id) => match service.get_job(id, None).await {
                 Ok(job) => Some(job.map.to_string()),
-                Err(_) => return Ok(()),
+                Err(error) if error.kind == ErrorKind::NotFound => return Ok(()),
+                Err(error) => return Err(error),
             },
         },
         "/localize" | "/jobs" | "/events" | "/usage" => {
@@ -241,12 +259,14 @@ fn tell(allowances: &Allowances, headers: &mut HeaderMap) {
     }
 }
 
-/// A call that an admin made.
+/// A call that changes something, for the audit log; written down when it ends, however that is.
 struct Audited {
     request_id: RequestId,
     key: Arc<ApiKey>,
     method: Method,
     path: String,
+    /// `None` as long as there is no answer.
+    status: Option<u16>,
 }
 
 impl Audited {
@@ -255,17 +275,36 @@ impl Audited {
             request_id: request.extensions().get::<RequestId>().cloned().unwrap_or_default(),
             key: Arc::clone(key),
             method: request.method().clone(),
-            path: request.uri().path().to_owned(),
+            path: without_secrets(request.uri().path()),
+            status: None,
         }
     }
 
-    fn log(&self, response: &Response) {
+    fn answered(&mut self, response: &Response) {
+        // Whoever refuses leaves the status to the problem.
+        self.status = Some(response.status().as_u16());
+    }
+}
+
+impl Drop for Audited {
+    fn drop(&mut self) {
+        let Self { request_id, key, method, path, status } = self;
         tracing::info!(
             target: "audit",
-            request_id = %self.request_id.0, key = %self.key.id, key_name = %self.key.name,
-            method = %self.method, path = %self.path, status = response.status().as_u16(),
-            "an admin's call"
+            request_id = %request_id.0, key = %key.id, key_name = %key.name, role = %key.role,
+            %method, path, status, "{}", if status.is_some() { "a call" } else { "a call that was given up" }
         );
+    }
+}
+
+/// A path as it may be logged: somebody may have put a key into it.
+pub(super) fn without_secrets(path: &str) -> String {
+    match path.find(Token::PREFIX) {
+        None => path.to_owned(),
+        Some(at) => {
+            let shown: String = path[at..].chars().take(Token::PREFIX.len() + Token::ID).collect();
+            format!("{}{shown}…", &path[..at])
+        }
     }
 }
 
@@ -287,6 +326,14 @@ mod tests {
         assert!(calls > 20);
         assert_eq!(access(&Method::HEAD, "/maps"), Some(Access::Role(Role::Robot)));
         assert_eq!(access(&Method::POST, "/maps/{map}/nonsense"), None);
+    }
+
+    #[test]
+    fn a_key_in_a_path_is_not_logged() {
+        let token = Token::new(&[0xa7; 38]);
+        let logged = without_secrets(&format!("/keys/{}/x", token.reveal()));
+        assert_eq!(logged, "/keys/wab_a7a7a7a7a7a7…");
+        assert_eq!(without_secrets("/maps/yard"), "/maps/yard");
     }
 
     #[test]

@@ -139,7 +139,7 @@ pub(super) async fn from_form(request: Request, limit: usize) -> Result<PictureB
 
 /// The whole body. What exceeds the bound is thrown away for a while, or the client, which is still
 /// sending, would see a reset connection instead of the answer.
-async fn whole(request: Request, state: &AppState) -> Result<Bytes, Problem> {
+pub(super) async fn whole(request: Request, state: &AppState) -> Result<Bytes, Problem> {
     let limit = state.settings.body_limit_bytes;
     let mut chunks = request.into_body().into_data_stream();
     let mut body = BytesMut::new();

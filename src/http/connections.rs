@@ -67,7 +67,10 @@ impl Connections {
         while let Some(stream) = shutdown.run_until_cancelled(accept(&listener)).await {
             let Some(slot) = slots.take() else {
                 this.metrics.refused(RefusedFor::Connections);
-                refuse(stream);
+                // Who expects TLS would not understand a sentence.
+                if this.tls.is_none() {
+                    refuse(stream);
+                }
                 continue;
             };
             let (this, shutdown) = (Arc::clone(&this), shutdown.clone());
@@ -93,10 +96,11 @@ impl Connections {
             return self.talk(plain, slot, shutdown).await;
         };
         let shaken = tokio::time::timeout(self.settings.header_timeout, self.encrypt(tls, stream));
-        match shaken.await {
-            Ok(Ok(encrypted)) => self.talk(encrypted, slot, shutdown).await,
-            Ok(Err(error)) => tracing::debug!(%error, "a connection was not encrypted"),
-            Err(_) => self.metrics.refused(RefusedFor::Slow),
+        match shutdown.run_until_cancelled(shaken).await {
+            Some(Ok(Ok(encrypted))) => self.talk(encrypted, slot, shutdown.clone()).await,
+            Some(Ok(Err(error))) => tracing::debug!(%error, "a connection was not encrypted"),
+            Some(Err(_)) => self.metrics.refused(RefusedFor::Slow),
+            None => {}
         }
     }
 
@@ -163,7 +167,9 @@ impl Connections {
             if !parts.read_buf.is_empty() {
                 self.metrics.refused(RefusedFor::Slow);
                 let answer = self.too_slow();
-                let _ = parts.io.into_inner().write_all(answer.as_bytes()).await;
+                let mut io = parts.io.into_inner();
+                let _ = io.write_all(answer.as_bytes()).await;
+                let _ = io.shutdown().await;
             }
         }
     }

@@ -1,11 +1,13 @@
 //! What holds for many calls, added to the description of each.
 
 use axum::http::Method;
-use utoipa::openapi::path::Operation;
+use utoipa::openapi::path::{Operation, ParameterBuilder, ParameterIn};
+use utoipa::openapi::schema::{ObjectBuilder, Type};
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
-use utoipa::openapi::{ContentBuilder, OpenApi, Ref, RefOr, Response, ResponseBuilder};
+use utoipa::openapi::{ContentBuilder, OpenApi, Ref, RefOr, Required, Response, ResponseBuilder};
 
 use super::auth::{Access, access};
+use super::idempotency::{LONGEST_KEY, applies};
 
 /// The name of the security scheme.
 const KEY: &str = "key";
@@ -31,6 +33,9 @@ pub(super) fn completed(mut description: OpenApi) -> OpenApi {
                 && let Some(Access::Role(role)) = access(&method, route)
             {
                 complete(operation, role.as_str());
+                if applies(&method, route) {
+                    take_key(operation);
+                }
             }
         }
     }
@@ -61,6 +66,34 @@ fn complete(operation: &mut Operation, role: &str) {
             let responses = &mut operation.responses.responses;
             responses.entry(status.into()).or_insert_with(|| problem(text));
         }
+    }
+}
+
+/// Adds the header of a request that may be sent again.
+fn take_key(operation: &mut Operation) {
+    let key = ObjectBuilder::new()
+        .schema_type(Type::String)
+        .min_length(Some(1))
+        .max_length(Some(LONGEST_KEY))
+        .pattern(Some("^[!-~]+$"));
+    let header = ParameterBuilder::new()
+        .name("Idempotency-Key")
+        .parameter_in(ParameterIn::Header)
+        .required(Required::False)
+        .schema(Some(key))
+        .description(Some(
+            "A text of the sender's choice, another for each request. The same request with the same key is \
+             not done again: it gets its first answer again (with Idempotent-Replayed: true), 409 while \
+             that is in the making, and 422 if the key was another request's. Errors are not kept.",
+        ));
+    operation.parameters.get_or_insert_default().push(header.build().into());
+    for (status, text) in [
+        ("400", "Malformed"),
+        ("409", "A request with this Idempotency-Key is in progress"),
+        ("422", "The Idempotency-Key was another request's"),
+    ] {
+        let responses = &mut operation.responses.responses;
+        responses.entry(status.into()).or_insert_with(|| problem(text));
     }
 }
 

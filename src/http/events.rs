@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use axum::Extension;
 use axum::extract::State;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::{Stream, StreamExt};
@@ -15,7 +16,7 @@ use super::jobs::job_id;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
-use crate::service::{AnyJobEvent, ErrorKind, JobEvent};
+use crate::service::{AnyJobEvent, Caller, ErrorKind, JobEvent};
 
 /// A comment is sent after so long without an event, so that nothing on the way hangs up.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -34,6 +35,7 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
 pub(super) async fn follow_job(
     State(state): State<AppState>,
     Ready(service): Ready,
+    Extension(caller): Extension<Caller>,
     Segments(id): Segments<String>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let permit = permit(&state)?;
@@ -48,6 +50,7 @@ pub(super) async fn follow_job(
     });
     // A drain does not wait for jobs that nobody may finish before the next start.
     let events = events.take_until(state.draining().cancelled_owned());
+    let events = events.take_until(async move { service.keys.ended(caller).await });
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
 }
 
@@ -72,6 +75,7 @@ pub(super) struct FollowParams {
 pub(super) async fn follow_jobs(
     State(state): State<AppState>,
     Ready(service): Ready,
+    Extension(caller): Extension<Caller>,
     Params(params): Params<FollowParams>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let map = params.map.as_deref().map(map_name).transpose()?;
@@ -84,6 +88,7 @@ pub(super) async fn follow_jobs(
         }
     });
     let events = events.take_until(state.draining().cancelled_owned());
+    let events = events.take_until(async move { service.keys.ended(caller).await });
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
 }
 

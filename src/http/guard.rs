@@ -11,6 +11,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt;
 
+use super::auth::without_secrets;
 use super::deadline::{self, Deadline};
 use super::incoming::Watch;
 use super::problem::Problem;
@@ -37,7 +38,7 @@ pub(super) async fn observe(
     // The pattern, not the path: a label for every image id would be a leak.
     let route =
         request.extensions().get::<MatchedPath>().map_or("none", |path| path.as_str()).to_owned();
-    let path = request.uri().path().to_owned();
+    let path = without_secrets(request.uri().path());
     let mut response = next.run(request).await;
     let (took, status) = (start.elapsed(), response.status().as_u16());
     state.metrics.request(method.as_str(), &route, status, took);

@@ -1,7 +1,7 @@
 //! `/localize`.
 
-use axum::Json;
 use axum::extract::{Request, State};
+use axum::{Extension, Json};
 use jiff::Timestamp;
 use serde::Deserialize;
 use utoipa::IntoParams;
@@ -13,7 +13,7 @@ use super::problem::Problem;
 use super::state::{AppState, Ready};
 use crate::domain::Priority;
 use crate::retrieve::{Class, Demand};
-use crate::service::{Answer, LocalizeRequest, RefineMode, ServiceError, TrackStep};
+use crate::service::{Answer, Caller, LocalizeRequest, RefineMode, ServiceError, TrackStep};
 
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
@@ -43,9 +43,9 @@ pub(super) struct LocalizeParams {
 }
 
 impl LocalizeParams {
-    fn step(&mut self) -> Result<Option<TrackStep>, ServiceError> {
+    fn step(&mut self, caller: &Caller) -> Result<Option<TrackStep>, ServiceError> {
         match self.track.take() {
-            Some(id) => TrackStep::new(id, self.captured_at, self.moved_m).map(Some),
+            Some(id) => TrackStep::new(caller, id, self.captured_at, self.moved_m).map(Some),
             None if self.captured_at.is_some() || self.moved_m.is_some() => {
                 Err(ServiceError::unprocessable(
                     "captured_at and moved_m are of a frame with track; name the track too",
@@ -95,12 +95,13 @@ struct FrameForm {
 pub(super) async fn localize(
     State(state): State<AppState>,
     Ready(service): Ready,
+    Extension(caller): Extension<Caller>,
     Params(mut params): Params<LocalizeParams>,
     Deadline(deadline): Deadline,
     request: Request,
 ) -> Result<Json<Answer>, Problem> {
     let map = map_name(&params.map)?;
-    let track = params.step()?;
+    let track = params.step(&caller)?;
     let demand = Demand { class: Class::Localize, deadline };
     let body = PictureBody::read(request, &state, &service, demand).await?;
     let request = LocalizeRequest {

@@ -8,6 +8,7 @@ mod description;
 mod events;
 mod guard;
 mod health;
+mod idempotency;
 mod images;
 mod incoming;
 mod jobs;
@@ -100,6 +101,7 @@ pub fn router(state: AppState) -> Router {
         .method_not_allowed_fallback(problem::no_such_method)
         .layer(DefaultBodyLimit::max(state.settings.body_limit_bytes))
         .layer(CatchPanicLayer::custom(problem::panicked))
+        .layer(from_fn_with_state(state.clone(), idempotency::once))
         .layer(from_fn_with_state(state.clone(), auth::admit))
         .layer(from_fn_with_state(state.clone(), guard::bound))
         .layer(from_fn(problem::render))

@@ -149,7 +149,10 @@ impl AllFollower {
             let record = match self.jobs.job(id).await {
                 Ok(Some(record)) => record,
                 // It was removed, as ended jobs are after a while.
-                Ok(None) => continue,
+                Ok(None) => {
+                    self.told.remove(&id);
+                    continue;
+                }
                 Err(error) => {
                     tracing::error!(job = %id, %error, "a job that is followed cannot be read");
                     return None;

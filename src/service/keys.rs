@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use jiff::{SignedDuration, Timestamp};
 use serde::{Deserialize, Serialize};
+use tokio::sync::watch;
 use utoipa::ToSchema;
 
 use super::{ErrorKind, ServiceError};
@@ -17,6 +18,12 @@ const WINDOW: Duration = Duration::from_secs(60);
 
 /// The most keys, revoked ones included: they are all held in memory.
 const MOST_KEYS: usize = 10_000;
+
+/// The largest limit in bytes: the largest whole number of a structured header field (RFC 9651).
+const MOST_BYTES: u64 = 999_999_999_999_999;
+
+/// How long it is waited at a time for a key to expire.
+const LONGEST_SLEEP: Duration = Duration::from_secs(3600);
 
 /// The longest name of a key, in bytes.
 const MOST_NAME_BYTES: usize = 100;
@@ -60,6 +67,14 @@ pub enum Caller {
 }
 
 impl Caller {
+    /// A name for the caller, under which what is kept for one is not seen by another.
+    pub fn scope(&self) -> &str {
+        match self {
+            Self::Anybody => "-",
+            Self::Holder(key) => &key.id,
+        }
+    }
+
     /// Whether the caller may do what takes that role.
     pub fn is(&self, role: Role) -> bool {
         match self {
@@ -105,7 +120,9 @@ pub struct Allowances {
 /// All keys, and what each has asked for lately.
 pub struct Keys {
     store: Arc<dyn KeyStore>,
-    known: RwLock<HashMap<String, StoredKey>>,
+    known: Arc<RwLock<HashMap<String, StoredKey>>>,
+    /// Told when a key was revoked.
+    revoked: watch::Sender<()>,
     buckets: Mutex<HashMap<String, Buckets>>,
 }
 
@@ -144,7 +161,8 @@ impl Keys {
     pub async fn load(store: Arc<dyn KeyStore>) -> Result<Self, ServiceError> {
         let known = store.keys().await?;
         let known = known.into_iter().map(|stored| (stored.key.id.clone(), stored)).collect();
-        Ok(Self { store, known: RwLock::new(known), buckets: Mutex::default() })
+        let known = Arc::new(RwLock::new(known));
+        Ok(Self { store, known, revoked: watch::Sender::new(()), buckets: Mutex::default() })
     }
 
     /// Makes a key. What comes back is the only place where its token is.
@@ -158,6 +176,11 @@ impl Keys {
         if limits.requests_per_minute == Some(0) || limits.bytes_per_minute == Some(0) {
             let detail =
                 "a limit of 0 allows nothing; revoke the key instead, or leave the limit out";
+            return Err(ServiceError::unprocessable(detail));
+        }
+        if limits.bytes_per_minute.is_some_and(|bytes| bytes > MOST_BYTES) {
+            let detail =
+                format!("bytes_per_minute must be at most {MOST_BYTES}; leave it out for no bound");
             return Err(ServiceError::unprocessable(detail));
         }
         if expires_days.is_some_and(|days| !(1..=36_500).contains(&days)) {
@@ -186,6 +209,7 @@ impl Keys {
             revoked_at: None,
         };
         self.keep(StoredKey { key: key.clone(), digest: token.digest() }).await?;
+        tracing::info!(target: "audit", made = %key.id, name = %key.name, role = %key.role, "a key was made");
         Ok(MadeKey { token: token.reveal().to_owned(), key })
     }
 
@@ -196,8 +220,10 @@ impl Keys {
         keys
     }
 
-    /// Ends a key for good; from the moment this returns nobody gets in with it.
+    /// Ends a key for good; from the moment this returns nobody gets in with it. `id` may be the whole key.
     pub async fn revoke(&self, id: &str) -> Result<ApiKey, ServiceError> {
+        let token: Option<Token> = id.parse().ok();
+        let id = token.as_ref().map_or(id, Token::id);
         let Some(mut stored) = self.read().get(id).cloned() else {
             let detail = "there is no such key; `whereabouts keys list` shows those there are";
             return Err(ServiceError::new(ErrorKind::NotFound, detail));
@@ -205,6 +231,8 @@ impl Keys {
         if stored.key.revoked_at.is_none() {
             stored.key.revoked_at = Some(Timestamp::now());
             self.keep(stored.clone()).await?;
+            self.revoked.send_replace(());
+            tracing::info!(target: "audit", revoked = %stored.key.id, "a key was revoked");
         }
         Ok(stored.key)
     }
@@ -213,6 +241,23 @@ impl Keys {
     pub fn any_valid(&self) -> bool {
         let now = Timestamp::now();
         self.read().values().any(|stored| stored.key.is_valid(now))
+    }
+
+    /// Returns when a caller may ask no more: the key was revoked, or has expired.
+    pub async fn ended(&self, caller: Caller) {
+        let Caller::Holder(key) = caller else { return std::future::pending().await };
+        let mut revoked = self.revoked.subscribe();
+        loop {
+            let now = Timestamp::now();
+            if self.read().get(&key.id).is_none_or(|stored| !stored.key.is_valid(now)) {
+                return;
+            }
+            let left = key.expires_at.map(|end| end.duration_since(now).unsigned_abs());
+            tokio::select! {
+                _ = revoked.changed() => {}
+                () = tokio::time::sleep(left.unwrap_or(Duration::MAX).min(LONGEST_SLEEP)) => {}
+            }
+        }
     }
 
     /// Whose token this is.
@@ -236,8 +281,8 @@ impl Keys {
 
     /// Takes a request from what is left to a key.
     pub fn take_request(&self, key: &ApiKey) -> (Allowances, Result<(), ServiceError>) {
-        let now = Instant::now();
         let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
+        let now = Instant::now();
         let of_key = buckets.entry(key.id.clone()).or_default();
         let mut allowances = Allowances::default();
         let mut refused = None;
@@ -280,11 +325,18 @@ impl Keys {
         of_key.bytes = Some(Bucket { left: bucket.left - bytes as f64, ..bucket });
     }
 
+    /// Stores a key, and knows it; both, though the caller has gone meanwhile.
     async fn keep(&self, stored: StoredKey) -> Result<(), ServiceError> {
-        self.store.put_key(stored.clone()).await?;
-        let mut known = self.known.write().unwrap_or_else(PoisonError::into_inner);
-        known.insert(stored.key.id.clone(), stored);
-        Ok(())
+        let (store, known) = (Arc::clone(&self.store), Arc::clone(&self.known));
+        let keeping = tokio::spawn(async move {
+            store.put_key(stored.clone()).await?;
+            let mut known = known.write().unwrap_or_else(PoisonError::into_inner);
+            known.insert(stored.key.id.clone(), stored);
+            Ok(())
+        });
+        keeping.await.unwrap_or_else(|_| {
+            Err(ServiceError::new(ErrorKind::Internal, "the key could not be stored"))
+        })
     }
 
     fn read(&self) -> std::sync::RwLockReadGuard<'_, HashMap<String, StoredKey>> {

@@ -13,6 +13,7 @@ mod keys;
 mod localize;
 mod maps;
 mod models;
+mod once;
 mod reindex;
 mod retention;
 mod submit;
@@ -22,6 +23,8 @@ mod usage;
 
 use std::sync::Arc;
 
+use uuid::Uuid;
+
 pub use self::calibration::CalibrationState;
 pub use self::error::{ErrorKind, ServiceError};
 pub use self::events::{AnyJobEvent, JobChange, JobEvent, JobStatus, Missed, PairDescribed};
@@ -30,6 +33,7 @@ pub use self::jobs::JobPage;
 pub use self::keys::{Allowance, Allowances, Caller, Keys, MadeKey, NewKey};
 pub use self::localize::{Answer, JobLink, LocalizeRequest, RefineMode, Retrieved, TimingMs};
 pub use self::maps::{IndexKind, MapChange, MapState};
+pub use self::once::{Once, OnceSettings};
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
 pub use self::retention::{Janitor, RetentionSettings};
 pub use self::submit::{NoJob, NoJobReason};
@@ -39,7 +43,9 @@ pub use self::usage::{Today, Total, UsageReport};
 use crate::domain::CalibrationSettings;
 use crate::refine::{DenseCache, JobPace, Refiner};
 use crate::retrieve::{Admission, CpuPool, LoadedModels};
-use crate::store::{BlobStore, DraftStore, ExportStore, JobStore, MapStore, Retention, UsageStore};
+use crate::store::{
+    AnswerStore, BlobStore, DraftStore, ExportStore, JobStore, MapStore, Retention, UsageStore,
+};
 use crate::telemetry::Metrics;
 
 /// Bounds and defaults of the use cases.
@@ -63,6 +69,8 @@ pub struct ServiceSettings {
     pub max_wait: std::time::Duration,
     /// For how many days it is known what was spent.
     pub usage_days: u32,
+    /// What is kept of requests that may be sent again.
+    pub once: OnceSettings,
 }
 
 /// How often a use case begins again because the map's descriptors were replaced meanwhile. Twice in
@@ -85,6 +93,10 @@ pub struct Service {
     pub blobs: Arc<dyn BlobStore>,
     /// Jobs.
     pub jobs: Arc<dyn JobStore>,
+    /// First answers to requests that may be sent again.
+    pub answers: Arc<dyn AnswerStore>,
+    /// Tells this process from those before it.
+    pub process: Uuid,
     /// What calls to models outside have cost.
     pub accounts: Arc<dyn UsageStore>,
     /// API keys.

@@ -6,8 +6,9 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use tokio_util::sync::CancellationToken;
 
+use super::OnceSettings;
 use crate::domain::utc_day;
-use crate::store::{KeepJobs, RemovedJobs, Retention, StoreError};
+use crate::store::{AnswerStore, KeepJobs, RemovedJobs, Retention, StoreError};
 use crate::telemetry::Metrics;
 
 /// How long what is kept, and how it is removed.
@@ -25,12 +26,16 @@ pub struct RetentionSettings {
     pub batch: usize,
     /// For how many days it is known what was spent.
     pub usage_days: u32,
+    /// Which answers to requests that may be sent again are kept.
+    pub once: OnceSettings,
 }
 
 /// Removes jobs that have ended, with their queries and frames, and old accounts.
 pub struct Janitor {
     /// Where they are.
     pub store: Arc<dyn Retention>,
+    /// Where answers are that may be given again.
+    pub answers: Arc<dyn AnswerStore>,
     /// What is counted.
     pub metrics: Arc<Metrics>,
     /// What is kept.
@@ -55,6 +60,8 @@ impl Janitor {
         let now = Timestamp::now();
         let days = SignedDuration::from_hours(24 * i64::from(self.settings.usage_days));
         self.store.forget_usage(utc_day(now).saturating_sub(days)).await?;
+        let OnceSettings { most, .. } = self.settings.once;
+        self.answers.forget_answers(self.settings.once.since(now), most).await?;
         let keep = KeepJobs {
             since: self.settings.keep.map(|keep| before(now, keep)),
             most: self.settings.most,

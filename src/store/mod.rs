@@ -370,6 +370,61 @@ pub trait KeyStore: Send + Sync {
     async fn keys(&self) -> Result<Vec<StoredKey>, StoreError>;
 }
 
+/// What became of a request that may be sent again.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FirstAnswer {
+    /// Tells it from another request.
+    pub fingerprint: Digest,
+    /// When it was begun, or answered.
+    pub at: Timestamp,
+    /// How far it has come.
+    pub progress: Progress,
+}
+
+/// How far a request has come that may be sent again.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Progress {
+    /// It is being done.
+    Running {
+        /// By this process.
+        process: Uuid,
+    },
+    /// It was done.
+    Answered(KeptAnswer),
+}
+
+/// An answer that is given again.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct KeptAnswer {
+    /// The HTTP status.
+    pub status: u16,
+    /// The media type of the body.
+    pub content_type: Option<String>,
+    /// The body.
+    pub body: String,
+}
+
+/// First answers to requests that may be sent again.
+#[async_trait]
+pub trait AnswerStore: Send + Sync {
+    /// What is known of the request with this id; or, if that is nothing, is older than `since`, or is of a
+    /// process that has ended, `None`, and from now on it is `reserved`.
+    async fn reserve_answer(
+        &self,
+        id: &str,
+        reserved: FirstAnswer,
+        since: Timestamp,
+    ) -> Result<Option<FirstAnswer>, StoreError>;
+    /// Keeps the answer.
+    async fn keep_answer(&self, id: &str, answer: FirstAnswer) -> Result<(), StoreError>;
+    /// Forgets that there was such a request.
+    async fn forget_answer(&self, id: &str) -> Result<(), StoreError>;
+    /// Forgets those from before that moment, and the oldest of those that are more than `most`. Returns
+    /// how many.
+    async fn forget_answers(&self, before: Timestamp, most: usize) -> Result<usize, StoreError>;
+}
+
 /// Which of the jobs that have ended are kept. A job is removed with its query and its frame.
 #[derive(Debug, Clone, Copy)]
 pub struct KeepJobs {

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 use std::process::Command;
+use std::time::Duration;
 
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -269,6 +270,62 @@ async fn a_key_that_was_revoked_opens_nothing_from_that_moment_on_and_after_a_ki
 }
 
 #[tokio::test]
+async fn what_an_admin_has_begun_is_done_and_written_down_though_the_admin_hangs_up() {
+    let Guarded { dir: _dir, server, admin, .. } = Guarded::start().await;
+    let mut keys = Vec::new();
+    for number in 0..20 {
+        let wanted = json!({"name": format!("key {number}"), "role": "robot"});
+        let made = ask(&server, &admin, Method::POST, "/keys", Some(wanted)).await.expect(201);
+        keys.push(made["token"].as_str().unwrap().to_owned());
+    }
+    for (number, key) in keys.iter().enumerate() {
+        let revoke = server.request(Method::DELETE, &format!("/keys/{}", &key[4..16]));
+        let patience = Duration::from_micros(500 + 200 * number as u64);
+        let _ = revoke.bearer_auth(&admin).timeout(patience).send().await;
+    }
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    let log = server.log();
+    for key in &keys {
+        let id = &key[4..16];
+        let revoked = log.lines().any(|line| line.contains("was revoked") && line.contains(id));
+        let audited = log.lines().any(|line| line.contains(&format!("/keys/{id}")));
+        // Some were given up before the server had heard of them.
+        assert_eq!(get(&server, key, "/maps").await.status == 401, revoked, "{id}");
+        assert!(!revoked || audited, "{id}");
+    }
+    assert!(log.contains("was revoked"), "{log}");
+}
+
+#[tokio::test]
+async fn streams_end_with_the_key_that_opened_them_and_tracks_belong_to_a_key() {
+    let Guarded { dir: _dir, server, admin, operator, robot } = Guarded::start().await;
+    let stream = server.request(Method::GET, "/events").bearer_auth(&operator);
+    let stream = stream.send().await.unwrap();
+    assert_eq!(stream.status(), 200);
+    let path = format!("/keys/{}", &operator[4..16]);
+    ask(&server, &admin, Method::DELETE, &path, None).await.expect(200);
+    let rest = tokio::time::timeout(Duration::from_secs(5), stream.bytes()).await;
+    assert!(rest.expect("the stream goes on").unwrap().is_empty());
+
+    let scene = Some(json!({"scene": "outdoor", "frame": "metric"}));
+    ask(&server, &admin, Method::PUT, "/maps/lane", scene).await.expect(201);
+    for place in 0..2 {
+        let path = format!("/maps/lane/images?id=p{place}&x={place}&y=0");
+        post_jpeg(&server, &admin, &path, reference(place)).await.expect(201);
+    }
+    let made = json!({"name": "r", "role": "robot"});
+    let made = ask(&server, &admin, Method::POST, "/keys", Some(made)).await.expect(201);
+    let path = "/localize?map=lane&refine=off&track=one";
+    for (key, frames) in
+        [(admin.as_str(), 1), (admin.as_str(), 2), (made["token"].as_str().unwrap(), 1)]
+    {
+        let answer = post_jpeg(&server, key, path, frame(0, 0)).await.expect(200);
+        assert_eq!(answer["track"]["frames"], frames);
+    }
+    post_jpeg(&server, &robot, path, frame(0, 0)).await.problem(403);
+}
+
+#[tokio::test]
 async fn a_key_is_bounded_in_requests_and_bytes_and_hears_what_is_left() {
     let dir = TempDir::new().unwrap();
     let few = create(dir.path(), &["--role", "robot", "--requests-per-minute", "3"]);
@@ -323,6 +380,20 @@ async fn the_commands_take_the_key_from_the_environment() {
     let (ok, _, said) = run(Some(&admin), &["keys", "revoke", &key[4..16]]);
     assert!(ok, "{said}");
     get(&server, key.trim(), "/maps/yard").await.problem(401);
+    // The whole key instead of its id is what people have at hand; nothing else gets into an address.
+    let (_, other, _) = run(Some(&admin), &create);
+    let (ok, _, said) = run(Some(&admin), &["keys", "revoke", other.trim()]);
+    assert!(ok, "{said}");
+    get(&server, other.trim(), "/maps/yard").await.problem(401);
+    let (ok, _, said) = run(Some(&admin), &["keys", "revoke", "../maps/vault"]);
+    assert!(!ok && said.contains("hexadecimal"), "{said}");
+    get(&server, &admin, "/maps/vault").await.expect(200);
+    let whole = get(&server, &admin, &format!("/keys/{}", other.trim())).await;
+    assert!(whole.status.is_client_error());
+    assert!(!server.log().contains(&other[20..70]), "a key is in the log");
+    let absent = dir.path().join("absent");
+    let (ok, _, said) = run(None, &["keys", "list", "--data", absent.to_str().unwrap()]);
+    assert!(!ok && said.contains("no data folder") && !absent.exists(), "{said}");
     // The folder belongs to the server while it runs.
     let data = dir.path().to_str().unwrap();
     let (ok, _, said) = run(None, &["keys", "list", "--data", data]);

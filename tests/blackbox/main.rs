@@ -21,6 +21,7 @@ mod doctor;
 mod durability;
 mod eval;
 mod events;
+mod idempotency;
 mod images;
 mod jobs;
 mod keys;

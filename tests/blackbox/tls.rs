@@ -87,6 +87,18 @@ async fn who_speaks_without_tls_is_told_so() {
     assert!(plain["detail"].as_str().unwrap().contains("https://"), "{plain}");
 }
 
+#[tokio::test]
+async fn a_connection_that_says_nothing_does_not_keep_the_server_from_stopping() {
+    let Encrypted { files: _files, _data, server, url } = Encrypted::start();
+    let address = url.trim_start_matches("https://").to_owned();
+    let silent = tokio::net::TcpStream::connect(&address).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let start = Instant::now();
+    assert!(server.terminate().success());
+    assert!(start.elapsed() < Duration::from_secs(8), "{:?}", start.elapsed());
+    drop(silent);
+}
+
 #[test]
 fn files_that_cannot_be_used_are_named_at_the_start() {
     let data = TempDir::new().unwrap();

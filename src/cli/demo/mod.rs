@@ -66,9 +66,9 @@ pub(super) struct Visit {
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let start = Instant::now();
-    let folders = Folders::fresh(&args.out)?;
     // The hub has the time to answer that the town takes to be drawn.
     let choosing = Choosing::begin(&args)?;
+    let folders = Folders::fresh(&args.out)?;
     let spec =
         TownSpec { seed: args.seed, places: usize::from(args.places), ..TownSpec::default() };
     account::heading(&args, "1. A town");

@@ -56,6 +56,8 @@ impl Choosing {
             }
             why => &why.to_string(),
         };
+        // Before anything is drawn.
+        assets.model(&model)?;
         Ok(Self::Settled(Choice { model, why: why.to_owned() }))
     }
 

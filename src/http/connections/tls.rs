@@ -43,6 +43,8 @@ pub enum TlsError {
 pub struct Tls {
     certificate: PathBuf,
     key: PathBuf,
+    /// What the files were like before they were first read.
+    seen: Stamp,
     current: RwLock<Arc<ServerConfig>>,
 }
 
@@ -52,8 +54,9 @@ type Stamp = [Option<(SystemTime, u64)>; 2];
 impl Tls {
     /// Reads a chain of certificates, the server's first, and its key; both in PEM.
     pub fn load(certificate: &Path, key: &Path) -> Result<Self, TlsError> {
+        let seen = stamp(certificate, key);
         let current = RwLock::new(read(certificate, key)?);
-        Ok(Self { certificate: certificate.to_owned(), key: key.to_owned(), current })
+        Ok(Self { certificate: certificate.to_owned(), key: key.to_owned(), seen, current })
     }
 
     /// Takes connections with the certificate of the moment.
@@ -64,9 +67,9 @@ impl Tls {
     /// Reads the files again when they have changed, until `shutdown`. While they cannot be used, as when
     /// one of them is there and the other is not yet, what was read before stays in use.
     pub(super) async fn follow(&self, shutdown: CancellationToken) {
-        let mut seen = self.stamp();
+        let (mut seen, mut warned) = (self.seen, None);
         while shutdown.run_until_cancelled(tokio::time::sleep(LOOK)).await.is_some() {
-            let now = self.stamp();
+            let now = stamp(&self.certificate, &self.key);
             if now == seen {
                 continue;
             }
@@ -77,18 +80,20 @@ impl Tls {
                     seen = now;
                 }
                 Err(error) => {
-                    tracing::warn!(%error, "the certificate has changed and cannot be used; the one before stays");
+                    if warned.replace(now) != Some(now) {
+                        tracing::warn!(%error, "the certificate has changed and cannot be used; the one before stays");
+                    }
                 }
             }
         }
     }
+}
 
-    fn stamp(&self) -> Stamp {
-        [&self.certificate, &self.key].map(|file| {
-            let about = std::fs::metadata(file).ok()?;
-            Some((about.modified().ok()?, about.len()))
-        })
-    }
+fn stamp(certificate: &Path, key: &Path) -> Stamp {
+    [certificate, key].map(|file| {
+        let about = std::fs::metadata(file).ok()?;
+        Some((about.modified().ok()?, about.len()))
+    })
 }
 
 fn read(certificate: &Path, key: &Path) -> Result<Arc<ServerConfig>, TlsError> {

@@ -66,7 +66,8 @@ impl Belief {
             let reached = places.near(image, high + TAIL * width, REACHED).unwrap_or_default();
             let weight = |distance: f64| {
                 let off = (low - distance).max(distance - high).max(0.0) / width;
-                (-0.5 * off * off).exp()
+                // Else the least unlikely image would be certain, however unlikely.
+                if off > TAIL { 0.0 } else { (-0.5 * off * off).exp() }
             };
             let total: f64 = reached.iter().map(|(_, distance)| weight(*distance)).sum();
             if total > f64::MIN_POSITIVE {
@@ -320,6 +321,15 @@ mod tests {
         let moved = start.after(Motion::By(300.0), &places, &settings);
         let moved = moved.given(&alike, 0.05, &places, &settings);
         assert_eq!(moved.best(&places, 5.0).unwrap().0, 40);
+    }
+
+    #[test]
+    fn a_way_that_leads_nowhere_leaves_the_robot_anywhere() {
+        let (places, settings) = (road(20), settings());
+        let start = Belief::anywhere().given(&[(0, 0.9), (10, 0.7)], 0.05, &places, &settings);
+        let lost = start.after(Motion::By(900.0), &places, &settings);
+        assert_eq!(lost.likely, []);
+        assert!((lost.elsewhere - 1.0).abs() < 1e-9);
     }
 
     #[test]

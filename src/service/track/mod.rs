@@ -12,12 +12,13 @@ use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use tokio::sync::Mutex as AsyncMutex;
 use utoipa::ToSchema;
 use uuid::Uuid;
 
 use self::belief::{Belief, Motion};
 use self::places::Places;
-use super::{Service, ServiceError};
+use super::{Caller, ErrorKind, Service, ServiceError};
 use crate::domain::{Calibration, Candidate, ImageId, Map, Pose};
 
 /// The images of a map that grows are looked up again no sooner than this.
@@ -26,6 +27,12 @@ const REFRESH: Duration = Duration::from_secs(2);
 /// The least gap between the similarities of wrong answers; keeps the filter defined where they are all
 /// the same.
 const LEAST_GAP: f32 = 1e-4;
+
+/// After a pause of a day a robot is anywhere.
+const LONGEST_PAUSE_S: f64 = 86_400.0;
+
+/// No robot is faster, in metres a second.
+const FASTEST_M_S: f64 = 1000.0;
 
 /// A way between two frames is shorter than this, in metres.
 const FARTHEST_M: f64 = 1e6;
@@ -67,6 +74,9 @@ impl TrackSettings {
             let wrong = !(value > 0.0 && value.is_finite());
             wrong.then(|| format!("track.{name} = {value} must be above 0"))
         };
+        if self.max_speed_m_s > FASTEST_M_S {
+            return Some(format!("track.max_speed_m_s must be at most {FASTEST_M_S}"));
+        }
         let counts = [("max", self.max), ("candidates", self.candidates), ("states", self.states)];
         let zero = counts.into_iter().find(|(_, count)| *count == 0);
         zero.map(|(name, _)| format!("track.{name} must be at least 1"))
@@ -83,6 +93,8 @@ impl TrackSettings {
 pub struct TrackStep {
     /// Which track; the robot's own choice.
     id: String,
+    /// Whose it is: those of one API key are not seen by another.
+    owner: String,
     /// When the frame was taken.
     captured_at: Timestamp,
     /// How far the robot has come since the frame before, in metres, if it knows.
@@ -95,6 +107,7 @@ impl TrackStep {
     /// # Errors
     /// [`ErrorKind::Unprocessable`](super::ErrorKind) for an id that is none, and for a way that cannot be.
     pub fn new(
+        caller: &Caller,
         id: String,
         captured_at: Option<Timestamp>,
         moved_m: Option<f64>,
@@ -111,7 +124,8 @@ impl TrackStep {
                 "moved_m is {way}; it must be the metres from the frame before, 0 to {FARTHEST_M}"
             )));
         }
-        Ok(Self { id, captured_at: captured_at.unwrap_or_else(Timestamp::now), moved_m })
+        let captured_at = captured_at.unwrap_or_else(Timestamp::now);
+        Ok(Self { id, owner: caller.scope().to_owned(), captured_at, moved_m })
     }
 }
 
@@ -147,7 +161,7 @@ struct Track {
 #[derive(Debug)]
 struct Remembered {
     used: Instant,
-    track: Arc<Mutex<Track>>,
+    track: Arc<AsyncMutex<Track>>,
 }
 
 /// The images of one map, as they were a moment ago.
@@ -162,15 +176,26 @@ struct Known {
 /// All tracks.
 #[derive(Debug)]
 pub struct Tracks {
-    settings: TrackSettings,
-    tracks: Mutex<HashMap<(Uuid, String), Remembered>>,
+    settings: Arc<TrackSettings>,
+    /// By map, owner and id.
+    tracks: Mutex<HashMap<Key, Remembered>>,
     maps: Mutex<HashMap<Uuid, Known>>,
+    /// Held while the images of a map are laid out, so that not everybody does it.
+    laying_out: AsyncMutex<()>,
 }
+
+/// A map, the owner of a track, and the owner's name for it.
+type Key = (Uuid, String, String);
 
 impl Tracks {
     /// No track yet.
     pub fn new(settings: TrackSettings) -> Self {
-        Self { settings, tracks: Mutex::default(), maps: Mutex::default() }
+        Self {
+            settings: Arc::new(settings),
+            tracks: Mutex::default(),
+            maps: Mutex::default(),
+            laying_out: AsyncMutex::default(),
+        }
     }
 
     /// How many images of a frame the filter wants to know of.
@@ -179,7 +204,7 @@ impl Tracks {
     }
 
     /// A track, which begins now unless it is remembered.
-    fn track(&self, key: &(Uuid, String)) -> Arc<Mutex<Track>> {
+    fn track(&self, key: &Key) -> Arc<AsyncMutex<Track>> {
         let mut tracks = self.tracks.lock().unwrap_or_else(PoisonError::into_inner);
         let now = Instant::now();
         let idle = Duration::from_secs(self.settings.idle_s);
@@ -189,23 +214,20 @@ impl Tracks {
             known.used = now;
             return Arc::clone(&known.track);
         }
-        tracks.remove(key);
-        if tracks.len() >= self.settings.max {
-            tracks.retain(|_, known| now.duration_since(known.used) <= idle);
-        }
+        tracks.retain(|_, known| now.duration_since(known.used) <= idle);
         if tracks.len() >= self.settings.max
             && let Some((oldest, _)) = tracks.iter().min_by_key(|(_, known)| known.used)
         {
             let oldest = oldest.clone();
             tracing::warn!(
-                track = oldest.1,
+                track = oldest.2,
                 max = self.settings.max,
                 "the track that was used least recently is forgotten; raise track.max if more robots drive"
             );
             tracks.remove(&oldest);
         }
         let track = Track { belief: Vec::new(), last: Timestamp::UNIX_EPOCH, frames: 0 };
-        let track = Arc::new(Mutex::new(track));
+        let track = Arc::new(AsyncMutex::new(track));
         tracks.insert(key.clone(), Remembered { used: now, track: Arc::clone(&track) });
         track
     }
@@ -221,7 +243,7 @@ impl Tracks {
     fn know(&self, map: &Map, version: (u32, u64), places: &Arc<Places>) {
         let used: Vec<Uuid> = {
             let tracks = self.tracks.lock().unwrap_or_else(PoisonError::into_inner);
-            tracks.keys().map(|(uid, _)| *uid).collect()
+            tracks.keys().map(|(uid, ..)| *uid).collect()
         };
         let mut maps = self.maps.lock().unwrap_or_else(PoisonError::into_inner);
         maps.retain(|uid, _| used.contains(uid));
@@ -247,23 +269,27 @@ impl Service {
                 map.name
             )));
         }
-        let settings = &self.tracks.settings;
+        // Not more than the filter is set to, however many the caller asked for.
+        let candidates = &candidates[..candidates.len().min(self.tracks.candidates())];
         let similarities: Vec<(u32, f32)> = candidates
             .iter()
             .filter_map(|one| Some((places.number(&one.image_id)?, one.similarity)))
             .collect();
         let gap =
             calibration.similarity.mean().unwrap_or_else(|| spread(candidates)).max(LEAST_GAP);
-        let track = self.tracks.track(&(map.uid, step.id.clone()));
-        let (mut belief, frames) = {
-            // Frames of one track that come at the same time are taken one after another.
-            let mut track = track.lock().unwrap_or_else(PoisonError::into_inner);
-            let belief = track.moved(&step, &places, settings);
-            let belief = belief.given(&similarities, gap, &places, settings);
-            track.belief = belief.named(&places);
-            (track.last, track.frames) = (step.captured_at, track.frames + 1);
+        let TrackStep { id, owner, captured_at, .. } = step.clone();
+        let track = self.tracks.track(&(map.uid, owner, id.clone()));
+        // Frames of one track that come at the same time are taken one after another.
+        let mut track = track.lock_owned().await;
+        let (filtered, settings) = (Arc::clone(&places), Arc::clone(&self.tracks.settings));
+        let (mut belief, frames) = off_the_runtime(move || {
+            let belief = track.moved(&step, &filtered, &settings);
+            let belief = belief.given(&similarities, gap, &filtered, &settings);
+            track.belief = belief.named(&filtered);
+            (track.last, track.frames) = (captured_at, track.frames + 1);
             (belief, track.frames)
-        };
+        })
+        .await?;
         let place_m = self.settings.calibration.place_m;
         let mut best = belief.best(&places, place_m);
         while let Some((image, _)) = best
@@ -275,12 +301,12 @@ impl Service {
         }
         let probability = best.map_or(0.0, |(_, probability)| probability);
         Ok(TrackEstimate {
-            id: step.id,
+            id,
             frames,
             image_id: best.map(|(image, _)| places.id(image).clone()),
             pose: best.map(|(image, _)| places.pose(image)),
             probability,
-            known: probability >= settings.known_probability,
+            known: probability >= self.tracks.settings.known_probability,
         })
     }
 
@@ -289,10 +315,27 @@ impl Service {
         if let Some(places) = self.tracks.known(map, version) {
             return Ok(places);
         }
-        let places = Arc::new(Places::new(self.maps.positions(map).await?));
+        let _turn = self.tracks.laying_out.lock().await;
+        if let Some(places) = self.tracks.known(map, version) {
+            return Ok(places);
+        }
+        let images = self.maps.positions(map).await?;
+        let places = Arc::new(off_the_runtime(move || Places::new(images)).await?);
         self.tracks.know(map, version, &places);
         Ok(places)
     }
+}
+
+/// Works something out where it keeps no request waiting but its own.
+async fn off_the_runtime<T: Send + 'static>(
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, ServiceError> {
+    tokio::task::spawn_blocking(work).await.map_err(|error| {
+        ServiceError::new(
+            ErrorKind::Internal,
+            format!("the track could not be worked out: {error}"),
+        )
+    })
 }
 
 impl Track {
@@ -304,7 +347,7 @@ impl Track {
         let motion = step.moved_m.map_or_else(
             || {
                 let passed = step.captured_at.duration_since(self.last).as_secs_f64();
-                Motion::Within(settings.max_speed_m_s * passed.abs())
+                Motion::Within(settings.max_speed_m_s * passed.abs().min(LONGEST_PAUSE_S))
             },
             Motion::By,
         );

@@ -72,43 +72,32 @@ impl Places {
     }
 
     /// Images within `radius` metres of one, itself included, with their distances, in no order;
-    /// `None` if there are more than `most`.
+    /// `None` if there are more than `most`, and for a circle so large that there probably are.
     pub fn near(&self, one: u32, radius: f64, most: usize) -> Option<Vec<(u32, f64)>> {
-        let centre = self.positions[one as usize];
-        let [low, high] =
-            [-radius, radius].map(|way| square([centre[0] + way, centre[1] + way], self.edge));
-        let across = |axis: usize| (high[axis] - low[axis] + 1).max(1) as f64;
-        // A circle over so many squares holds more images than that, or the map is smaller than it.
-        if across(0) * across(1) > 16.0 * (most as f64 + 16.0) {
-            return self.near_by_looking_at_all(one, radius, most);
-        }
+        let edges = (2.0 * radius / self.edge).ceil() + 1.0;
+        let squares = edges * edges;
         let mut found = Vec::new();
-        for x in low[0]..=high[0] {
-            for y in low[1]..=high[1] {
-                for &number in self.squares.get(&[x, y]).map_or(&[][..], Vec::as_slice) {
-                    let distance = self.distance(one, number);
-                    if distance <= radius {
-                        found.push((number, distance));
-                        if found.len() > most {
-                            return None;
-                        }
-                    }
-                }
+        let mut take = |number: u32| {
+            let distance = self.distance(one, number);
+            if distance <= radius {
+                found.push((number, distance));
             }
-        }
-        Some(found)
-    }
-
-    fn near_by_looking_at_all(
-        &self,
-        one: u32,
-        radius: f64,
-        most: usize,
-    ) -> Option<Vec<(u32, f64)>> {
-        let all = (0..self.len() as u32).map(|number| (number, self.distance(one, number)));
-        let found: Vec<_> =
-            all.filter(|(_, distance)| *distance <= radius).take(most + 1).collect();
-        (found.len() <= most).then_some(found)
+            found.len() <= most
+        };
+        let all_taken = if squares < (self.len().min(2 * most)) as f64 {
+            let centre = self.positions[one as usize];
+            let corner = |way: f64| square([centre[0] + way, centre[1] + way], self.edge);
+            let [low, high] = [corner(-radius), corner(radius)];
+            let mut wanted =
+                (low[0]..=high[0]).flat_map(|x| (low[1]..=high[1]).map(move |y| [x, y]));
+            wanted.all(|square| {
+                self.squares.get(&square).is_none_or(|numbers| numbers.iter().all(|n| take(*n)))
+            })
+        } else {
+            // A small map is looked at as a whole. A circle over so much of a large one holds too many.
+            self.len() <= 4 * most && (0..self.len() as u32).all(take)
+        };
+        all_taken.then_some(found)
     }
 
     /// Of some hundred images, spread over the map.
@@ -189,6 +178,7 @@ mod tests {
         assert_eq!(places.near(500, 4.5, 4), None);
         assert_eq!(places.near(0, 1e9, 2000).unwrap().len(), 1000);
         assert_eq!(places.near(0, 1e9, 999), None);
+        assert_eq!(places.near(0, 1e300, 100), None);
         assert_eq!(places.number(places.id(7)), Some(7));
     }
 

@@ -13,6 +13,7 @@
 //! One writer thread applies every change and makes those that arrived together durable together.
 //! The graph of a map is derived from its segments and is built in the background.
 
+mod answers;
 mod blobs;
 mod compact;
 mod descriptions;

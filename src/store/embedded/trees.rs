@@ -34,6 +34,10 @@ pub(super) struct Trees {
     pub usage: sled::Tree,
     /// Id → API key.
     pub keys: sled::Tree,
+    /// Caller and idempotency key → first answer.
+    pub answers: sled::Tree,
+    /// When that was, and the same → nothing.
+    pub answers_by_age: sled::Tree,
 }
 
 /// The key of the number of the last commit, in the default tree.
@@ -77,6 +81,8 @@ impl Trees {
             frames: tree("frames")?,
             usage: tree("usage")?,
             keys: tree("keys")?,
+            answers: tree("answers")?,
+            answers_by_age: tree("answers_by_age")?,
             db,
         })
     }

@@ -1,0 +1,74 @@
+//! Requests that are done once, however often they are sent.
+
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::{Service, ServiceError};
+use crate::domain::Digest;
+use crate::store::{FirstAnswer, KeptAnswer, Progress};
+
+/// What answers to requests with a key are kept for.
+#[derive(Debug, Clone, Copy)]
+pub struct OnceSettings {
+    /// How long.
+    pub keep: Duration,
+    /// How many.
+    pub most: usize,
+}
+
+impl OnceSettings {
+    /// Answers from before this moment count no more.
+    pub fn since(&self, now: Timestamp) -> Timestamp {
+        let keep = SignedDuration::try_from(self.keep).unwrap_or(SignedDuration::MAX);
+        now.saturating_sub(keep).unwrap_or(Timestamp::UNIX_EPOCH)
+    }
+}
+
+/// What is to be done with a request that has a key.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Once {
+    /// It is the first: do it, and then say so with [`Service::end_once`].
+    First,
+    /// It was done: this was the answer.
+    Again(KeptAnswer),
+    /// It is being done.
+    Running,
+    /// The key was another request's.
+    Other,
+}
+
+impl Service {
+    /// Takes up a request by the id that its sender gave it.
+    pub async fn begin_once(&self, id: &str, fingerprint: Digest) -> Result<Once, ServiceError> {
+        let now = Timestamp::now();
+        let settings = self.settings.once;
+        let progress = Progress::Running { process: self.process };
+        let reserved = FirstAnswer { fingerprint, at: now, progress };
+        Ok(match self.answers.reserve_answer(id, reserved, settings.since(now)).await? {
+            None => Once::First,
+            Some(known) if known.fingerprint != fingerprint => Once::Other,
+            Some(FirstAnswer { progress: Progress::Answered(kept), .. }) => Once::Again(kept),
+            Some(FirstAnswer { progress: Progress::Running { .. }, .. }) => Once::Running,
+        })
+    }
+
+    /// The request was done: `kept` is what is answered when it comes again; `None`, if it is to be done
+    /// anew then.
+    pub async fn end_once(
+        &self,
+        id: &str,
+        fingerprint: Digest,
+        kept: Option<KeptAnswer>,
+    ) -> Result<(), ServiceError> {
+        match kept {
+            None => self.answers.forget_answer(id).await?,
+            Some(kept) => {
+                let progress = Progress::Answered(kept);
+                let answer = FirstAnswer { fingerprint, at: Timestamp::now(), progress };
+                self.answers.keep_answer(id, answer).await?;
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,95 @@
+//! First answers to requests that may be sent again, by the key that their sender gave them.
+
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use jiff::Timestamp;
+
+use super::super::{AnswerStore, FirstAnswer, Progress, StoreError};
+use super::trees::{Trees, decode, failed, get, put};
+use super::{EmbeddedStore, blocking};
+
+/// Sorted by age.
+fn age_key(at: Timestamp, id: &[u8]) -> Vec<u8> {
+    // Times before 1970 do not occur, and would sort last.
+    [&at.as_millisecond().to_be_bytes(), id].concat()
+}
+
+fn write(trees: &Trees, id: &[u8], answer: &FirstAnswer) -> Result<(), StoreError> {
+    remove(trees, id)?;
+    put(&trees.answers, id, answer)?;
+    put(&trees.answers_by_age, &age_key(answer.at, id), &())
+}
+
+fn remove(trees: &Trees, id: &[u8]) -> Result<(), StoreError> {
+    if let Some(old) = trees.answers.remove(id).map_err(failed)? {
+        let old: FirstAnswer = decode(&old)?;
+        trees.answers_by_age.remove(age_key(old.at, id)).map_err(failed)?;
+    }
+    Ok(())
+}
+
+#[async_trait]
+impl AnswerStore for EmbeddedStore {
+    async fn reserve_answer(
+        &self,
+        id: &str,
+        reserved: FirstAnswer,
+        since: Timestamp,
+    ) -> Result<Option<FirstAnswer>, StoreError> {
+        let id = id.to_owned();
+        let reserve = move |trees: &Trees, _: &mut _| {
+            let known: Option<FirstAnswer> = get(&trees.answers, id.as_bytes())?;
+            let counts = |known: &FirstAnswer| match (&known.progress, &reserved.progress) {
+                // Of a process that has ended nothing more will come.
+                (Progress::Running { process }, Progress::Running { process: own }) => {
+                    process == own
+                }
+                _ => known.at >= since,
+            };
+            match known.filter(counts) {
+                Some(known) => Ok(Some(known)),
+                None => write(trees, id.as_bytes(), &reserved).map(|()| None),
+            }
+        };
+        self.inner.writer.commit(reserve, |_| {}).await
+    }
+
+    async fn keep_answer(&self, id: &str, answer: FirstAnswer) -> Result<(), StoreError> {
+        let id = id.to_owned();
+        let keep = move |trees: &Trees, _: &mut _| write(trees, id.as_bytes(), &answer);
+        self.inner.writer.commit(keep, |()| {}).await
+    }
+
+    async fn forget_answer(&self, id: &str) -> Result<(), StoreError> {
+        let id = id.to_owned();
+        let forget = move |trees: &Trees, _: &mut _| remove(trees, id.as_bytes());
+        self.inner.writer.commit(forget, |()| {}).await
+    }
+
+    async fn forget_answers(&self, before: Timestamp, most: usize) -> Result<usize, StoreError> {
+        let inner = Arc::clone(&self.inner);
+        let old = blocking(move || {
+            let ages = &inner.trees.answers_by_age;
+            let surplus = ages.len().saturating_sub(most);
+            let end = before.as_millisecond().to_be_bytes();
+            let mut old = Vec::new();
+            for key in ages.iter().keys() {
+                let key = key.map_err(failed)?;
+                if old.len() >= surplus && key[..] >= end[..] {
+                    break;
+                }
+                old.extend(key.get(end.len()..).map(<[u8]>::to_vec));
+            }
+            Ok(old)
+        })
+        .await?;
+        let count = old.len();
+        if count > 0 {
+            let forget =
+                move |trees: &Trees, _: &mut _| old.iter().try_for_each(|id| remove(trees, id));
+            self.inner.writer.commit(forget, |()| {}).await?;
+        }
+        Ok(count)
+    }
+}
