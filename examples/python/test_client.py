@@ -115,6 +115,13 @@ class RealServer(unittest.TestCase):
     def frame(self, number: int) -> Path:
         return self.town / "frames" / f"frame-{number:04}.jpg"
 
+    def test_a_frame_with_a_key_is_localized_once(self) -> None:
+        first, again, other = (
+            self.service.localize("town", self.frame(0), idempotency_key=key) for key in ("a", "a", "b")
+        )
+        self.assertEqual(first, again)
+        self.assertNotEqual(first.query_id, other.query_id)
+
     def test_the_right_image_is_first_and_its_job_ends(self) -> None:
         answer = self.service.localize("town", self.place(2).read_bytes(), k=3)
         self.assertEqual(len(answer.candidates), 3)
@@ -407,6 +414,17 @@ class ScriptedServer(unittest.TestCase):
                     call()
                 self.assertEqual(raised.exception.status, 503)
         self.assertEqual([method for method, _, _ in script.requests], ["POST", "DELETE"])
+
+    def test_a_frame_with_a_key_is_sent_again_after_503_with_the_same_key(self) -> None:
+        script = Script(problem(503, 0), problem(404))
+        with (
+            script.serving() as url,
+            Whereabouts(url, retry_for_s=1) as service,
+            self.assertRaises(Problem),
+        ):
+            service.localize("m", JPEG, idempotency_key="k")
+        keys = [{name.lower(): value for name, value in sent.items()} for _, _, sent in script.requests]
+        self.assertEqual([sent["idempotency-key"] for sent in keys], ["k", "k"])
 
     def test_an_image_is_sent_again_after_503_as_the_same_bytes_are_welcome_twice(self) -> None:
         stored = {"id": "i", "digest": "sha256:0", "media_type": "image/jpeg", "width": 1, "height": 1}

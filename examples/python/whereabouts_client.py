@@ -490,6 +490,7 @@ class Whereabouts:
         captured_at: datetime | None = None,
         moved_m: float | None = None,
         deadline_ms: int | None = None,
+        idempotency_key: str | None = None,
     ) -> Answer:
         """Localizes a frame: the `k` most similar images of the map, and a job that orders them anew.
 
@@ -500,6 +501,10 @@ class Whereabouts:
         A robot that names its `track`, an id of its own choice, also hears where it is given all frames of
         that track. `captured_at` is then when the frame was taken, by default when it came, and `moved_m`
         how many metres the robot has come since the frame before, by its odometry.
+
+        With an `idempotency_key`, a text that no other request has, the same frame can be sent again
+        after an answer was lost, and gets its first answer: no second job. `retry_for_s` then does so
+        after 503 too.
         """
         _, data, media_type = _load(frame)
         return self._call(
@@ -516,7 +521,12 @@ class Whereabouts:
                 captured_at=_rfc3339(captured_at) if captured_at else None,
                 moved_m=moved_m,
             ),
-            headers={"Content-Type": media_type, **_deadline(deadline_ms)},
+            headers={
+                "Content-Type": media_type,
+                **_deadline(deadline_ms),
+                **({"Idempotency-Key": idempotency_key} if idempotency_key else {}),
+            },
+            repeatable=idempotency_key is not None,
             content=data,
         )
 
