@@ -50,9 +50,10 @@ url=http://$(cat "$scratch/address")
 curl --silent --fail --output /dev/null -X PUT "$url/maps/town" -H 'Content-Type: application/json' \
     -d '{"scene": "outdoor"}'
 
-# The stream of all jobs has no end.
+# The stream of all jobs has no end. One worker: Python before 3.11.5 breaks off now and then when two threads
+# parse Python, as schemathesis does.
 (cd "$scratch" && "$venv/bin/schemathesis" --config-file "$OLDPWD/schemathesis.toml" run "$url/openapi.json" \
-    --exclude-path /events --max-examples "$examples" --seed 1 --workers 2 --phases examples,coverage,fuzzing \
+    --exclude-path /events --max-examples "$examples" --seed 1 --workers 1 --phases examples,coverage,fuzzing \
     --checks not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance \
     --continue-on-failure --no-shrink --warnings off --request-timeout 60)
 if grep -q panicked "$scratch/log"; then
