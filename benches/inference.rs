@@ -76,9 +76,10 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The middle one, or the mean of the two in the middle.
 fn median(mut numbers: Vec<f64>) -> f64 {
     numbers.sort_by(f64::total_cmp);
-    numbers[numbers.len() / 2]
+    (numbers[(numbers.len() - 1) / 2] + numbers[numbers.len() / 2]) / 2.0
 }
 
 /// One run after another and side by side, of one picture and of the whole batch: as a server does that
