@@ -25,12 +25,10 @@ step() {
     echo "== $*"
 }
 
-if [ ! -e "$venv/complete" ]; then
-    step "an environment with the tools, in $venv"
-    python3 -m venv "$venv"
-    "$venv/bin/pip" install --quiet --disable-pip-version-check -r python/requirements.txt -r check-requirements.txt
-    touch "$venv/complete"
-fi
+# shellcheck source-path=SCRIPTDIR source=../tests/server.sh
+. ../tests/server.sh
+if [ ! -e "$venv/complete" ]; then step "an environment with the tools, in $venv"; fi
+environment "$venv" python/requirements.txt check-requirements.txt
 export PATH=$venv/bin:$PATH PYTHONDONTWRITEBYTECODE=1
 
 step ruff
@@ -52,35 +50,12 @@ step "tests of the localizer of the ROS 2 node"
 step "tests of the Python client"
 (cd python && WHEREABOUTS_BIN=$binary timeout 120 python -m unittest)
 
-scratch=$(mktemp -d)
-server=
-finish() {
-    if [ -n "$server" ]; then
-        kill "$server" 2> /dev/null || true
-        wait "$server" 2> /dev/null || true
-    fi
-    rm -rf "$scratch"
-}
-trap finish EXIT
-
 step "a server with a small town"
 if ! "$binary" demo --offline --json --places 6 --out "$scratch/town" > "$scratch/log" 2>&1; then
     cat "$scratch/log" >&2
     exit 1
 fi
-"$binary" serve --data "$scratch/data" --listen 127.0.0.1:0 --address-file "$scratch/address" \
-    > "$scratch/log" 2>&1 &
-server=$!
-for _ in $(seq 300); do
-    if [ -s "$scratch/address" ] || ! kill -0 "$server" 2> /dev/null; then break; fi
-    sleep 0.1
-done
-if [ ! -s "$scratch/address" ]; then
-    echo "the server did not start:" >&2
-    cat "$scratch/log" >&2
-    exit 1
-fi
-url=http://$(cat "$scratch/address")
+serve "$binary"
 (cd python && python index_and_localize.py --server "$url" --map town "$scratch/town/map" "$scratch/town/frames")
 
 step curl.sh

@@ -18,35 +18,11 @@ venv=$(realpath -m "$2")
 examples=${3:-5}
 cd "$(dirname "$0")"
 
-if [ ! -e "$venv/complete" ]; then
-    python3 -m venv "$venv"
-    "$venv/bin/pip" install --quiet --disable-pip-version-check -r requirements.txt
-    touch "$venv/complete"
-fi
-
-scratch=$(mktemp -d)
-server=
-finish() {
-    if [ -n "$server" ]; then
-        kill "$server" 2> /dev/null || true
-        wait "$server" 2> /dev/null || true
-    fi
-    rm -rf "$scratch"
-}
-trap finish EXIT
-WHEREABOUTS_MODEL__NAME=xfeat "$binary" serve --data "$scratch/data" --listen 127.0.0.1:0 \
-    --address-file "$scratch/address" > "$scratch/log" 2>&1 &
-server=$!
-for _ in $(seq 300); do
-    if [ -s "$scratch/address" ] || ! kill -0 "$server" 2> /dev/null; then break; fi
-    sleep 0.1
-done
-if [ ! -s "$scratch/address" ]; then
-    echo "the server did not start:" >&2
-    cat "$scratch/log" >&2
-    exit 1
-fi
-url=http://$(cat "$scratch/address")
+# shellcheck source-path=SCRIPTDIR source=../server.sh
+. ../server.sh
+environment "$venv" requirements.txt
+export WHEREABOUTS_MODEL__NAME=xfeat
+serve "$binary"
 curl --silent --fail --output /dev/null -X PUT "$url/maps/town" -H 'Content-Type: application/json' \
     -d '{"scene": "outdoor"}'
 

@@ -10,38 +10,10 @@ set -euo pipefail
 # shellcheck source-path=SCRIPTDIR source=summary.sh
 . "$(dirname "$0")/summary.sh"
 
-usage="usage: $0 URL MAP FOLDER [CLIENTS] [REQUESTS]"
-if [ $# -lt 3 ]; then
-    echo "$usage" >&2
-    exit 2
-fi
-url=$1 map=$2 folder=$3
-url=${url%/}
-clients=${4:-4} requests=${5:-100}
+arguments 4 100 "$@"
 wait_s=${WAIT_S:-300}
-frames=()
-key=${WHEREABOUTS_API_KEY:+Authorization: Bearer $WHEREABOUTS_API_KEY}
-read_frames "$folder"
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
-
-post_configuration() {
-    local number
-    for ((number = 0; number < requests; number++)); do
-        if [ "$number" -gt 0 ]; then echo next; fi
-        cat << END
-url = "$url/localize?map=$map&refine=async"
-request = POST
-upload-file = "${frames[number % ${#frames[@]}]}"
-header = "Content-Type: image/jpeg"
-header = "Expect:"
-header = "$key"
-max-time = 120
-output = "$scratch/answer-$number"
-write-out = "%{http_code} %{time_total}\n"
-END
-    done
-}
 
 # Asks for the jobs whose ids are in a file; each answer goes to job-ID.
 job_configuration() {
@@ -60,7 +32,7 @@ END
 }
 
 start=$(now)
-post_configuration | in_parallel "$clients" > "$scratch/posts"
+frames_configuration async "$scratch/answer-#" | in_parallel "$clients" > "$scratch/posts"
 echo "POST /localize (refine=async), $requests frames by $clients clients"
 summary "$scratch/posts" "$(between "$start" "$(now)")"
 

@@ -34,6 +34,40 @@ acceptable() {
     awk '$1 == 200 { served++ } $1 != 200 && $1 != 429 { other++ } END { exit !(served && !other) }' "$1"
 }
 
+# arguments CLIENTS REQUESTS "$@": what a script was called with, as $url, $map, $folder, $clients and $requests
+# (the first two stand in where they are not given), and the key, if there is one, as the header $key.
+arguments() {
+    if [ $# -lt 5 ]; then
+        echo "usage: $0 URL MAP FOLDER [CLIENTS] [REQUESTS]" >&2
+        exit 2
+    fi
+    url=${3%/} map=$4 folder=$5
+    # shellcheck disable=SC2034 # for whoever sources this
+    clients=${6:-$1}
+    requests=${7:-$2}
+    key=${WHEREABOUTS_API_KEY:+Authorization: Bearer $WHEREABOUTS_API_KEY}
+    read_frames "$folder"
+}
+
+# frames_configuration REFINE OUTPUT: posts so many frames; # in OUTPUT, where the answer goes, is its number.
+frames_configuration() {
+    local number
+    for ((number = 0; number < requests; number++)); do
+        if [ "$number" -gt 0 ]; then echo next; fi
+        cat << END
+url = "$url/localize?map=$map&refine=$1"
+request = POST
+upload-file = "${frames[number % ${#frames[@]}]}"
+header = "Content-Type: image/jpeg"
+header = "Expect:"
+header = "$key"
+max-time = 120
+output = "${2//\#/$number}"
+write-out = "%{http_code} %{time_total}\n"
+END
+    done
+}
+
 # The JPEGs of a folder, as the array `frames`.
 read_frames() {
     shopt -s nullglob

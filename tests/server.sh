@@ -1,0 +1,43 @@
+# Shared by the scripts that start a server; not run by itself.
+# shellcheck shell=bash
+
+# environment FOLDER REQUIREMENTS...: a Python environment with what these files name, made if it is not there.
+environment() {
+    local folder=$1 files=() file
+    shift
+    if [ -e "$folder/complete" ]; then return; fi
+    for file in "$@"; do files+=(-r "$file"); done
+    python3 -m venv "$folder"
+    "$folder/bin/pip" install --quiet --disable-pip-version-check "${files[@]}"
+    touch "$folder/complete"
+}
+
+# A folder for this run, as $scratch. It goes when the script ends, and the server with it.
+scratch=$(mktemp -d)
+server=
+finish() {
+    if [ -n "$server" ]; then
+        kill "$server" 2> /dev/null || true
+        wait "$server" 2> /dev/null || true
+    fi
+    rm -rf "$scratch"
+}
+trap finish EXIT
+
+# serve BINARY: starts a server and waits until it is ready; its address is $url, its log $scratch/log.
+serve() {
+    "$1" serve --data "$scratch/data" --listen 127.0.0.1:0 --address-file "$scratch/address" \
+        > "$scratch/log" 2>&1 &
+    server=$!
+    for _ in $(seq 300); do
+        if [ -s "$scratch/address" ] || ! kill -0 "$server" 2> /dev/null; then break; fi
+        sleep 0.1
+    done
+    if [ ! -s "$scratch/address" ]; then
+        echo "the server did not start:" >&2
+        cat "$scratch/log" >&2
+        exit 1
+    fi
+    # shellcheck disable=SC2034 # for whoever sources this
+    url=http://$(cat "$scratch/address")
+}
