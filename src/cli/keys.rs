@@ -161,11 +161,7 @@ impl Place {
 
 /// The id of a key, which goes into an address.
 fn key_id(text: &str) -> Result<String, String> {
-    if let Ok(token) = text.parse::<Token>() {
-        return Ok(token.id().to_owned());
-    }
-    let is_id = text.len() == Token::ID && text.bytes().all(|byte| byte.is_ascii_hexdigit());
-    is_id.then(|| text.to_owned()).ok_or_else(|| {
+    Token::id_of(text).map(str::to_owned).ok_or_else(|| {
         format!(
             "a key's id has {} hexadecimal digits; `whereabouts keys list` shows them",
             Token::ID

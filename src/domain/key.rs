@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use subtle::ConstantTimeEq;
 use utoipa::ToSchema;
 
+use super::digest::hex;
 use super::map::display_as_written;
 use super::{Digest, InvalidName, MapName};
 
@@ -107,14 +108,22 @@ impl Token {
 
     /// The token of 38 random bytes.
     pub fn new(random: &[u8; 38]) -> Self {
-        let hex: String = random.iter().map(|byte| format!("{byte:02x}")).collect();
-        let (id, secret) = hex.split_at(Self::ID);
+        let digits = hex(random);
+        let (id, secret) = digits.split_at(Self::ID);
         Self(format!("{}{id}_{secret}", Self::PREFIX))
     }
 
     /// The id of the key.
     pub fn id(&self) -> &str {
         &self.0[Self::PREFIX.len()..Self::PREFIX.len() + Self::ID]
+    }
+
+    /// The id that a text is, or the id of the key that it is.
+    pub fn id_of(text: &str) -> Option<&str> {
+        match parts(text) {
+            Some((id, _)) => Some(id),
+            None => (text.len() == Self::ID && is_hex(text)).then_some(text),
+        }
     }
 
     /// What is stored of it.
@@ -132,19 +141,22 @@ impl FromStr for Token {
     type Err = InvalidName;
 
     fn from_str(text: &str) -> Result<Self, InvalidName> {
-        let is_hex = |text: &str| text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
-        let parts = text.strip_prefix(Self::PREFIX).and_then(|rest| rest.split_once('_'));
-        match parts {
-            Some((id, secret))
-                if (id.len(), secret.len()) == (Self::ID, Self::SECRET)
-                    && is_hex(id)
-                    && is_hex(secret) =>
-            {
-                Ok(Self(text.to_owned()))
-            }
-            _ => Err(InvalidName("this is no key: one begins with \"wab_\"".into())),
+        match parts(text) {
+            Some(_) => Ok(Self(text.to_owned())),
+            None => Err(InvalidName("this is no key: one begins with \"wab_\"".into())),
         }
     }
+}
+
+/// The id and the secret of a key.
+fn parts(text: &str) -> Option<(&str, &str)> {
+    let (id, secret) = text.strip_prefix(Token::PREFIX)?.split_once('_')?;
+    let fit = (id.len(), secret.len()) == (Token::ID, Token::SECRET);
+    (fit && is_hex(id) && is_hex(secret)).then_some((id, secret))
+}
+
+fn is_hex(text: &str) -> bool {
+    text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
 }
 
 impl fmt::Debug for Token {
@@ -175,6 +187,12 @@ mod tests {
             assert!(text.parse::<Token>().is_err(), "{text}");
         }
         assert!("wab_ä_".parse::<Token>().is_err());
+        for text in [token.reveal(), token.id()] {
+            assert_eq!(Token::id_of(text), Some(token.id()));
+        }
+        for text in ["", "../maps/vault", &token.id()[1..], "A7A7A7A7A7A7", &token.reveal()[1..]] {
+            assert_eq!(Token::id_of(text), None, "{text}");
+        }
     }
 
     #[test]

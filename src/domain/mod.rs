@@ -25,7 +25,7 @@ pub use job::{
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use map::{DescriptorKind, Frame, Map, MapName, Precision, Scene};
-pub use pose::{GeographicPose, MetricPose, Pose, PoseError};
+pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError};
 
 /// A text that does not obey the rules of the type it was meant for.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]

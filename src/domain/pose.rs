@@ -85,6 +85,9 @@ pub enum PoseError {
     Quaternion(&'static str),
 }
 
+/// Mean radius of the Earth in metres (IUGG).
+pub const EARTH_RADIUS_M: f64 = 6_371_008.8;
+
 /// Farther from the origin than any building, city or orbit of the Earth; keeps typing errors out.
 const FARTHEST_METRES: f64 = 1e8;
 
@@ -150,7 +153,6 @@ impl GeographicPose {
     }
 
     fn haversine_m(&self, other: &Self) -> f64 {
-        const EARTH_RADIUS_M: f64 = 6_371_008.8;
         let (a, b) = (self.lat.to_radians(), other.lat.to_radians());
         let half_lat = ((b - a) / 2.0).sin();
         let half_lon = ((other.lon - self.lon).to_radians() / 2.0).sin();

@@ -6,14 +6,14 @@ use std::sync::Arc;
 use axum::RequestExt;
 use axum::body::Body;
 use axum::extract::{MatchedPath, Query, RawPathParams, Request, State};
-use axum::http::header::{AUTHORIZATION, CONNECTION, WWW_AUTHENTICATE};
+use axum::http::header::{AUTHORIZATION, WWW_AUTHENTICATE};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, Uri};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::TryStreamExt;
 
-use super::guard::{RequestId, throw_away};
-use super::problem::Problem;
+use super::guard::{RequestId, hanging_up, throw_away};
+use super::problem::{Problem, defect};
 use super::state::AppState;
 use crate::domain::{ApiKey, MapName, Role, Token};
 use crate::service::{Allowances, Caller, ErrorKind, Service, ServiceError};
@@ -81,19 +81,12 @@ pub(super) async fn admit(
     let changes = !matches!(*request.method(), Method::GET | Method::HEAD);
     let audited = changes && route.as_deref() != Some("/localize");
     let mut audited = audited.then(|| Audited::of(&request, &key));
-    let (allowances, taken) = service.keys.take_request(&key);
-    let checked = match taken {
-        Ok(()) if !caller.is(role) => Err(ServiceError::new(
-            ErrorKind::Forbidden,
-            format!(
-                "this takes the role {role}, and the key {} has the role {}; ask an admin for another key",
-                key.id, key.role
-            ),
-        )),
-        Ok(()) => may_use_maps(&service, &caller, &mut request, route.as_deref()).await,
+    let (allowances, taken) = service.keys.limits.take_request(&key);
+    let allowed = match taken {
+        Ok(()) => may_make(&service, &caller, role, &mut request, route.as_deref()).await,
         Err(error) => Err(error),
     };
-    let mut response = match checked {
+    let mut response = match allowed {
         Err(error) => {
             let response = refuse(request, error);
             audited.iter_mut().for_each(|audited| audited.answered(&response));
@@ -112,10 +105,7 @@ pub(super) async fn admit(
             };
             match to_the_end {
                 false => doing.await,
-                true => tokio::spawn(doing).await.unwrap_or_else(|_| {
-                    let detail = "the request hit a defect of the server; see its log";
-                    Problem::new(ErrorKind::Internal, detail).into_response()
-                }),
+                true => tokio::spawn(doing).await.unwrap_or_else(|_| defect().into_response()),
             }
         }
     };
@@ -146,14 +136,25 @@ fn holder(service: &Service, headers: &HeaderMap) -> Result<Arc<ApiKey>, Service
     service.keys.holder(&token)
 }
 
-/// Whether the caller may use the maps that the request is about.
-async fn may_use_maps(
+/// Whether the caller has the role that a call takes, and may use the maps that it is about.
+async fn may_make(
     service: &Service,
     caller: &Caller,
+    role: Role,
     request: &mut Request,
     route: Option<&str>,
 ) -> Result<(), ServiceError> {
-    if !caller.is_limited() {
+    let Caller::Holder(key) = caller else { return Ok(()) };
+    if key.role < role {
+        return Err(ServiceError::new(
+            ErrorKind::Forbidden,
+            format!(
+                "this takes the role {role}, and the key {} has the role {}; ask an admin for another key",
+                key.id, key.role
+            ),
+        ));
+    }
+    if key.maps.is_empty() {
         return Ok(());
     }
     let route = route.unwrap_or_default();
@@ -182,7 +183,7 @@ async fn may_use_maps(
     };
     let map = named.as_deref().map(str::parse::<MapName>);
     match map {
-        Some(Ok(map)) if caller.may_use(&map) => Ok(()),
+        Some(Ok(map)) if key.may_use(&map) => Ok(()),
         Some(Ok(map)) => Err(ServiceError::new(
             ErrorKind::Forbidden,
             format!("this key is not for the map {map}; ask an admin for another key"),
@@ -214,7 +215,7 @@ fn counted(request: Request, service: &Arc<Service>, key: &Arc<ApiKey>) -> Reque
     }
     let (service, key) = (Arc::clone(service), Arc::clone(key));
     request.map(|body| {
-        let count = move |chunk: &bytes::Bytes| service.keys.take_bytes(&key, chunk.len());
+        let count = move |chunk: &bytes::Bytes| service.keys.limits.take_bytes(&key, chunk.len());
         Body::from_stream(body.into_data_stream().inspect_ok(count))
     })
 }
@@ -223,10 +224,8 @@ fn refuse(request: Request, error: ServiceError) -> Response {
     let unauthorized = error.kind == ErrorKind::Unauthorized;
     let has_body = !matches!(*request.method(), Method::GET | Method::HEAD | Method::DELETE);
     throw_away(request);
-    let mut response = Problem::from(error).into_response();
-    if has_body {
-        response.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
-    }
+    let problem = Problem::from(error);
+    let mut response = if has_body { hanging_up(problem) } else { problem.into_response() };
     if unauthorized {
         let challenge = HeaderValue::from_static("Bearer realm=\"whereabouts\"");
         response.headers_mut().insert(WWW_AUTHENTICATE, challenge);
@@ -281,7 +280,6 @@ impl Audited {
     }
 
     fn answered(&mut self, response: &Response) {
-        // Whoever refuses leaves the status to the problem.
         self.status = Some(response.status().as_u16());
     }
 }

@@ -52,20 +52,29 @@ fn complete(operation: &mut Operation, role: &str) {
     });
     let malformed = operation.parameters.as_ref().is_some_and(|parameters| !parameters.is_empty());
     let has_body = operation.request_body.is_some();
-    for (applies, status, text) in [
-        (malformed, "400", "Malformed"),
-        (true, "401", "No key, or one that is unknown, revoked or expired"),
-        (true, "403", "The key has not the role, or is not for the map"),
-        (has_body, "408", "The body came too slowly"),
-        (has_body, "413", "Too large"),
-        (true, "429", "Overloaded, or the key has used up what it may ask for in a minute"),
-        (true, "500", "A defect, or a disk that fails; the server's log has more"),
-        (true, "503", "Starting, or it took too long; Retry-After says when to try again"),
-    ] {
-        if applies {
-            let responses = &mut operation.responses.responses;
-            responses.entry(status.into()).or_insert_with(|| problem(text));
-        }
+    if malformed {
+        can_fail(operation, [("400", "Malformed")]);
+    }
+    if has_body {
+        can_fail(operation, [("408", "The body came too slowly"), ("413", "Too large")]);
+    }
+    can_fail(
+        operation,
+        [
+            ("401", "No key, or one that is unknown, revoked or expired"),
+            ("403", "The key has not the role, or is not for the map"),
+            ("429", "Overloaded, or the key has used up what it may ask for in a minute"),
+            ("500", "A defect, or a disk that fails; the server's log has more"),
+            ("503", "Starting, or it took too long; Retry-After says when to try again"),
+        ],
+    );
+}
+
+/// Adds these problems, by status, unless the call has told of them in words of its own.
+fn can_fail<const N: usize>(operation: &mut Operation, problems: [(&str, &str); N]) {
+    for (status, text) in problems {
+        let responses = &mut operation.responses.responses;
+        responses.entry(status.into()).or_insert_with(|| problem(text));
     }
 }
 
@@ -87,14 +96,14 @@ fn take_key(operation: &mut Operation) {
              that is in the making, and 422 if the key was another request's. Errors are not kept.",
         ));
     operation.parameters.get_or_insert_default().push(header.build().into());
-    for (status, text) in [
-        ("400", "Malformed"),
-        ("409", "A request with this Idempotency-Key is in progress"),
-        ("422", "The Idempotency-Key was another request's"),
-    ] {
-        let responses = &mut operation.responses.responses;
-        responses.entry(status.into()).or_insert_with(|| problem(text));
-    }
+    can_fail(
+        operation,
+        [
+            ("400", "Malformed"),
+            ("409", "A request with this Idempotency-Key is in progress"),
+            ("422", "The Idempotency-Key was another request's"),
+        ],
+    );
 }
 
 fn problem(text: &str) -> RefOr<Response> {

@@ -9,6 +9,7 @@ use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::{Stream, StreamExt};
 use serde::Deserialize;
 use tokio::sync::OwnedSemaphorePermit;
+use tokio_util::sync::CancellationToken;
 use utoipa::IntoParams;
 
 use super::body::{Params, Segments};
@@ -16,7 +17,7 @@ use super::jobs::job_id;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
-use crate::service::{AnyJobEvent, Caller, ErrorKind, JobEvent};
+use crate::service::{AnyJobEvent, Caller, ErrorKind, JobEvent, Service};
 
 /// A comment is sent after so long without an event, so that nothing on the way hangs up.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -48,10 +49,7 @@ pub(super) async fn follow_job(
             JobEvent::Ended(job) => Event::default().event("end").json_data(job),
         }
     });
-    // A drain does not wait for jobs that nobody may finish before the next start.
-    let events = events.take_until(state.draining().cancelled_owned());
-    let events = events.take_until(async move { service.keys.ended(caller).await });
-    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
+    Ok(streamed(events, state.draining(), service, caller))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -87,9 +85,7 @@ pub(super) async fn follow_jobs(
             AnyJobEvent::Missed(missed) => Event::default().event("missed").json_data(missed),
         }
     });
-    let events = events.take_until(state.draining().cancelled_owned());
-    let events = events.take_until(async move { service.keys.ended(caller).await });
-    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
+    Ok(streamed(events, state.draining(), service, caller))
 }
 
 /// The right to one of the streams that may be open.
@@ -102,4 +98,17 @@ fn permit(state: &AppState) -> Result<OwnedSemaphorePermit, Problem> {
         );
         Problem::new(ErrorKind::Overloaded, detail)
     })
+}
+
+/// Sends events until they end, the server drains, or the caller may ask no more. A drain does not wait for
+/// jobs that nobody may finish before the next start.
+fn streamed(
+    events: impl Stream<Item = Result<Event, axum::Error>> + Send + 'static,
+    draining: CancellationToken,
+    service: Arc<Service>,
+    caller: Caller,
+) -> Sse<impl Stream<Item = Result<Event, axum::Error>>> {
+    let events = events.take_until(draining.cancelled_owned());
+    let events = events.take_until(async move { service.keys.ended(caller).await });
+    Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE))
 }

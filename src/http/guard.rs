@@ -137,7 +137,7 @@ pub(super) fn throw_away(request: Request) {
 }
 
 /// The answer after which the connection is closed.
-fn hanging_up(problem: Problem) -> Response {
+pub(super) fn hanging_up(problem: Problem) -> Response {
     let mut response = problem.into_response();
     response.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
     response

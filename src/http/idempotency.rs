@@ -12,7 +12,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
 use super::body::whole;
-use super::problem::Problem;
+use super::problem::{Problem, defect};
 use super::state::AppState;
 use crate::domain::Digest;
 use crate::service::{Caller, ErrorKind, Once, Service};
@@ -53,12 +53,11 @@ async fn answer(state: AppState, request: Request, next: Next) -> Result<Respons
     let service = state.service()?;
     let scope = request.extensions().get::<Caller>().map_or("-", Caller::scope);
     let id = format!("{scope} {key}");
-    let what = format!("{} {}\n", request.method(), request.uri());
-    let kind = request.headers().get(CONTENT_TYPE).cloned();
     let (parts, body) = request.into_parts();
     let bytes = whole(Request::new(body), &state).await?;
-    let kind_bytes = kind.as_ref().map_or(&[][..], HeaderValue::as_bytes);
-    let fingerprint = Digest::of(&[what.as_bytes(), kind_bytes, b"\n", &bytes].concat());
+    let what = format!("{} {}\n", parts.method, parts.uri);
+    let kind = parts.headers.get(CONTENT_TYPE).map_or(&[][..], HeaderValue::as_bytes);
+    let fingerprint = Digest::of(&[what.as_bytes(), kind, b"\n", &bytes].concat());
     match service.begin_once(&id, fingerprint).await? {
         Once::Again(kept) => Ok(replay(kept)),
         Once::Other => Err(Problem::new(
@@ -76,12 +75,7 @@ async fn answer(state: AppState, request: Request, next: Next) -> Result<Respons
             let request = Request::from_parts(parts, Body::from(bytes));
             // Goes on when the sender has gone: it will ask again.
             let doing = tokio::spawn(do_and_keep(service, id, fingerprint, request, next));
-            doing.await.map_err(|_| {
-                Problem::new(
-                    ErrorKind::Internal,
-                    "the request hit a defect of the server; see its log",
-                )
-            })
+            doing.await.map_err(|_| defect())
         }
     }
 }

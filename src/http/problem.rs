@@ -49,6 +49,11 @@ impl Problem {
     }
 }
 
+/// The request hit a defect of the server.
+pub(super) fn defect() -> Problem {
+    Problem::new(ErrorKind::Internal, "the request hit a defect of the server; see its log")
+}
+
 fn status_of(kind: ErrorKind) -> (StatusCode, &'static str, &'static str) {
     match kind {
         ErrorKind::Malformed => (StatusCode::BAD_REQUEST, "malformed", "Malformed request"),
@@ -141,6 +146,5 @@ pub(super) async fn no_such_method(request: Request) -> Response {
 }
 
 pub(super) fn panicked(_: Box<dyn std::any::Any + Send>) -> Response {
-    Problem::new(ErrorKind::Internal, "the request hit a defect of the server; see its log")
-        .into_response()
+    defect().into_response()
 }

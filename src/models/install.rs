@@ -177,12 +177,8 @@ impl ModelsFolder {
         let given: Vec<PathBuf> = iter::once(file.to_owned()).chain(data).collect();
         let mut digests = Vec::new();
         for (file, (_, pinned)) in given.iter().zip(manifest.files()) {
-            let (got, _) = digest_of(file)?;
-            if let Some(pinned) = pinned.filter(|pinned| *pinned != got) {
-                let remedy = format!("give the file that {} is for", source.display());
-                return Err(InstallError::Damaged { file: file.clone(), got, pinned, remedy });
-            }
-            digests.push(got);
+            let remedy = || format!("give the file that {} is for", source.display());
+            digests.push(checked(file, pinned, remedy)?.0);
         }
         let target = self.models.join(&name);
         if target.exists() {
@@ -290,16 +286,27 @@ pub fn verify(folder: &Path) -> Result<Verdict, InstallError> {
     let manifest = Manifest::read(&folder.join(MANIFEST))?;
     let (mut digests, mut bytes) = (Vec::new(), 0);
     for (file, pinned) in manifest.files() {
-        let file = folder.join(file);
-        let (got, size) = digest_of(&file)?;
-        if let Some(pinned) = pinned.filter(|pinned| *pinned != got) {
-            let remedy = "install it again".to_owned();
-            return Err(InstallError::Damaged { file, got, pinned, remedy });
-        }
-        digests.push(got);
+        let (digest, size) = checked(&folder.join(file), pinned, || "install it again".into())?;
+        digests.push(digest);
         bytes += size;
     }
     Ok(Verdict { manifest, digests, bytes })
+}
+
+/// The digest and the size of a file, which is the one that is pinned, if one is.
+fn checked(
+    file: &Path,
+    pinned: Option<Digest>,
+    remedy: impl FnOnce() -> String,
+) -> Result<(Digest, u64), InstallError> {
+    let (got, bytes) = digest_of(file)?;
+    match pinned {
+        Some(pinned) if pinned != got => {
+            let (file, remedy) = (file.to_owned(), remedy());
+            Err(InstallError::Damaged { file, got, pinned, remedy })
+        }
+        _ => Ok((got, bytes)),
+    }
 }
 
 fn is_name(name: &str) -> bool {

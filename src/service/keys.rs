@@ -1,20 +1,18 @@
 //! API keys: making, listing and revoking them, and who a token belongs to.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
-use std::time::{Duration, Instant};
+use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
+use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 use utoipa::ToSchema;
 
+use super::limits::Limits;
 use super::{ErrorKind, ServiceError};
-use crate::domain::{ApiKey, KeyLimits, MapName, Role, StoredKey, Token};
+use crate::domain::{ApiKey, Digest, KeyLimits, MapName, Role, StoredKey, Token};
 use crate::store::KeyStore;
-
-/// A bucket of a key fills up in this time.
-const WINDOW: Duration = Duration::from_secs(60);
 
 /// The most keys, revoked ones included: they are all held in memory.
 const MOST_KEYS: usize = 10_000;
@@ -75,14 +73,6 @@ impl Caller {
         }
     }
 
-    /// Whether the caller may do what takes that role.
-    pub fn is(&self, role: Role) -> bool {
-        match self {
-            Self::Anybody => true,
-            Self::Holder(key) => key.role >= role,
-        }
-    }
-
     /// Whether the caller may use that map.
     pub fn may_use(&self, map: &MapName) -> bool {
         match self {
@@ -90,70 +80,16 @@ impl Caller {
             Self::Holder(key) => key.may_use(map),
         }
     }
-
-    /// Whether the caller may use some maps only.
-    pub fn is_limited(&self) -> bool {
-        matches!(self, Self::Holder(key) if !key.maps.is_empty())
-    }
 }
 
-/// What is left to a key, of one of its limits.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Allowance {
-    /// The limit.
-    pub limit: u64,
-    /// What is left of it.
-    pub remaining: u64,
-    /// When all of it is there again.
-    pub reset: Duration,
-}
-
-/// What is left to a key.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Allowances {
-    /// Of requests.
-    pub requests: Option<Allowance>,
-    /// Of bytes.
-    pub bytes: Option<Allowance>,
-}
-
-/// All keys, and what each has asked for lately.
+/// All keys, and what each may still ask for.
 pub struct Keys {
     store: Arc<dyn KeyStore>,
     known: Arc<RwLock<HashMap<String, StoredKey>>>,
     /// Told when a key was revoked.
     revoked: watch::Sender<()>,
-    buckets: Mutex<HashMap<String, Buckets>>,
-}
-
-#[derive(Debug, Default)]
-struct Buckets {
-    requests: Option<Bucket>,
-    bytes: Option<Bucket>,
-}
-
-/// What is left at a moment; below zero after a body that was larger than what was left.
-#[derive(Debug, Clone, Copy)]
-struct Bucket {
-    left: f64,
-    at: Instant,
-}
-
-impl Bucket {
-    fn filled(bucket: Option<Self>, limit: f64, now: Instant) -> Self {
-        let Some(known) = bucket else { return Self { left: limit, at: now } };
-        let passed = now.duration_since(known.at).as_secs_f64() / WINDOW.as_secs_f64();
-        Self { left: (known.left + passed * limit).min(limit), at: now }
-    }
-
-    fn allowance(self, limit: f64) -> Allowance {
-        let missing = (limit - self.left) / limit;
-        Allowance {
-            limit: limit as u64,
-            remaining: self.left.max(0.0) as u64,
-            reset: WINDOW.mul_f64(missing.max(0.0)),
-        }
-    }
+    /// How much each may ask for.
+    pub limits: Limits,
 }
 
 impl Keys {
@@ -162,7 +98,7 @@ impl Keys {
         let known = store.keys().await?;
         let known = known.into_iter().map(|stored| (stored.key.id.clone(), stored)).collect();
         let known = Arc::new(RwLock::new(known));
-        Ok(Self { store, known, revoked: watch::Sender::new(()), buckets: Mutex::default() })
+        Ok(Self { store, known, revoked: watch::Sender::new(()), limits: Limits::default() })
     }
 
     /// Makes a key. What comes back is the only place where its token is.
@@ -222,9 +158,8 @@ impl Keys {
 
     /// Ends a key for good; from the moment this returns nobody gets in with it. `id` may be the whole key.
     pub async fn revoke(&self, id: &str) -> Result<ApiKey, ServiceError> {
-        let token: Option<Token> = id.parse().ok();
-        let id = token.as_ref().map_or(id, Token::id);
-        let Some(mut stored) = self.read().get(id).cloned() else {
+        let known = Token::id_of(id).and_then(|id| self.read().get(id).cloned());
+        let Some(mut stored) = known else {
             let detail = "there is no such key; `whereabouts keys list` shows those there are";
             return Err(ServiceError::new(ErrorKind::NotFound, detail));
         };
@@ -266,7 +201,7 @@ impl Keys {
         // An id that is unknown takes as long as one that is known.
         let is_right = match &known {
             Some(stored) => stored.is(token),
-            None => token.digest() == crate::domain::Digest::of(b""),
+            None => token.digest() == Digest::of(b""),
         };
         match known.filter(|_| is_right) {
             None => Err(ServiceError::new(ErrorKind::Unauthorized, "the key is unknown")),
@@ -277,52 +212,6 @@ impl Keys {
                 Err(ServiceError::new(ErrorKind::Unauthorized, detail))
             }
         }
-    }
-
-    /// Takes a request from what is left to a key.
-    pub fn take_request(&self, key: &ApiKey) -> (Allowances, Result<(), ServiceError>) {
-        let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
-        let now = Instant::now();
-        let of_key = buckets.entry(key.id.clone()).or_default();
-        let mut allowances = Allowances::default();
-        let mut refused = None;
-        if let Some(limit) = key.limits.bytes_per_minute.map(|limit| limit as f64) {
-            let bucket = Bucket::filled(of_key.bytes, limit, now);
-            of_key.bytes = Some(bucket);
-            allowances.bytes = Some(bucket.allowance(limit));
-            if bucket.left <= 0.0 {
-                let pause = WINDOW.mul_f64((1.0 - bucket.left).max(1.0) / limit);
-                refused = Some((pause, format!("{limit} bytes")));
-            }
-        }
-        if let Some(limit) = key.limits.requests_per_minute.map(f64::from) {
-            let mut bucket = Bucket::filled(of_key.requests, limit, now);
-            if bucket.left < 1.0 {
-                let pause = WINDOW.mul_f64((1.0 - bucket.left) / limit);
-                refused = Some((pause, format!("{limit} requests")));
-            } else if refused.is_none() {
-                bucket.left -= 1.0;
-            }
-            of_key.requests = Some(bucket);
-            allowances.requests = Some(bucket.allowance(limit));
-        }
-        let Some((pause, what)) = refused else { return (allowances, Ok(())) };
-        let detail = format!(
-            "the key {} has used up its {what} a minute; wait as Retry-After says, or have an admin make \
-             one with another limit",
-            key.id
-        );
-        let error = ServiceError::new(ErrorKind::Overloaded, detail).retry_after(pause);
-        (allowances, Err(error))
-    }
-
-    /// Takes bytes that have come from what is left to a key.
-    pub fn take_bytes(&self, key: &ApiKey, bytes: usize) {
-        let Some(limit) = key.limits.bytes_per_minute else { return };
-        let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
-        let of_key = buckets.entry(key.id.clone()).or_default();
-        let bucket = Bucket::filled(of_key.bytes, limit as f64, Instant::now());
-        of_key.bytes = Some(Bucket { left: bucket.left - bytes as f64, ..bucket });
     }
 
     /// Stores a key, and knows it; both, though the caller has gone meanwhile.
@@ -339,7 +228,7 @@ impl Keys {
         })
     }
 
-    fn read(&self) -> std::sync::RwLockReadGuard<'_, HashMap<String, StoredKey>> {
+    fn read(&self) -> RwLockReadGuard<'_, HashMap<String, StoredKey>> {
         self.known.read().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -361,6 +250,7 @@ mod tests {
     use super::*;
     use crate::store::StoreError;
     use async_trait::async_trait;
+    use std::sync::Mutex;
 
     #[derive(Default)]
     struct Drawer(Mutex<Vec<StoredKey>>);
@@ -411,20 +301,20 @@ mod tests {
         let limits = KeyLimits { requests_per_minute: Some(3), bytes_per_minute: Some(1000) };
         let key = keys.create(wanted(Role::Robot, limits)).await.unwrap().key;
         for left in [2, 1, 0] {
-            let (allowances, taken) = keys.take_request(&key);
+            let (allowances, taken) = keys.limits.take_request(&key);
             taken.unwrap();
             assert_eq!(allowances.requests.unwrap().remaining, left);
         }
-        let refused = keys.take_request(&key).1.unwrap_err();
+        let refused = keys.limits.take_request(&key).1.unwrap_err();
         assert_eq!(refused.kind, ErrorKind::Overloaded);
         let pause = refused.retry_after.unwrap().as_secs_f64();
         assert!((15.0..=20.0).contains(&pause), "{pause}");
 
         let limits = KeyLimits { requests_per_minute: None, ..limits };
         let key = keys.create(wanted(Role::Robot, limits)).await.unwrap().key;
-        keys.take_request(&key).1.unwrap();
-        keys.take_bytes(&key, 3000);
-        let (allowances, refused) = keys.take_request(&key);
+        keys.limits.take_request(&key).1.unwrap();
+        keys.limits.take_bytes(&key, 3000);
+        let (allowances, refused) = keys.limits.take_request(&key);
         assert_eq!(allowances.bytes.unwrap().remaining, 0);
         let pause = refused.unwrap_err().retry_after.unwrap().as_secs_f64();
         assert!((115.0..=121.0).contains(&pause), "{pause}");

@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 
+use super::retention::before;
 use super::{Service, ServiceError};
 use crate::domain::Digest;
 use crate::store::{FirstAnswer, KeptAnswer, Progress};
@@ -20,8 +21,7 @@ pub struct OnceSettings {
 impl OnceSettings {
     /// Answers from before this moment count no more.
     pub fn since(&self, now: Timestamp) -> Timestamp {
-        let keep = SignedDuration::try_from(self.keep).unwrap_or(SignedDuration::MAX);
-        now.saturating_sub(keep).unwrap_or(Timestamp::UNIX_EPOCH)
+        before(now, self.keep)
     }
 }
 

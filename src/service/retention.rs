@@ -60,8 +60,8 @@ impl Janitor {
         let now = Timestamp::now();
         let days = SignedDuration::from_hours(24 * i64::from(self.settings.usage_days));
         self.store.forget_usage(utc_day(now).saturating_sub(days)).await?;
-        let OnceSettings { most, .. } = self.settings.once;
-        self.answers.forget_answers(self.settings.once.since(now), most).await?;
+        let once = self.settings.once;
+        self.answers.forget_answers(once.since(now), once.most).await?;
         let keep = KeepJobs {
             since: self.settings.keep.map(|keep| before(now, keep)),
             most: self.settings.most,
@@ -84,7 +84,8 @@ impl Janitor {
     }
 }
 
-fn before(now: Timestamp, duration: Duration) -> Timestamp {
+/// The moment so long before another; the epoch, if that is out of reach.
+pub(super) fn before(now: Timestamp, duration: Duration) -> Timestamp {
     let duration = SignedDuration::try_from(duration).unwrap_or(SignedDuration::MAX);
     now.saturating_sub(duration).unwrap_or(Timestamp::UNIX_EPOCH)
 }

@@ -2,10 +2,7 @@
 
 use std::collections::HashMap;
 
-use crate::domain::{ImageId, Pose};
-
-/// Mean radius of the Earth in metres (IUGG).
-const EARTH_RADIUS_M: f64 = 6_371_008.8;
+use crate::domain::{EARTH_RADIUS_M, ImageId, Pose};
 
 /// The least that a place is wide, in metres: maps that have many images of one spot say nothing of it.
 const LEAST_SPACING_M: f64 = 0.5;
