@@ -1,6 +1,8 @@
 //! The records in sled, and how they are keyed.
 
 use std::path::Path;
+use std::thread;
+use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use serde::Serialize;
@@ -43,6 +45,29 @@ pub(super) struct Trees {
 /// The key of the number of the last commit, in the default tree.
 const COMMITS: &[u8] = b"commits";
 
+/// How long [`open_when_released`] waits.
+const RELEASE: Duration = Duration::from_secs(10);
+
+/// Opens the database, after waiting for sled's own threads to let go of it.
+///
+/// A database that this process has just closed, after a migration say, stays locked until the
+/// last piece of work in sled's thread pool has ended, and sled has no call that waits for that.
+/// Nobody else can hold it: the data folder has a lock of its own, which is taken first.
+fn open_when_released(config: &sled::Config) -> sled::Result<sled::Db> {
+    let until = Instant::now() + RELEASE;
+    loop {
+        match config.open() {
+            Err(sled::Error::Io(error))
+                if error.to_string().contains("could not acquire lock")
+                    && Instant::now() < until =>
+            {
+                thread::sleep(Duration::from_millis(5));
+            }
+            result => return result,
+        }
+    }
+}
+
 /// An image and where its descriptor is.
 #[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 pub(super) struct StoredImage {
@@ -62,13 +87,12 @@ pub(super) enum BlobOwner<'a> {
 
 impl Trees {
     pub fn open(path: &Path, cache_bytes: u64) -> Result<Self, StoreError> {
-        let db = sled::Config::new()
+        let config = sled::Config::new()
             .path(path)
             .cache_capacity(cache_bytes)
             // The writer flushes; a flush by the clock would only split what belongs together.
-            .flush_every_ms(None)
-            .open()
-            .map_err(failed)?;
+            .flush_every_ms(None);
+        let db = open_when_released(&config).map_err(failed)?;
         let tree = |name: &str| db.open_tree(name).map_err(failed);
         Ok(Self {
             maps: tree("maps")?,
@@ -284,5 +308,22 @@ pub(super) fn transaction_failed(error: sled::transaction::TransactionError<()>)
             StoreError::Failed("a transaction was given up".into())
         }
         sled::transaction::TransactionError::Storage(error) => failed(error),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_database_that_is_being_let_go_of_is_waited_for() {
+        let dir = tempfile::tempdir().unwrap();
+        let first = Trees::open(dir.path(), 1 << 20).unwrap();
+        let holding = thread::spawn(move || {
+            thread::sleep(Duration::from_millis(100));
+            drop(first);
+        });
+        Trees::open(dir.path(), 1 << 20).unwrap();
+        holding.join().unwrap();
     }
 }
