@@ -27,6 +27,7 @@ openvino: ## Get ONNX Runtime with OpenVINO too, the faster one on many x86-64 p
 test: assets nasm ## Set up, build and run every test
 	$(CARGO) test --release --locked
 	tests/api/conformance.sh $(BINARY) target/api-venv
+	tests/grpc/check.sh $(BINARY) target/grpc-venv
 	examples/check.sh $(BINARY) target/examples-venv
 
 conformance: build ## Hold the server against its own description with thousands of made-up requests

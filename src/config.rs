@@ -17,7 +17,7 @@ use crate::domain::{Precision, RefinerKind};
 use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
 use crate::retrieve::{AdmissionSettings, Layout, Provider, Wanted};
-use crate::service::TrackSettings;
+use crate::service::{BulkSettings, TrackSettings};
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
@@ -44,6 +44,8 @@ pub struct Config {
     pub confidence: Confidence,
     /// The frames of one robot, one after another.
     pub track: TrackSettings,
+    /// Many images in one request.
+    pub bulk: BulkSettings,
     /// Requests that may be sent again.
     pub idempotency: Idempotency,
     /// Refinement jobs.
@@ -478,6 +480,8 @@ impl Config {
             ("server.max_streams", self.server.max_streams),
             ("server.max_connections", self.server.max_connections),
             ("server.max_headers", self.server.max_headers),
+            ("server.max_concurrent", self.server.max_concurrent as usize),
+            ("server.stream_idle_s", self.server.stream_idle_s as usize),
             ("server.header_timeout_s", self.server.header_timeout_s as usize),
             ("server.body_timeout_s", self.server.body_timeout_s as usize),
             ("server.body_pause_s", self.server.body_pause_s as usize),
@@ -494,6 +498,8 @@ impl Config {
             ("index.ef_construction", self.index.ef_construction),
             ("index.ef_search", self.index.ef_search),
             ("localize.k", self.localize.k),
+            ("bulk.in_flight", self.bulk.in_flight),
+            ("bulk.max_images", self.bulk.max_images),
             ("jobs.queue", self.jobs.queue),
             ("jobs.workers", self.jobs.workers),
             ("jobs.attempts", self.jobs.attempts as usize),

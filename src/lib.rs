@@ -11,11 +11,12 @@
 //! | [`evaluate`] | how often the service is right on two folders: layouts, recall, reports |
 //! | [`archive`] | the file of `whereabouts backup`: written, continued, read with suspicion |
 //! | [`http`] | axum: extract, call the service, convert |
+//! | [`grpc`] | tonic: the same for the contract in `proto/` |
 //! | [`cli`] | one file for each command |
 //! | [`demo`] | a procedural town, to try it all on |
 //! | [`config`], [`telemetry`], [`startup`] | settings, logs and metrics, wiring |
 //!
-//! Dependencies point one way: `cli, http, evaluate → service → retrieve, refine, store → domain`. Only
+//! Dependencies point one way: `cli, http, grpc, evaluate → service → retrieve, refine, store → domain`. Only
 //! [`startup`] sees everything.
 
 pub mod archive;
@@ -24,6 +25,7 @@ pub mod config;
 pub mod demo;
 pub mod domain;
 pub mod evaluate;
+pub mod grpc;
 pub mod http;
 pub mod models;
 pub mod refine;

@@ -57,7 +57,7 @@ pub async fn serve(
         settings: retention,
     };
     let service = Arc::new(service);
-    state.set_ready(Arc::clone(&service));
+    state.door().open(Arc::clone(&service));
     let mut running = JoinSet::new();
     let until = shutdown.clone();
     running.spawn(async move { janitor.run(until).await });
@@ -72,7 +72,7 @@ pub async fn serve(
 
     shutdown.cancelled().await;
     tracing::info!("draining");
-    state.set_draining();
+    state.door().drain();
     let drained = async {
         let served = server.await;
         while running.join_next().await.is_some() {}
@@ -101,6 +101,8 @@ fn http_settings(config: &Config) -> HttpSettings {
         max_wait: Duration::from_secs(config.jobs.max_wait_s),
         max_requests: config.server.max_requests,
         max_streams: config.server.max_streams,
+        stream_idle: Duration::from_secs(config.server.stream_idle_s),
+        bulk_in_flight: config.bulk.in_flight,
         keys_required: config.keys_required(),
     }
 }
@@ -257,6 +259,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             max_wait: Duration::from_secs(config.jobs.max_wait_s),
             usage_days: config.data.usage_days,
             once: once(config),
+            bulk: config.bulk,
         },
     };
     let model = service.models.default_model();

@@ -29,7 +29,10 @@ pub struct Client {
 }
 
 /// How often a request is sent again while the server says that it is overloaded.
-const PATIENCE: usize = 60;
+pub const PATIENCE: usize = 60;
+
+/// The longest pause before that.
+pub const LONGEST_PAUSE: Duration = Duration::from_secs(30);
 
 impl Client {
     pub fn new(server: &ServerArg) -> anyhow::Result<Self> {
@@ -139,7 +142,7 @@ pub fn segment(text: &str) -> String {
 fn retry_after(response: &Response) -> Duration {
     let header = response.headers().get(reqwest::header::RETRY_AFTER);
     let seconds = header.and_then(|value| value.to_str().ok()?.parse().ok()).unwrap_or(1);
-    Duration::from_secs(u64::min(seconds, 30))
+    Duration::from_secs(seconds).min(LONGEST_PAUSE)
 }
 
 /// What the server says went wrong.

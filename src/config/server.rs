@@ -26,8 +26,10 @@ pub struct Server {
     pub header_timeout_s: u64,
     /// The largest head, in bytes.
     pub max_header_bytes: usize,
-    /// The most headers.
+    /// The most headers, of HTTP/1.
     pub max_headers: usize,
+    /// The most requests in progress on one connection, of HTTP/2.
+    pub max_concurrent: u32,
     /// The longest time that a body takes, in seconds.
     pub body_timeout_s: u64,
     /// The longest pause within a body, in seconds.
@@ -40,8 +42,10 @@ pub struct Server {
     pub request_timeout_s: u64,
     /// The most requests in progress.
     pub max_requests: usize,
-    /// The most event streams that are open.
+    /// The most event streams and gRPC streams that are open.
     pub max_streams: usize,
+    /// The longest pause between two messages of a gRPC stream, in seconds.
+    pub stream_idle_s: u64,
     /// The longest drain, in seconds.
     pub drain_timeout_s: u64,
 }
@@ -74,6 +78,7 @@ impl Server {
             header_timeout: Duration::from_secs(self.header_timeout_s),
             max_header_bytes: self.max_header_bytes,
             max_headers: self.max_headers,
+            max_concurrent: self.max_concurrent,
             write_timeout: Duration::from_secs(self.write_timeout_s),
         }
     }

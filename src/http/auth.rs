@@ -12,10 +12,12 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::TryStreamExt;
 
-use super::guard::{RequestId, hanging_up, throw_away};
+use super::batch;
+use super::guard::{RequestId, answered, hanging_up, throw_away};
 use super::problem::{Problem, defect};
 use super::state::AppState;
 use crate::domain::{ApiKey, MapName, Role, Token};
+use crate::grpc;
 use crate::service::{Allowances, Caller, ErrorKind, Service, ServiceError};
 
 const RATE_LIMIT: HeaderName = HeaderName::from_static("ratelimit");
@@ -40,6 +42,7 @@ pub(super) fn access(method: &Method, route: &str) -> Option<Access> {
         ("GET", "/jobs" | "/events" | "/usage" | "/metrics")
         | ("POST", "/jobs/{id}/cancel" | "/jobs/{id}/retry")
         | ("GET" | "POST", "/maps/{map}/images")
+        | ("POST", batch::PATH)
         | ("GET" | "DELETE", "/maps/{map}/images/{id}")
         | ("GET", "/maps/{map}/images/{id}/content") => Access::Role(Role::Operator),
         ("PUT" | "DELETE", "/maps/{map}")
@@ -60,8 +63,12 @@ pub(super) async fn admit(
 ) -> Response {
     // What has no route is answered with 404, whoever asks.
     let route = request.extensions().get::<MatchedPath>().map(|path| path.as_str().to_owned());
+    let call = route.as_deref().and_then(grpc::call);
     let needed = match &route {
         None => Access::Public,
+        Some(_) if call.is_some() => {
+            call.and_then(|call| call.role).map_or(Access::Public, Access::Role)
+        }
         Some(route) => access(request.method(), route).unwrap_or(Access::Role(Role::Admin)),
     };
     let Access::Role(role) = needed else { return next.run(request).await };
@@ -69,7 +76,7 @@ pub(super) async fn admit(
         request.extensions_mut().insert(Caller::Anybody);
         return next.run(request).await;
     }
-    let service = match state.service() {
+    let service = match state.door.service() {
         Ok(service) => service,
         Err(error) => return Problem::from(error).into_response(),
     };
@@ -78,8 +85,13 @@ pub(super) async fn admit(
         Err(error) => return refuse(request, error),
     };
     let caller = Caller::Holder(Arc::clone(&key));
-    let changes = !matches!(*request.method(), Method::GET | Method::HEAD);
-    let audited = changes && route.as_deref() != Some("/localize");
+    let audited = match call {
+        Some(call) => call.changes,
+        None => {
+            let changes = !matches!(*request.method(), Method::GET | Method::HEAD);
+            changes && route.as_deref() != Some("/localize")
+        }
+    };
     let mut audited = audited.then(|| Audited::of(&request, &key));
     let (allowances, taken) = service.keys.limits.take_request(&key);
     let allowed = match taken {
@@ -154,10 +166,11 @@ async fn may_make(
             ),
         ));
     }
-    if key.maps.is_empty() {
+    let route = route.unwrap_or_default();
+    // The map of a call of gRPC is in a message, and checked when that has been read.
+    if key.maps.is_empty() || grpc::call(route).is_some() {
         return Ok(());
     }
-    let route = route.unwrap_or_default();
     let parameters = request.extract_parts::<RawPathParams>().await.ok();
     let parameter = |name: &str| {
         let known = parameters.as_ref()?.iter().find(|(key, _)| *key == name);
@@ -183,11 +196,7 @@ async fn may_make(
     };
     let map = named.as_deref().map(str::parse::<MapName>);
     match map {
-        Some(Ok(map)) if key.may_use(&map) => Ok(()),
-        Some(Ok(map)) => Err(ServiceError::new(
-            ErrorKind::Forbidden,
-            format!("this key is not for the map {map}; ask an admin for another key"),
-        )),
+        Some(Ok(map)) => caller.check_map(&map),
         // No map has such a name; the handler says so.
         Some(Err(_)) => Ok(()),
         None => Err(ServiceError::new(
@@ -280,7 +289,7 @@ impl Audited {
     }
 
     fn answered(&mut self, response: &Response) {
-        self.status = Some(response.status().as_u16());
+        self.status = Some(answered(response));
     }
 }
 

@@ -1,5 +1,7 @@
 //! Connections: how many, how long one may stay silent, and how they end.
 
+mod answers;
+mod preface;
 mod slots;
 mod tls;
 mod writes;
@@ -11,11 +13,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
-use axum::body::{Body, HttpBody};
+use axum::body::Body;
+use axum::http::header::CONNECTION;
 use hyper::body::Incoming;
-use hyper::server::conn::http1;
+use hyper::server::conn::{http1, http2};
 use hyper::service::service_fn;
-use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio_rustls::server::TlsStream;
@@ -23,10 +26,18 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use tower::ServiceExt;
 
+use self::answers::Answers;
+use self::preface::{Looked, Version};
 use self::slots::{Slot, Slots};
 pub use self::tls::{Tls, TlsError};
 use self::writes::TimedWrites;
 use crate::telemetry::{Metrics, RefusedFor};
+
+/// What a client of HTTP/2 may send of one request before it is read, in bytes.
+const STREAM_WINDOW: u32 = 512 << 10;
+
+/// The same of all requests on its connection.
+const CONNECTION_WINDOW: u32 = 1 << 20;
 
 /// Bounds on connections.
 #[derive(Debug, Clone)]
@@ -37,8 +48,10 @@ pub struct ConnectionSettings {
     pub header_timeout: Duration,
     /// The largest head, in bytes, at least 8192.
     pub max_header_bytes: usize,
-    /// The most headers.
+    /// The most headers, of HTTP/1.
     pub max_headers: usize,
+    /// The most requests in progress on one connection, of HTTP/2.
+    pub max_concurrent: u32,
     /// The longest time that a client takes nothing of an answer.
     pub write_timeout: Duration,
 }
@@ -76,6 +89,7 @@ impl Connections {
             let (this, shutdown) = (Arc::clone(&this), shutdown.clone());
             open.spawn(async move {
                 this.metrics.connection_opened();
+                let slot = Arc::new(slot);
                 tokio::select! {
                     () = this.serve_one(stream, &slot, shutdown) => {}
                     () = slot.taken_away() => this.metrics.refused(RefusedFor::Connections),
@@ -88,7 +102,7 @@ impl Connections {
         open.wait().await;
     }
 
-    async fn serve_one(&self, stream: TcpStream, slot: &Slot, shutdown: CancellationToken) {
+    async fn serve_one(&self, stream: TcpStream, slot: &Arc<Slot>, shutdown: CancellationToken) {
         // An answer should not wait for the acknowledgement of the one before.
         let _ = stream.set_nodelay(true);
         let Some(tls) = &self.tls else {
@@ -122,32 +136,44 @@ impl Connections {
         tls.acceptor().accept(TimedWrites::new(stream, self.settings.write_timeout)).await
     }
 
-    /// Answers the requests of a connection, one after another.
+    /// Answers the requests of a connection, in the version of HTTP that the client speaks.
     async fn talk<S: AsyncRead + AsyncWrite + Unpin>(
         &self,
         stream: S,
-        slot: &Slot,
+        slot: &Arc<Slot>,
         shutdown: CancellationToken,
     ) {
-        let io = TokioIo::new(stream);
-        let answer = |request: hyper::Request<Incoming>| {
-            slot.request_began();
-            let router = self.router.clone();
-            async move {
-                let response = router.oneshot(request.map(Body::new)).await?;
-                // A connection that streams events does not look idle.
-                if response.body().size_hint().exact().is_some() {
-                    slot.request_ended();
-                }
-                Ok::<_, Infallible>(response)
+        let answers = Answers::new(Arc::clone(slot));
+        let mut stream = Looked::new(stream);
+        let looked = tokio::time::timeout(self.settings.header_timeout, stream.version());
+        match shutdown.run_until_cancelled(looked).await {
+            Some(Ok(Ok(Version::Http1))) => {
+                self.talk_http1(stream, answers, shutdown.clone()).await
             }
-        };
+            Some(Ok(Ok(Version::Http2))) => {
+                self.talk_http2(stream, answers, shutdown.clone()).await
+            }
+            Some(Ok(Err(error))) => tracing::debug!(%error, "a connection broke off"),
+            // Who has sent nothing has asked for nothing.
+            Some(Err(_)) if stream.has_begun() => self.give_up(stream).await,
+            Some(Err(_)) | None => {}
+        }
+    }
+
+    /// Answers one request after another.
+    async fn talk_http1<S: AsyncRead + AsyncWrite + Unpin>(
+        &self,
+        stream: Looked<S>,
+        answers: Answers,
+        shutdown: CancellationToken,
+    ) {
+        let answer = |request| self.answer(&answers, request);
         let mut connection = http1::Builder::new()
             .timer(TokioTimer::new())
             .header_read_timeout(self.settings.header_timeout)
             .max_buf_size(self.settings.max_header_bytes)
             .max_headers(self.settings.max_headers)
-            .serve_connection(io, service_fn(answer));
+            .serve_connection(TokioIo::new(stream), service_fn(answer));
         let mut stopping = pin!(shutdown.cancelled());
         let mut draining = false;
         let ended = loop {
@@ -155,7 +181,7 @@ impl Connections {
                 ended = &mut connection => break ended,
                 () = &mut stopping, if !draining => {
                     draining = true;
-                    std::pin::Pin::new(&mut connection).graceful_shutdown();
+                    Pin::new(&mut connection).graceful_shutdown();
                 }
             }
         };
@@ -163,15 +189,82 @@ impl Connections {
         tracing::debug!(%error, "a connection broke off");
         if error.is_timeout() {
             let parts = connection.into_parts();
-            // Who has sent nothing has asked for nothing.
             if !parts.read_buf.is_empty() {
-                self.metrics.refused(RefusedFor::Slow);
-                let answer = self.too_slow();
-                let mut io = parts.io.into_inner();
-                let _ = io.write_all(answer.as_bytes()).await;
-                let _ = io.shutdown().await;
+                self.give_up(parts.io.into_inner()).await;
             }
         }
+    }
+
+    /// Answers several requests at a time. A client that takes nothing of an answer is given up, though
+    /// it takes others.
+    async fn talk_http2<S: AsyncRead + AsyncWrite + Unpin>(
+        &self,
+        stream: Looked<S>,
+        answers: Answers,
+        shutdown: CancellationToken,
+    ) {
+        let answer = |request| {
+            let answer = self.answer(&answers, request);
+            async {
+                let mut response = answer.await?;
+                // There is no such header in HTTP/2, and no need to hang up.
+                response.headers_mut().remove(CONNECTION);
+                Ok::<_, Infallible>(response)
+            }
+        };
+        let patience = self.settings.write_timeout;
+        let header_bytes = u32::try_from(self.settings.max_header_bytes).unwrap_or(u32::MAX);
+        let mut connection = pin!(
+            http2::Builder::new(TokioExecutor::new())
+                .timer(TokioTimer::new())
+                .max_concurrent_streams(self.settings.max_concurrent)
+                .max_header_list_size(header_bytes)
+                .initial_stream_window_size(STREAM_WINDOW)
+                .initial_connection_window_size(CONNECTION_WINDOW)
+                .keep_alive_interval(patience)
+                .keep_alive_timeout(patience)
+                .serve_connection(TokioIo::new(stream), service_fn(answer))
+        );
+        let mut stopping = pin!(shutdown.cancelled());
+        let mut draining = false;
+        let mut looking = tokio::time::interval(patience / 4);
+        let ended = loop {
+            tokio::select! {
+                ended = &mut connection => break ended,
+                () = &mut stopping, if !draining => {
+                    draining = true;
+                    connection.as_mut().graceful_shutdown();
+                }
+                _ = looking.tick() => if answers.are_stalled(patience) {
+                    self.metrics.refused(RefusedFor::Slow);
+                    return tracing::debug!("a client takes nothing of an answer");
+                },
+            }
+        };
+        if let Err(error) = ended {
+            tracing::debug!(%error, "a connection broke off");
+        }
+    }
+
+    /// The answer to a request, which is in progress as long as there is more of the answer.
+    fn answer(
+        &self,
+        answers: &Answers,
+        request: hyper::Request<Incoming>,
+    ) -> impl Future<Output = Result<axum::response::Response, Infallible>> + Send + use<> {
+        let in_progress = answers.begin();
+        let router = self.router.clone();
+        async move {
+            let response = router.oneshot(request.map(Body::new)).await?;
+            Ok(response.map(|body| in_progress.over(body)))
+        }
+    }
+
+    /// Says that the head of a request did not come in time.
+    async fn give_up(&self, mut stream: impl AsyncWrite + Unpin) {
+        self.metrics.refused(RefusedFor::Slow);
+        let _ = stream.write_all(self.too_slow().as_bytes()).await;
+        let _ = stream.shutdown().await;
     }
 
     fn too_slow(&self) -> String {

@@ -1,14 +1,14 @@
 //! `X-Deadline-Ms`: how long a client is willing to wait for an answer.
 
 use std::convert::Infallible;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName};
 
 use super::problem::Problem;
-use crate::service::ErrorKind;
+use crate::service::{Deadline, ErrorKind};
 
 /// Milliseconds from the arrival of the request's head.
 pub(super) const DEADLINE: HeaderName = HeaderName::from_static("x-deadline-ms");
@@ -16,12 +16,19 @@ pub(super) const DEADLINE: HeaderName = HeaderName::from_static("x-deadline-ms")
 /// The longest wait that can be asked for: longer than any request may take.
 const LONGEST_MS: u64 = 3_600_000;
 
-/// When the client no longer wants the answer, if it said so.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Deadline(pub Option<Instant>);
+/// The deadline of a call of gRPC: up to eight digits and a unit.
+const GRPC_TIMEOUT: HeaderName = HeaderName::from_static("grpc-timeout");
 
 /// The wait that the headers allow.
 pub(super) fn allowed(headers: &HeaderMap) -> Result<Option<Duration>, Problem> {
+    if let Some(value) = headers.get(GRPC_TIMEOUT) {
+        let wait = value.to_str().ok().and_then(grpc_timeout);
+        return wait.map(Some).ok_or_else(|| {
+            let detail =
+                format!("grpc-timeout is {value:?}; it must be up to 8 digits and one of HMSmun");
+            Problem::new(ErrorKind::Malformed, detail)
+        });
+    }
     let Some(value) = headers.get(DEADLINE) else { return Ok(None) };
     let milliseconds = value.to_str().ok().and_then(|text| text.parse::<u64>().ok());
     match milliseconds {
@@ -36,12 +43,29 @@ pub(super) fn allowed(headers: &HeaderMap) -> Result<Option<Duration>, Problem> 
     }
 }
 
+fn grpc_timeout(text: &str) -> Option<Duration> {
+    let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
+    if !(1..=8).contains(&digits.len()) || !digits.bytes().all(|byte| byte.is_ascii_digit()) {
+        return None;
+    }
+    let amount: u64 = digits.parse().ok()?;
+    Some(match unit {
+        "H" => Duration::from_secs(amount * 3600),
+        "M" => Duration::from_secs(amount * 60),
+        "S" => Duration::from_secs(amount),
+        "m" => Duration::from_millis(amount),
+        "u" => Duration::from_micros(amount),
+        "n" => Duration::from_nanos(amount),
+        _ => return None,
+    })
+}
+
 pub(super) fn passed(wait: Duration) -> Problem {
     Problem::new(
         ErrorKind::DeadlinePassed,
         format!(
-            "the {} ms of X-Deadline-Ms have passed, and the request was given up; allow more time, \
-             or send a later frame",
+            "the {} ms that the request was given (X-Deadline-Ms, grpc-timeout) have passed, and it was \
+             given up; allow more time, or send a later frame",
             wait.as_millis()
         ),
     )
@@ -52,5 +76,19 @@ impl<S: Sync> FromRequestParts<S> for Deadline {
 
     async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
         Ok(parts.extensions.get().copied().unwrap_or_default())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_deadline_of_a_call_has_digits_and_a_unit() {
+        assert_eq!(grpc_timeout("250m"), Some(Duration::from_millis(250)));
+        assert_eq!(grpc_timeout("99999999H"), Some(Duration::from_secs(99_999_999 * 3600)));
+        for bad in ["", "S", "5", "123456789S", "-1S", "+1S", "5s", "5é"] {
+            assert_eq!(grpc_timeout(bad), None, "{bad}");
+        }
     }
 }

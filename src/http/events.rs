@@ -8,7 +8,6 @@ use axum::extract::State;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::{Stream, StreamExt};
 use serde::Deserialize;
-use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
 use utoipa::IntoParams;
 
@@ -17,7 +16,7 @@ use super::jobs::job_id;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
-use crate::service::{AnyJobEvent, Caller, ErrorKind, JobEvent, Service};
+use crate::service::{AnyJobEvent, Caller, JobEvent, Service};
 
 /// A comment is sent after so long without an event, so that nothing on the way hangs up.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -39,7 +38,7 @@ pub(super) async fn follow_job(
     Extension(caller): Extension<Caller>,
     Segments(id): Segments<String>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
-    let permit = permit(&state)?;
+    let permit = state.stream()?;
     let events = service.follow_job(job_id(&id)?).await?.map(move |event| {
         // Given back when the stream ends or the client has gone.
         let _permit = &permit;
@@ -49,7 +48,7 @@ pub(super) async fn follow_job(
             JobEvent::Ended(job) => Event::default().event("end").json_data(job),
         }
     });
-    Ok(streamed(events, state.draining(), service, caller))
+    Ok(streamed(events, state.door.draining(), service, caller))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -77,7 +76,7 @@ pub(super) async fn follow_jobs(
     Params(params): Params<FollowParams>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let map = params.map.as_deref().map(map_name).transpose()?;
-    let permit = permit(&state)?;
+    let permit = state.stream()?;
     let events = service.follow_jobs(map).map(move |event| {
         let _permit = &permit;
         match event {
@@ -85,19 +84,7 @@ pub(super) async fn follow_jobs(
             AnyJobEvent::Missed(missed) => Event::default().event("missed").json_data(missed),
         }
     });
-    Ok(streamed(events, state.draining(), service, caller))
-}
-
-/// The right to one of the streams that may be open.
-fn permit(state: &AppState) -> Result<OwnedSemaphorePermit, Problem> {
-    Arc::clone(&state.streams).try_acquire_owned().map_err(|_| {
-        let detail = format!(
-            "{} event streams are open, the bound (server.max_streams); ask with GET /jobs or \
-             GET /jobs/{{id}}?wait= instead",
-            state.settings.max_streams
-        );
-        Problem::new(ErrorKind::Overloaded, detail)
-    })
+    Ok(streamed(events, state.door.draining(), service, caller))
 }
 
 /// Sends events until they end, the server drains, or the caller may ask no more. A drain does not wait for

@@ -3,20 +3,24 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use axum::body::BodyDataStream;
+use axum::body::{Body, BodyDataStream};
 use axum::extract::{MatchedPath, Request, State};
 use axum::http::header::{CONNECTION, CONTENT_LENGTH, EXPECT};
 use axum::http::{HeaderName, HeaderValue};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt;
+use http_body_util::BodyExt;
 
 use super::auth::without_secrets;
-use super::deadline::{self, Deadline};
+use super::batch;
+use super::deadline;
 use super::incoming::Watch;
+use super::messages;
 use super::problem::Problem;
 use super::state::AppState;
-use crate::service::ErrorKind;
+use crate::grpc::{self, Call};
+use crate::service::{Deadline, ErrorKind};
 use crate::telemetry::RefusedFor;
 
 /// The id of a request: the caller's `x-request-id`, or a fresh one.
@@ -40,13 +44,19 @@ pub(super) async fn observe(
         request.extensions().get::<MatchedPath>().map_or("none", |path| path.as_str()).to_owned();
     let path = without_secrets(request.uri().path());
     let mut response = next.run(request).await;
-    let (took, status) = (start.elapsed(), response.status().as_u16());
+    let (took, status) = (start.elapsed(), answered(&response));
     state.metrics.request(method.as_str(), &route, status, took);
     tracing::debug!(request_id = %id.0, %method, path, status, ms = took.as_secs_f64() * 1e3);
     if let Ok(value) = HeaderValue::from_str(&id.0) {
         response.headers_mut().insert(REQUEST_ID, value);
     }
     response
+}
+
+/// What a request was answered with; of a call of gRPC, whose status of HTTP is always 200, what comes
+/// nearest to it.
+pub(super) fn answered(response: &Response) -> u16 {
+    grpc::status::as_http(response).unwrap_or(response.status().as_u16())
 }
 
 fn request_id(request: &Request) -> RequestId {
@@ -71,6 +81,11 @@ pub(super) async fn bound(
     if matches!(request.uri().path(), "/livez" | "/readyz" | "/metrics") {
         return next.run(request).await;
     }
+    let call = grpc::call(request.uri().path()).filter(|_| grpc::is_call(request.headers()));
+    let route = request.extensions().get::<MatchedPath>().map(MatchedPath::as_str);
+    if call.is_some_and(|call| call.streams) || route == Some(batch::PATH) {
+        return bound_stream(state, request, next, arrival, call).await;
+    }
     let Ok(_permit) = Arc::clone(&state.permits).try_acquire_owned() else {
         state.metrics.refused(RefusedFor::Requests);
         let detail = format!(
@@ -90,8 +105,11 @@ pub(super) async fn bound(
     };
     request.extensions_mut().insert(Deadline(wanted_for.map(|wait| arrival + wait)));
     let watch = Watch::default();
-    let request = request.map(|body| watch.over(body, &state.settings, &state.bodies_memory));
-    let longest = time_allowed(&state, &request);
+    let request = request.map(|body| match call {
+        Some(call) => messages::bounded(body, call, &state.settings, &state.bodies_memory),
+        None => watch.over(body, &state.settings, &state.bodies_memory),
+    });
+    let longest = time_allowed(&state, &request, call);
     let allowed = wanted_for.map_or(longest, |wait| wait.min(longest));
     let answered = tokio::time::timeout(allowed, next.run(request)).await;
     watch.answered();
@@ -113,12 +131,45 @@ pub(super) async fn bound(
     }
 }
 
+/// Bounds a request that may take any time, message by message, or piece by piece.
+async fn bound_stream(
+    state: AppState,
+    mut request: Request,
+    next: Next,
+    arrival: Instant,
+    call: Option<Call>,
+) -> Response {
+    let permit = match state.stream() {
+        Ok(permit) => permit,
+        Err(problem) => return problem.into_response(),
+    };
+    match deadline::allowed(request.headers()) {
+        Ok(wait) => request.extensions_mut().insert(Deadline(wait.map(|wait| arrival + wait))),
+        Err(problem) => return problem.into_response(),
+    };
+    let request = request.map(|body| match call {
+        Some(call) => messages::bounded(body, call, &state.settings, &state.bodies_memory),
+        None => batch::unhurried(body, state.settings.body_pause),
+    });
+    let response = next.run(request).await;
+    response.map(|body| {
+        Body::new(body.map_frame(move |frame| {
+            // Given back when the answers end or the client has gone.
+            let _permit = &permit;
+            frame
+        }))
+    })
+}
+
 pub(super) fn too_large(limit: usize) -> String {
     format!("the body exceeds {limit} bytes (server.body_limit_bytes); send a smaller picture")
 }
 
-fn time_allowed(state: &AppState, request: &Request) -> Duration {
-    let waits = request.uri().query().is_some_and(|query| query.contains("wait"));
+fn time_allowed(state: &AppState, request: &Request, call: Option<Call>) -> Duration {
+    let waits = match call {
+        Some(call) => call.waits,
+        None => request.uri().query().is_some_and(|query| query.contains("wait")),
+    };
     state.settings.request_timeout + if waits { state.settings.max_wait } else { Duration::ZERO }
 }
 

@@ -22,8 +22,8 @@ pub(super) async fn livez() -> &'static str {
     (status = 503, body = Problem, description = "Starting or draining", content_type = "application/problem+json"),
 ))]
 pub(super) async fn readyz(State(state): State<AppState>) -> Result<&'static str, Problem> {
-    state.service()?;
-    if state.is_draining() {
+    state.door.service()?;
+    if state.door.draining().is_cancelled() {
         return Err(Problem::new(ErrorKind::Unavailable, "the server is draining; use another"));
     }
     Ok("ready\n")

@@ -11,15 +11,20 @@ use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
+use super::batch;
 use super::body::whole;
 use super::problem::{Problem, defect};
 use super::state::AppState;
 use crate::domain::Digest;
+use crate::grpc;
 use crate::service::{Caller, ErrorKind, Once, Service};
 use crate::store::KeptAnswer;
 
 pub(super) const IDEMPOTENCY_KEY: &str = "idempotency-key";
 const REPLAYED: HeaderName = HeaderName::from_static("idempotent-replayed");
+
+/// The call that makes an API key.
+const KEYS: &str = "/keys";
 
 /// The longest key, in bytes.
 pub(super) const LONGEST_KEY: usize = 255;
@@ -28,9 +33,10 @@ pub(super) const LONGEST_KEY: usize = 255;
 const LARGEST_ANSWER: usize = 4 << 20;
 
 /// Whether a call can be sent again with a key. The answer of the one that makes an API key is not kept,
-/// because the key is in it.
+/// because the key is in it; a call of gRPC is no single text; many images can be sent again anyway, and may
+/// be too many to look at before.
 pub(super) fn applies(method: &Method, route: &str) -> bool {
-    method == Method::POST && route != "/keys"
+    method == Method::POST && ![KEYS, batch::PATH].contains(&route) && grpc::call(route).is_none()
 }
 
 /// Does a request with a key once, and gives its answer again.
@@ -50,7 +56,7 @@ async fn answer(state: AppState, request: Request, next: Next) -> Result<Respons
             "this call takes no Idempotency-Key: what it answers is not kept; leave the header out",
         ));
     }
-    let service = state.service()?;
+    let service = state.door.service()?;
     let scope = request.extensions().get::<Caller>().map_or("-", Caller::scope);
     let id = format!("{scope} {key}");
     let (parts, body) = request.into_parts();

@@ -12,13 +12,12 @@ use serde_json::{Map as JsonObject, Value};
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody, Segments};
-use super::deadline::Deadline;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
 use crate::domain::{Image, ImageId};
 use crate::retrieve::{Class, Demand};
-use crate::service::{ErrorKind, ImageMeta, ImagePage, NewImage, ServiceError};
+use crate::service::{Deadline, ErrorKind, ImageMeta, ImagePage, NewImage, ServiceError};
 use crate::store::Added;
 
 /// What can be said about a raw image in the query string; a form says it in its part `meta`.

@@ -7,13 +7,14 @@ use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody};
-use super::deadline::Deadline;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
 use crate::domain::Priority;
 use crate::retrieve::{Class, Demand};
-use crate::service::{Answer, Caller, LocalizeRequest, RefineMode, ServiceError, TrackStep};
+use crate::service::{
+    Answer, Caller, Deadline, LocalizeRequest, RefineMode, ServiceError, TrackStep,
+};
 
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]

@@ -1,6 +1,7 @@
 //! HTTP: extract, call the service, convert. No decision about maps or frames is taken here.
 
 mod auth;
+mod batch;
 mod body;
 mod connections;
 mod deadline;
@@ -15,6 +16,7 @@ mod jobs;
 mod keys;
 mod localize;
 mod maps;
+mod messages;
 mod problem;
 mod state;
 mod transfer;
@@ -25,9 +27,12 @@ use axum::extract::DefaultBodyLimit;
 use axum::middleware::{from_fn, from_fn_with_state};
 use tower_http::catch_panic::CatchPanicLayer;
 use utoipa::OpenApi;
-use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt};
 use utoipa_axum::routes;
 
+use crate::grpc;
+
+pub use batch::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 pub use connections::{ConnectionSettings, Connections, Tls, TlsError};
 pub use state::{AppState, HttpSettings};
 
@@ -67,6 +72,7 @@ fn described() -> OpenApiRouter<AppState> {
         .routes(routes!(transfer::export))
         .routes(routes!(transfer::import_map, transfer::import_image))
         .routes(routes!(images::list_images, images::add_image))
+        .routes(routes!(batch::add_images).layer(DefaultBodyLimit::disable()))
         .routes(routes!(images::get_image, images::delete_image))
         .routes(routes!(images::image_content))
         .routes(routes!(localize::localize))
@@ -94,6 +100,7 @@ pub fn router(state: AppState) -> Router {
     let (router, description) = described().split_for_parts();
     let description = description::completed(description);
     router
+        .merge(grpc::routes(&state.door, state.settings.body_limit_bytes))
         .route("/openapi.json", axum::routing::get(move || health::openapi_json(description)))
         .route("/docs", axum::routing::get(health::docs))
         .route("/", axum::routing::get(health::to_docs))

@@ -1,5 +1,7 @@
 //! Errors as RFC 9457 problems. This is the one place that maps an error's kind to a status.
 
+use std::time::Duration;
+
 use axum::Json;
 use axum::extract::Request;
 use axum::http::header::{CONTENT_TYPE, RETRY_AFTER};
@@ -10,6 +12,7 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::guard::RequestId;
+use crate::grpc;
 use crate::service::{ErrorKind, ServiceError};
 
 /// What went wrong, for programs and people (RFC 9457, `application/problem+json`).
@@ -26,25 +29,25 @@ pub(super) struct Problem {
     detail: String,
     /// The id of the request, as in the `x-request-id` header and the logs.
     request_id: String,
-    /// When it is worth trying again, in whole seconds.
+    /// The kind, for other forms than this.
     #[serde(skip)]
-    retry_after: Option<u64>,
+    of: ErrorKind,
+    /// When it is worth trying again.
+    #[serde(skip)]
+    retry_after: Option<Duration>,
 }
 
 impl Problem {
     pub fn new(kind: ErrorKind, detail: impl Into<String>) -> Self {
-        let (status, word, title) = status_of(kind);
+        let (status, title) = status_of(kind);
         Self {
-            kind: format!("about:blank#{word}"),
+            kind: format!("about:blank#{}", kind.word()),
             title,
             status: status.as_u16(),
             detail: detail.into(),
             request_id: String::new(),
-            retry_after: match kind {
-                ErrorKind::Overloaded => Some(1),
-                ErrorKind::Unavailable => Some(2),
-                _ => None,
-            },
+            of: kind,
+            retry_after: kind.retry_after(),
         }
     }
 }
@@ -54,42 +57,38 @@ pub(super) fn defect() -> Problem {
     Problem::new(ErrorKind::Internal, "the request hit a defect of the server; see its log")
 }
 
-fn status_of(kind: ErrorKind) -> (StatusCode, &'static str, &'static str) {
+fn status_of(kind: ErrorKind) -> (StatusCode, &'static str) {
     match kind {
-        ErrorKind::Malformed => (StatusCode::BAD_REQUEST, "malformed", "Malformed request"),
-        ErrorKind::Unauthorized => (StatusCode::UNAUTHORIZED, "unauthorized", "Unauthorized"),
-        ErrorKind::Forbidden => (StatusCode::FORBIDDEN, "forbidden", "Forbidden"),
-        ErrorKind::NotFound => (StatusCode::NOT_FOUND, "not-found", "Not found"),
-        ErrorKind::Conflict => (StatusCode::CONFLICT, "conflict", "Conflict"),
-        ErrorKind::TooLarge => (StatusCode::PAYLOAD_TOO_LARGE, "too-large", "Body too large"),
+        ErrorKind::Malformed => (StatusCode::BAD_REQUEST, "Malformed request"),
+        ErrorKind::Unauthorized => (StatusCode::UNAUTHORIZED, "Unauthorized"),
+        ErrorKind::Forbidden => (StatusCode::FORBIDDEN, "Forbidden"),
+        ErrorKind::NotFound => (StatusCode::NOT_FOUND, "Not found"),
+        ErrorKind::Conflict => (StatusCode::CONFLICT, "Conflict"),
+        ErrorKind::TooLarge => (StatusCode::PAYLOAD_TOO_LARGE, "Body too large"),
         ErrorKind::UnsupportedMedia => {
-            (StatusCode::UNSUPPORTED_MEDIA_TYPE, "media-type", "Unsupported media type")
+            (StatusCode::UNSUPPORTED_MEDIA_TYPE, "Unsupported media type")
         }
-        ErrorKind::Unprocessable => {
-            (StatusCode::UNPROCESSABLE_ENTITY, "unprocessable", "Unprocessable content")
-        }
-        ErrorKind::Overloaded => (StatusCode::TOO_MANY_REQUESTS, "overloaded", "Overloaded"),
-        ErrorKind::Full => (StatusCode::INSUFFICIENT_STORAGE, "disk-full", "Insufficient storage"),
-        ErrorKind::TooSlow => (StatusCode::REQUEST_TIMEOUT, "too-slow", "Request timeout"),
-        ErrorKind::DeadlinePassed => {
-            (StatusCode::GATEWAY_TIMEOUT, "deadline-passed", "Deadline passed")
-        }
-        ErrorKind::Unavailable => {
-            (StatusCode::SERVICE_UNAVAILABLE, "unavailable", "Service unavailable")
-        }
-        ErrorKind::Internal => {
-            (StatusCode::INTERNAL_SERVER_ERROR, "internal", "Internal server error")
-        }
+        ErrorKind::Unprocessable => (StatusCode::UNPROCESSABLE_ENTITY, "Unprocessable content"),
+        ErrorKind::Overloaded => (StatusCode::TOO_MANY_REQUESTS, "Overloaded"),
+        ErrorKind::Full => (StatusCode::INSUFFICIENT_STORAGE, "Insufficient storage"),
+        ErrorKind::TooSlow => (StatusCode::REQUEST_TIMEOUT, "Request timeout"),
+        ErrorKind::DeadlinePassed => (StatusCode::GATEWAY_TIMEOUT, "Deadline passed"),
+        ErrorKind::Unavailable => (StatusCode::SERVICE_UNAVAILABLE, "Service unavailable"),
+        ErrorKind::Internal => (StatusCode::INTERNAL_SERVER_ERROR, "Internal server error"),
     }
 }
 
 impl From<ServiceError> for Problem {
     fn from(error: ServiceError) -> Self {
         let mut problem = Self::new(error.kind, error.detail);
-        if let Some(pause) = error.retry_after {
-            problem.retry_after = Some(pause.as_millis().div_ceil(1000) as u64);
-        }
+        problem.retry_after = error.retry_after.or(problem.retry_after);
         problem
+    }
+}
+
+impl From<Problem> for tonic::Status {
+    fn from(problem: Problem) -> Self {
+        grpc::status::status(problem.of, &problem.detail, problem.retry_after)
     }
 }
 
@@ -103,8 +102,9 @@ impl IntoResponse for Problem {
     }
 }
 
-/// Writes the body of every error response.
+/// Writes the body of every error response, or the status of a call of gRPC.
 pub(super) async fn render(request: Request, next: Next) -> Response {
+    let is_call = grpc::is_call(request.headers());
     let id = request.extensions().get::<RequestId>().cloned().unwrap_or_default();
     let mut response = next.run(request).await;
     let Some(mut problem) = response.extensions_mut().remove::<Problem>() else { return response };
@@ -113,10 +113,17 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
     }
     problem.request_id = id.0;
     let retry_after = problem.retry_after;
-    let mut rendered = (response.status(), Json(problem)).into_response();
+    let mut rendered = if is_call {
+        tonic::Status::from(problem).into_http()
+    } else {
+        let mut rendered = (response.status(), Json(problem)).into_response();
+        let problem = HeaderValue::from_static("application/problem+json");
+        rendered.headers_mut().insert(CONTENT_TYPE, problem);
+        rendered
+    };
     let headers = rendered.headers_mut();
-    headers.insert(CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
-    if let Some(seconds) = retry_after {
+    if let Some(pause) = retry_after {
+        let seconds = pause.as_millis().div_ceil(1000) as u64;
         headers.insert(RETRY_AFTER, HeaderValue::from(seconds));
     }
     // What was said beside the body: that the connection closes, what is left to a key.
@@ -124,11 +131,15 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
     rendered
 }
 
-pub(super) async fn no_such_path(request: Request) -> Problem {
-    Problem::new(
-        ErrorKind::NotFound,
-        format!("there is nothing at {}; GET /docs lists the calls", request.uri().path()),
-    )
+pub(super) async fn no_such_path(request: Request) -> Response {
+    let path = request.uri().path();
+    if grpc::is_call(request.headers()) {
+        let detail =
+            format!("there is no call {path}; ask the reflection service for those there are");
+        return tonic::Status::unimplemented(detail).into_http();
+    }
+    let detail = format!("there is nothing at {path}; GET /docs lists the calls");
+    Problem::new(ErrorKind::NotFound, detail).into_response()
 }
 
 pub(super) async fn no_such_method(request: Request) -> Response {

@@ -1,15 +1,14 @@
 //! What handlers share, and how a handler gets a service that is ready.
 
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
-use tokio::sync::Semaphore;
-use tokio_util::sync::CancellationToken;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::problem::Problem;
-use crate::service::{ErrorKind, Service, ServiceError};
+use crate::service::{Door, ErrorKind, Service};
 use crate::telemetry::Metrics;
 
 /// Bounds of the HTTP layer.
@@ -31,6 +30,10 @@ pub struct HttpSettings {
     pub max_requests: usize,
     /// The most event streams that are open.
     pub max_streams: usize,
+    /// The longest pause between two messages of a gRPC stream.
+    pub stream_idle: Duration,
+    /// Images of one upload that are worked on at a time.
+    pub bulk_in_flight: usize,
     /// Whether callers need a key.
     pub keys_required: bool,
 }
@@ -43,8 +46,7 @@ pub struct AppState {
     pub(super) permits: Arc<Semaphore>,
     pub(super) streams: Arc<Semaphore>,
     pub(super) bodies_memory: Arc<Semaphore>,
-    service: Arc<OnceLock<Arc<Service>>>,
-    draining: CancellationToken,
+    pub(super) door: Door,
 }
 
 impl AppState {
@@ -56,34 +58,24 @@ impl AppState {
             bodies_memory: Arc::new(Semaphore::new(settings.bodies_limit_bytes)),
             settings: Arc::new(settings),
             metrics,
-            service: Arc::default(),
-            draining: CancellationToken::new(),
+            door: Door::default(),
         }
     }
 
-    /// Opens the doors.
-    pub fn set_ready(&self, service: Arc<Service>) {
-        let _ = self.service.set(service);
+    /// What stands between the callers and the service.
+    pub fn door(&self) -> &Door {
+        &self.door
     }
 
-    /// Says from now on that the server is not ready, while it answers what it has begun. Event
-    /// streams end.
-    pub fn set_draining(&self) {
-        self.draining.cancel();
-    }
-
-    pub(super) fn is_draining(&self) -> bool {
-        self.draining.is_cancelled()
-    }
-
-    pub(super) fn draining(&self) -> CancellationToken {
-        self.draining.clone()
-    }
-
-    pub(super) fn service(&self) -> Result<Arc<Service>, ServiceError> {
-        self.service.get().cloned().ok_or_else(|| {
-            let detail = "the server is starting; try again in a second";
-            ServiceError::new(ErrorKind::Unavailable, detail)
+    /// The right to one of the streams that may be open.
+    pub(super) fn stream(&self) -> Result<OwnedSemaphorePermit, Problem> {
+        Arc::clone(&self.streams).try_acquire_owned().map_err(|_| {
+            let detail = format!(
+                "{} streams are open, the bound (server.max_streams); ask with GET /jobs or \
+                 GET /jobs/{{id}}?wait= instead",
+                self.settings.max_streams
+            );
+            Problem::new(ErrorKind::Overloaded, detail)
         })
     }
 }
@@ -95,6 +87,6 @@ impl FromRequestParts<AppState> for Ready {
     type Rejection = Problem;
 
     async fn from_request_parts(_: &mut Parts, state: &AppState) -> Result<Self, Problem> {
-        Ok(Self(state.service()?))
+        Ok(Self(state.door.service()?))
     }
 }

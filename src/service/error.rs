@@ -6,7 +6,7 @@ use crate::domain::{InvalidName, PoseError};
 use crate::retrieve::{ExtractError, Overloaded, Refusal, Refused};
 use crate::store::StoreError;
 
-/// The kinds that a caller can tell apart; HTTP maps each to one status.
+/// The kinds that a caller can tell apart; HTTP and gRPC map each to one status.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ErrorKind {
     /// The request cannot be read.
@@ -37,6 +37,37 @@ pub enum ErrorKind {
     Unavailable,
     /// The service failed.
     Internal,
+}
+
+impl ErrorKind {
+    /// The kind in a word, for programs.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Malformed => "malformed",
+            Self::Unauthorized => "unauthorized",
+            Self::Forbidden => "forbidden",
+            Self::NotFound => "not-found",
+            Self::Conflict => "conflict",
+            Self::TooLarge => "too-large",
+            Self::UnsupportedMedia => "media-type",
+            Self::Unprocessable => "unprocessable",
+            Self::Overloaded => "overloaded",
+            Self::Full => "disk-full",
+            Self::TooSlow => "too-slow",
+            Self::DeadlinePassed => "deadline-passed",
+            Self::Unavailable => "unavailable",
+            Self::Internal => "internal",
+        }
+    }
+
+    /// When it is worth trying again, where nothing better is known.
+    pub fn retry_after(self) -> Option<Duration> {
+        match self {
+            Self::Overloaded => Some(Duration::from_secs(1)),
+            Self::Unavailable => Some(Duration::from_secs(2)),
+            _ => None,
+        }
+    }
 }
 
 /// What went wrong, in a sentence for the caller.

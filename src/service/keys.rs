@@ -80,6 +80,25 @@ impl Caller {
             Self::Holder(key) => key.may_use(map),
         }
     }
+
+    /// Whether the caller may use all maps.
+    pub fn may_use_all(&self) -> bool {
+        match self {
+            Self::Anybody => true,
+            Self::Holder(key) => key.maps.is_empty(),
+        }
+    }
+
+    /// Refuses a map that the caller may not use.
+    pub fn check_map(&self, map: &MapName) -> Result<(), ServiceError> {
+        match self.may_use(map) {
+            true => Ok(()),
+            false => Err(ServiceError::new(
+                ErrorKind::Forbidden,
+                format!("this key is not for the map {map}; ask an admin for another key"),
+            )),
+        }
+    }
 }
 
 /// All keys, and what each may still ask for.

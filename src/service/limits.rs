@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::{ErrorKind, ServiceError};
+use super::{Caller, ErrorKind, ServiceError};
 use crate::domain::ApiKey;
 
 /// A bucket of a key fills up in this time.
@@ -100,6 +100,14 @@ impl Limits {
         );
         let error = ServiceError::new(ErrorKind::Overloaded, detail).retry_after(pause);
         (allowances, Err(error))
+    }
+
+    /// Takes one of several things that came in one request from the requests left to a key.
+    pub fn take_one_more(&self, caller: &Caller) -> Result<(), ServiceError> {
+        match caller {
+            Caller::Anybody => Ok(()),
+            Caller::Holder(key) => self.take_request(key).1,
+        }
     }
 
     /// Takes bytes that have come from what is left to a key.

@@ -29,6 +29,10 @@ pub enum RefineMode {
     Off,
 }
 
+/// When a caller no longer wants the answer, if it said so.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Deadline(pub Option<Instant>);
+
 /// A frame to localize.
 #[derive(Debug)]
 pub struct LocalizeRequest {

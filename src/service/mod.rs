@@ -4,7 +4,9 @@
 //! knows the stores by their traits alone.
 
 mod admission;
+mod bulk;
 mod calibration;
+mod door;
 mod error;
 mod events;
 mod images;
@@ -26,14 +28,18 @@ use std::sync::Arc;
 
 use uuid::Uuid;
 
+pub use self::bulk::{BulkImage, BulkResult, BulkSettings};
 pub use self::calibration::CalibrationState;
+pub use self::door::{Door, Phase};
 pub use self::error::{ErrorKind, ServiceError};
 pub use self::events::{AnyJobEvent, JobChange, JobEvent, JobStatus, Missed, PairDescribed};
 pub use self::images::{ImageMeta, ImagePage, NewImage};
 pub use self::jobs::JobPage;
 pub use self::keys::{Caller, Keys, MadeKey, NewKey};
 pub use self::limits::{Allowance, Allowances, Limits};
-pub use self::localize::{Answer, JobLink, LocalizeRequest, RefineMode, Retrieved, TimingMs};
+pub use self::localize::{
+    Answer, Deadline, JobLink, LocalizeRequest, RefineMode, Retrieved, TimingMs,
+};
 pub use self::maps::{IndexKind, MapChange, MapState};
 pub use self::once::{Once, OnceSettings};
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
@@ -73,6 +79,8 @@ pub struct ServiceSettings {
     pub usage_days: u32,
     /// What is kept of requests that may be sent again.
     pub once: OnceSettings,
+    /// Bounds of bulk uploads.
+    pub bulk: BulkSettings,
 }
 
 /// How often a use case begins again because the map's descriptors were replaced meanwhile. Twice in

@@ -104,7 +104,7 @@ async fn index_town(
         model: None,
         descriptor: None,
         frame: None,
-        concurrency: 4,
+        concurrency: 2,
         json: false,
         server: server.clone(),
     };

@@ -16,8 +16,16 @@ pub(super) struct Slots {
 pub(super) struct Slot {
     shared: Arc<Shared>,
     evicted: CancellationToken,
-    /// Its key among the idle ones, while it is.
-    idle_as: Mutex<Option<u64>>,
+    use_of: Mutex<Use>,
+}
+
+/// What a connection is doing.
+#[derive(Debug)]
+enum Use {
+    /// Nothing; this is its key among the idle ones.
+    Idle(u64),
+    /// So many requests.
+    Busy(usize),
 }
 
 #[derive(Debug)]
@@ -67,7 +75,7 @@ impl Slots {
         }
         let evicted = CancellationToken::new();
         let key = state.add_idle(&evicted);
-        Some(Slot { shared: Arc::clone(&self.shared), evicted, idle_as: Mutex::new(Some(key)) })
+        Some(Slot { shared: Arc::clone(&self.shared), evicted, use_of: Mutex::new(Use::Idle(key)) })
     }
 }
 
@@ -78,17 +86,26 @@ impl Slot {
     }
 
     pub fn request_began(&self) {
-        if let Some(key) = self.idle_as().take() {
-            self.shared.lock().idle.remove(&key);
-        }
+        let mut use_of = self.use_of();
+        *use_of = match *use_of {
+            Use::Idle(key) => {
+                self.shared.lock().idle.remove(&key);
+                Use::Busy(1)
+            }
+            Use::Busy(requests) => Use::Busy(requests + 1),
+        };
     }
 
     pub fn request_ended(&self) {
-        *self.idle_as() = Some(self.shared.lock().add_idle(&self.evicted));
+        let mut use_of = self.use_of();
+        *use_of = match *use_of {
+            Use::Busy(requests) if requests > 1 => Use::Busy(requests - 1),
+            _ => Use::Idle(self.shared.lock().add_idle(&self.evicted)),
+        };
     }
 
-    fn idle_as(&self) -> MutexGuard<'_, Option<u64>> {
-        self.idle_as.lock().unwrap_or_else(PoisonError::into_inner)
+    fn use_of(&self) -> MutexGuard<'_, Use> {
+        self.use_of.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -113,6 +130,8 @@ mod tests {
         a.request_began();
         a.request_ended();
         c.request_began();
+        c.request_began();
+        c.request_ended();
         let d = slots.take().unwrap();
         assert!(b.evicted.is_cancelled() && !a.evicted.is_cancelled());
         d.request_began();

@@ -1,0 +1,247 @@
+//! `/maps/{map}/images:batch`: many images in one request.
+
+mod archive;
+mod form;
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::http::header::CONTENT_TYPE;
+use axum::{Extension, Json};
+use futures_util::{Stream, StreamExt, stream};
+use serde::{Deserialize, Serialize};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use utoipa::ToSchema;
+
+use super::body::Segments;
+use super::guard::too_large;
+use super::maps::map_name;
+use super::problem::Problem;
+use super::state::{AppState, HttpSettings, Ready};
+use crate::service::{BulkImage, BulkResult, Caller, ErrorKind, ImageMeta, ServiceError};
+use crate::store::Added;
+
+/// The route.
+pub(super) const PATH: &str = "/maps/{map}/images:batch";
+
+/// The largest description of an image, in bytes.
+const LARGEST_META: usize = 64 << 10;
+
+/// What became of many images.
+#[derive(Debug, Serialize, Deserialize, ToSchema)]
+pub struct BatchAnswer {
+    /// Images that are new.
+    pub stored: usize,
+    /// Images that were there already.
+    pub present: usize,
+    /// Images that could not be stored.
+    pub failed: usize,
+    /// One for each image, in the order in which they came.
+    pub results: Vec<BatchResult>,
+}
+
+/// What became of one of many images.
+#[derive(Debug, Serialize, Deserialize, ToSchema)]
+pub struct BatchResult {
+    /// Its id, where one is known.
+    #[schema(nullable)]
+    pub id: Option<String>,
+    /// What became of it.
+    pub outcome: BatchOutcome,
+    /// Why it could not be stored; else null.
+    #[schema(nullable)]
+    pub problem: Option<BatchProblem>,
+}
+
+/// What became of one of many images.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum BatchOutcome {
+    /// It is stored.
+    Stored,
+    /// It was there already.
+    Present,
+    /// It could not be stored.
+    Failed,
+}
+
+/// Why an image could not be stored.
+#[derive(Debug, Serialize, Deserialize, ToSchema)]
+pub struct BatchProblem {
+    /// The kind: the word that ends the `type` of a problem.
+    pub kind: String,
+    /// What happened and what to do next.
+    pub detail: String,
+    /// When it is worth trying again, in seconds, where that is known.
+    #[schema(nullable)]
+    pub retry_after_s: Option<f64>,
+}
+
+/// The images of a request, each as it came in or why it cannot be stored; the first problem ends it.
+type Images = Pin<Box<dyn Stream<Item = Result<Result<BulkImage, ServiceError>, Problem>> + Send>>;
+
+/// The room that there is for an image that comes in.
+#[derive(Clone)]
+struct Room {
+    settings: Arc<HttpSettings>,
+    memory: Arc<Semaphore>,
+}
+
+impl Room {
+    /// Refuses an image of so many bytes if that is too large.
+    fn check(&self, bytes: usize) -> Result<(), Problem> {
+        let limit = self.settings.body_limit_bytes;
+        match bytes > limit {
+            true => Err(Problem::new(ErrorKind::TooLarge, too_large(limit))),
+            false => Ok(()),
+        }
+    }
+
+    /// So many bytes of the memory for bodies, once images before this one have given them back.
+    async fn take(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Problem> {
+        self.check(bytes)?;
+        let count = u32::try_from(bytes).unwrap_or(u32::MAX);
+        let taking = Arc::clone(&self.memory).acquire_many_owned(count);
+        let taken = tokio::time::timeout(self.settings.request_timeout, taking).await;
+        taken.ok().and_then(Result::ok).ok_or_else(|| {
+            let detail = format!(
+                "the bodies of all requests in progress hold {} bytes, the bound \
+                 (server.bodies_limit_bytes); try again in a moment",
+                self.settings.bodies_limit_bytes
+            );
+            Problem::new(ErrorKind::Overloaded, detail)
+        })
+    }
+}
+
+/// The form of many images.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "describes the form; the body is read part by part")]
+struct BatchForm {
+    /// What is known about the image after it.
+    meta: Option<Vec<ImageMeta>>,
+    /// The pictures. A file name is the id of an image that `meta` gives none.
+    #[schema(value_type = Vec<String>, format = Binary)]
+    image: Vec<Vec<u8>>,
+}
+
+/// Add many images
+///
+/// A form with a part `image` for each picture, after a part `meta` (JSON) if something is known about it; or
+/// a tar archive of pictures, in which what is known about `a.jpg` is in `a.jpg.json`, right before or
+/// after it. An image whose `meta` has no id has its file name as id. Several images are worked on at a time,
+/// and there is no bound on the whole, only on each (`server.body_limit_bytes`) and on their number
+/// (`bulk.max_images`). What is wrong with one image does not keep the others back; sending all of it again
+/// is safe. A problem with the request as a whole ends it; what came before that is stored.
+#[utoipa::path(post, path = "/maps/{map}/images:batch", tag = "images", params(("map" = String, Path)),
+    request_body(content(
+        (BatchForm = "multipart/form-data"), (Vec<u8> = "application/x-tar"),
+    )),
+    responses(
+        (status = 200, body = BatchAnswer, description = "What became of each"),
+        (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+        (status = 408, body = Problem, description = "The body came too slowly", content_type = "application/problem+json"),
+        (status = 415, body = Problem, description = "Neither a form nor a tar archive", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn add_images(
+    State(state): State<AppState>,
+    Ready(service): Ready,
+    Extension(caller): Extension<Caller>,
+    Segments(map): Segments<String>,
+    request: Request,
+) -> Result<Json<BatchAnswer>, Problem> {
+    let map = map_name(&map)?;
+    let room = Room { settings: state.settings, memory: state.bodies_memory };
+    let images = images(request, room).await?;
+    service.get_map(&map).await?;
+    let results = service.add_images(&map, &caller, images).await?;
+    let results: Vec<BatchResult> = results.into_iter().map(BatchResult::from).collect();
+    let count = |of| results.iter().filter(|result| result.outcome == of).count();
+    Ok(Json(BatchAnswer {
+        stored: count(BatchOutcome::Stored),
+        present: count(BatchOutcome::Present),
+        failed: count(BatchOutcome::Failed),
+        results,
+    }))
+}
+
+async fn images(request: Request, room: Room) -> Result<Images, Problem> {
+    let header = request.headers().get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let essence = header.unwrap_or("").split(';').next().unwrap_or("").trim().to_ascii_lowercase();
+    match essence.as_str() {
+        "multipart/form-data" => Ok(Box::pin(form::images(request, room).await?)),
+        "application/x-tar" => Ok(Box::pin(archive::images(request.into_body(), room))),
+        _ => Err(Problem::new(
+            ErrorKind::UnsupportedMedia,
+            format!(
+                "the Content-Type is {header:?}; send a form (with curl: -F image=@a.jpg -F image=@b.jpg), \
+                 or a tar archive (tar c *.jpg | curl -H 'Content-Type: application/x-tar' --data-binary \
+                 @- …)"
+            ),
+        )),
+    }
+}
+
+/// A body that may take any time, if nothing of it waits for long.
+pub(super) fn unhurried(body: Body, pause: Duration) -> Body {
+    Body::from_stream(stream::unfold(Some(body.into_data_stream()), move |body| async move {
+        let mut body = body?;
+        match tokio::time::timeout(pause, body.next()).await {
+            Ok(next) => Some((next?, Some(body))),
+            Err(_) => Some((Err(axum::Error::new(Paused(pause))), None)),
+        }
+    }))
+}
+
+/// Nothing of a body came for so long.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "nothing of the body came for {} s (server.body_pause_s); send it again, what was stored is left as it is",
+    .0.as_secs()
+)]
+struct Paused(Duration);
+
+/// What an error of a body or its reader means, whose own words for it are these.
+fn unreadable(error: &(dyn std::error::Error + 'static), words: &str) -> Problem {
+    let mut causes = std::iter::successors(Some(error), |error| error.source());
+    match causes.find_map(|cause| cause.downcast_ref::<Paused>()) {
+        Some(paused) => Problem::new(ErrorKind::TooSlow, paused.to_string()),
+        None => Problem::new(ErrorKind::Malformed, format!("the body cannot be read: {words}")),
+    }
+}
+
+/// What a caller says about an image; its name is its id unless that says otherwise.
+fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, ServiceError> {
+    let meta: ImageMeta = meta
+        .map(serde_json::from_slice)
+        .transpose()
+        .map_err(|error| {
+            let of = name.map(|name| format!(" of {name:?}")).unwrap_or_default();
+            ServiceError::malformed(format!("what is said{of} is not the JSON expected: {error}"))
+        })?
+        .unwrap_or_default();
+    let id = meta.id.or_else(|| name.map(str::to_owned));
+    Ok(ImageMeta { id, ..meta })
+}
+
+impl From<BulkResult> for BatchResult {
+    fn from(result: BulkResult) -> Self {
+        let (id, outcome, problem) = match result {
+            Ok(Added::Created(image)) => (Some(image.id.into()), BatchOutcome::Stored, None),
+            Ok(Added::Present(image)) => (Some(image.id.into()), BatchOutcome::Present, None),
+            Err((id, error)) => {
+                let kind = error.kind.word().to_owned();
+                let pause = error.retry_after.or(error.kind.retry_after());
+                let retry_after_s = pause.map(|pause| pause.as_secs_f64());
+                let problem = BatchProblem { kind, detail: error.detail, retry_after_s };
+                (id, BatchOutcome::Failed, Some(problem))
+            }
+        };
+        Self { id, outcome, problem }
+    }
+}

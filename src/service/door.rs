@@ -1,0 +1,71 @@
+//! The way in: a service once there is one, and until it drains.
+
+use std::sync::{Arc, OnceLock};
+
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use super::{ErrorKind, Service, ServiceError};
+
+/// Whether requests are answered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Phase {
+    /// Not yet.
+    Starting,
+    /// They are.
+    Open,
+    /// Those that were begun; new ones go to another server.
+    Draining,
+}
+
+/// What stands between the callers and a service; clones share it.
+#[derive(Clone)]
+pub struct Door {
+    service: Arc<OnceLock<Arc<Service>>>,
+    phase: watch::Sender<Phase>,
+    draining: CancellationToken,
+}
+
+impl Default for Door {
+    /// A door without a service behind it.
+    fn default() -> Self {
+        Self {
+            service: Arc::default(),
+            phase: watch::Sender::new(Phase::Starting),
+            draining: CancellationToken::new(),
+        }
+    }
+}
+
+impl Door {
+    /// Lets callers in.
+    pub fn open(&self, service: Arc<Service>) {
+        if self.service.set(service).is_ok() {
+            self.phase.send_replace(Phase::Open);
+        }
+    }
+
+    /// Says from now on that the service is not ready, while it answers what it has begun. Streams end.
+    pub fn drain(&self) {
+        self.phase.send_replace(Phase::Draining);
+        self.draining.cancel();
+    }
+
+    /// Ends when the drain begins.
+    pub fn draining(&self) -> CancellationToken {
+        self.draining.clone()
+    }
+
+    /// The phase, and every change of it.
+    pub fn phases(&self) -> watch::Receiver<Phase> {
+        self.phase.subscribe()
+    }
+
+    /// The service, once it is ready.
+    pub fn service(&self) -> Result<Arc<Service>, ServiceError> {
+        self.service.get().cloned().ok_or_else(|| {
+            let detail = "the server is starting; try again in a second";
+            ServiceError::new(ErrorKind::Unavailable, detail)
+        })
+    }
+}

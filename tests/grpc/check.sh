@@ -1,0 +1,45 @@
+#!/usr/bin/env bash
+# Holds the server against the contract in proto/, with a client of gRPC that others wrote, which knows no more
+# of it than reflection tells; and the contract against the rules of buf.
+#
+#     check.sh BINARY VENV
+#
+# VENV is a folder for a Python environment with grpcio (requirements.txt); it is made if it is not there.
+# Takes about half a minute once it is. Ends with 1 if anything fails.
+set -euo pipefail
+
+if [ $# -ne 2 ]; then
+    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/grpc-venv" >&2
+    exit 2
+fi
+binary=$(realpath "$1")
+venv=$(realpath -m "$2")
+cd "$(dirname "$0")"
+
+# shellcheck source-path=SCRIPTDIR source=../server.sh
+. ../server.sh
+environment "$venv" requirements.txt
+(cd ../../proto && "$venv/bin/buf" lint)
+
+if ! "$binary" demo --offline --json --places 12 --out "$scratch/town" > "$scratch/demo" 2>&1; then
+    cat "$scratch/demo" >&2
+    exit 1
+fi
+export WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_SERVER__BODY_LIMIT_BYTES=2000000
+export WHEREABOUTS_SERVER__BODY_PAUSE_S=2 WHEREABOUTS_SERVER__STREAM_IDLE_S=4
+export WHEREABOUTS_AUTH__KEYS=required
+"$binary" keys create --data "$scratch/data" --name test --role admin --json > "$scratch/key.json"
+serve "$binary"
+# HTTP over version 2, without TLS.
+version=$(curl --silent --fail --http2-prior-knowledge --output /dev/null --write-out '%{http_version}' "$url/livez")
+if [ "$version" != 2 ]; then
+    echo "GET /livez was answered over HTTP/$version" >&2
+    exit 1
+fi
+BINARY=$binary TOWN=$scratch/town URL=$url KEY=$scratch/key.json SERVER=$server PYTHONDONTWRITEBYTECODE=1 \
+    timeout 240 "$venv/bin/python" -m unittest
+server=
+if grep -q panicked "$scratch/log"; then
+    grep panicked "$scratch/log" >&2
+    exit 1
+fi

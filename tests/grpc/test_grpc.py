@@ -1,0 +1,491 @@
+"""The server as a client of gRPC sees it that knows the contract by reflection alone."""
+
+import contextlib
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+import unittest
+import urllib.request
+from collections.abc import Iterator
+from typing import Any
+
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from google.rpc import error_details_pb2
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha.proto_reflection_descriptor_database import (
+    ProtoReflectionDescriptorDatabase,
+)
+from grpc_status import rpc_status
+
+import grpc
+
+TOWN = pathlib.Path(os.environ["TOWN"])
+URL = os.environ["URL"]
+KEY = json.loads(pathlib.Path(os.environ["KEY"]).read_text())["token"]
+ADDRESS = URL.removeprefix("http://")
+PACKAGE = "whereabouts.v1"
+
+
+class Services:
+    """The services of a server, by reflection."""
+
+    def __init__(self, key: str | None) -> None:
+        self.channel = grpc.insecure_channel(ADDRESS)
+        self.metadata = [("authorization", f"Bearer {key}")] if key else []
+        admin = grpc.intercept_channel(grpc.insecure_channel(ADDRESS), WithKey(KEY))
+        self.database = ProtoReflectionDescriptorDatabase(admin)
+        self.pool = DescriptorPool(self.database)
+
+    def message(self, name: str, **fields: Any) -> Any:
+        return GetMessageClass(self.pool.FindMessageTypeByName(f"{PACKAGE}.{name}"))(**fields)
+
+    def call(self, service: str, method: str, request: Any, **options: Any) -> Any:
+        """Calls a method; `request` is a message, or an iterator of them where those stream."""
+        about = self.pool.FindServiceByName(f"{PACKAGE}.{service}").FindMethodByName(method)
+        shapes = {
+            (False, False): self.channel.unary_unary,
+            (False, True): self.channel.unary_stream,
+            (True, False): self.channel.stream_unary,
+            (True, True): self.channel.stream_stream,
+        }
+        make = shapes[(about.client_streaming, about.server_streaming)]
+        answer = GetMessageClass(about.output_type)
+        function = make(
+            f"/{PACKAGE}.{service}/{method}",
+            request_serializer=lambda message: message.SerializeToString(),
+            response_deserializer=answer.FromString,
+        )
+        return function(request, metadata=self.metadata, timeout=options.get("timeout", 30))
+
+
+class WithKey(grpc.StreamStreamClientInterceptor):
+    """Sends a key with the calls of reflection."""
+
+    def __init__(self, key: str) -> None:
+        self.key = key
+
+    def intercept_stream_stream(self, continuation: Any, details: Any, requests: Any) -> Any:
+        metadata = [("authorization", f"Bearer {self.key}")]
+        return continuation(details._replace(metadata=metadata), requests)
+
+
+def pictures(folder: str) -> list[tuple[str, bytes]]:
+    return [(file.stem, file.read_bytes()) for file in sorted((TOWN / folder).glob("*.jpg"))]
+
+
+def poses() -> dict[str, dict[str, float]]:
+    lines = (TOWN / "map" / "poses.csv").read_text().splitlines()
+    fields = lines[0].split(",")[1:]
+    rows = (line.split(",") for line in lines[1:])
+    return {
+        row[0].removesuffix(".jpg"): dict(zip(fields, map(float, row[1:]), strict=True))
+        for row in rows
+    }
+
+
+def over_http(method: str, path: str, body: bytes | None = None, kind: str = "image/jpeg") -> Any:
+    headers = {"Authorization": f"Bearer {KEY}", "Content-Type": kind}
+    request = urllib.request.Request(URL + path, method=method, data=body, headers=headers)
+    with urllib.request.urlopen(request, timeout=60) as response:
+        text = response.read()
+    return json.loads(text) if text else None
+
+
+def make_key(**wanted: Any) -> tuple[str, str]:
+    """A key's id and the key."""
+    made = over_http("POST", "/keys", json.dumps(wanted).encode(), "application/json")
+    return made["key"]["id"], made["token"]
+
+
+class Contract(unittest.TestCase):
+    services: Services
+
+    @classmethod
+    def setUpClass(cls) -> None:
+        cls.services = Services(KEY)
+        message, call = cls.services.message, cls.services.call
+        made = call("MapService", "PutMap", message("PutMapRequest", map="town", scene=2))
+        assert made.created and made.map.name == "town" and made.map.images == 0, made
+        again = call("MapService", "PutMap", message("PutMapRequest", map="town", description="x"))
+        assert not again.created and again.map.description == "x" and again.map.scene == 2, again
+
+        def images() -> Iterator[Any]:
+            where = poses()
+            for index, (name, picture) in enumerate(pictures("map")):
+                pose = message("Pose", geographic=message("GeographicPose", **where[name]))
+                named = "town" if index == 0 else ""
+                yield message("AddImagesRequest", map=named, id=name, image=picture, pose=pose)
+                if index == 3:
+                    yield message("AddImagesRequest", id="broken", image=b"no picture")
+                    yield message("AddImagesRequest", id=name, image=picture)
+                    yield message("AddImagesRequest", map="other", id="x", image=picture)
+                    bad = message("Pose", geographic=message("GeographicPose", lat=91))
+                    yield message("AddImagesRequest", id="pole", image=picture, pose=bad)
+
+        cls.added = call("MapService", "AddImages", images()).results
+        deadline = time.monotonic() + 30
+        while over_http("GET", "/maps/town")["calibration"] is None:
+            assert time.monotonic() < deadline, "the map was not measured"
+            time.sleep(0.2)
+
+    def call(self, service: str, method: str, request: Any, **options: Any) -> Any:
+        return self.services.call(service, method, request, **options)
+
+    def message(self, name: str, **fields: Any) -> Any:
+        return self.services.message(name, **fields)
+
+    def refused(self, code: grpc.StatusCode, call: Any) -> grpc.RpcError:
+        with self.assertRaises(grpc.RpcError) as raised:
+            answer = call()
+            if hasattr(answer, "__next__"):
+                list(answer)
+        self.assertEqual(raised.exception.code(), code, raised.exception)
+        return raised.exception
+
+    def test_reflection_names_all_services(self) -> None:
+        names = set(self.services.database.get_services())
+        expected = {f"{PACKAGE}.{name}Service" for name in ("Localization", "Map", "Job")}
+        self.assertLessEqual(expected | {"grpc.health.v1.Health"}, names)
+
+    def test_images_of_a_stream_are_answered_one_by_one(self) -> None:
+        outcomes = [(result.id, result.WhichOneof("outcome")) for result in self.added]
+        names = [name for name, _ in pictures("map")]
+        expected = [(name, "stored") for name in names]
+        expected[4:4] = [("broken", "problem"), (names[3], "stored"), ("", "problem"), ("pole", "problem")]
+        self.assertEqual(outcomes, expected)
+        by_place = {index: result for index, result in enumerate(self.added)}
+        self.assertEqual(by_place[4].problem.kind, "unprocessable")
+        self.assertTrue(by_place[5].stored.present and not by_place[3].stored.present)
+        self.assertIn("one map", by_place[6].problem.detail)
+        self.assertIn("lat is 91", by_place[7].problem.detail)
+        self.assertEqual(over_http("GET", "/maps/town")["images"], len(names))
+
+    def test_a_frame_is_answered_as_over_http(self) -> None:
+        frame = pictures("frames")[0][1]
+        request = self.message("LocalizeRequest", map="town", image=frame, k=5, refine=3)
+        answer = self.call("LocalizationService", "Localize", request)
+        same = over_http("POST", "/localize?map=town&k=5&refine=off", frame)
+        candidates = [(c.rank, c.image_id, round(c.similarity, 5)) for c in answer.candidates]
+        expected = [(c["rank"], c["image_id"], round(c["similarity"], 5)) for c in same["candidates"]]
+        self.assertEqual(candidates, expected)
+        self.assertEqual(answer.estimate.image_id, same["estimate"]["image_id"])
+        self.assertAlmostEqual(answer.estimate.confidence, same["estimate"]["confidence"], 5)
+        pose = answer.estimate.pose.geographic
+        self.assertEqual((pose.lat, pose.lon), tuple(same["estimate"]["pose"][f] for f in ("lat", "lon")))
+        self.assertFalse(answer.HasField("job") or answer.HasField("track"))
+        self.assertGreater(answer.timing.total_ms, 0)
+
+    def test_a_track_is_followed(self) -> None:
+        for number, (_, frame) in enumerate(pictures("frames")[:3], 1):
+            track = self.message("Track", id="robot-7", moved_m=1.0)
+            request = self.message("LocalizeRequest", map="town", image=frame, refine=3, track=track)
+            answer = self.call("LocalizationService", "Localize", request)
+            self.assertEqual((answer.track.id, answer.track.frames), ("robot-7", number))
+
+    def test_a_job_is_followed_to_its_end(self) -> None:
+        frame = pictures("frames")[1][1]
+        request = self.message("LocalizeRequest", map="town", image=frame)
+        job = self.call("LocalizationService", "Localize", request).job
+        watch = self.message("WatchJobRequest", id=job.id)
+        events = [event.WhichOneof("event") for event in self.call("JobService", "WatchJob", watch)]
+        self.assertEqual(events[-1], "ended")
+        self.assertIn("described", events)
+        ended = self.call("JobService", "GetJob", self.message("GetJobRequest", id=job.id, wait_s=20)).job
+        same = over_http("GET", f"/jobs/{job.id}")
+        self.assertEqual(ended.state, 3)
+        self.assertEqual([c.image_id for c in ended.ranking], [c["image_id"] for c in same["ranking"]])
+        self.assertEqual([d.text for d in ended.descriptions], [d["text"] for d in same["descriptions"]])
+        self.assertEqual(ended.finished_at.ToJsonString()[:19], same["finished_at"][:19])
+        page = self.call("JobService", "ListJobs", self.message("ListJobsRequest", map="town", page_size=1))
+        self.assertEqual(len(page.jobs), 1)
+        retry = self.message("RetryJobRequest", id=job.id)
+        self.refused(grpc.StatusCode.FAILED_PRECONDITION, lambda: self.call("JobService", "RetryJob", retry))
+        cancel = self.message("CancelJobRequest", id=job.id)
+        self.assertEqual(self.call("JobService", "CancelJob", cancel).job.state, 3)
+
+    def test_the_newest_frame_wins(self) -> None:
+        frames = [frame for _, frame in pictures("frames")]
+        count = 80
+
+        def fast() -> Iterator[Any]:
+            for number in range(1, count + 1):
+                frame = self.message(
+                    "LocalizeRequest", map="town", image=frames[number % len(frames)], refine=3
+                )
+                yield self.message("LocalizeStreamRequest", frame_number=number, frame=frame)
+                time.sleep(0.005)
+
+        answers = list(self.call("LocalizationService", "LocalizeStream", fast()))
+        numbers = [answer.frame_number for answer in answers]
+        self.assertEqual(numbers, sorted(numbers))
+        self.assertEqual(numbers[-1], count, "the last frame is answered")
+        self.assertEqual(sum(answer.skipped for answer in answers) + len(answers), count)
+        self.assertGreater(sum(answer.skipped for answer in answers), 0)
+        before = [0, *numbers[:-1]]
+        for answer, last in zip(answers, before, strict=True):
+            self.assertEqual(answer.skipped, answer.frame_number - last - 1)
+            self.assertEqual(answer.WhichOneof("outcome"), "answer")
+
+    def test_a_bad_frame_does_not_end_a_stream(self) -> None:
+        frame = pictures("frames")[0][1]
+        good = self.message("LocalizeRequest", map="town", image=frame, refine=3)
+        turn = threading.Semaphore(1)
+
+        def one_by_one() -> Iterator[Any]:
+            bad = self.message("LocalizeRequest", map="town", image=b"no picture")
+            nowhere = self.message("LocalizeRequest", map="nowhere", image=frame)
+            for number, request in enumerate([good, bad, None, nowhere, good]):
+                turn.acquire()
+                yield self.message("LocalizeStreamRequest", frame_number=number, frame=request)
+
+        outcomes = []
+        for answer in self.call("LocalizationService", "LocalizeStream", one_by_one()):
+            outcomes.append(answer.problem.kind or "answer")
+            turn.release()
+        self.assertEqual(outcomes, ["answer", "unprocessable", "malformed", "not-found", "answer"])
+
+    def test_errors_say_what_they_are(self) -> None:
+        frame = pictures("frames")[0][1]
+        for code, reason, fields in [
+            (grpc.StatusCode.NOT_FOUND, "NOT_FOUND", {"map": "nowhere", "image": frame}),
+            (grpc.StatusCode.INVALID_ARGUMENT, "MALFORMED", {"map": "No Name", "image": frame}),
+            (grpc.StatusCode.INVALID_ARGUMENT, "MALFORMED", {"map": "town"}),
+            (grpc.StatusCode.INVALID_ARGUMENT, "MALFORMED", {"map": "town", "image": frame, "refine": 9}),
+            (grpc.StatusCode.INVALID_ARGUMENT, "UNPROCESSABLE", {"map": "town", "image": frame, "k": 0}),
+            (grpc.StatusCode.INVALID_ARGUMENT, "UNPROCESSABLE", {"map": "town", "image": b"no picture"}),
+            (grpc.StatusCode.OUT_OF_RANGE, "TOO_LARGE", {"map": "town", "image": bytes(2_000_001)}),
+        ]:
+            request = self.message("LocalizeRequest", **fields)
+            error = self.refused(code, lambda r=request: self.call("LocalizationService", "Localize", r))
+            info = error_details_pb2.ErrorInfo()
+            [detail] = [d for d in rpc_status.from_call(error).details if d.Is(info.DESCRIPTOR)]
+            detail.Unpack(info)
+            self.assertEqual((info.reason, info.domain), (reason, "whereabouts"))
+            self.assertGreater(len(error.details()), 10)
+
+    def test_what_is_not_there_is_unimplemented(self) -> None:
+        for path in [f"/{PACKAGE}.JobService/Nothing", "/some.Other/Thing"]:
+            call = self.services.channel.unary_unary(path)
+            self.refused(
+                grpc.StatusCode.UNIMPLEMENTED,
+                lambda c=call: c(b"", metadata=self.services.metadata, timeout=5),
+            )
+
+    def test_a_deadline_is_kept(self) -> None:
+        frame = pictures("frames")[0][1]
+        request = self.message("LocalizeRequest", map="town", image=frame)
+        begun = time.monotonic()
+        self.refused(
+            grpc.StatusCode.DEADLINE_EXCEEDED,
+            lambda: self.call("LocalizationService", "Localize", request, timeout=0.001),
+        )
+        silent = threading.Event()
+
+        def nothing() -> Iterator[Any]:
+            silent.wait(20)
+            yield from ()
+
+        self.refused(
+            grpc.StatusCode.DEADLINE_EXCEEDED,
+            lambda: self.call("LocalizationService", "LocalizeStream", nothing(), timeout=0.5),
+        )
+        self.assertLess(time.monotonic() - begun, 3)
+        error = self.refused(
+            grpc.StatusCode.DEADLINE_EXCEEDED,
+            lambda: self.call("LocalizationService", "LocalizeStream", nothing()),
+        )
+        self.assertIn("server.stream_idle_s", error.details())
+        silent.set()
+
+    def test_a_call_that_is_given_up_frees_its_place(self) -> None:
+        def watch() -> Any:
+            # A connection of its own: one has at most server.max_concurrent calls.
+            own = [("grpc.use_local_subchannel_pool", 1)]
+            health = health_pb2_grpc.HealthStub(grpc.insecure_channel(ADDRESS, own))
+            asked = health_pb2.HealthCheckRequest()
+            return health.Watch(asked, metadata=self.services.metadata, timeout=30)
+
+        streams = [watch() for _ in range(300)]
+        # 256 may be open (server.max_streams); the rest is refused, and told when to come again.
+        codes = []
+        for stream in streams:
+            try:
+                self.assertEqual(next(stream).status, health_pb2.HealthCheckResponse.SERVING)
+            except grpc.RpcError as error:
+                codes.append(error.code())
+                self.assertIn("server.max_streams", error.details())
+            if len(codes) == 44:
+                break
+        self.assertEqual(codes, [grpc.StatusCode.RESOURCE_EXHAUSTED] * 44)
+        for stream in streams:
+            stream.cancel()
+        deadline = time.monotonic() + 10
+        while True:
+            try:
+                stream = watch()
+                next(stream)
+                stream.cancel()
+                break
+            except grpc.RpcError:
+                self.assertLess(time.monotonic(), deadline, "the places were not given back")
+                time.sleep(0.1)
+
+    def metric(self, name: str) -> list[str]:
+        request = urllib.request.Request(URL + "/metrics", headers={"Authorization": f"Bearer {KEY}"})
+        with urllib.request.urlopen(request, timeout=10) as response:
+            lines = response.read().decode().splitlines()
+        return [line for line in lines if line.startswith(name)]
+
+    def test_calls_are_counted_by_what_they_were_answered(self) -> None:
+        request = self.message("GetMapRequest", map="not-there")
+        self.refused(grpc.StatusCode.NOT_FOUND, lambda: self.call("MapService", "GetMap", request))
+        counted = self.metric("whereabouts_http_requests_total")
+        counted = [line for line in counted if "MapService/GetMap" in line]
+        self.assertTrue(any('status="404"' in line for line in counted), counted)
+
+    def test_health_needs_no_key(self) -> None:
+        health = health_pb2_grpc.HealthStub(grpc.insecure_channel(ADDRESS))
+        for name in ["", f"{PACKAGE}.LocalizationService"]:
+            answer = health.Check(health_pb2.HealthCheckRequest(service=name), timeout=5)
+            self.assertEqual(answer.status, health_pb2.HealthCheckResponse.SERVING)
+        unknown = health_pb2.HealthCheckRequest(service="nothing")
+        self.refused(grpc.StatusCode.NOT_FOUND, lambda: health.Check(unknown, timeout=5))
+
+    def test_a_key_opens_what_it_is_for(self) -> None:
+        frame = pictures("frames")[0][1]
+        here = self.message("LocalizeRequest", map="town", image=frame, refine=3)
+        nobody, stranger = Services(None), Services("wab_" + "0" * 77)
+        for services in (nobody, stranger):
+            error = self.refused(
+                grpc.StatusCode.UNAUTHENTICATED,
+                lambda s=services: s.call("LocalizationService", "Localize", here),
+            )
+            self.assertNotIn("0000", error.details())
+        _, token = make_key(name="robot", role="robot", maps=["yard"])
+        robot = Services(token)
+        listed = robot.call("MapService", "ListMaps", self.message("ListMapsRequest"))
+        self.assertEqual(list(listed.maps), [])
+        for service, method, request in [
+            ("LocalizationService", "Localize", here),
+            ("MapService", "GetMap", self.message("GetMapRequest", map="town")),
+            ("MapService", "PutMap", self.message("PutMapRequest", map="yard")),
+            ("MapService", "DeleteMap", self.message("DeleteMapRequest", map="town")),
+            ("JobService", "ListJobs", self.message("ListJobsRequest")),
+        ]:
+            self.refused(
+                grpc.StatusCode.PERMISSION_DENIED,
+                lambda s=service, m=method, r=request: robot.call(s, m, r),
+            )
+        frame_of_town = self.message("LocalizeStreamRequest", frame=here)
+        [answer] = robot.call("LocalizationService", "LocalizeStream", iter([frame_of_town]))
+        self.assertEqual(answer.problem.kind, "forbidden")
+        request = self.message("LocalizeRequest", map="town", image=frame)
+        job = self.call("LocalizationService", "Localize", request).job.id
+        for method in ("GetJob", "WatchJob"):
+            asked = self.message(f"{method}Request", id=job)
+            self.refused(
+                grpc.StatusCode.PERMISSION_DENIED,
+                lambda m=method, r=asked: robot.call("JobService", m, r),
+            )
+
+    def test_a_stream_ends_with_its_key(self) -> None:
+        id, token = make_key(name="short", role="robot")
+        requests = threading.Event()
+
+        def nothing() -> Iterator[Any]:
+            requests.wait(20)
+            yield from ()
+
+        stream = Services(token).call("LocalizationService", "LocalizeStream", nothing())
+        threading.Timer(0.5, lambda: over_http("DELETE", f"/keys/{id}")).start()
+        begun = time.monotonic()
+        error = self.refused(grpc.StatusCode.UNAUTHENTICATED, lambda: stream)
+        self.assertIn("revoked", error.details())
+        self.assertLess(time.monotonic() - begun, 3)
+        requests.set()
+
+    def test_each_frame_of_a_stream_counts(self) -> None:
+        _, token = make_key(name="few", role="robot", limits={"requests_per_minute": 3})
+        frame = pictures("frames")[0][1]
+        request = self.message("LocalizeRequest", map="town", image=frame, refine=3)
+        turn = threading.Semaphore(1)
+
+        def frames() -> Iterator[Any]:
+            for number in range(4):
+                turn.acquire()
+                yield self.message("LocalizeStreamRequest", frame_number=number, frame=request)
+
+        outcomes = []
+        for answer in Services(token).call("LocalizationService", "LocalizeStream", frames()):
+            outcomes.append(answer.problem.kind or "answer")
+            turn.release()
+        self.assertEqual(outcomes, ["answer", "answer", "answer", "overloaded"])
+        self.assertGreater(answer.problem.retry_after.seconds, 5)
+
+
+class Encrypted(unittest.TestCase):
+    """Over TLS, where the version of HTTP is agreed on before the first byte of it."""
+
+    def test_calls_are_answered_over_tls(self) -> None:
+        with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+            place = pathlib.Path(folder)
+            certificate, key = place / "certificate.pem", place / "key.pem"
+            subprocess.run(
+                ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"]
+                + ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"]
+                + ["-days", "2", "-keyout", key, "-out", certificate],
+                check=True,
+                capture_output=True,
+            )
+            settings = {
+                "WHEREABOUTS_SERVER__TLS_CERTIFICATE": str(certificate),
+                "WHEREABOUTS_SERVER__TLS_KEY": str(key),
+                "WHEREABOUTS_AUTH__KEYS": "off",
+            }
+            command = [os.environ["BINARY"], "serve", "--data", place / "data", "--listen", "127.0.0.1:0"]
+            server = subprocess.Popen(
+                [*command, "--address-file", place / "address"],
+                env=os.environ | settings,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            stack.callback(server.wait)
+            stack.callback(server.terminate)
+            deadline = time.monotonic() + 30
+            while not (place / "address").exists() or not (place / "address").read_text():
+                self.assertLess(time.monotonic(), deadline, "the server did not start")
+                time.sleep(0.05)
+            port = (place / "address").read_text().strip().rpartition(":")[2]
+            trusted = grpc.ssl_channel_credentials(certificate.read_bytes())
+            channel = stack.enter_context(grpc.secure_channel(f"localhost:{port}", trusted))
+            answer = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=10)
+            self.assertEqual(answer.status, health_pb2.HealthCheckResponse.SERVING)
+
+
+class ZDrain(unittest.TestCase):
+    """Ends the server; its name makes it the last."""
+
+    def test_streams_end_when_the_server_drains(self) -> None:
+        services = Services(KEY)
+        go_on = threading.Event()
+
+        def nothing() -> Iterator[Any]:
+            go_on.wait(20)
+            yield from ()
+
+        stream = services.call("LocalizationService", "LocalizeStream", nothing())
+        threading.Timer(0.5, lambda: os.kill(int(os.environ["SERVER"]), signal.SIGTERM)).start()
+        with self.assertRaises(grpc.RpcError) as raised:
+            list(stream)
+        self.assertEqual(raised.exception.code(), grpc.StatusCode.UNAVAILABLE, raised.exception)
+        go_on.set()
+
+
+if __name__ == "__main__":
+    unittest.main()
