@@ -17,13 +17,26 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import threading
+from bisect import bisect_left
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
+from datetime import datetime, timedelta, timezone
 from typing import Generic, Protocol, TypeAlias, TypeVar
 
-from whereabouts_client import Answer, Candidate, Estimate, Job, MetricPose, Pose, Problem, RefineMode
+from whereabouts_client import (
+    Answer,
+    Candidate,
+    Estimate,
+    Job,
+    MetricPose,
+    Pose,
+    Problem,
+    RefineMode,
+    TrackEstimate,
+)
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -144,7 +157,7 @@ def place(pose: Pose, origin: Origin | None) -> Placed:
 
 
 def pose_with_covariance(
-    estimate: Estimate,
+    estimate: Estimate | TrackEstimate,
     candidates: Sequence[Candidate],
     origin: Origin | None = None,
     spread: Spread = Spread(),
@@ -218,6 +231,79 @@ def _rotation_vector(start: Quaternion, end: Quaternion) -> Vector:
     return (x * scale, y * scale, z * scale)
 
 
+# --- Odometry ---------------------------------------------------------------------------------------------
+
+MOST_READINGS = 10_000
+"""What is remembered of the odometry: at 50 Hz, more than three minutes."""
+LONGEST_GAP = timedelta(seconds=1)
+"""Between two readings further apart, the robot may have come any way."""
+LONGEST_STEP_M = 100.0
+"""Between two readings further apart, the odometry was set anew and the robot did not move."""
+LATEST = timedelta(seconds=0.2)
+"""A frame may be ahead of the newest reading by so much: readings are on their way, too."""
+
+
+def instant(sec: int, nanosec: int) -> datetime | None:
+    """A stamp of ROS, to the microsecond; None for zero, which means that it is not known."""
+    if sec == nanosec == 0:
+        return None
+    return datetime(1970, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=sec, microseconds=nanosec // 1000)
+
+
+class Odometer:
+    """The length of the path that a robot has come, by its odometry. May be used by several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._readings: deque[tuple[datetime, float]] = deque(maxlen=MOST_READINGS)
+        """Without a gap and in order: when, and the metres from where the path begins."""
+        self._position: Vector = (0.0, 0.0, 0.0)
+        """Where the newest of them was taken."""
+
+    def add(self, at: datetime, position: Vector) -> None:
+        """A position in metres, in the odometry's own frame.
+
+        One that comes late is left out. After a gap, a leap, or a clock that was set back, the path begins
+        anew.
+        """
+        if not all(map(math.isfinite, position)):
+            return
+        with self._lock:
+            metres = 0.0
+            if self._readings:
+                newest, before = self._readings[-1]
+                if -LONGEST_GAP <= at - newest <= timedelta(0):
+                    return
+                step = math.dist(position, self._position)
+                if abs(at - newest) > LONGEST_GAP or step > LONGEST_STEP_M:
+                    self._readings.clear()
+                else:
+                    metres = before + step
+            self._readings.append((at, metres))
+            self._position = position
+
+    def metres(self, start: datetime, end: datetime) -> float | None:
+        """The metres from one moment to another, in either order; None if the path does not cover both."""
+        start, end = min(start, end), max(start, end)
+        with self._lock:
+            readings = list(self._readings)
+        if not readings or start < readings[0][0] or end > readings[-1][0] + LATEST:
+            return None
+        # Rounding must not make it negative, which the service refuses.
+        return max(0.0, _metres_at(readings, end) - _metres_at(readings, start))
+
+
+def _metres_at(readings: Sequence[tuple[datetime, float]], moment: datetime) -> float:
+    """The metres at a moment that is not before the first reading; between two, at constant speed."""
+    after = bisect_left(readings, moment, key=lambda reading: reading[0])
+    if after == len(readings):
+        return readings[-1][1]
+    if after == 0:
+        return readings[0][1]
+    (earlier, low), (later, high) = readings[after - 1], readings[after]
+    return low + (high - low) * ((moment - earlier) / (later - earlier))
+
+
 # --- Frames -----------------------------------------------------------------------------------------------
 
 
@@ -249,6 +335,8 @@ class Shot(Generic[T]):
     stamp: T
     picture: Callable[[], bytes]
     """Gives the bytes of a JPEG, PNG or WebP; called only if the frame is posted."""
+    taken_at: datetime | None = None
+    """When the frame was taken, with a time zone, if that is known."""
 
 
 class Newest(Generic[T]):
@@ -284,7 +372,16 @@ class Service(Protocol):
     """What is asked of a client: `whereabouts_client.Whereabouts` has it."""
 
     def localize(
-        self, map: str, frame: bytes, *, k: int | None, refine: RefineMode, deadline_ms: int | None
+        self,
+        map: str,
+        frame: bytes,
+        *,
+        k: int | None,
+        refine: RefineMode,
+        deadline_ms: int | None,
+        track: str | None,
+        captured_at: datetime | None,
+        moved_m: float | None,
     ) -> Answer: ...
 
     def wait_for_job(self, id: str, timeout_s: float) -> Job: ...
@@ -306,6 +403,12 @@ class Wishes:
     """Whether to give no pose where the service is not sure that the place is in the map."""
     origin: Origin | None = None
     spread: Spread = field(default_factory=Spread)
+    track: str | None = None
+    """The robot's name for its frames one after another; None if each of them is for itself."""
+
+    def __post_init__(self) -> None:
+        if self.track is not None and not re.fullmatch(r"[A-Za-z0-9_.:-]{1,64}", self.track):
+            raise Refused(f"the track {self.track!r} must have 1 to 64 letters, digits, -, _, . and :")
 
 
 class Sink(Protocol[S_contra]):
@@ -317,6 +420,9 @@ class Sink(Protocol[S_contra]):
     def refined(self, stamp: S_contra, pose: PoseWithCovariance) -> None:
         """The pose by the refined order, once the job has ended."""
 
+    def tracked(self, stamp: S_contra, pose: PoseWithCovariance) -> None:
+        """The pose by all frames of the track, at once."""
+
     def job(self, text: str) -> None:
         """A job that has ended, or was given up waiting for, as JSON."""
 
@@ -327,8 +433,12 @@ class Sink(Protocol[S_contra]):
 class Localizer(Generic[T]):
     """Posts the newest frame while no other is in flight, and follows the newest job."""
 
-    def __init__(self, service: Service, wishes: Wishes, sink: Sink[T]) -> None:
-        self._service, self._wishes, self._sink = service, wishes, sink
+    def __init__(
+        self, service: Service, wishes: Wishes, sink: Sink[T], odometer: Odometer | None = None
+    ) -> None:
+        self._service, self._wishes, self._sink, self._odometer = service, wishes, sink, odometer
+        self._last: datetime | None = None
+        """When the last frame that the service has in the track was taken; None if that is not certain."""
         self._frames: Newest[Shot[T]] = Newest()
         self._jobs: Newest[tuple[T, Answer, str]] = Newest()
         self.posted = 0
@@ -369,18 +479,37 @@ class Localizer(Generic[T]):
         wishes = self._wishes
         picture = shot.picture()
         self.posted += 1
-        answer = self._service.localize(
-            wishes.map,
-            picture,
-            k=wishes.k,
-            refine="async" if wishes.refine else "off",
-            deadline_ms=wishes.deadline_ms,
-        )
+        try:
+            answer = self._service.localize(
+                wishes.map,
+                picture,
+                k=wishes.k,
+                refine="async" if wishes.refine else "off",
+                deadline_ms=wishes.deadline_ms,
+                track=wishes.track,
+                captured_at=shot.taken_at if wishes.track else None,
+                moved_m=self._moved_m(shot),
+            )
+        except Problem as problem:
+            if not 400 <= problem.status < 500:
+                # The frame may be in the track all the same; one that was refused is not.
+                self._last = None
+            raise
+        if answer.track:
+            self._last = shot.taken_at
         if answer.job:
             self._jobs.put((shot.stamp, answer, answer.job.id))
         elif answer.no_job:
             self._sink.trouble(f"no refinement: {answer.no_job.detail}")
         self._tell(self._sink.coarse, shot.stamp, answer.estimate, answer)
+        if answer.track and answer.track.pose:
+            self._tell(self._sink.tracked, shot.stamp, answer.track, answer)
+
+    def _moved_m(self, shot: Shot[T]) -> float | None:
+        """How far the robot has come since the last frame of the track, in metres, if that is known."""
+        if self._odometer is None or self._last is None or shot.taken_at is None:
+            return None
+        return self._odometer.metres(self._last, shot.taken_at)
 
     def _follow(self) -> None:
         while item := self._jobs.take():
@@ -396,7 +525,7 @@ class Localizer(Generic[T]):
         self,
         publish: Callable[[T, PoseWithCovariance], None],
         stamp: T,
-        estimate: Estimate | None,
+        estimate: Estimate | TrackEstimate | None,
         answer: Answer,
     ) -> None:
         wishes = self._wishes

@@ -12,15 +12,18 @@ import time
 import types
 import unittest
 from collections.abc import Callable
-from datetime import datetime, timezone
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
 from typing import Any
 from unittest import mock
 
 import localizer
 from localizer import (
+    MOST_READINGS,
     UNKNOWN_VARIANCE,
     Localizer,
     Newest,
+    Odometer,
     Origin,
     PoseWithCovariance,
     Refused,
@@ -28,6 +31,7 @@ from localizer import (
     Spread,
     Wishes,
     encode,
+    instant,
     origin_of,
     pose_with_covariance,
 )
@@ -45,6 +49,7 @@ from whereabouts_client import (
     RankedCandidate,
     RefineMode,
     TimingMs,
+    TrackEstimate,
     Usage,
 )
 
@@ -185,6 +190,93 @@ class Globe(unittest.TestCase):
                 origin_of(lat, lon, nan)
 
 
+def at(seconds: float) -> datetime:
+    return datetime(2026, 1, 2, 3, 4, 5, tzinfo=timezone.utc) + timedelta(seconds=seconds)
+
+
+def driven(start: float, end: float, speed_m_s: float = 10.0) -> Odometer:
+    """An odometer of a robot that drives along x, read every 0.1 s."""
+    odometer = Odometer()
+    for tenth in range(round(start * 10), round(end * 10) + 1):
+        odometer.add(at(tenth / 10), (tenth / 10 * speed_m_s, 0.0, 0.0))
+    return odometer
+
+
+class Odometry(unittest.TestCase):
+    def metres(self, odometer: Odometer, start: float, end: float, expected: float | None) -> None:
+        found = odometer.metres(at(start), at(end))
+        if found is None or expected is None:
+            self.assertEqual(found, expected)
+        else:
+            self.assertAlmostEqual(found, expected)
+
+    def test_a_stamp_is_a_moment_and_zero_is_none(self) -> None:
+        self.assertIsNone(instant(0, 0))
+        moment = instant(1_767_323_045, 250_000_999)
+        self.assertEqual(moment, at(0.25))
+        assert moment
+        self.assertEqual(moment.isoformat(), "2026-01-02T03:04:05.250000+00:00")
+
+    def test_the_path_is_measured_and_not_the_way_as_the_crow_flies(self) -> None:
+        odometer = Odometer()
+        for second, position in enumerate([(0, 0, 0), (3, 4, 0), (3, 4, 2), (0, 0, 0)]):
+            odometer.add(at(second), position)
+        self.metres(odometer, 0, 3, 5 + 2 + math.sqrt(29))
+
+    def test_between_two_readings_the_speed_is_constant(self) -> None:
+        odometer = driven(0, 2)
+        self.metres(odometer, 0.5, 1.25, 7.5)
+        self.metres(odometer, 0.51, 0.53, 0.2)
+        self.metres(odometer, 1, 1, 0)
+        # A frame before the last one: the robot has come as far, the other way.
+        self.metres(odometer, 1.25, 0.5, 7.5)
+
+    def test_what_was_not_measured_is_not_known(self) -> None:
+        self.metres(Odometer(), 0, 1, None)
+        odometer = driven(1, 2)
+        self.metres(odometer, 0.95, 1.5, None)
+        self.metres(odometer, 1.5, 2.25, None)
+        self.metres(odometer, 1, 2, 10)
+        # The reading after the frame is on its way.
+        self.metres(odometer, 1.5, 2.15, 5)
+
+    def test_after_a_gap_it_begins_anew(self) -> None:
+        odometer = driven(0, 1)
+        for seconds in (2.0, 4.0, 5.0):
+            odometer.add(at(seconds), (10 * seconds, 0, 0))
+        self.metres(odometer, 1, 4, None)
+        self.metres(odometer, 4, 5, 10)
+
+    def test_odometry_that_was_set_anew_is_no_way(self) -> None:
+        odometer = driven(0, 1)
+        for seconds, x in ((1.1, 500_000.0), (1.2, 500_001.0)):
+            odometer.add(at(seconds), (x, 0, 0))
+        self.metres(odometer, 1, 1.2, None)
+        self.metres(odometer, 1.1, 1.2, 1)
+
+    def test_late_and_broken_readings_are_left_out(self) -> None:
+        odometer = driven(0, 1)
+        odometer.add(at(0.45), (900, 0, 0))
+        odometer.add(at(1), (900, 0, 0))
+        odometer.add(at(1.05), (math.nan, 0, 0))
+        odometer.add(at(1.1), (11, 0, 0))
+        self.metres(odometer, 0, 1.1, 11)
+
+    def test_a_clock_that_was_set_back_begins_anew(self) -> None:
+        odometer = driven(100, 101)
+        for seconds in (1.0, 1.5):
+            odometer.add(at(seconds), (10 * seconds, 0, 0))
+        self.metres(odometer, 100, 101, None)
+        self.metres(odometer, 1, 1.5, 5)
+
+    def test_it_remembers_so_much_and_no_more(self) -> None:
+        end = MOST_READINGS / 10 + 5
+        odometer = driven(0, end)
+        self.assertEqual(len(odometer._readings), MOST_READINGS)
+        self.metres(odometer, 0, end, None)
+        self.metres(odometer, 6, end, 10 * (end - 6))
+
+
 class Encoding(unittest.TestCase):
     def setUp(self) -> None:
         try:
@@ -241,20 +333,38 @@ def job(id: str, state: Any = "succeeded") -> Job:
     )  # fmt: skip
 
 
+def tracked(number: int, known: bool = True, pose: Pose | None = None) -> Answer:
+    """An answer that has the robot elsewhere, given its track."""
+    track = TrackEstimate("robot-7", number, 0.9, known, "first", pose or MetricPose(0.0, float(number)))
+    return replace(answer(number), track=track)
+
+
 class Client:
     """Answers when it is let, and keeps what it was asked."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[bytes, int | None, str, int | None]] = []
+        self.steps: list[tuple[str | None, datetime | None, float | None]] = []
+        """Track, time and way of each frame."""
         self.waited: list[str] = []
         self.may_answer = threading.Semaphore(0)
         self.answers: Callable[[int], Answer] = answer
         self.jobs: Callable[[str], Job] = job
 
     def localize(
-        self, map: str, frame: bytes, *, k: int | None, refine: RefineMode, deadline_ms: int | None
+        self,
+        map: str,
+        frame: bytes,
+        *,
+        k: int | None,
+        refine: RefineMode,
+        deadline_ms: int | None,
+        track: str | None,
+        captured_at: datetime | None,
+        moved_m: float | None,
     ) -> Answer:
         assert map == "town"
+        self.steps.append((track, captured_at, moved_m))
         self.asked.append((frame, k, refine, deadline_ms))
         assert self.may_answer.acquire(timeout=10)
         return self.answers(len(self.asked))
@@ -270,6 +380,7 @@ class Told:
     def __init__(self) -> None:
         self.poses: list[tuple[int, PoseWithCovariance]] = []
         self.refined_poses: list[tuple[int, PoseWithCovariance]] = []
+        self.tracked_poses: list[tuple[int, PoseWithCovariance]] = []
         self.jobs: list[dict[str, Any]] = []
         self.troubles: list[str] = []
 
@@ -279,6 +390,9 @@ class Told:
     def refined(self, stamp: int, pose: PoseWithCovariance) -> None:
         self.refined_poses.append((stamp, pose))
 
+    def tracked(self, stamp: int, pose: PoseWithCovariance) -> None:
+        self.tracked_poses.append((stamp, pose))
+
     def job(self, text: str) -> None:
         self.jobs.append(json.loads(text))
 
@@ -286,10 +400,10 @@ class Told:
         self.troubles.append(text)
 
 
-class Frames(unittest.TestCase):
-    def start(self, wishes: Wishes | None = None) -> None:
+class WithLocalizer(unittest.TestCase):
+    def start(self, wishes: Wishes | None = None, odometer: Odometer | None = None) -> None:
         self.client, self.told = Client(), Told()
-        self.localizer: Localizer[int] = Localizer(self.client, wishes or Wishes("town"), self.told)
+        self.localizer: Localizer[int] = Localizer(self.client, wishes or Wishes("town"), self.told, odometer)
         self.addCleanup(self.localizer.close)
 
     def offer(self, number: int) -> None:
@@ -302,6 +416,8 @@ class Frames(unittest.TestCase):
                 self.fail(f"never came; told: {vars(self.told)}, asked: {self.client.asked}")
             time.sleep(0.002)
 
+
+class Frames(WithLocalizer):
     def test_only_the_newest_frame_is_posted_and_the_others_are_counted(self) -> None:
         self.start(Wishes("town", k=3, deadline_ms=400))
         self.offer(1)
@@ -409,6 +525,128 @@ class Frames(unittest.TestCase):
         self.assertIsNone(newest.take())
 
 
+class Tracks(WithLocalizer):
+    """Frames of a robot that drives at 10 m/s; frame n is taken n seconds after the start."""
+
+    def setUp(self) -> None:
+        self.start(Wishes("town", track="robot-7"), driven(0, 10))
+        self.client.answers = tracked
+
+    def frame(self, number: int, taken_at: datetime | None = None) -> None:
+        """Offers a frame, and waits until it is dealt with."""
+        before = len(self.told.poses) + len(self.told.troubles)
+        self.client.may_answer.release()
+        self.localizer.offer(Shot(number, lambda: b"frame", taken_at or at(number)))
+        self.until(lambda: len(self.told.poses) + len(self.told.troubles) > before)
+
+    def ways(self) -> list[float | None]:
+        return [None if way is None else round(way, 6) for _, _, way in self.client.steps]
+
+    def failing(self, *problems: Problem | None) -> None:
+        """Frame after frame is answered so."""
+
+        def answers(number: int) -> Answer:
+            if number <= len(problems) and (problem := problems[number - 1]):
+                raise problem
+            return tracked(number)
+
+        self.client.answers = answers
+
+    def test_without_a_track_every_frame_is_for_itself(self) -> None:
+        self.start(Wishes("town"), driven(0, 10))
+        for number in (1, 2):
+            self.frame(number)
+        self.assertEqual(self.client.steps, [(None, None, None)] * 2)
+        self.assertEqual(self.told.tracked_poses, [])
+
+    def test_frames_of_a_track_have_a_time_and_the_way_since_the_one_before(self) -> None:
+        for number in (1, 2, 5):
+            self.frame(number)
+        times = [("robot-7", at(number)) for number in (1, 2, 5)]
+        self.assertEqual([(track, taken) for track, taken, _ in self.client.steps], times)
+        self.assertEqual(self.ways(), [None, 10, 30])
+
+    def test_without_odometry_no_way_is_told(self) -> None:
+        self.start(Wishes("town", track="robot-7"))
+        self.client.answers = tracked
+        for number in (1, 2):
+            self.frame(number)
+        self.assertEqual(self.client.steps, [("robot-7", at(1), None), ("robot-7", at(2), None)])
+
+    def test_after_a_frame_that_was_refused_the_way_is_since_the_last_one_of_the_track(self) -> None:
+        self.failing(None, Problem(429, "Overloaded", "drop the frame"), None)
+        for number in (1, 2, 3, 4):
+            self.frame(number)
+        self.assertEqual(self.ways(), [None, 10, 20, 10])
+
+    def test_after_a_frame_that_is_perhaps_in_the_track_no_way_is_told_once(self) -> None:
+        for status in (0, 500, 504):
+            with self.subTest(status):
+                self.setUp()
+                self.failing(None, Problem(status, "No answer", "try again"))
+                for number in (1, 2, 3, 4):
+                    self.frame(number)
+                self.assertEqual(self.ways(), [None, 10, None, 10])
+
+    def test_a_frame_that_was_not_posted_is_not_in_the_track(self) -> None:
+        def broken() -> bytes:
+            raise Refused("cannot be encoded")
+
+        self.frame(1)
+        self.localizer.offer(Shot(2, broken, at(2)))
+        self.until(lambda: self.told.troubles)
+        self.frame(3)
+        self.assertEqual(self.ways(), [None, 20])
+
+    def test_a_frame_of_an_unknown_time_has_no_way_and_neither_has_the_next(self) -> None:
+        self.frame(1)
+        self.client.may_answer.release()
+        self.localizer.offer(Shot(2, lambda: b"frame"))
+        self.until(lambda: len(self.told.poses) == 2)
+        for number in (3, 4):
+            self.frame(number)
+        self.assertEqual([taken for _, taken, _ in self.client.steps], [at(1), None, at(3), at(4)])
+        self.assertEqual(self.ways(), [None, None, None, 10])
+
+    def test_where_the_odometry_ends_the_way_is_not_known(self) -> None:
+        for number in (9, 10, 11):
+            self.frame(number)
+        self.assertEqual(self.ways(), [None, 10, None])
+
+    def test_the_pose_by_the_track_is_told_beside_that_of_the_frame(self) -> None:
+        self.frame(3, at(0))
+        self.until(lambda: self.told.tracked_poses)
+        (stamp, pose), = self.told.tracked_poses
+        self.assertEqual((stamp, pose.position), (3, (0, 1, 0)))
+        self.assertEqual(self.told.poses[0][1].position, (1, 0, 0))
+        # The frame's candidate is elsewhere, which the covariance tells.
+        self.assertAlmostEqual(block(pose, 0)[0][0], Spread().place_m ** 2 + 1)
+
+    def test_a_track_that_does_not_know_the_place_gives_no_pose_unless_wished(self) -> None:
+        for only_known, poses in ((True, 0), (False, 1)):
+            self.start(Wishes("town", track="robot-7", only_known=only_known))
+            self.client.answers = lambda number: tracked(number, known=False)
+            self.frame(1)
+            self.localizer.close()
+            self.assertEqual((len(self.told.poses), len(self.told.tracked_poses)), (1, poses))
+
+    def test_a_track_without_a_likely_image_gives_no_pose_and_no_trouble(self) -> None:
+        self.start(Wishes("town", track="robot-7", only_known=False))
+        self.client.answers = lambda number: replace(
+            answer(number), track=TrackEstimate("robot-7", number, 0.0, False)
+        )
+        self.frame(1)
+        self.localizer.close()
+        self.assertEqual((self.told.tracked_poses, self.told.troubles), ([], []))
+
+    def test_an_id_that_the_service_would_not_take_is_refused_at_once(self) -> None:
+        for id in ("r", "Robot-7_a.b:c", "x" * 64):
+            self.assertEqual(Wishes("town", track=id).track, id)
+        for id in ("", "robot 7", "x" * 65, "röbot", "robot-7\n"):
+            with self.assertRaisesRegex(Refused, "1 to 64"):
+                Wishes("town", track=id)
+
+
 class Anything(types.SimpleNamespace):
     """A message stub: whatever is asked of it is there."""
 
@@ -449,10 +687,11 @@ class StubNode:
 def stubs() -> dict[str, Any]:
     """Modules in place of ROS."""
     messages = dict.fromkeys(
-        ["Time", "PoseWithCovarianceStamped", "CompressedImage", "Image", "String"], Anything
+        ["Time", "PoseWithCovarianceStamped", "CompressedImage", "Image", "Odometry", "String"], Anything
     )
     names = ["rclpy", "rclpy.node", "rclpy.qos"]
-    names += [f"{package}_msgs{part}" for package in ("geometry", "sensor", "std") for part in ("", ".msg")]
+    packages = ("geometry", "nav", "sensor", "std")
+    names += [f"{package}_msgs{part}" for package in packages for part in ("", ".msg")]
     names += ["builtin_interfaces", "builtin_interfaces.msg"]
     modules = {name: types.ModuleType(name) for name in names}
     for module in modules.values():
@@ -494,7 +733,7 @@ class NodeWithStubs(unittest.TestCase):
     def test_a_compressed_frame_becomes_a_pose_and_a_job(self) -> None:
         node = self.node(frame_id="world", k=4, server_url="http://robot:1")
         self.assertEqual(self.connect.call_args.args, ("http://robot:1",))
-        stamp = Anything(sec=12)
+        stamp = Anything(sec=12, nanosec=0)
         node.subscriptions["image/compressed"](Anything(header=Anything(stamp=stamp), data=[1, 2, 3]))
         self.until(lambda: node.published["~/refined_pose"] and node.published["~/job"])
         self.assertEqual(self.client.asked, [(b"\1\2\3", 4, "async", 2000)])
@@ -513,11 +752,36 @@ class NodeWithStubs(unittest.TestCase):
     def test_a_raw_frame_in_an_unknown_encoding_is_a_warning(self) -> None:
         node = self.node(image_transport="raw")
         self.assertEqual(list(node.subscriptions), ["image"])
-        raw = Anything(encoding="16UC1", width=1, height=1, step=2, data=b"\0\0", header=Anything())
+        raw = Anything(encoding="16UC1", width=1, height=1, step=2, data=b"\0\0")
+        raw.header = Anything(stamp=Anything(sec=0, nanosec=0))
         node.subscriptions["image"](raw)
         self.until(lambda: node.warnings)
         self.assertIn("16UC1", node.warnings[0])
         self.assertEqual(self.client.asked, [])
+
+    def test_frames_of_a_track_have_the_way_by_the_odometry(self) -> None:
+        node = self.node(track="robot-7", odometry_topic="/odom")
+        self.client.answers = tracked
+        for tenth in range(21):
+            stamp = Anything(sec=100 + tenth // 10, nanosec=tenth % 10 * 100_000_000)
+            pose = Anything(pose=Anything(position=Anything(x=0.0, y=tenth / 2, z=0.0)))
+            node.subscriptions["/odom"](Anything(header=Anything(stamp=stamp), pose=pose))
+        for number, stamp in enumerate(
+            (Anything(sec=100, nanosec=500_000_000), Anything(sec=102, nanosec=0)), start=1
+        ):
+            frame = Anything(header=Anything(stamp=stamp), data=b"frame")
+            node.subscriptions["image/compressed"](frame)
+            self.until(lambda number=number: len(node.published["~/track_pose"]) == number)  # type: ignore[misc]
+        (_, first, _), (track, second, way) = self.client.steps
+        self.assertEqual((track, first, second), ("robot-7", instant(100, 500_000_000), instant(102, 0)))
+        assert way is not None
+        self.assertAlmostEqual(way, 7.5)
+        self.assertEqual(node.published["~/track_pose"][1].pose.pose.position.y, 2)
+        self.assertIs(node.published["~/track_pose"][1].header.stamp, stamp)
+
+    def test_without_a_track_there_is_no_need_of_odometry(self) -> None:
+        node = self.node(odometry_topic="/odom")
+        self.assertEqual(list(node.subscriptions), ["image/compressed"])
 
 
 if __name__ == "__main__":

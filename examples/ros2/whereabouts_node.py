@@ -4,16 +4,28 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 
 import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import String
 
-from localizer import Localizer, PoseWithCovariance, Shot, Spread, Wishes, encode, origin_of
+from localizer import (
+    Localizer,
+    Odometer,
+    PoseWithCovariance,
+    Shot,
+    Spread,
+    Wishes,
+    encode,
+    instant,
+    origin_of,
+)
 from whereabouts_client import Whereabouts
 
 REPORT_EVERY_S = 60.0
@@ -46,9 +58,11 @@ class WhereaboutsNode(Node):
             only_known=self.declare_parameter("only_known", True).value,
             origin=origin_of(number["origin_lat"], number["origin_lon"], number["origin_alt"]),
             spread=Spread(number["place_sigma_m"], number["turn_sigma_rad"], number["similarity_scale"]),
+            track=self.declare_parameter("track", "").value or None,
         )
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
         self._refined_pose = self.create_publisher(PoseWithCovarianceStamped, "~/refined_pose", 10)
+        self._track_pose = self.create_publisher(PoseWithCovarianceStamped, "~/track_pose", 10)
         self._job = self.create_publisher(String, "~/job", 10)
         # The key is no parameter, as everybody may read those.
         self._service = Whereabouts(
@@ -56,7 +70,11 @@ class WhereaboutsNode(Node):
             api_key=os.environ.get("WHEREABOUTS_API_KEY"),
             timeout_s=wishes.deadline_ms / 1000 + 3,
         )
-        self._localizer: Localizer[Time] = Localizer(self._service, wishes, self)
+        self._odometer = Odometer()
+        self._localizer: Localizer[Time] = Localizer(self._service, wishes, self, self._odometer)
+        odometry_topic = self.declare_parameter("odometry_topic", "").value
+        if odometry_topic and wishes.track:
+            self.create_subscription(Odometry, odometry_topic, self._odometry, qos_profile_sensor_data)
         if self.declare_parameter("image_transport", "compressed").value == "raw":
             self.create_subscription(Image, "image", self._raw, qos_profile_sensor_data)
         else:
@@ -70,14 +88,23 @@ class WhereaboutsNode(Node):
         self._service.close()
 
     def _compressed(self, message: CompressedImage) -> None:
-        self._localizer.offer(Shot(message.header.stamp, lambda: bytes(message.data)))
+        self._offer(message.header.stamp, lambda: bytes(message.data))
 
     def _raw(self, message: Image) -> None:
         def jpeg() -> bytes:
             size = (message.width, message.height, message.step)
             return encode(message.encoding, *size, bytes(message.data))
 
-        self._localizer.offer(Shot(message.header.stamp, jpeg))
+        self._offer(message.header.stamp, jpeg)
+
+    def _offer(self, stamp: Time, picture: Callable[[], bytes]) -> None:
+        self._localizer.offer(Shot(stamp, picture, instant(stamp.sec, stamp.nanosec)))
+
+    def _odometry(self, message: Odometry) -> None:
+        at = instant(message.header.stamp.sec, message.header.stamp.nanosec)
+        position = message.pose.pose.position
+        if at:
+            self._odometer.add(at, (position.x, position.y, position.z))
 
     def _report(self) -> None:
         at = self._localizer
@@ -93,6 +120,9 @@ class WhereaboutsNode(Node):
 
     def refined(self, stamp: Time, pose: PoseWithCovariance) -> None:
         self._refined_pose.publish(self._message(stamp, pose))
+
+    def tracked(self, stamp: Time, pose: PoseWithCovariance) -> None:
+        self._track_pose.publish(self._message(stamp, pose))
 
     def job(self, text: str) -> None:
         self._job.publish(String(data=text))
