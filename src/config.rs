@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::server::Server;
 use crate::domain::{Precision, RefinerKind};
+use crate::http::Tiles;
 use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
 use crate::retrieve::{AdmissionSettings, Layout, Provider, Wanted};
@@ -54,6 +55,8 @@ pub struct Config {
     pub refine: Refine,
     /// The multimodal LLM.
     pub mllm: MllmSettings,
+    /// The operator's console.
+    pub console: Console,
     /// Logs.
     pub log: Log,
 }
@@ -234,6 +237,38 @@ pub enum KeysWanted {
     Required,
     /// Never: whoever reaches the server may do everything.
     Off,
+}
+
+/// `[console]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Console {
+    /// Where the pictures behind a plan come from; empty for none.
+    pub tiles_url: String,
+    /// Whom to thank for them.
+    pub tiles_attribution: String,
+}
+
+impl Console {
+    /// The server of map tiles, if there is one.
+    pub fn tiles(&self) -> Option<Tiles> {
+        let (url, attribution) = (self.tiles_url.clone(), self.tiles_attribution.clone());
+        (!url.is_empty()).then_some(Tiles { url, attribution })
+    }
+
+    fn contradiction(&self) -> Option<String> {
+        let url = &self.tiles_url;
+        if url.is_empty() {
+            return None;
+        }
+        // It becomes a part of a header.
+        let whole = ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part));
+        let plain = url.bytes().all(|byte| byte.is_ascii_graphic() && !b";,'\"".contains(&byte));
+        let known = ["https://", "http://"].iter().any(|scheme| url.starts_with(scheme));
+        (!(whole && plain && known)).then(|| {
+            "console.tiles_url must be an address like https://HOST/{z}/{x}/{y}.png".to_owned()
+        })
+    }
 }
 
 /// `[idempotency]`
@@ -473,6 +508,11 @@ impl Config {
         }
     }
 
+    fn contradiction_of_a_section(&self) -> Option<String> {
+        let track = || self.track.contradiction();
+        self.server.contradiction().or_else(track).or_else(|| self.console.contradiction())
+    }
+
     fn contradiction(&self) -> Option<String> {
         let at_least_one = [
             ("server.body_limit_bytes", self.server.body_limit_bytes),
@@ -537,7 +577,7 @@ impl Config {
         {
             return Some(why);
         }
-        if let Some(why) = self.server.contradiction().or_else(|| self.track.contradiction()) {
+        if let Some(why) = self.contradiction_of_a_section() {
             return Some(why);
         }
         if !(0.0..=1.0).contains(&self.jobs.shed_at) {

@@ -12,6 +12,7 @@
 //! | [`archive`] | the file of `whereabouts backup`: written, continued, read with suspicion |
 //! | [`http`] | axum: extract, call the service, convert |
 //! | [`grpc`] | tonic: the same for the contract in `proto/` |
+//! | [`console`] | the operator's page and what it is made of |
 //! | [`cli`] | one file for each command |
 //! | [`demo`] | a procedural town, to try it all on |
 //! | [`config`], [`telemetry`], [`startup`] | settings, logs and metrics, wiring |
@@ -22,6 +23,7 @@
 pub mod archive;
 pub mod cli;
 pub mod config;
+pub mod console;
 pub mod demo;
 pub mod domain;
 pub mod evaluate;

@@ -14,7 +14,7 @@ use uuid::Uuid;
 
 use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
 use crate::domain::{CalibrationSettings, utc_day};
-use crate::http::{AppState, Connections, HttpSettings, router};
+use crate::http::{About, AppState, Connections, HttpSettings, router};
 use crate::refine::local::{LocalMatcher, LocalSettings};
 use crate::refine::mllm::{MllmParts, MllmRefiner};
 use crate::refine::{DenseCache, JobPace, LocalRefiner, Refiner, Worker, WorkerSettings};
@@ -26,18 +26,21 @@ use crate::service::{
 };
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
 use crate::store::{JobStore, UsageStore};
-use crate::telemetry::Metrics;
+use crate::telemetry::{Metrics, Troubles};
 
-/// Serves on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200.
+/// Serves on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200; `troubles`
+/// are those of the log.
 pub async fn serve(
     config: Config,
+    troubles: Arc<Troubles>,
     listener: TcpListener,
     shutdown: CancellationToken,
     on_ready: impl FnOnce(SocketAddr) -> anyhow::Result<()>,
 ) -> anyhow::Result<()> {
     let address = listener.local_addr().context("the listener has no address")?;
     let metrics = Arc::new(Metrics::new());
-    let state = AppState::new(http_settings(&config), Arc::clone(&metrics));
+    let state =
+        AppState::new(http_settings(&config), about(&config, troubles)?, Arc::clone(&metrics));
     let connections = Connections {
         settings: config.server.connections(),
         router: router(state.clone()),
@@ -89,6 +92,16 @@ pub async fn serve(
     tokio::task::spawn_blocking(idle).await.context("the end broke off")?;
     tracing::info!("stopped");
     Ok(())
+}
+
+fn about(config: &Config, troubles: Arc<Troubles>) -> anyhow::Result<About> {
+    Ok(About {
+        started_at: Timestamp::now(),
+        settings: toml::to_string(config)?,
+        pictures: config.image.queue,
+        tiles: config.console.tiles(),
+        troubles,
+    })
 }
 
 fn http_settings(config: &Config) -> HttpSettings {

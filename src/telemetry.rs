@@ -1,28 +1,36 @@
 //! Logs and metrics.
 
+mod recent;
 mod refused;
 
 use std::io::IsTerminal;
+use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use prometheus_client::encoding::{EncodeLabelSet, text};
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::Registry;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::LevelFilter;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer, fmt};
 
+use self::recent::Listener;
+pub use self::recent::{LastHour, Minute, Trouble, Troubles};
 pub use self::refused::RefusedFor;
 use crate::config::{Log, LogFormat};
-use crate::domain::Job;
+use crate::domain::{Job, JobState};
 use crate::refine::mllm::MllmLevels;
 use crate::retrieve::{AdmissionLevels, StageTimes};
 use crate::store::RemovedJobs;
 
-/// Starts logging to standard error. A second call changes nothing.
-pub fn init_logs(log: &Log) -> Result<(), String> {
+/// Starts logging to standard error, and gives the last warnings and errors. A second call changes nothing.
+pub fn init_logs(log: &Log) -> Result<Arc<Troubles>, String> {
     let filter = EnvFilter::try_new(&log.filter)
         .map_err(|error| format!("log.filter cannot be read: {error}"))?;
     let pretty = match log.format {
@@ -30,17 +38,26 @@ pub fn init_logs(log: &Log) -> Result<(), String> {
         LogFormat::Json => false,
         LogFormat::Auto => std::io::stderr().is_terminal(),
     };
-    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
-    let _ = match pretty {
-        true => builder.with_target(false).try_init(),
-        false => builder.json().flatten_event(true).try_init(),
+    let lines = fmt::layer().with_writer(std::io::stderr);
+    let lines = match pretty {
+        true => lines.with_target(false).boxed(),
+        false => lines.json().flatten_event(true).boxed(),
     };
-    Ok(())
+    let troubles = Arc::new(Troubles::default());
+    let listener = Listener(Arc::clone(&troubles)).with_filter(LevelFilter::WARN);
+    let _ =
+        tracing_subscriber::registry().with(lines.with_filter(filter)).with(listener).try_init();
+    Ok(troubles)
 }
+
+/// The routes that localize a frame.
+const FRAME_ROUTES: [&str; 2] = ["/localize", "/whereabouts.v1.LocalizationService/Localize"];
 
 /// What is counted, in the words of the API.
 #[derive(Debug)]
 pub struct Metrics {
+    /// The last hour.
+    pub last_hour: LastHour,
     registry: Registry,
     requests: Family<RequestLabels, Counter>,
     request_seconds: Family<RouteLabels, Histogram, fn() -> Histogram>,
@@ -172,6 +189,7 @@ impl Metrics {
     /// All zero.
     pub fn new() -> Self {
         let mut metrics = Self {
+            last_hour: LastHour::default(),
             registry: Registry::with_prefix("whereabouts"),
             requests: Family::default(),
             request_seconds: Family::new_with_constructor(latency),
@@ -313,6 +331,8 @@ impl Metrics {
 
     /// Counts an answered request.
     pub fn request(&self, method: &str, route: &str, status: u16, took: Duration) {
+        let is_frame = status == 200 && FRAME_ROUTES.contains(&route);
+        self.last_hour.answered(Timestamp::now(), status, is_frame.then_some(took));
         let route = route.to_owned();
         self.request_seconds
             .get_or_create(&RouteLabels { route: route.clone() })
@@ -363,6 +383,7 @@ impl Metrics {
 
     /// Counts an ended job.
     pub fn job_ended(&self, job: &Job) {
+        self.last_hour.job_ended(Timestamp::now(), job.state == JobState::Failed);
         let refiner = job.refiner.as_str();
         self.jobs.get_or_create(&JobLabels { refiner, state: job.state.as_str() }).inc();
         let (of, usage) = (RefinerLabels { refiner }, job.usage);

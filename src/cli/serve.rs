@@ -50,13 +50,13 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         .no_keys(args.no_keys)
         .mllm_base_url(args.mllm_base_url);
     let config = Config::load(args.config.as_deref(), &flags)?;
-    telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
+    let troubles = telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
     let listener = TcpListener::bind(config.server.listen).await.with_context(|| {
         format!("cannot listen on {}; choose another with --listen", config.server.listen)
     })?;
     let shutdown = CancellationToken::new();
     tokio::spawn(cancel_on_signal(shutdown.clone()));
-    startup::serve(config, listener, shutdown, |address| {
+    startup::serve(config, troubles, listener, shutdown, |address| {
         args.address_file.as_deref().map_or(Ok(()), |file| write_address(file, address))
     })
     .await

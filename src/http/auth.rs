@@ -36,7 +36,9 @@ pub(super) enum Access {
 pub(super) fn access(method: &Method, route: &str) -> Option<Access> {
     let method = if method == Method::HEAD { &Method::GET } else { method };
     Some(match (method.as_str(), route) {
-        ("GET", "/" | "/docs" | "/openapi.json" | "/livez" | "/readyz") => Access::Public,
+        ("GET", "/" | "/console/{file}" | "/docs" | "/openapi.json" | "/livez" | "/readyz") => {
+            Access::Public
+        }
         ("GET", "/maps" | "/maps/{map}" | "/jobs/{id}" | "/jobs/{id}/events")
         | ("POST", "/localize") => Access::Role(Role::Robot),
         ("GET", "/jobs" | "/events" | "/usage" | "/metrics")
@@ -44,7 +46,10 @@ pub(super) fn access(method: &Method, route: &str) -> Option<Access> {
         | ("GET" | "POST", "/maps/{map}/images")
         | ("POST", batch::PATH)
         | ("GET" | "DELETE", "/maps/{map}/images/{id}")
-        | ("GET", "/maps/{map}/images/{id}/content") => Access::Role(Role::Operator),
+        | ("GET", "/maps/{map}/images/{id}/content")
+        | ("GET", "/jobs/{id}/frame" | "/jobs/{id}/matches/{image}" | "/status") => {
+            Access::Role(Role::Operator)
+        }
         ("PUT" | "DELETE", "/maps/{map}")
         | ("POST", "/maps/{map}/reindex")
         | ("GET", "/maps/{map}/export")

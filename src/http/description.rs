@@ -7,6 +7,7 @@ use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement
 use utoipa::openapi::{ContentBuilder, OpenApi, Ref, RefOr, Required, Response, ResponseBuilder};
 
 use super::auth::{Access, access};
+use super::examples;
 use super::idempotency::{LONGEST_KEY, applies};
 
 /// The name of the security scheme.
@@ -39,6 +40,7 @@ pub(super) fn completed(mut description: OpenApi) -> OpenApi {
             }
         }
     }
+    examples::show(&mut description);
     description
 }
 

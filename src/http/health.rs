@@ -3,7 +3,7 @@
 use axum::Json;
 use axum::extract::State;
 use axum::http::header::{CONTENT_SECURITY_POLICY, CONTENT_TYPE};
-use axum::response::{Html, IntoResponse, Redirect, Response};
+use axum::response::{Html, IntoResponse, Response};
 
 use super::problem::Problem;
 use super::state::{AppState, Ready};
@@ -41,10 +41,6 @@ pub(super) async fn metrics(Ready(service): Ready) -> Result<impl IntoResponse, 
 
 pub(super) async fn openapi_json(description: utoipa::openapi::OpenApi) -> Response {
     Json(description).into_response()
-}
-
-pub(super) async fn to_docs() -> Redirect {
-    Redirect::temporary("/docs")
 }
 
 /// The page that shows `/openapi.json` to people; all of it is in the binary.

@@ -3,16 +3,19 @@
 use std::time::Duration;
 
 use axum::Json;
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::IntoResponse;
 use serde::Deserialize;
 use utoipa::IntoParams;
 use uuid::Uuid;
 
 use super::body::{Params, Segments};
+use super::images::image_id;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::Ready;
 use crate::domain::{Job, JobState};
-use crate::service::{ErrorKind, JobPage};
+use crate::service::{ErrorKind, JobPage, PairRegions};
 use crate::store::JobFilter;
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -67,6 +70,48 @@ pub(super) async fn get_job(
 ) -> Result<Json<Job>, Problem> {
     let wait = params.wait.map(seconds).transpose()?;
     Ok(Json(service.get_job(job_id(&id)?, wait).await?))
+}
+
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct FrameParams {
+    /// The longest edge in pixels, 16 to 4096; without it the picture comes as it was sent.
+    max_edge: Option<u32>,
+}
+
+/// The frame of a job
+#[utoipa::path(get, path = "/jobs/{id}/frame", tag = "jobs",
+    params(("id" = Uuid, Path), FrameParams), responses(
+    (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"))),
+    (status = 404, body = Problem, description = "No such job, or its frame is no longer there", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "max_edge is out of range", content_type = "application/problem+json"),
+    (status = 429, body = Problem, description = "Overloaded, and max_edge asks for a smaller picture", content_type = "application/problem+json"),
+))]
+pub(super) async fn frame(
+    Ready(service): Ready,
+    Segments(id): Segments<String>,
+    Params(params): Params<FrameParams>,
+) -> Result<impl IntoResponse, Problem> {
+    let (media_type, bytes) = service.frame_of(job_id(&id)?, params.max_edge).await?;
+    let headers = [(CONTENT_TYPE, media_type.as_str()), (CACHE_CONTROL, "private, max-age=3600")];
+    Ok((headers, bytes))
+}
+
+/// What a job's frame and a candidate have in common
+///
+/// The regions that agree, the most telling first. Only the refiner `local` compares regions; they are compared
+/// anew, with the pictures as they are now.
+#[utoipa::path(get, path = "/jobs/{id}/matches/{image}", tag = "jobs",
+    params(("id" = Uuid, Path), ("image" = String, Path)), responses(
+    (status = 200, body = PairRegions),
+    (status = 404, body = Problem, description = "No such job, or no such matches", content_type = "application/problem+json"),
+))]
+pub(super) async fn matches(
+    Ready(service): Ready,
+    Segments((id, image)): Segments<(String, String)>,
+) -> Result<Json<PairRegions>, Problem> {
+    Ok(Json(service.matches(job_id(&id)?, &image_id(&image)?).await?))
 }
 
 /// Cancel a job

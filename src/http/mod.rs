@@ -7,6 +7,7 @@ mod connections;
 mod deadline;
 mod description;
 mod events;
+mod examples;
 mod guard;
 mod health;
 mod idempotency;
@@ -19,6 +20,7 @@ mod maps;
 mod messages;
 mod problem;
 mod state;
+mod status;
 mod transfer;
 mod usage;
 
@@ -34,7 +36,9 @@ use crate::grpc;
 
 pub use batch::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 pub use connections::{ConnectionSettings, Connections, Tls, TlsError};
+pub use examples::{Example, ExampleBody, ExamplePart, Taken, examples};
 pub use state::{AppState, HttpSettings};
+pub use status::{About, Tiles};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -78,11 +82,14 @@ fn described() -> OpenApiRouter<AppState> {
         .routes(routes!(localize::localize))
         .routes(routes!(jobs::list_jobs))
         .routes(routes!(jobs::get_job))
+        .routes(routes!(jobs::frame))
+        .routes(routes!(jobs::matches))
         .routes(routes!(jobs::cancel_job))
         .routes(routes!(jobs::retry_job))
         .routes(routes!(events::follow_job))
         .routes(routes!(events::follow_jobs))
         .routes(routes!(usage::usage))
+        .routes(routes!(status::status))
         .routes(routes!(keys::create_key, keys::list_keys))
         .routes(routes!(keys::revoke_key))
         .routes(routes!(health::livez))
@@ -103,7 +110,7 @@ pub fn router(state: AppState) -> Router {
         .merge(grpc::routes(&state.door, state.settings.body_limit_bytes))
         .route("/openapi.json", axum::routing::get(move || health::openapi_json(description)))
         .route("/docs", axum::routing::get(health::docs))
-        .route("/", axum::routing::get(health::to_docs))
+        .merge(crate::console::routes(state.about.tiles.as_ref().map(|tiles| tiles.url.as_str())))
         .fallback(problem::no_such_path)
         .method_not_allowed_fallback(problem::no_such_method)
         .layer(DefaultBodyLimit::max(state.settings.body_limit_bytes))

@@ -8,6 +8,7 @@ use axum::http::request::Parts;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::problem::Problem;
+use super::status::About;
 use crate::service::{Door, ErrorKind, Service};
 use crate::telemetry::Metrics;
 
@@ -42,6 +43,7 @@ pub struct HttpSettings {
 #[derive(Clone)]
 pub struct AppState {
     pub(super) settings: Arc<HttpSettings>,
+    pub(super) about: Arc<About>,
     pub(super) metrics: Arc<Metrics>,
     pub(super) permits: Arc<Semaphore>,
     pub(super) streams: Arc<Semaphore>,
@@ -51,12 +53,13 @@ pub struct AppState {
 
 impl AppState {
     /// A state without a service: every call but `/livez` answers 503 until there is one.
-    pub fn new(settings: HttpSettings, metrics: Arc<Metrics>) -> Self {
+    pub fn new(settings: HttpSettings, about: About, metrics: Arc<Metrics>) -> Self {
         Self {
             permits: Arc::new(Semaphore::new(settings.max_requests)),
             streams: Arc::new(Semaphore::new(settings.max_streams)),
             bodies_memory: Arc::new(Semaphore::new(settings.bodies_limit_bytes)),
             settings: Arc::new(settings),
+            about: Arc::new(about),
             metrics,
             door: Door::default(),
         }

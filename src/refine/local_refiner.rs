@@ -5,10 +5,10 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use bytes::Bytes;
 
-use super::local::{LocalMatcher, PairMatch, describe, rank};
-use super::{DenseCache, DenseKey, Progress, RefineError, Refinement, Refiner};
+use super::local::{LocalMatcher, Match, PairMatch, describe, rank};
+use super::{DenseCache, DenseKey, PairRegion, Progress, RefineError, Refinement, Refiner};
 use crate::domain::{
-    Candidate, DenseFeatures, Description, DescriptorKind, Digest, Evidence, Map, Ranking,
+    Candidate, DenseFeatures, Description, DescriptorKind, Digest, Evidence, ImageId, Map, Ranking,
     RefinerKind, Usage,
 };
 use crate::retrieve::{CpuPool, ExtractError, Extractor, LoadedModels, ModelError};
@@ -47,19 +47,25 @@ impl Refiner for LocalRefiner {
         record: &JobRecord,
         _: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        let map = match self.maps.map(&record.job.map).await? {
-            Some(map) if map.uid == record.map_uid => map,
-            _ => return Err(RefineError::Hopeless("the map was removed".into())),
-        };
-        let extractor = self.models.of(&map).await.map_err(no_model)?;
-        let model = extractor.identity();
-        let query = self
-            .source(DenseKey { model, picture: record.query.digest })
-            .await?
-            .ok_or_else(|| RefineError::Hopeless("the frame is missing from the store".into()))?;
-        let Compared { present, pairs } =
-            self.compared(&map, extractor, query, &record.candidates).await?;
+        let Compared { present, pairs } = self.compared_of(record).await?;
         conclude(&record.candidates, &present, &pairs)
+    }
+
+    async fn regions(
+        &self,
+        record: &JobRecord,
+        image: &ImageId,
+    ) -> Result<Option<Vec<PairRegion>>, RefineError> {
+        // Beside the others, as it was compared: what speaks for it depends on them.
+        let Compared { present, pairs } = self.compared_of(record).await?;
+        let of = present.iter().position(|&index| record.candidates[index].image_id == *image);
+        let matches = of.and_then(|of| pairs.into_iter().nth(of)).map(|pair| pair.matches);
+        let region = |found: Match| PairRegion {
+            frame: found.query,
+            image: found.candidate,
+            similarity: found.similarity,
+        };
+        Ok(matches.map(|matches| matches.into_iter().map(region).collect()))
     }
 
     async fn chance(&self, map: &Map, asked: &LookAlikes) -> Result<Option<Evidence>, RefineError> {
@@ -85,6 +91,21 @@ struct Compared {
 }
 
 impl LocalRefiner {
+    /// The frame of a job with its candidates.
+    async fn compared_of(&self, record: &JobRecord) -> Result<Compared, RefineError> {
+        let map = match self.maps.map(&record.job.map).await? {
+            Some(map) if map.uid == record.map_uid => map,
+            _ => return Err(RefineError::Hopeless("the map was removed".into())),
+        };
+        let extractor = self.models.of(&map).await.map_err(no_model)?;
+        let model = extractor.identity();
+        let query = self
+            .source(DenseKey { model, picture: record.query.digest })
+            .await?
+            .ok_or_else(|| RefineError::Hopeless("the frame is missing from the store".into()))?;
+        self.compared(&map, extractor, query, &record.candidates).await
+    }
+
     async fn compared(
         &self,
         map: &Map,

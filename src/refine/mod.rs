@@ -15,12 +15,14 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use async_trait::async_trait;
+use serde::Serialize;
+use utoipa::ToSchema;
 
 pub use dense_cache::{DenseCache, DenseKey};
 pub use local_refiner::LocalRefiner;
 pub use worker::{Worker, WorkerSettings};
 
-use crate::domain::{Description, Evidence, Map, Ranking, RefinerKind, Usage};
+use crate::domain::{Description, Evidence, ImageId, Map, Ranking, RefinerKind, Usage};
 use crate::retrieve::Pace;
 use crate::store::{JobRecord, LookAlikes, Step, StoreError};
 
@@ -52,6 +54,28 @@ pub trait Refiner: Send + Sync {
         let _ = (map, asked);
         Ok(None)
     }
+    /// The regions that the frame of a job and one of its candidates have in common, the most telling
+    /// first; `None` from a refiner that compares none, and for an image that is no candidate or gone.
+    async fn regions(
+        &self,
+        record: &JobRecord,
+        image: &ImageId,
+    ) -> Result<Option<Vec<PairRegion>>, RefineError> {
+        let _ = (record, image);
+        Ok(None)
+    }
+}
+
+/// A region of a frame, and the one that it agrees with in a reference image. Positions are in fractions of
+/// the pictures' width and height, from the top left.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, ToSchema)]
+pub struct PairRegion {
+    /// In the frame.
+    pub frame: [f32; 2],
+    /// In the image.
+    pub image: [f32; 2],
+    /// Cosine similarity of the two, −1 to 1.
+    pub similarity: f32,
 }
 
 /// Hears of the steps of a refinement.

@@ -7,7 +7,7 @@ use std::time::SystemTime;
 use super::decode::ImageLimits;
 use super::extractor::{Extractor, ExtractorSettings};
 use super::manifest::{MANIFEST, Manifest};
-use super::provider::Wanted;
+use super::provider::{Execution, Wanted};
 use super::runtime::{Assets, RuntimeError};
 use crate::domain::{Digest, Map, Precision};
 
@@ -73,6 +73,15 @@ impl LoadedModels {
     pub fn new(assets: Assets, settings: LoadedSettings) -> Self {
         let (loaded, loading) = (Mutex::default(), tokio::sync::Mutex::default());
         Self { shared: Arc::new(Shared { assets, settings, loaded, loading }) }
+    }
+
+    /// Those in memory, the most recently used first: their names, and how they run.
+    pub fn in_memory(&self) -> Vec<(String, Execution)> {
+        let loaded = self.shared.loaded();
+        let told = |loaded: &Loaded| {
+            (loaded.extractor.manifest().name.clone(), loaded.extractor.execution())
+        };
+        loaded.iter().rev().map(told).collect()
     }
 
     /// The model of maps for which none is named.

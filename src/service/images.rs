@@ -128,7 +128,17 @@ impl Service {
                 format!("the bytes of {id} ({}) are missing from the store", image.digest),
             )
         })?;
-        let Some(max_edge) = max_edge else { return Ok((image.media_type, bytes)) };
+        self.shown(image.media_type, bytes, max_edge).await
+    }
+
+    /// A picture as it was sent, or as a JPEG no larger than `max_edge` pixels.
+    pub(super) async fn shown(
+        &self,
+        media_type: MediaType,
+        bytes: Bytes,
+        max_edge: Option<u32>,
+    ) -> Result<(MediaType, Bytes), ServiceError> {
+        let Some(max_edge) = max_edge else { return Ok((media_type, bytes)) };
         if !(16..=4096).contains(&max_edge) {
             return Err(ServiceError::unprocessable("max_edge must be between 16 and 4096 pixels"));
         }

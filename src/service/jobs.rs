@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use bytes::Bytes;
 use serde::Serialize;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::RecvError;
@@ -10,7 +11,8 @@ use uuid::Uuid;
 
 use super::images::page_size;
 use super::{ErrorKind, Service, ServiceError};
-use crate::domain::Job;
+use crate::domain::{ImageId, Job, MediaType};
+use crate::refine::{PairRegion, RefineError};
 use crate::store::JobFilter;
 
 /// Some jobs, newest first.
@@ -20,6 +22,13 @@ pub struct JobPage {
     pub jobs: Vec<Job>,
     /// Where the next page starts: `cursor=` of the next request. Null on the last page.
     pub next_cursor: Option<Uuid>,
+}
+
+/// The regions that two pictures have in common, the most telling first.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct PairRegions {
+    /// The pairs of regions.
+    pub regions: Vec<PairRegion>,
 }
 
 impl Service {
@@ -57,6 +66,49 @@ impl Service {
     /// Queues a job again that ended without success.
     pub async fn retry_job(&self, id: Uuid) -> Result<Job, ServiceError> {
         Ok(self.jobs.retry(id).await?)
+    }
+
+    /// Jobs that wait or run.
+    pub async fn open_jobs(&self) -> Result<usize, ServiceError> {
+        Ok(self.jobs.queued().await?)
+    }
+
+    /// The frame of a job: as it was sent, or as a JPEG no larger than `max_edge` pixels.
+    pub async fn frame_of(
+        &self,
+        id: Uuid,
+        max_edge: Option<u32>,
+    ) -> Result<(MediaType, Bytes), ServiceError> {
+        let query = self.jobs.job(id).await?.ok_or_else(|| no_job(id))?.query;
+        let bytes = self.blobs.blob(&query.digest).await?.ok_or_else(|| {
+            ServiceError::not_found(format!("the frame of the job {id} is no longer there"))
+        })?;
+        self.shown(query.media_type, bytes, max_edge).await
+    }
+
+    /// The regions that a job's frame and one of its candidates have in common, if its refiner compares
+    /// regions. They are compared anew, with the pictures as they are now.
+    pub async fn matches(&self, id: Uuid, image: &ImageId) -> Result<PairRegions, ServiceError> {
+        let record = self.jobs.job(id).await?.ok_or_else(|| no_job(id))?;
+        let refiner = self.refiner.as_ref().filter(|refiner| refiner.kind() == record.job.refiner);
+        let regions = match refiner {
+            Some(refiner) => {
+                refiner.regions(&record, image).await.map_err(|error| match error {
+                    RefineError::Hopeless(why) => ServiceError::not_found(why),
+                    RefineError::Passing(why) | RefineError::Later { why, .. } => {
+                        ServiceError::new(ErrorKind::Unavailable, why)
+                    }
+                })?
+            }
+            None => None,
+        };
+        let regions = regions.ok_or_else(|| {
+            ServiceError::not_found(format!(
+                "the job {id} has no matches with {image}: it is not among its candidates any more, or the \
+                 refiner is not the one that compares regions (local)"
+            ))
+        })?;
+        Ok(PairRegions { regions })
     }
 
     /// Waits until the job has ended, but no longer than `longest`; the job as it then is.

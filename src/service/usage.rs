@@ -68,15 +68,19 @@ impl Service {
             usage: sum.usage + spent.usage,
             money: sum.money + spent.money,
         });
-        let levels = self.refiner.as_ref().and_then(|refiner| refiner.levels());
-        let today = levels.map(|levels| Today {
-            date,
+        Ok(UsageReport { today: self.today(), days: spent, total })
+    }
+
+    /// The budget of today, if the refiner asks models outside.
+    pub fn today(&self) -> Option<Today> {
+        let levels = self.refiner.as_ref()?.levels()?;
+        Some(Today {
+            date: utc_day(Timestamp::now()),
             tokens: levels.spent_today.tokens,
             token_limit: Some(levels.limit.tokens).filter(|limit| *limit > 0),
             money: levels.spent_today.money,
             money_limit: Some(levels.limit.money).filter(|limit| *limit > 0.0),
             suspended: levels.suspended,
-        });
-        Ok(UsageReport { today, days: spent, total })
+        })
     }
 }

@@ -471,4 +471,6 @@ pub trait Retention: Send + Sync {
     async fn forget_usage(&self, before: Date) -> Result<(), StoreError>;
     /// Bytes of the database's files.
     async fn db_bytes(&self) -> Result<u64, StoreError>;
+    /// Bytes that are free where pictures are kept; `None` where that cannot be told.
+    async fn free_bytes(&self) -> Option<u64>;
 }

@@ -16,6 +16,13 @@ const HEADERS: u8 = 1;
 const RST_STREAM: u8 = 3;
 const SETTINGS: u8 = 4;
 const GOAWAY: u8 = 7;
+const WINDOW_UPDATE: u8 = 8;
+
+/// Of settings.
+const INITIAL_WINDOW_SIZE: u16 = 4;
+
+/// More than any answer has bytes.
+const LARGE: u32 = 1 << 24;
 
 const END_STREAM: u8 = 1;
 const END_HEADERS: u8 = 4;
@@ -55,10 +62,13 @@ type Came = (u8, u8, u32, Vec<u8>);
 struct Client(TcpStream);
 
 impl Client {
-    async fn connect(server: &Server, settings: &[u8]) -> Self {
+    /// A client that takes so many bytes of each answer before it says more.
+    async fn connect(server: &Server, window: u32) -> Self {
         let mut client = Self::silent(server).await;
         client.send(PREFACE).await;
-        client.send(&frame(SETTINGS, 0, 0, settings)).await;
+        let setting = [&INITIAL_WINDOW_SIZE.to_be_bytes()[..], &window.to_be_bytes()].concat();
+        client.send(&frame(SETTINGS, 0, 0, &setting)).await;
+        client.send(&frame(WINDOW_UPDATE, 0, 0, &LARGE.to_be_bytes())).await;
         client
     }
 
@@ -113,8 +123,7 @@ async fn refused(server: &Server, reason: &str) -> u64 {
 #[tokio::test]
 async fn a_client_that_takes_nothing_of_one_answer_is_given_up() {
     let (_dir, server) = server(&[]);
-    // SETTINGS_INITIAL_WINDOW_SIZE = 1
-    let mut client = Client::connect(&server, &[0, 4, 0, 0, 0, 1]).await;
+    let mut client = Client::connect(&server, 1).await;
     let begun = Instant::now();
     client.request(1, "/openapi.json").await;
     let (mut bytes, mut healthy) = (0, 0);
@@ -146,10 +155,10 @@ async fn a_preface_that_stops_halfway_is_not_waited_for() {
 #[tokio::test]
 async fn an_idle_connection_makes_room_and_a_busy_one_does_not() {
     let (_dir, server) = server(&[("WHEREABOUTS_SERVER__MAX_CONNECTIONS", "2")]);
-    let mut idle = Client::connect(&server, &[]).await;
+    let mut idle = Client::connect(&server, LARGE).await;
     idle.request(1, "/openapi.json").await;
     assert!(idle.body(1).await.len() > 50_000);
-    let mut busy = Client::connect(&server, &[]).await;
+    let mut busy = Client::connect(&server, LARGE).await;
     busy.request(1, "/events").await;
     while busy.next().await.unwrap().0 != HEADERS {}
     // A stream has been opened and answered on each; this one needs a place.
@@ -164,7 +173,7 @@ async fn an_idle_connection_makes_room_and_a_busy_one_does_not() {
 #[tokio::test]
 async fn a_head_that_is_too_large_is_refused_and_others_are_answered() {
     let (_dir, server) = server(&[("WHEREABOUTS_SERVER__MAX_HEADER_BYTES", "8192")]);
-    let mut client = Client::connect(&server, &[]).await;
+    let mut client = Client::connect(&server, LARGE).await;
     let mut head = get("/livez");
     for index in 0..100 {
         // A literal header with a name of its own.
@@ -192,7 +201,7 @@ async fn a_head_that_is_too_large_is_refused_and_others_are_answered() {
 #[tokio::test]
 async fn requests_that_are_taken_back_by_the_thousand_cost_the_client_its_connection() {
     let (_dir, server) = server(&[]);
-    let mut client = Client::connect(&server, &[]).await;
+    let mut client = Client::connect(&server, LARGE).await;
     let (mut reader, mut writer) = client.0.into_split();
     let flooding = tokio::spawn(async move {
         for request in 0..20_000_u32 {
@@ -211,7 +220,7 @@ async fn requests_that_are_taken_back_by_the_thousand_cost_the_client_its_connec
     let goaway = answer.windows(5).any(|bytes| bytes[3] == GOAWAY && bytes[..2] == [0, 0]);
     assert!(goaway, "the server says why");
     server.get("/livez").await.expect(200);
-    client = Client::connect(&server, &[]).await;
+    client = Client::connect(&server, LARGE).await;
     client.request(1, "/openapi.json").await;
     client.body(1).await;
 }

@@ -19,6 +19,7 @@ mod confidence;
 mod demo;
 mod dinov2;
 mod doctor;
+mod documented;
 mod durability;
 mod eval;
 mod events;

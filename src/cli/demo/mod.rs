@@ -147,11 +147,12 @@ impl Server {
             .model(Some(model));
         let mut config = Config::load(None, &flags)?;
         "warn".clone_into(&mut config.log.filter);
-        telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
+        let troubles = telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
         let listener = TcpListener::bind(config.server.listen).await?;
         let (announce, ready) = oneshot::channel();
         let shutdown = CancellationToken::new();
-        let running = tokio::spawn(startup::serve(config, listener, shutdown.clone(), |address| {
+        let until = shutdown.clone();
+        let running = tokio::spawn(startup::serve(config, troubles, listener, until, |address| {
             let _ = announce.send(address);
             Ok(())
         }));

@@ -75,12 +75,13 @@ impl Entries {
                     entry.read_to_end(&mut text).map_err(broken)?;
                     self.meta(of.into(), text)
                 }
-                None => {
+                None if self.makes_way_for(&name) => {
                     let memory = self.runtime.block_on(self.room.take(size))?;
                     let mut bytes = Vec::with_capacity(size);
                     entry.read_to_end(&mut bytes).map_err(broken)?;
                     self.picture(name, bytes.into(), memory)
                 }
+                None => false,
             };
             if !go_on {
                 return Ok(());
@@ -104,14 +105,18 @@ impl Entries {
         }
     }
 
+    /// Passes the entry before on, unless it is about the picture that comes now: of two pictures one would
+    /// wait for the memory of the other.
+    fn makes_way_for(&mut self, picture: &str) -> bool {
+        matches!(&self.before, Before::Meta { of, .. } if **of == *picture) || self.pass_on()
+    }
+
     fn picture(&mut self, name: Arc<str>, bytes: Bytes, memory: OwnedSemaphorePermit) -> bool {
         match std::mem::replace(&mut self.before, Before::Nothing) {
-            Before::Meta { of, text } if of == name => self.send(&name, Some(&text), bytes, memory),
-            before => {
-                self.before = before;
-                let go_on = self.pass_on();
+            Before::Meta { text, .. } => self.send(&name, Some(&text), bytes, memory),
+            _ => {
                 self.before = Before::Picture { name, bytes, memory };
-                go_on
+                true
             }
         }
     }

@@ -82,7 +82,9 @@ async fn picture(
         let so_far = bytes.len() + chunk.len();
         room.check(so_far)?;
         if held.num_permits() < so_far {
-            held.merge(room.take(STEP.max(chunk.len())).await?);
+            let missing = so_far - held.num_permits();
+            let step = STEP.min(room.settings.body_limit_bytes - held.num_permits());
+            held.merge(room.take(missing.max(step)).await?);
         }
         bytes.extend_from_slice(&chunk);
     }

@@ -47,14 +47,17 @@ impl Blobs {
         Ok(Self { dir, min_free, pinned: Arc::default() })
     }
 
+    /// Bytes of the disk that are free.
+    pub fn free_bytes(&self) -> Result<u64, StoreError> {
+        fs2::available_space(&self.dir).map_err(|error| {
+            let dir = self.dir.display();
+            StoreError::Failed(format!("cannot look at the disk of {dir}: {error}"))
+        })
+    }
+
     /// Nearly every change begins with the bytes of a picture, so this guards the whole folder.
     fn check_room(&self, bytes: usize) -> Result<(), StoreError> {
-        let free = fs2::available_space(&self.dir).map_err(|error| {
-            StoreError::Failed(format!(
-                "cannot look at the disk of {}: {error}",
-                self.dir.display()
-            ))
-        })?;
+        let free = self.free_bytes()?;
         if free < self.min_free.saturating_add(bytes as u64) {
             return Err(StoreError::Full { free, kept: self.min_free });
         }

@@ -52,6 +52,11 @@ impl Retention for EmbeddedStore {
         let inner = Arc::clone(&self.inner);
         blocking(move || inner.trees.bytes()).await
     }
+
+    async fn free_bytes(&self) -> Option<u64> {
+        let inner = Arc::clone(&self.inner);
+        blocking(move || inner.blobs.free_bytes()).await.ok()
+    }
 }
 
 /// Removes the records of up to `batch` of the jobs that have ended, and counts down.

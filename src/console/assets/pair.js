@@ -1,0 +1,133 @@
+// A frame beside a candidate: both pictures, the lines between their matched regions, and the words.
+
+import { address, call, contentOf, frameOf, isAbort, picture } from "./api.js";
+import { fill, h } from "./dom.js";
+import { cost, plural } from "./format.js";
+import { apart } from "./words.js";
+
+const EDGE = 1024;
+
+/** The two pictures of a pair. */
+export function pictures(job, imageId, { signal }) {
+  const lines = h("canvas", { class: "lines", "aria-hidden": "true" });
+  const note = h("span", { class: "muted small" });
+  const box = h("input", { type: "checkbox", id: "lines-on", checked: true });
+  const bar = h("div", { class: "pair-bar", hidden: true }, h("label", { class: "check", for: "lines-on" }, box, "Lines between matched regions"), note);
+  let redraw = () => {};
+  const options = { signal, loaded: () => redraw() };
+  const frame = picture(frameOf(job.id, EDGE), "The frame", { ...options, gone: "The frame is not kept any more, or this server does not show frames." });
+  const image = picture(contentOf(job.map, imageId, EDGE), `Candidate ${imageId}`, { ...options, gone: "The image is no longer in the map." });
+  const stage = h("div", { class: "pair" },
+    h("figure", {}, frame, h("figcaption", {}, "Frame")),
+    h("figure", {}, image, h("figcaption", {}, "Candidate ", h("code", {}, imageId))), lines);
+  const all = h("div", {}, stage, bar);
+  if (job.refiner !== "local") return all;
+
+  call(address(["jobs", job.id, "matches", imageId]), { signal }).then((matches) => {
+    bar.hidden = false;
+    if (!matches.regions.length) { box.parentElement.hidden = true; note.textContent = "No regions agree."; return; }
+    note.textContent = plural(matches.regions.length, "region");
+    let near = -1;
+    redraw = () => draw(lines, stage, frame, image, matches, box.checked, near);
+    box.addEventListener("change", redraw);
+    stage.addEventListener("pointermove", (event) => {
+      const found = nearest(event, frame, image, matches);
+      if (found !== near) { near = found; redraw(); }
+    });
+    stage.addEventListener("pointerleave", () => { near = -1; redraw(); });
+    const observer = new ResizeObserver(redraw);
+    observer.observe(stage);
+    signal.addEventListener("abort", () => observer.disconnect());
+    redraw();
+  }).catch((problem) => {
+    if (isAbort(problem)) return;
+    bar.hidden = false;
+    box.parentElement.hidden = true;
+    note.textContent = problem.status === 404 ? "Matched regions cannot be shown: the frame or the image is gone, or this server does not tell them." : `Matched regions cannot be shown: ${problem.detail}`;
+  });
+  return all;
+}
+
+const boxOf = (picture) => picture.querySelector("img")?.getBoundingClientRect();
+
+function draw(canvas, stage, frame, image, matches, on, near) {
+  const here = stage.getBoundingClientRect();
+  const ratio = devicePixelRatio || 1;
+  canvas.width = Math.round(here.width * ratio);
+  canvas.height = Math.round(here.height * ratio);
+  const ink = canvas.getContext("2d");
+  const [a, b] = [boxOf(frame), boxOf(image)];
+  if (!on || !a?.width || !b?.width) return;
+  ink.scale(ratio, ratio);
+  ink.translate(-here.left, -here.top);
+  const many = matches.regions.length;
+  const line = (region, at) => {
+    const [x0, y0] = place(region.frame, a, matches.frame);
+    const [x1, y1] = place(region.image, b, matches.image);
+    // The hue goes with the place in the frame: what moved together has lines that run together.
+    const hue = 20 + 300 * (region.frame[1] / matches.frame.height);
+    ink.strokeStyle = ink.fillStyle = at === near ? "#fff" : `hsl(${hue} 90% 62% / ${many > 200 ? 0.45 : 0.7})`;
+    ink.lineWidth = at === near ? 3 : 1;
+    ink.beginPath();
+    ink.moveTo(x0, y0);
+    ink.lineTo(x1, y1);
+    ink.stroke();
+    for (const [x, y] of [[x0, y0], [x1, y1]]) {
+      ink.beginPath();
+      ink.arc(x, y, at === near ? 5 : 2, 0, 2 * Math.PI);
+      ink.fill();
+    }
+  };
+  matches.regions.forEach(line);
+  if (near >= 0) line(matches.regions[near], near);
+}
+
+const place = ([x, y], box, size) => [box.left + (x / size.width) * box.width, box.top + (y / size.height) * box.height];
+
+function nearest(event, frame, image, matches) {
+  let best = 14 ** 2;
+  let found = -1;
+  for (const [side, box] of [["frame", boxOf(frame)], ["image", boxOf(image)]]) {
+    if (!box) continue;
+    matches.regions.forEach((region, at) => {
+      const [x, y] = place(region[side], box, matches[side]);
+      const far = (x - event.clientX) ** 2 + (y - event.clientY) ** 2;
+      if (far < best) { best = far; found = at; }
+    });
+  }
+  return found;
+}
+
+/** The description of a pair, with what agrees and what differs set apart. */
+export function words(description) {
+  if (!description) return h("p", { class: "muted" }, "This pair has no description.");
+  const found = apart(description.text);
+  const list = (name, title, items) => h("section", { class: name }, h("h4", {}, title),
+    items.length ? h("ul", {}, items.map((item) => h("li", {}, item))) : h("p", { class: "muted" }, "Nothing was named."));
+  const whole = (text) => text.split(/\n{2,}/).map((part) => h("p", { class: "told" }, part));
+  return h("div", { class: "words" },
+    found?.verdict && h("p", { class: "verdict" }, found.verdict),
+    found && h("div", { class: "apart" }, list("agree", "Agrees", found.agree), list("differ", "Differs", found.differ)),
+    found?.view && h("p", { class: "muted" }, found.view),
+    found ? h("details", {}, h("summary", {}, "The whole text"), whole(description.text)) : whole(description.text),
+    h("p", { class: "muted small" }, bought(description)));
+}
+
+/** Whether a description was bought, and for how much. */
+export function bought(description) {
+  if (description.stands_in) return `Stands in from the earlier frame of query ${description.stands_in.query_id}, whose similarity is ${description.stands_in.similarity.toFixed(3)}.`;
+  if (description.cached) return "Known from an earlier job; no call was made.";
+  return description.usage.calls ? cost(description.usage) : "Compared on this server; no call was made.";
+}
+
+/** How a candidate moved, as text and as a sign. */
+export function moved(candidate) {
+  const by = candidate.coarse_rank - candidate.rank;
+  if (by === 0) return h("span", { class: "moved" }, "unmoved");
+  return h("span", { class: by > 0 ? "moved up" : "moved down" }, by > 0 ? `▲ ${by}` : `▼ ${-by}`,
+    h("span", { class: "unseen" }, by > 0 ? " places up" : " places down"));
+}
+
+export function fillPair(parent, job, imageId, description, options) {
+  fill(parent, pictures(job, imageId, options), words(description));
+}

@@ -1,0 +1,70 @@
+// What agrees and what differs, out of the text of a description. `local` writes fixed sentences; `mllm` is asked
+// for OBJECTS, MATCHES and COMPARISON, but no model is bound to follow. Where the form is another, there are no
+// lists, and the text stands for itself. Nothing is left out: the whole text is shown too.
+
+/** `{agree, differ, view, verdict}` (lists of sentences, a sentence or null), or null if the text has no such form. */
+export function apart(text) {
+  return /^(None of the |\d+ of )?\d+ (pairs of )?regions?\b/.test(text) || /^None of the \d+ regions? of the query/.test(text) ? ofLocal(text) : ofModel(text);
+}
+
+const sentences = (text) => text.split(/(?<=[.!?])\s+(?=\S)/).map((one) => one.trim()).filter(Boolean);
+const ended = (part) => (/[.!?]$/.test(part) ? part : `${part}.`);
+
+function ofLocal(text) {
+  const found = { agree: [], differ: [], view: null, verdict: null };
+  for (const sentence of sentences(text)) {
+    if (/^None of /.test(sentence)) found.differ.push(sentence);
+    else if (/have a counterpart|has a counterpart/.test(sentence)) {
+      const [agree, differ] = sentence.split("; ");
+      found.agree.push(ended(agree));
+      if (differ && !/^0 /.test(differ)) found.differ.push(differ.replace("more resembled each other but", "regions resembled each other, but"));
+    } else if (/^0 of them/.test(sentence) || /^Hardly anything/.test(sentence)) found.differ.push(sentence);
+    else if (/^Seen from/.test(sentence)) found.view = sentence;
+    else if (/agreement: |no sign that this/.test(sentence)) found.verdict = sentence;
+    else found.agree.push(sentence);
+  }
+  return found;
+}
+
+const HEADINGS = [
+  [/^objects?\b/i, "objects"],
+  [/^(matches|matching|counterparts)\b/i, "matches"],
+  [/^(comparison)\b/i, "comparison"],
+  [/^(similarit|what agrees|agree|in common|what (the two|both))/i, "agree"],
+  [/^(differen|what differs|differ|missing|no counterpart|only in)/i, "differ"],
+  [/^(limits?|notes?)\b/i, "rest"],
+];
+const NOT = /\b(no counterpart|no match|not (there|present|visible|found|in the|seen|match|the same)|missing|absent|differ\w*|unlike|whereas|instead|only in|cannot be (seen|found)|does not|do not|another)\b/i;
+const YES = /\b(agree\w*|same|both|identical\w*|match\w*|alike|correspond\w*|similar\w*|known by|recogni[sz]ed|also|likewise|there too|counterpart)\b/i;
+
+function heading(line) {
+  const bare = line.replace(/^[#*_\s\d.)]+/, "").replace(/[*_]+/g, "");
+  for (const [pattern, section] of HEADINGS) {
+    // A heading stands alone, or ends with a stop or a colon, or is written in capitals.
+    const [first, ...after] = bare.split(/(?<=^[\w ]{3,40})[.:]\s*/);
+    if (pattern.test(first) && (after.length > 0 || bare.length < 40) && first.length < 40) return { section, after: after.join(" ").trim() };
+  }
+  return null;
+}
+
+function ofModel(text) {
+  const found = { agree: [], differ: [], view: null, verdict: null };
+  let section = "";
+  let headed = false;
+  for (const raw of text.split("\n")) {
+    const told = heading(raw.trim());
+    let line = raw;
+    if (told) { section = told.section; headed = true; line = told.after; }
+    line = line.replace(/^[\s\-*•–]+/, "").replace(/^\d+[.)]\s+/, "").replace(/\*\*/g, "").trim();
+    if (!line || section === "objects" || section === "rest") continue;
+    // One object to a line is kept whole; running text is taken sentence by sentence.
+    const parts = section === "matches" ? [line] : sentences(line);
+    for (const part of parts) {
+      if (section === "agree" || section === "differ") found[section].push(part);
+      else if (NOT.test(part)) found.differ.push(part);
+      else if (section === "matches" || YES.test(part)) found.agree.push(part);
+    }
+  }
+  const known = headed ? found.agree.length + found.differ.length : Math.min(found.agree.length, found.differ.length);
+  return known > 0 ? found : null;
+}
