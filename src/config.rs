@@ -17,7 +17,7 @@ use crate::domain::{Precision, RefinerKind};
 use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
 use crate::retrieve::{AdmissionSettings, Layout, Provider, Wanted};
-use crate::service::TrackSettings;
+use crate::service::{TrackSettings, WebhookSettings};
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
@@ -48,6 +48,8 @@ pub struct Config {
     pub idempotency: Idempotency,
     /// Refinement jobs.
     pub jobs: Jobs,
+    /// Who is told of the ends of jobs.
+    pub webhooks: WebhookSettings,
     /// The refiner.
     pub refine: Refine,
     /// The multimodal LLM.
@@ -532,6 +534,9 @@ impl Config {
             return Some(why);
         }
         if let Some(why) = self.server.contradiction().or_else(|| self.track.contradiction()) {
+            return Some(why);
+        }
+        if let Some(why) = self.webhooks.contradiction() {
             return Some(why);
         }
         if !(0.0..=1.0).contains(&self.jobs.shed_at) {

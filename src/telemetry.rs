@@ -1,6 +1,7 @@
 //! Logs and metrics.
 
 mod refused;
+mod webhooks;
 
 use std::io::IsTerminal;
 use std::sync::atomic::AtomicU64;
@@ -15,6 +16,8 @@ use prometheus_client::registry::Registry;
 use tracing_subscriber::EnvFilter;
 
 pub use self::refused::RefusedFor;
+pub use self::webhooks::AttemptOutcome;
+use self::webhooks::OutcomeLabels;
 use crate::config::{Log, LogFormat};
 use crate::domain::Job;
 use crate::refine::mllm::MllmLevels;
@@ -68,6 +71,8 @@ pub struct Metrics {
     permits_in_use: Gauge,
     waiting: Family<ClassLabels, Gauge>,
     connections: Gauge,
+    webhook_attempts: Family<OutcomeLabels, Counter>,
+    waiting_deliveries: Gauge,
 }
 
 /// What came of looking for a pair's description.
@@ -88,6 +93,8 @@ pub struct Levels {
     pub maps: Vec<(String, usize)>,
     /// Jobs that wait or run.
     pub queued: usize,
+    /// Deliveries to webhooks that wait.
+    pub waiting_deliveries: usize,
     /// Bytes of the database's files.
     pub db_bytes: u64,
     /// Bytes of cached dense features.
@@ -199,6 +206,8 @@ impl Metrics {
             permits_in_use: Gauge::default(),
             waiting: Family::default(),
             connections: Gauge::default(),
+            webhook_attempts: Family::default(),
+            waiting_deliveries: Gauge::default(),
         };
         metrics.register();
         metrics
@@ -309,6 +318,17 @@ impl Metrics {
             self.waiting.clone(),
         );
         registry.register("connections", "Connections that are open", self.connections.clone());
+        registry.register(
+            "webhook_attempts",
+            "Attempts to deliver a message to a webhook: delivered, failed (it is tried again) or dead \
+             (it is given up)",
+            self.webhook_attempts.clone(),
+        );
+        registry.register(
+            "webhook_deliveries_waiting",
+            "Deliveries to webhooks that wait",
+            self.waiting_deliveries.clone(),
+        );
     }
 
     /// Counts an answered request.
@@ -397,6 +417,7 @@ impl Metrics {
             self.map_images.get_or_create(&labels).set(*images as i64);
         }
         self.queued_jobs.set(levels.queued as i64);
+        self.waiting_deliveries.set(levels.waiting_deliveries as i64);
         self.db_bytes.set(levels.db_bytes as i64);
         self.dense_cache_bytes.set(levels.dense_cache_bytes as f64);
         let AdmissionLevels { permits, in_use, localize, index, background } = levels.admission;

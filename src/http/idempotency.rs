@@ -27,10 +27,10 @@ pub(super) const LONGEST_KEY: usize = 255;
 /// The largest answer that is kept, in bytes; none comes near it.
 const LARGEST_ANSWER: usize = 4 << 20;
 
-/// Whether a call can be sent again with a key. The answer of the one that makes an API key is not kept,
-/// because the key is in it.
+/// Whether a call can be sent again with a key. The answers of those that make an API key and a webhook are
+/// not kept, because a secret is in them.
 pub(super) fn applies(method: &Method, route: &str) -> bool {
-    method == Method::POST && route != "/keys"
+    method == Method::POST && !matches!(route, "/keys" | "/webhooks")
 }
 
 /// Does a request with a key once, and gives its answer again.
