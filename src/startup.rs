@@ -58,7 +58,7 @@ pub async fn serve(
         settings: retention,
     };
     let Webhooks { store, settings } = &service.webhooks;
-    let dispatcher = Dispatcher::new(Arc::clone(store), counted, settings.clone())?;
+    let dispatcher = Dispatcher::new(Arc::clone(store), counted, settings.clone());
     let service = Arc::new(service);
     state.set_ready(Arc::clone(&service));
     let mut running = JoinSet::new();

@@ -41,3 +41,4 @@ mod service;
 mod slow_clients;
 mod tls;
 mod track;
+mod webhooks;

@@ -16,7 +16,6 @@ use super::WebhookSettings;
 use super::messenger::{Messenger, Reply};
 use crate::domain::{Attempt, Delivery, StoredWebhook, Then};
 use crate::refine::mllm::random_fraction;
-use crate::service::ServiceError;
 use crate::store::{StoreError, StoredDelivery, WebhookStore};
 use crate::telemetry::{AttemptOutcome, Metrics};
 
@@ -51,9 +50,8 @@ impl Dispatcher {
         store: Arc<dyn WebhookStore>,
         metrics: Arc<Metrics>,
         settings: WebhookSettings,
-    ) -> Result<Self, ServiceError> {
-        let messenger = Messenger::new(&settings)?;
-        Ok(Self { store, messenger, metrics, settings })
+    ) -> Self {
+        Self { store, messenger: Messenger::new(&settings), metrics, settings }
     }
 
     /// Works until `shutdown`.

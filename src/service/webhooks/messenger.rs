@@ -12,7 +12,6 @@ use super::address::{PublicOnly, check};
 use super::signature::sign;
 use crate::domain::StoredWebhook;
 use crate::refine::mllm::retry_after;
-use crate::service::{ErrorKind, ServiceError};
 
 const USER_AGENT: &str = concat!("whereabouts/", env!("CARGO_PKG_VERSION"));
 
@@ -47,13 +46,14 @@ impl Reply {
 
 /// Posts messages.
 pub(super) struct Messenger {
-    http: Client,
+    /// Or why there is none; a server that has no webhook can do without.
+    http: Result<Client, String>,
     timeout: Duration,
     allow_private: bool,
 }
 
 impl Messenger {
-    pub fn new(settings: &WebhookSettings) -> Result<Self, ServiceError> {
+    pub fn new(settings: &WebhookSettings) -> Self {
         // reqwest panics without one. Only the first call sets it; a library user may have chosen
         // another.
         let _ = rustls::crypto::ring::default_provider().install_default();
@@ -70,8 +70,14 @@ impl Messenger {
             // Messages to one webhook are rare; each looks its address up anew.
             .pool_max_idle_per_host(0)
             .build()
-            .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))?;
-        Ok(Self { http, timeout: settings.timeout(), allow_private })
+            .map_err(|error| {
+                format!(
+                    "no message can be sent from this machine: {}; see to it that it has CA \
+                     certificates, and start the server again",
+                    cause(error)
+                )
+            });
+        Self { http, timeout: settings.timeout(), allow_private }
     }
 
     /// Posts a message.
@@ -84,9 +90,12 @@ impl Messenger {
         if let Err(why) = check(&url, self.allow_private) {
             return Reply::failed(why);
         }
+        let http = match &self.http {
+            Ok(http) => http,
+            Err(why) => return Reply::failed(why),
+        };
         let (id, now) = (id.to_string(), Timestamp::now());
-        let request = self
-            .http
+        let request = http
             .post(url)
             .header(CONTENT_TYPE, "application/json")
             .header("webhook-id", &id)
