@@ -34,6 +34,7 @@ mod model_files;
 mod models;
 mod overload;
 mod real_images;
+mod receiver;
 mod reindex;
 mod retention;
 mod schema;

@@ -1,126 +1,18 @@
-//! Webhooks from outside: a receiver that checks what comes, and answers as it is told.
+//! Webhooks from outside: what a receiver is told, and what becomes of it when it does not listen.
 
-use std::collections::VecDeque;
 use std::path::Path;
 use std::process::Command;
-use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use axum::Router;
-use axum::body::to_bytes;
-use axum::extract::Request;
-use axum::http::HeaderMap;
-use axum::response::{IntoResponse, Response};
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
-use reqwest::{Method, StatusCode};
-use ring::hmac;
+use reqwest::Method;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
+use super::receiver::{Receiver, Reply};
 use super::support::{Answer, BINARY, Server, frame};
 
 const PRIVATE: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__ALLOW_PRIVATE", "true");
 const NO_RETRY: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[]");
-
-/// What a receiver answers.
-#[derive(Clone)]
-enum Reply {
-    Status(u16),
-    /// A status with a header.
-    With(u16, &'static str, String),
-    /// Nothing, for ever.
-    Silence,
-}
-
-/// What came.
-#[derive(Clone)]
-struct Message {
-    path: String,
-    headers: HeaderMap,
-    body: Vec<u8>,
-}
-
-impl Message {
-    fn header(&self, name: &str) -> &str {
-        self.headers[name].to_str().unwrap()
-    }
-
-    fn json(&self) -> Value {
-        serde_json::from_slice(&self.body).unwrap()
-    }
-
-    /// Checks the signature as a receiver does.
-    #[track_caller]
-    fn verify(&self, secret: &str) {
-        let key = STANDARD.decode(secret.strip_prefix("whsec_").unwrap()).unwrap();
-        assert!((24..=64).contains(&key.len()));
-        let (id, at) = (self.header("webhook-id"), self.header("webhook-timestamp"));
-        let age = jiff::Timestamp::now().as_second() - at.parse::<i64>().unwrap();
-        assert!((0..60).contains(&age), "{age}");
-        let signed = [format!("{id}.{at}.").as_bytes(), &self.body].concat();
-        let signature = self.header("webhook-signature").strip_prefix("v1,").unwrap();
-        let signature = STANDARD.decode(signature).unwrap();
-        let key = hmac::Key::new(hmac::HMAC_SHA256, &key);
-        hmac::verify(&key, &signed, &signature).expect("the signature is wrong");
-    }
-}
-
-/// Somebody who is told.
-#[derive(Clone)]
-struct Receiver {
-    url: String,
-    messages: Arc<Mutex<Vec<Message>>>,
-    /// What it answers next; 200 when there is nothing left.
-    replies: Arc<Mutex<VecDeque<Reply>>>,
-}
-
-impl Receiver {
-    async fn start(replies: impl IntoIterator<Item = Reply>) -> Self {
-        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let receiver = Self {
-            url: format!("http://{}/hook?token=of-the-url", listener.local_addr().unwrap()),
-            messages: Arc::default(),
-            replies: Arc::new(Mutex::new(replies.into_iter().collect())),
-        };
-        let taking = receiver.clone();
-        let router = Router::new().fallback(move |request: Request| {
-            let taking = taking.clone();
-            async move { taking.take(request).await }
-        });
-        tokio::spawn(async move { axum::serve(listener, router).await });
-        receiver
-    }
-
-    async fn take(self, request: Request) -> Response {
-        let (parts, body) = request.into_parts();
-        assert_eq!(parts.method, Method::POST);
-        let body = to_bytes(body, 1 << 20).await.unwrap().to_vec();
-        let path = parts.uri.to_string();
-        self.messages.lock().unwrap().push(Message { path, headers: parts.headers, body });
-        let reply = self.replies.lock().unwrap().pop_front().unwrap_or(Reply::Status(200));
-        let status = |status| StatusCode::from_u16(status).unwrap();
-        match reply {
-            Reply::Status(code) => (status(code), "an answer").into_response(),
-            Reply::With(code, name, value) => (status(code), [(name, value)]).into_response(),
-            Reply::Silence => std::future::pending().await,
-        }
-    }
-
-    fn messages(&self) -> Vec<Message> {
-        self.messages.lock().unwrap().clone()
-    }
-
-    /// The messages, once there are so many.
-    async fn wait(&self, count: usize) -> Vec<Message> {
-        let deadline = Instant::now() + Duration::from_secs(30);
-        while self.messages().len() < count {
-            assert!(Instant::now() < deadline, "{} of {count} came", self.messages().len());
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-        self.messages()
-    }
-}
 
 /// Makes a webhook; its id and its secret.
 async fn hook(server: &Server, wanted: Value) -> (String, String) {
@@ -221,28 +113,39 @@ async fn the_end_of_a_job_is_told_to_whom_it_concerns_signed_and_whole() {
 #[tokio::test]
 async fn a_message_that_is_not_taken_comes_again_as_the_same() {
     let dir = TempDir::new().unwrap();
-    let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[0, 0]")]);
+    let retry = ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[0, 0, 5]");
+    let server =
+        Server::start(dir.path(), &[PRIVATE, retry, ("WHEREABOUTS_WEBHOOKS__TIMEOUT_S", "1")]);
     let patience = Reply::With(503, "retry-after", "2".into());
-    let receiver = Receiver::start([Reply::Status(500), patience]).await;
+    let receiver = Receiver::start([Reply::Status(500), patience, Reply::Silence]).await;
     let (id, secret) = hook(&server, json!({"url": receiver.url})).await;
     post(&server, &format!("/webhooks/{id}/test")).await.expect(202);
     receiver.wait(2).await;
     let asked = Instant::now();
-    let messages = receiver.wait(3).await;
+    receiver.wait(3).await;
     assert!(asked.elapsed() > Duration::from_millis(1500), "Retry-After was not waited for");
+    let waiting = newest(&server, &id, "waiting", 3).await;
+    assert!(waiting["last_error"].as_str().unwrap().contains("webhooks.timeout_s"), "{waiting}");
+    assert!(waiting["last_status"].is_null());
+    let messages = receiver.wait(4).await;
     for message in &messages {
         message.verify(&secret);
         assert_eq!(message.body, messages[0].body);
         assert_eq!(message.header("webhook-id"), messages[0].header("webhook-id"));
     }
     assert_ne!(messages[0].header("webhook-timestamp"), messages[2].header("webhook-timestamp"));
-    newest(&server, &id, "delivered", 3).await;
+    newest(&server, &id, "delivered", 4).await;
 }
 
 #[tokio::test]
 async fn what_was_given_up_is_kept_and_can_be_delivered_again() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[0]")]);
+    let (nobody, _) = hook(&server, json!({"url": "http://127.0.0.1:1/"})).await;
+    post(&server, &format!("/webhooks/{nobody}/test")).await.expect(202);
+    let dead = newest(&server, &nobody, "dead", 2).await;
+    assert!(dead["last_error"].as_str().unwrap().contains("refused"), "{dead}");
+    assert!(dead["last_status"].is_null() && dead["ended_at"].is_string());
     let receiver = Receiver::start([Reply::Status(500), Reply::Status(404)]).await;
     let (id, secret) = hook(&server, json!({"url": receiver.url})).await;
     post(&server, &format!("/webhooks/{id}/test")).await.expect(202);
