@@ -18,7 +18,7 @@ use crate::http::Tiles;
 use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
 use crate::retrieve::{AdmissionSettings, Layout, Provider, Wanted};
-use crate::service::{BulkSettings, TrackSettings};
+use crate::service::{BulkSettings, TrackSettings, WebhookSettings};
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
@@ -51,6 +51,8 @@ pub struct Config {
     pub idempotency: Idempotency,
     /// Refinement jobs.
     pub jobs: Jobs,
+    /// Who is told of the ends of jobs.
+    pub webhooks: WebhookSettings,
     /// The refiner.
     pub refine: Refine,
     /// The multimodal LLM.
@@ -578,6 +580,9 @@ impl Config {
             return Some(why);
         }
         if let Some(why) = self.contradiction_of_a_section() {
+            return Some(why);
+        }
+        if let Some(why) = self.webhooks.contradiction() {
             return Some(why);
         }
         if !(0.0..=1.0).contains(&self.jobs.shed_at) {

@@ -22,7 +22,8 @@ use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
 use crate::service::{
-    Janitor, Keys, OnceSettings, Reindexes, RetentionSettings, Service, ServiceSettings, Tracks,
+    Dispatcher, Janitor, Keys, OnceSettings, Reindexes, RetentionSettings, Service,
+    ServiceSettings, Tracks, Webhooks,
 };
 use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
 use crate::store::{JobStore, UsageStore};
@@ -56,14 +57,17 @@ pub async fn serve(
     let janitor = Janitor {
         store: Arc::clone(&service.retention),
         answers: Arc::clone(&service.answers),
-        metrics: counted,
+        metrics: Arc::clone(&counted),
         settings: retention,
     };
+    let Webhooks { store, settings } = &service.webhooks;
+    let dispatcher = Dispatcher::new(Arc::clone(store), counted, settings.clone());
     let service = Arc::new(service);
     state.door().open(Arc::clone(&service));
     let mut running = JoinSet::new();
     let until = shutdown.clone();
     running.spawn(async move { janitor.run(until).await });
+    running.spawn(dispatcher.run(shutdown.clone()));
     let until = shutdown.clone();
     running.spawn(async move { service.keep_calibrated(until).await });
     for worker in workers {
@@ -237,6 +241,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     check_keys(config, &keys)?;
     let service = Service {
         keys,
+        webhooks: Webhooks { store: store.clone(), settings: config.webhooks.clone() },
         answers: store.clone(),
         process: Uuid::now_v7(),
         maps: store.clone(),

@@ -2,6 +2,7 @@
 
 mod recent;
 mod refused;
+mod webhooks;
 
 use std::io::IsTerminal;
 use std::sync::Arc;
@@ -23,6 +24,8 @@ use tracing_subscriber::{EnvFilter, Layer, fmt};
 use self::recent::Listener;
 pub use self::recent::{LastHour, Minute, Trouble, Troubles};
 pub use self::refused::RefusedFor;
+pub use self::webhooks::AttemptOutcome;
+use self::webhooks::OutcomeLabels;
 use crate::config::{Log, LogFormat};
 use crate::domain::{Job, JobState};
 use crate::refine::mllm::MllmLevels;
@@ -85,6 +88,8 @@ pub struct Metrics {
     permits_in_use: Gauge,
     waiting: Family<ClassLabels, Gauge>,
     connections: Gauge,
+    webhook_attempts: Family<OutcomeLabels, Counter>,
+    waiting_deliveries: Gauge,
 }
 
 /// What came of looking for a pair's description.
@@ -105,6 +110,8 @@ pub struct Levels {
     pub maps: Vec<(String, usize)>,
     /// Jobs that wait or run.
     pub queued: usize,
+    /// Deliveries to webhooks that wait.
+    pub waiting_deliveries: usize,
     /// Bytes of the database's files.
     pub db_bytes: u64,
     /// Bytes of cached dense features.
@@ -217,6 +224,8 @@ impl Metrics {
             permits_in_use: Gauge::default(),
             waiting: Family::default(),
             connections: Gauge::default(),
+            webhook_attempts: Family::default(),
+            waiting_deliveries: Gauge::default(),
         };
         metrics.register();
         metrics
@@ -327,6 +336,17 @@ impl Metrics {
             self.waiting.clone(),
         );
         registry.register("connections", "Connections that are open", self.connections.clone());
+        registry.register(
+            "webhook_attempts",
+            "Attempts to deliver a message to a webhook: delivered, failed (it is tried again) or dead \
+             (it is given up)",
+            self.webhook_attempts.clone(),
+        );
+        registry.register(
+            "webhook_deliveries_waiting",
+            "Deliveries to webhooks that wait",
+            self.waiting_deliveries.clone(),
+        );
     }
 
     /// Counts an answered request.
@@ -418,6 +438,7 @@ impl Metrics {
             self.map_images.get_or_create(&labels).set(*images as i64);
         }
         self.queued_jobs.set(levels.queued as i64);
+        self.waiting_deliveries.set(levels.waiting_deliveries as i64);
         self.db_bytes.set(levels.db_bytes as i64);
         self.dense_cache_bytes.set(levels.dense_cache_bytes as f64);
         let AdmissionLevels { permits, in_use, localize, index, background } = levels.admission;

@@ -13,6 +13,7 @@ mod job;
 mod key;
 mod map;
 mod pose;
+mod webhook;
 
 pub use self::image::{Image, ImageId, MediaType};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
@@ -26,6 +27,10 @@ pub use job::{
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use map::{DescriptorKind, Frame, Map, MapName, Precision, Scene};
 pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError};
+pub use webhook::{
+    Attempt, Delivery, DeliveryState, Message, StoredWebhook, Then, Webhook, WebhookEvent,
+    WebhookSecret,
+};
 
 /// A text that does not obey the rules of the type it was meant for.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]

@@ -55,7 +55,13 @@ pub(super) fn access(method: &Method, route: &str) -> Option<Access> {
         | ("GET", "/maps/{map}/export")
         | ("PUT" | "POST", "/maps/{map}/import")
         | ("GET" | "POST", "/keys")
-        | ("DELETE", "/keys/{id}") => Access::Role(Role::Admin),
+        | ("DELETE", "/keys/{id}")
+        | ("GET" | "POST", "/webhooks")
+        | ("GET" | "DELETE", "/webhooks/{id}")
+        | ("GET", "/webhooks/{id}/deliveries")
+        | ("POST", "/webhooks/{id}/test" | "/webhooks/{id}/deliveries/{delivery}/redeliver") => {
+            Access::Role(Role::Admin)
+        }
         _ => return None,
     })
 }

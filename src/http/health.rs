@@ -62,6 +62,7 @@ impl crate::service::Service {
         self.metrics.set_levels(&Levels {
             maps,
             queued: self.jobs.queued().await?,
+            waiting_deliveries: self.webhooks.store.waiting_deliveries().await?,
             db_bytes: self.retention.db_bytes().await?,
             dense_cache_bytes: self.dense.bytes(),
             admission: self.admission.levels(),

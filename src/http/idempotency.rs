@@ -23,20 +23,18 @@ use crate::store::KeptAnswer;
 pub(super) const IDEMPOTENCY_KEY: &str = "idempotency-key";
 const REPLAYED: HeaderName = HeaderName::from_static("idempotent-replayed");
 
-/// The call that makes an API key.
-const KEYS: &str = "/keys";
-
 /// The longest key, in bytes.
 pub(super) const LONGEST_KEY: usize = 255;
 
 /// The largest answer that is kept, in bytes; none comes near it.
 const LARGEST_ANSWER: usize = 4 << 20;
 
-/// Whether a call can be sent again with a key. The answer of the one that makes an API key is not kept,
-/// because the key is in it; a call of gRPC is no single text; many images can be sent again anyway, and may
-/// be too many to look at before.
+/// Whether a call can be sent again with a key. The answers of those that make an API key and a webhook are
+/// not kept, because a secret is in them; a call of gRPC is no single text; many images can be sent again
+/// anyway, and may be too many to look at before.
 pub(super) fn applies(method: &Method, route: &str) -> bool {
-    method == Method::POST && ![KEYS, batch::PATH].contains(&route) && grpc::call(route).is_none()
+    let never = ["/keys", "/webhooks", batch::PATH];
+    method == Method::POST && !never.contains(&route) && grpc::call(route).is_none()
 }
 
 /// Does a request with a key once, and gives its answer again.

@@ -23,6 +23,7 @@ mod state;
 mod status;
 mod transfer;
 mod usage;
+mod webhooks;
 
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
@@ -63,6 +64,7 @@ pub use status::{About, Tiles};
         (name = "localize", description = "From a frame to candidates"),
         (name = "jobs", description = "Refinements of the candidates"),
         (name = "keys", description = "API keys, where the server asks for them"),
+        (name = "webhooks", description = "Who is told of the ends of jobs"),
         (name = "service", description = "Health, metrics and this description")
     )
 )]
@@ -92,6 +94,11 @@ fn described() -> OpenApiRouter<AppState> {
         .routes(routes!(status::status))
         .routes(routes!(keys::create_key, keys::list_keys))
         .routes(routes!(keys::revoke_key))
+        .routes(routes!(webhooks::list_webhooks, webhooks::create_webhook))
+        .routes(routes!(webhooks::get_webhook, webhooks::delete_webhook))
+        .routes(routes!(webhooks::test_webhook))
+        .routes(routes!(webhooks::list_deliveries))
+        .routes(routes!(webhooks::redeliver))
         .routes(routes!(health::livez))
         .routes(routes!(health::readyz))
         .routes(routes!(health::metrics))

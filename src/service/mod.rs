@@ -23,6 +23,7 @@ mod submit;
 mod track;
 mod transfer;
 mod usage;
+mod webhooks;
 
 use std::sync::Arc;
 
@@ -48,6 +49,9 @@ pub use self::submit::{NoJob, NoJobReason};
 pub use self::track::{TrackEstimate, TrackSettings, TrackStep, Tracks};
 pub use self::transfer::{ExportPage, ImportedImage};
 pub use self::usage::{Today, Total, UsageReport};
+pub use self::webhooks::{
+    DeliveryPage, Dispatcher, MadeWebhook, NewWebhook, WebhookSettings, Webhooks,
+};
 use crate::domain::CalibrationSettings;
 use crate::refine::{DenseCache, JobPace, Refiner};
 use crate::retrieve::{Admission, CpuPool, LoadedModels};
@@ -111,6 +115,8 @@ pub struct Service {
     pub accounts: Arc<dyn UsageStore>,
     /// API keys.
     pub keys: Keys,
+    /// Who is told of the ends of jobs.
+    pub webhooks: Webhooks,
     /// The models in memory.
     pub models: LoadedModels,
     /// Who may have a picture decoded and inferred.

@@ -4,6 +4,7 @@
 //! Every call that returns `Ok` after a change means that the change is on disk.
 
 pub mod embedded;
+mod webhooks;
 
 use std::sync::Arc;
 
@@ -16,6 +17,7 @@ use tokio::sync::broadcast;
 use utoipa::ToSchema;
 use uuid::Uuid;
 
+pub use self::webhooks::{ForgottenDeliveries, KeepDeliveries, StoredDelivery, WebhookStore};
 use crate::domain::{
     Calibration, CalibrationSettings, Candidate, DayUsage, Description, Descriptor, Digest, Image,
     ImageId, Job, JobState, Map, MapName, MediaType, Pose, StoredKey, Usage,

@@ -46,6 +46,7 @@ pub use budget::Spent;
 pub use cache::{CacheLevels, CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame};
 pub use prompts::PROMPT_VERSION;
 pub use reason::{AnswerError, Labels, Verdict};
+pub(crate) use retry::{random_fraction, retry_after};
 pub use secret::Secret;
 pub use settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError, OnUnavailable};
 

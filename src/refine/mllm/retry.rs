@@ -126,7 +126,7 @@ impl RetryPolicy {
 }
 
 /// 0 to 1. The low bits of a version 7 UUID are random; this saves a generator of our own.
-fn random_fraction() -> f64 {
+pub fn random_fraction() -> f64 {
     let (_, low) = Uuid::now_v7().as_u64_pair();
     f64::from(low as u32) / f64::from(u32::MAX)
 }

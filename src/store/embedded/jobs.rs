@@ -17,6 +17,7 @@ use super::trees::{
     BlobOwner, Lease, Trees, blob_ref_key, decode, encode, ended_key, failed, put, queue_key,
     queued_job, transaction_failed,
 };
+use super::webhooks::WebhookTrees;
 use super::{EmbeddedStore, blocking};
 use crate::domain::{Job, JobState, Usage};
 
@@ -40,6 +41,7 @@ impl EmbeddedStore {
                         (false, true) => {
                             inner.queued.fetch_sub(1, Ordering::Relaxed);
                             inner.ended.fetch_add(1, Ordering::Relaxed);
+                            inner.deliveries.send_replace(());
                         }
                         (true, false) => {
                             inner.queued.fetch_add(1, Ordering::Relaxed);
@@ -287,7 +289,7 @@ pub(super) fn ended_at(job: &Job) -> Timestamp {
     job.finished_at.unwrap_or(job.created_at)
 }
 
-/// Writes a job and its place.
+/// Writes a job and its place; and with its end, what webhooks are told of that.
 fn write_job(trees: &Trees, record: &JobRecord, place: Place) -> Result<(), StoreError> {
     let (key, in_queue) = (record.job.id.as_bytes(), queue_key(&record.job));
     let value = encode(record)?;
@@ -296,8 +298,10 @@ fn write_job(trees: &Trees, record: &JobRecord, place: Place) -> Result<(), Stor
         Place::Again { ended } => (Some(encode(&Lease::None)?), Some(ended), None),
         Place::Ended(at) => (None, None, Some(at)),
     };
-    (&trees.jobs, &trees.queue, &trees.ended)
-        .transaction(|(jobs, queue, ended)| {
+    let news = end.map(|_| trees.webhooks.news_of(&record.job)).transpose()?.unwrap_or_default();
+    let WebhookTrees { deliveries, bodies, due, .. } = &trees.webhooks;
+    (&trees.jobs, &trees.queue, &trees.ended, deliveries, bodies, due)
+        .transaction(|(jobs, queue, ended, deliveries, bodies, due)| {
             jobs.insert(key, value.as_slice())?;
             match &lease {
                 Some(lease) => queue.insert(&in_queue, lease.as_slice())?,
@@ -309,7 +313,7 @@ fn write_job(trees: &Trees, record: &JobRecord, place: Place) -> Result<(), Stor
             if let Some(at) = end {
                 ended.insert(&ended_key(at, record.job.id), &[] as &[u8])?;
             }
-            Ok(())
+            news.iter().try_for_each(|news| news.write(deliveries, bodies, due))
         })
         .map_err(transaction_failed)
 }

@@ -31,6 +31,7 @@ mod schema;
 mod segments;
 mod trees;
 mod usage;
+mod webhooks;
 mod writer;
 
 use std::collections::BTreeMap;
@@ -39,7 +40,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, PoisonError, RwLock};
 
-use tokio::sync::broadcast;
+use tokio::sync::{broadcast, watch};
 use uuid::Uuid;
 
 use self::blobs::Blobs;
@@ -96,6 +97,8 @@ struct Inner {
     ended: AtomicUsize,
     descriptions: DescriptionUse,
     changes: broadcast::Sender<Uuid>,
+    /// Told when deliveries to webhooks were queued.
+    deliveries: watch::Sender<()>,
     /// Held, never read: the lock ends with the file handle.
     _lock: File,
 }
@@ -138,6 +141,7 @@ impl EmbeddedStore {
             queued: AtomicUsize::new(queued),
             ended: AtomicUsize::new(ended),
             changes: broadcast::channel(CHANGES_KEPT).0,
+            deliveries: watch::Sender::new(()),
             _lock: lock,
         };
         for live in inner.maps.read().unwrap_or_else(PoisonError::into_inner).values() {

@@ -10,6 +10,7 @@ use serde::de::DeserializeOwned;
 use uuid::Uuid;
 
 use super::super::{JobRecord, StoreError};
+use super::webhooks::WebhookTrees;
 use crate::domain::{Digest, Image, ImageId, Job, JobState, Map, Priority};
 
 /// The sled trees. Clones share them.
@@ -40,6 +41,8 @@ pub(super) struct Trees {
     pub answers: sled::Tree,
     /// When that was, and the same → nothing.
     pub answers_by_age: sled::Tree,
+    /// Webhooks and their deliveries.
+    pub webhooks: WebhookTrees,
 }
 
 /// The key of the number of the last commit, in the default tree.
@@ -107,6 +110,7 @@ impl Trees {
             keys: tree("keys")?,
             answers: tree("answers")?,
             answers_by_age: tree("answers_by_age")?,
+            webhooks: WebhookTrees::open(&db)?,
             db,
         })
     }

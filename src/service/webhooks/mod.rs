@@ -1,0 +1,177 @@
+//! Webhooks: who is told of the ends of jobs, and what became of that.
+//!
+//! The store queues deliveries in the change that ends a job; the [`Dispatcher`] brings them to where they
+//! belong, as `messenger` posts them and `signature` signs them; `address` says where none may go.
+
+mod address;
+mod dispatcher;
+mod messenger;
+mod settings;
+mod signature;
+
+use std::sync::Arc;
+
+use jiff::Timestamp;
+use ring::rand::{SecureRandom, SystemRandom};
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use uuid::Uuid;
+
+pub use self::dispatcher::Dispatcher;
+pub use self::settings::WebhookSettings;
+use super::images::page_size;
+use super::{ErrorKind, ServiceError};
+use crate::domain::{
+    Delivery, DeliveryState, MapName, Message, StoredWebhook, Webhook, WebhookEvent, WebhookSecret,
+};
+use crate::store::{StoredDelivery, WebhookStore};
+
+/// A webhook that is wanted.
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct NewWebhook {
+    /// Where messages are to be posted: https or http, without credentials and fragment.
+    #[schema(format = "uri", min_length = 1, max_length = 2048)]
+    pub url: String,
+    /// What it is to be told; all ends of jobs, if nothing is said.
+    #[serde(default = "all_ends")]
+    #[schema(min_items = 1)]
+    pub events: Vec<WebhookEvent>,
+    /// Only of jobs of this map, which need not be there yet; null for all.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub map: Option<MapName>,
+}
+
+fn all_ends() -> Vec<WebhookEvent> {
+    WebhookEvent::ENDS.to_vec()
+}
+
+/// A webhook that was made.
+#[derive(Debug, Clone, Serialize, ToSchema)]
+pub struct MadeWebhook {
+    /// What is known of it.
+    #[serde(flatten)]
+    pub webhook: Webhook,
+    /// What its messages are signed with: `whsec_` and 32 bytes in base64. It is shown this once.
+    #[schema(value_type = String)]
+    pub secret: WebhookSecret,
+}
+
+/// Some deliveries, newest first.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct DeliveryPage {
+    /// The deliveries.
+    pub deliveries: Vec<Delivery>,
+    /// Where the next page starts: `cursor=` of the next request. Null on the last page.
+    pub next_cursor: Option<Uuid>,
+}
+
+/// All webhooks.
+pub struct Webhooks {
+    /// Where they are kept.
+    pub store: Arc<dyn WebhookStore>,
+    /// Their bounds.
+    pub settings: WebhookSettings,
+}
+
+impl Webhooks {
+    /// Makes a webhook. What comes back is the only place where its secret is shown.
+    pub async fn create(&self, wanted: NewWebhook) -> Result<MadeWebhook, ServiceError> {
+        let NewWebhook { url, mut events, map } = wanted;
+        let url = address::parse(&url, self.settings.allow_private)
+            .map_err(ServiceError::unprocessable)?;
+        events.sort();
+        events.dedup();
+        if events.is_empty() || events.contains(&WebhookEvent::Ping) {
+            let detail = "events must name ends of jobs, such as \"job.succeeded\", or be left out for all \
+                          of them; a ping is sent by POST /webhooks/{id}/test";
+            return Err(ServiceError::unprocessable(detail));
+        }
+        let webhook = Webhook {
+            id: Uuid::now_v7(),
+            url: url.into(),
+            events,
+            map,
+            created_at: Timestamp::now(),
+            disabled_at: None,
+            disabled_reason: None,
+        };
+        let stored = StoredWebhook { webhook, secret: random_secret()? };
+        self.store.add_webhook(stored.clone(), self.settings.max).await?;
+        let StoredWebhook { webhook, secret } = stored;
+        tracing::info!(target: "audit", made = %webhook.id, "a webhook was made");
+        Ok(MadeWebhook { webhook, secret })
+    }
+
+    /// All webhooks, the newest first.
+    pub async fn list(&self) -> Result<Vec<Webhook>, ServiceError> {
+        let stored = self.store.webhooks().await?;
+        Ok(stored.into_iter().rev().map(|stored| stored.webhook).collect())
+    }
+
+    /// One webhook.
+    pub async fn get(&self, id: Uuid) -> Result<Webhook, ServiceError> {
+        let stored = self.store.webhook(id).await?;
+        stored.map(|stored| stored.webhook).ok_or_else(|| no_webhook(id))
+    }
+
+    /// Removes a webhook with its deliveries. A message that is on its way arrives.
+    pub async fn delete(&self, id: Uuid) -> Result<(), ServiceError> {
+        if !self.store.delete_webhook(id).await? {
+            return Err(no_webhook(id));
+        }
+        tracing::info!(target: "audit", deleted = %id, "a webhook was deleted");
+        Ok(())
+    }
+
+    /// Queues a ping.
+    pub async fn test(&self, id: Uuid) -> Result<Delivery, ServiceError> {
+        let (webhook, now) = (self.get(id).await?, Timestamp::now());
+        let message = Message { event: WebhookEvent::Ping, timestamp: now, data: &webhook };
+        let body = serde_json::to_vec(&message)
+            .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))?;
+        let delivery = Delivery::queued(id, WebhookEvent::Ping, None, now);
+        self.store.queue_delivery(StoredDelivery { delivery: delivery.clone(), body }).await?;
+        Ok(delivery)
+    }
+
+    /// Deliveries of a webhook, newest first, a page at a time.
+    pub async fn deliveries(
+        &self,
+        id: Uuid,
+        state: Option<DeliveryState>,
+        cursor: Option<Uuid>,
+        limit: Option<usize>,
+    ) -> Result<DeliveryPage, ServiceError> {
+        let limit = page_size(limit)?;
+        self.get(id).await?;
+        let mut deliveries = self.store.deliveries(id, state, cursor, limit + 1).await?;
+        let more = deliveries.len() > limit;
+        deliveries.truncate(limit);
+        let next_cursor = deliveries.last().filter(|_| more).map(|delivery| delivery.id);
+        Ok(DeliveryPage { deliveries, next_cursor })
+    }
+
+    /// Queues a delivery again that does not wait. Its attempts begin anew.
+    pub async fn redeliver(&self, id: Uuid, delivery: Uuid) -> Result<Delivery, ServiceError> {
+        Ok(self.store.queue_again(id, delivery, Timestamp::now()).await?)
+    }
+}
+
+fn no_webhook(id: Uuid) -> ServiceError {
+    ServiceError::not_found(format!(
+        "there is no webhook {id}; GET /webhooks lists those there are"
+    ))
+}
+
+fn random_secret() -> Result<WebhookSecret, ServiceError> {
+    let mut random = [0; 32];
+    match SystemRandom::new().fill(&mut random) {
+        Ok(()) => Ok(WebhookSecret::new(&random)),
+        Err(_) => {
+            let detail = "the system gives no random numbers; the webhook was not made";
+            Err(ServiceError::new(ErrorKind::Internal, detail))
+        }
+    }
+}

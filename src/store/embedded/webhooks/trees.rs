@@ -1,0 +1,224 @@
+//! The records of webhooks in sled, and how they are keyed.
+
+use jiff::Timestamp;
+use sled::Transactional;
+use sled::transaction::{ConflictableTransactionResult, TransactionalTree};
+use uuid::Uuid;
+
+use super::super::super::{KeepDeliveries, StoreError};
+use super::super::trees::{decode, encode, failed, get, transaction_failed};
+use crate::domain::{Delivery, DeliveryState, Job, Message, StoredWebhook, WebhookEvent};
+
+/// The sled trees of webhooks.
+#[derive(Clone)]
+pub(in super::super) struct WebhookTrees {
+    /// Id → webhook.
+    pub webhooks: sled::Tree,
+    /// Webhook, id → delivery.
+    pub deliveries: sled::Tree,
+    /// The same → the body of its message.
+    pub bodies: sled::Tree,
+    /// Webhook, when it is due, id → nothing, for deliveries that wait.
+    pub due: sled::Tree,
+    /// When it ended, webhook, id → nothing, for all others.
+    pub ended: sled::Tree,
+}
+
+impl WebhookTrees {
+    pub fn open(db: &sled::Db) -> Result<Self, StoreError> {
+        let tree = |name: &str| db.open_tree(name).map_err(failed);
+        Ok(Self {
+            webhooks: tree("webhooks")?,
+            deliveries: tree("deliveries")?,
+            bodies: tree("delivery_bodies")?,
+            due: tree("deliveries_due")?,
+            ended: tree("deliveries_ended")?,
+        })
+    }
+
+    pub fn webhook(&self, id: Uuid) -> Result<Option<StoredWebhook>, StoreError> {
+        get(&self.webhooks, id.as_bytes())
+    }
+
+    pub fn delivery(&self, key: &[u8]) -> Result<Option<Delivery>, StoreError> {
+        get(&self.deliveries, key)
+    }
+
+    /// The webhook, if it may be told something.
+    pub fn enabled(&self, id: Uuid) -> Result<(), StoreError> {
+        match self.webhook(id)? {
+            None => Err(no_webhook(id)),
+            Some(StoredWebhook { webhook, .. }) if webhook.disabled_at.is_some() => {
+                let why = webhook.disabled_reason.unwrap_or_default();
+                let why = format!("the webhook is disabled ({why}); make another one");
+                Err(StoreError::Conflict(why))
+            }
+            Some(_) => Ok(()),
+        }
+    }
+
+    /// What is to be written because a job has ended.
+    pub fn news_of(&self, job: &Job) -> Result<Vec<News>, StoreError> {
+        let (Some(event), false) = (WebhookEvent::of(job.state), self.webhooks.is_empty()) else {
+            return Ok(Vec::new());
+        };
+        let now = Timestamp::now();
+        let timestamp = job.finished_at.unwrap_or(now);
+        let body = encode(&Message { event, timestamp, data: job })?;
+        let mut news = Vec::new();
+        for value in self.webhooks.iter().values() {
+            let StoredWebhook { webhook, .. } = decode(&value.map_err(failed)?)?;
+            if webhook.wants(event, job) {
+                let delivery = Delivery::queued(webhook.id, event, Some(job.id), now);
+                news.push(News::of(&delivery, body.clone())?);
+            }
+        }
+        Ok(news)
+    }
+
+    pub fn queue(&self, news: &News) -> Result<(), StoreError> {
+        (&self.deliveries, &self.bodies, &self.due)
+            .transaction(|(deliveries, bodies, due)| news.write(deliveries, bodies, due))
+            .map_err(transaction_failed)
+    }
+
+    /// Puts a delivery in the place of what it was.
+    pub fn replace(&self, before: &Delivery, after: &Delivery) -> Result<(), StoreError> {
+        let (key, value) = (key(after.webhook, after.id), encode(after)?);
+        (&self.deliveries, &self.due, &self.ended)
+            .transaction(|(deliveries, due, ended)| {
+                due.remove(due_key(before))?;
+                ended.remove(ended_key(before))?;
+                match after.state {
+                    DeliveryState::Waiting => due.insert(due_key(after), &[])?,
+                    _ => ended.insert(ended_key(after), &[])?,
+                };
+                deliveries.insert(&key, value.as_slice())?;
+                Ok(())
+            })
+            .map_err(transaction_failed)
+    }
+
+    pub fn remove(&self, delivery: &Delivery) -> Result<(), StoreError> {
+        let key = key(delivery.webhook, delivery.id);
+        (&self.deliveries, &self.bodies, &self.due, &self.ended)
+            .transaction(|(deliveries, bodies, due, ended)| {
+                due.remove(due_key(delivery))?;
+                ended.remove(ended_key(delivery))?;
+                bodies.remove(&key)?;
+                deliveries.remove(&key)?;
+                Ok(())
+            })
+            .map_err(transaction_failed)
+    }
+
+    /// Some deliveries of a webhook.
+    pub fn some_of(&self, webhook: Uuid, limit: usize) -> Result<Vec<Delivery>, StoreError> {
+        let values = self.deliveries.scan_prefix(webhook.as_bytes()).values();
+        values.take(limit).map(|value| decode(&value.map_err(failed)?)).collect()
+    }
+
+    /// Keys of deliveries that wait and are due, by when that was.
+    pub fn due_until(
+        &self,
+        webhook: Uuid,
+        until: Timestamp,
+        limit: usize,
+    ) -> Result<Vec<[u8; 32]>, StoreError> {
+        let end = [&webhook.as_bytes()[..], &millis(until), &[u8::MAX; 16]].concat();
+        let places = self.due.range(webhook.as_bytes().to_vec()..=end).keys();
+        let mut keys = Vec::new();
+        for place in places.take(limit) {
+            keys.extend(delivery_at(&place.map_err(failed)?, 0, 24));
+        }
+        Ok(keys)
+    }
+
+    /// Keys of deliveries that are not to be kept.
+    pub fn surplus(&self, keep: KeepDeliveries, batch: usize) -> Result<Vec<[u8; 32]>, StoreError> {
+        let too_many = self.deliveries.len().saturating_sub(keep.most);
+        let since = millis(keep.since.unwrap_or(Timestamp::UNIX_EPOCH));
+        let mut keys = Vec::new();
+        for place in self.ended.iter().keys() {
+            let place = place.map_err(failed)?;
+            if keys.len() >= batch || (keys.len() >= too_many && place[..] >= since[..]) {
+                return Ok(keys);
+            }
+            keys.extend(delivery_at(&place, 8, 24));
+        }
+        if keys.len() < too_many {
+            let mut waiting = Vec::new();
+            for place in self.due.iter().keys() {
+                waiting.extend(delivery_at(&place.map_err(failed)?, 0, 24));
+            }
+            // Ids sort by age.
+            waiting.sort_by(|a, b| a[16..].cmp(&b[16..]));
+            let room = too_many.min(batch) - keys.len();
+            keys.extend(waiting.into_iter().take(room));
+        }
+        Ok(keys)
+    }
+}
+
+/// A delivery that is to be written.
+pub(in super::super) struct News {
+    key: [u8; 32],
+    due: Vec<u8>,
+    delivery: Vec<u8>,
+    body: Vec<u8>,
+}
+
+impl News {
+    pub fn of(delivery: &Delivery, body: Vec<u8>) -> Result<Self, StoreError> {
+        let key = key(delivery.webhook, delivery.id);
+        Ok(Self { key, due: due_key(delivery), delivery: encode(delivery)?, body })
+    }
+
+    pub fn write(
+        &self,
+        deliveries: &TransactionalTree,
+        bodies: &TransactionalTree,
+        due: &TransactionalTree,
+    ) -> ConflictableTransactionResult<(), ()> {
+        deliveries.insert(&self.key, self.delivery.as_slice())?;
+        bodies.insert(&self.key, self.body.as_slice())?;
+        due.insert(self.due.as_slice(), &[])?;
+        Ok(())
+    }
+}
+
+pub(super) fn no_webhook(id: Uuid) -> StoreError {
+    StoreError::NotFound(format!("there is no webhook {id}; GET /webhooks lists those there are"))
+}
+
+pub(super) fn key(webhook: Uuid, id: Uuid) -> [u8; 32] {
+    let mut key = [0; 32];
+    key[..16].copy_from_slice(webhook.as_bytes());
+    key[16..].copy_from_slice(id.as_bytes());
+    key
+}
+
+/// The key of the delivery whose place has its webhook and its id here.
+fn delivery_at(place: &[u8], webhook: usize, id: usize) -> Option<[u8; 32]> {
+    let mut key = [0; 32];
+    key[..16].copy_from_slice(place.get(webhook..webhook + 16)?);
+    key[16..].copy_from_slice(place.get(id..id + 16)?);
+    Some(key)
+}
+
+/// Sorts by time. Times before 1970 do not occur.
+fn millis(at: Timestamp) -> [u8; 8] {
+    at.as_millisecond().max(0).to_be_bytes()
+}
+
+fn due_key(delivery: &Delivery) -> Vec<u8> {
+    let due = delivery.next_attempt_at.unwrap_or(delivery.created_at);
+    let Delivery { webhook, id, .. } = delivery;
+    [webhook.as_bytes().as_slice(), &millis(due), id.as_bytes()].concat()
+}
+
+fn ended_key(delivery: &Delivery) -> Vec<u8> {
+    let ended = delivery.ended_at.unwrap_or(delivery.created_at);
+    let Delivery { webhook, id, .. } = delivery;
+    [&millis(ended), webhook.as_bytes().as_slice(), id.as_bytes()].concat()
+}

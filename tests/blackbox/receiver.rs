@@ -1,0 +1,116 @@
+//! A receiver of webhooks: it keeps what comes, checks signatures as its own code would have to, and answers
+//! as it is told.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use axum::Router;
+use axum::body::to_bytes;
+use axum::extract::Request;
+use axum::http::HeaderMap;
+use axum::response::{IntoResponse, Response};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use reqwest::{Method, StatusCode};
+use ring::hmac;
+use serde_json::Value;
+
+/// What a receiver answers.
+#[derive(Clone)]
+pub enum Reply {
+    Status(u16),
+    /// A status with a header.
+    With(u16, &'static str, String),
+    /// Nothing, for ever.
+    Silence,
+}
+
+/// What came.
+#[derive(Clone)]
+pub struct Message {
+    pub path: String,
+    headers: HeaderMap,
+    pub body: Vec<u8>,
+}
+
+impl Message {
+    pub fn header(&self, name: &str) -> &str {
+        self.headers[name].to_str().unwrap()
+    }
+
+    pub fn json(&self) -> Value {
+        serde_json::from_slice(&self.body).unwrap()
+    }
+
+    /// Checks the signature as a receiver does.
+    #[track_caller]
+    pub fn verify(&self, secret: &str) {
+        let key = STANDARD.decode(secret.strip_prefix("whsec_").unwrap()).unwrap();
+        assert!((24..=64).contains(&key.len()));
+        let (id, at) = (self.header("webhook-id"), self.header("webhook-timestamp"));
+        let age = jiff::Timestamp::now().as_second() - at.parse::<i64>().unwrap();
+        assert!((0..60).contains(&age), "{age}");
+        let signed = [format!("{id}.{at}.").as_bytes(), &self.body].concat();
+        let signature = self.header("webhook-signature").strip_prefix("v1,").unwrap();
+        let signature = STANDARD.decode(signature).unwrap();
+        let key = hmac::Key::new(hmac::HMAC_SHA256, &key);
+        hmac::verify(&key, &signed, &signature).expect("the signature is wrong");
+    }
+}
+
+/// Somebody who is told.
+#[derive(Clone)]
+pub struct Receiver {
+    pub url: String,
+    messages: Arc<Mutex<Vec<Message>>>,
+    /// What it answers next; 200 when there is nothing left.
+    pub replies: Arc<Mutex<VecDeque<Reply>>>,
+}
+
+impl Receiver {
+    pub async fn start(replies: impl IntoIterator<Item = Reply>) -> Self {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let receiver = Self {
+            url: format!("http://{}/hook?token=of-the-url", listener.local_addr().unwrap()),
+            messages: Arc::default(),
+            replies: Arc::new(Mutex::new(replies.into_iter().collect())),
+        };
+        let taking = receiver.clone();
+        let router = Router::new().fallback(move |request: Request| {
+            let taking = taking.clone();
+            async move { taking.take(request).await }
+        });
+        tokio::spawn(async move { axum::serve(listener, router).await });
+        receiver
+    }
+
+    async fn take(self, request: Request) -> Response {
+        let (parts, body) = request.into_parts();
+        assert_eq!(parts.method, Method::POST);
+        let body = to_bytes(body, 1 << 20).await.unwrap().to_vec();
+        let path = parts.uri.to_string();
+        self.messages.lock().unwrap().push(Message { path, headers: parts.headers, body });
+        let reply = self.replies.lock().unwrap().pop_front().unwrap_or(Reply::Status(200));
+        let status = |status| StatusCode::from_u16(status).unwrap();
+        match reply {
+            Reply::Status(code) => (status(code), "an answer").into_response(),
+            Reply::With(code, name, value) => (status(code), [(name, value)]).into_response(),
+            Reply::Silence => std::future::pending().await,
+        }
+    }
+
+    pub fn messages(&self) -> Vec<Message> {
+        self.messages.lock().unwrap().clone()
+    }
+
+    /// The messages, once there are so many.
+    pub async fn wait(&self, count: usize) -> Vec<Message> {
+        let deadline = Instant::now() + Duration::from_secs(30);
+        while self.messages().len() < count {
+            assert!(Instant::now() < deadline, "{} of {count} came", self.messages().len());
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        self.messages()
+    }
+}
