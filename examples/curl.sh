@@ -112,6 +112,8 @@ call 404 -H "$jpeg" --data-binary "@$first" "$url/localize?map=curl-nowhere"
 call 200 "$url/jobs/$job?wait=30"
 call 200 -N "$url/jobs/$job/events"
 call 200 "$url/jobs?map=curl-example&state=succeeded&limit=2"
+call 200 "$url/jobs/$job/frame?max_edge=160"
+call '200|404' "$url/jobs/$job/matches/gate"
 call 200 -X POST "$url/jobs/$job/cancel"
 call '200|409' -X POST "$url/jobs/$job/retry"
 
@@ -128,6 +130,14 @@ cp "$body" "$scratch/picture"
 call 201 -X PUT "$url/maps/curl-copy/import" -H "$json" -d "@$scratch/map.json"
 call 201 -F "image=@$scratch/picture" -F "meta=<$scratch/meta.json" "$url/maps/curl-copy/import"
 
+# Many images in one request: a form, or an archive with what is known of each beside it.
+call 200 -F 'meta={"id": "gate"}' -F "image=@$first" -F "image=@$second" "$url/maps/curl-copy/images:batch"
+cp "$first" "$scratch/arch.jpg"
+echo '{"pose": {"lat": 45.0007, "lon": -30.0005}}' > "$scratch/arch.jpg.json"
+tar c -C "$scratch" arch.jpg arch.jpg.json > "$scratch/images.tar"
+call 200 -H 'Content-Type: application/x-tar' --data-binary "@$scratch/images.tar" \
+    "$url/maps/curl-copy/images:batch"
+
 # Descriptors anew, in the background.
 call 202 -X POST "$url/maps/curl-example/reindex" -H "$json" -d '{}'
 
@@ -137,7 +147,19 @@ key=$(pick '.*"key":\{"id":"([^"]*)".*')
 call 200 "$url/keys"
 call 200 -X DELETE "$url/keys/$key"
 
+# Webhooks: a program is told when a job ends. The answer is the only place that shows the secret.
+call 201 "$url/webhooks" -H "$json" -d '{"url": "https://fleet.example.com/hooks", "map": "curl-example"}'
+webhook=$(pick '.*"id":"([^"]*)".*')
+call 200 "$url/webhooks"
+call 200 "$url/webhooks/$webhook"
+call 202 -X POST "$url/webhooks/$webhook/test"
+call 200 "$url/webhooks/$webhook/deliveries?limit=2"
+delivery=$(pick '.*"deliveries":\[\{"id":"([^"]*)".*')
+call '202|409' -X POST "$url/webhooks/$webhook/deliveries/$delivery/redeliver"
+call 204 -X DELETE "$url/webhooks/$webhook"
+
 # What an operator looks at.
+call 200 "$url/status"
 call 200 "$url/usage?map=curl-example&days=7"
 call 200 "$url/metrics"
 call 200 "$url/openapi.json"

@@ -23,7 +23,27 @@ macro_rules! assets {
 }
 
 /// Every file of the page.
-const ASSETS: &[(&str, &str)] = assets!["index.html"];
+const ASSETS: &[(&str, &str)] = assets![
+    "api.js",
+    "app.js",
+    "chart.js",
+    "dom.js",
+    "format.js",
+    "health.js",
+    "icon.svg",
+    "images.js",
+    "index.html",
+    "job.js",
+    "jobs.js",
+    "map.js",
+    "maps.js",
+    "pair.js",
+    "plan.js",
+    "points.js",
+    "style.css",
+    "try.js",
+    "words.js",
+];
 
 /// The routes of the page. `tiles` is the address of map tiles, from whose host pictures may come.
 pub fn routes<S: Clone + Send + Sync + 'static>(tiles: Option<&str>) -> Router<S> {

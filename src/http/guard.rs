@@ -81,7 +81,12 @@ pub(super) async fn bound(
     if matches!(request.uri().path(), "/livez" | "/readyz" | "/metrics") {
         return next.run(request).await;
     }
-    let call = grpc::call(request.uri().path()).filter(|_| grpc::is_call(request.headers()));
+    let call = grpc::call(request.uri().path());
+    if call.is_some() && !grpc::is_call(request.headers()) {
+        let detail = "this is a call of gRPC, whose Content-Type is application/grpc; GET /docs lists the calls \
+                      of HTTP";
+        return refuse(request, ErrorKind::UnsupportedMedia, detail.into());
+    }
     let route = request.extensions().get::<MatchedPath>().map(MatchedPath::as_str);
     if call.is_some_and(|call| call.streams) || route == Some(batch::PATH) {
         return bound_stream(state, request, next, arrival, call).await;

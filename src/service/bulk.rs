@@ -1,11 +1,13 @@
 //! Many images, one after another, several of which are worked on at a time.
 
+use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt, future};
 use serde::{Deserialize, Serialize};
 use tokio::sync::OwnedSemaphorePermit;
+use tokio_util::sync::CancellationToken;
 
 use super::{Caller, ErrorKind, ImageMeta, NewImage, Service, ServiceError};
 use crate::domain::MapName;
@@ -50,6 +52,8 @@ impl Service {
     ) -> Result<Vec<BulkResult>, E> {
         let BulkSettings { in_flight, max_images, .. } = self.settings.bulk;
         let mut broken = None;
+        // The last image so far of each id, and whether it is done: of two with one id the first counts.
+        let mut last_of: HashMap<String, CancellationToken> = HashMap::new();
         let whole = images
             .scan((), |(), next| future::ready(next.map_err(|error| broken = Some(error)).ok()));
         let results = whole
@@ -73,7 +77,18 @@ impl Service {
                     Err(error) => refuse(error),
                 }
             })
-            .map(|image| async { self.add_patiently(map, image?).await })
+            .map(|image| {
+                let done = CancellationToken::new();
+                let id = image.as_ref().ok().and_then(|image| image.meta.id.clone());
+                let before = id.and_then(|id| last_of.insert(id, done.clone()));
+                async move {
+                    let _done = done.drop_guard();
+                    if let Some(before) = before {
+                        before.cancelled().await;
+                    }
+                    self.add_patiently(map, image?).await
+                }
+            })
             .buffered(in_flight)
             .collect()
             .await;

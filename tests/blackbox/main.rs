@@ -16,6 +16,7 @@ mod bad_input;
 mod batch;
 mod cli;
 mod confidence;
+mod console;
 mod demo;
 mod dinov2;
 mod doctor;

@@ -10,10 +10,12 @@ import tempfile
 import threading
 import time
 import unittest
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from typing import Any
 
+import grpc
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from google.rpc import error_details_pb2
@@ -22,8 +24,6 @@ from grpc_reflection.v1alpha.proto_reflection_descriptor_database import (
     ProtoReflectionDescriptorDatabase,
 )
 from grpc_status import rpc_status
-
-import grpc
 
 TOWN = pathlib.Path(os.environ["TOWN"])
 URL = os.environ["URL"]
@@ -276,6 +276,12 @@ class Contract(unittest.TestCase):
                 grpc.StatusCode.UNIMPLEMENTED,
                 lambda c=call: c(b"", metadata=self.services.metadata, timeout=5),
             )
+
+    def test_a_call_is_no_post(self) -> None:
+        for path in [f"/{PACKAGE}.JobService/WatchJob", f"/{PACKAGE}.JobService/GetJob"]:
+            with self.assertRaises(urllib.error.HTTPError) as raised:
+                over_http("POST", path, b"")
+            self.assertEqual(raised.exception.code, 415)
 
     def test_a_deadline_is_kept(self) -> None:
         frame = pictures("frames")[0][1]

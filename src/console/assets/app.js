@@ -72,8 +72,17 @@ async function render({ again = false } = {}) {
     fill(root, h("h1", {}, "There is no such page"), h("p", {}, h("a", { href: "#/jobs" }, "To the jobs")));
     return;
   }
+  let view;
   try {
-    const view = await views[name]();
+    view = await views[name]();
+  } catch (error) {
+    // The file did not come. Browsers may remember that of a module until the page is loaded again.
+    mine.reload = true;
+    signals.dispatchEvent(new Event("unreachable"));
+    fail({ title: "This page did not load", detail: "The server did not answer. This page goes on trying.", cause: error });
+    return;
+  }
+  try {
     if (mine !== current) return;
     mine.update = (await view.show(context)) ?? null;
   } catch (problem) {
@@ -163,7 +172,8 @@ signals.addEventListener("unreachable", probe);
 signals.addEventListener("reachable", () => {
   if (outage.hidden) return;
   outage.hidden = true;
-  if (current.failed) render({ again: true });
+  if (current.reload) location.reload();
+  else if (current.failed) render({ again: true });
 });
 
 // Light and dark follow the system unless somebody chose.

@@ -3,7 +3,7 @@
 
 import { address, call, follow, isAbort } from "./api.js";
 import { announce, badge, command, empty, failure, fill, h, loading } from "./dom.js";
-import { cost, count, duration, plural, shortId, timeAgo } from "./format.js";
+import { cost, count, duration, percent, plural, shortId, timeAgo } from "./format.js";
 
 const PAGE = 50;
 const STATES = ["queued", "running", "succeeded", "degraded", "failed", "cancelled"];
@@ -33,14 +33,14 @@ export async function show({ root, query, signal, setQuery, title }) {
   const maps = h("select", { id: "f-map", onchange: () => setQuery({ map: maps.value }, { step: true }) }, h("option", { value: "" }, "all maps"));
   const states = h("select", { id: "f-state", onchange: () => setQuery({ state: states.value }, { step: true }) },
     h("option", { value: "" }, "all states"), STATES.map((state) => h("option", { value: state }, state)));
-  const search = h("input", { id: "f-q", type: "search", placeholder: "id, query, error…", spellcheck: "false", oninput: () => {
+  const search = h("input", { id: "f-q", type: "search", placeholder: "id, image, error…", spellcheck: "false", oninput: () => {
     filter.q = search.value.trim();
     setQuery({ q: filter.q });
     draw();
   } });
   const body = h("tbody");
   const table = h("table", { class: "jobs stack" }, h("caption", { class: "unseen" }, "Jobs, newest first"),
-    h("thead", {}, h("tr", {}, ["State", "Job", "Map", "Age", "Took", "Refiner", "Cost"].map((name) => h("th", { scope: "col" }, name)))), body);
+    h("thead", {}, h("tr", {}, ["State", "Job", "Map", "Age", "Took", "Estimate", "Refiner", "Cost"].map((name) => h("th", { scope: "col" }, name)))), body);
   const before = h("div");
   const after = h("div", { class: "after" });
   fill(root,
@@ -192,7 +192,8 @@ function cells(job) {
     cell("Map", job.map),
     cell("Age", timeAgo(job.created_at)),
     cell("Took", took),
+    cell("Estimate", job.estimate ? [job.estimate.image_id, h("span", { class: job.estimate.known ? "sure" : "muted" }, ` ${percent(job.estimate.confidence)}`)] : "–"),
     cell("Refiner", job.refiner),
-    cell("Cost", cost(job.usage)),
+    cell("Cost", h("span", { class: job.usage.calls || job.usage.cached ? null : "muted" }, cost(job.usage))),
   ];
 }

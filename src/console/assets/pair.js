@@ -48,7 +48,8 @@ export function pictures(job, imageId, { signal }) {
   return all;
 }
 
-const boxOf = (picture) => picture.querySelector("img")?.getBoundingClientRect();
+// Before it has loaded, a picture has the size of its alternative text.
+const boxOf = (picture) => picture.classList.contains("here") && picture.querySelector("img").getBoundingClientRect();
 
 function draw(canvas, stage, frame, image, matches, on, near) {
   const here = stage.getBoundingClientRect();
@@ -57,7 +58,7 @@ function draw(canvas, stage, frame, image, matches, on, near) {
   canvas.height = Math.round(here.height * ratio);
   const ink = canvas.getContext("2d");
   const [a, b] = [boxOf(frame), boxOf(image)];
-  if (!on || !a?.width || !b?.width) return;
+  if (!on || !a || !b) return;
   ink.scale(ratio, ratio);
   ink.translate(-here.left, -here.top);
   const many = matches.regions.length;
@@ -66,7 +67,7 @@ function draw(canvas, stage, frame, image, matches, on, near) {
     const [x1, y1] = place(region.image, b, matches.image);
     // The hue goes with the place in the frame: what moved together has lines that run together.
     const hue = 20 + 300 * (region.frame[1] / matches.frame.height);
-    ink.strokeStyle = ink.fillStyle = at === near ? "#fff" : `hsl(${hue} 90% 62% / ${many > 200 ? 0.45 : 0.7})`;
+    ink.strokeStyle = ink.fillStyle = at === near ? "#fff" : `hsl(${hue} 90% 62% / ${many > 300 ? 0.3 : many > 100 ? 0.45 : 0.75})`;
     ink.lineWidth = at === near ? 3 : 1;
     ink.beginPath();
     ink.moveTo(x0, y0);

@@ -4,7 +4,7 @@
 
 /** `{agree, differ, view, verdict}` (lists of sentences, a sentence or null), or null if the text has no such form. */
 export function apart(text) {
-  return /^(None of the |\d+ of )?\d+ (pairs of )?regions?\b/.test(text) || /^None of the \d+ regions? of the query/.test(text) ? ofLocal(text) : ofModel(text);
+  return /^(\d+|None) of (the )?\d+ regions? of the query\b/.test(text) ? ofLocal(text) : ofModel(text);
 }
 
 const sentences = (text) => text.split(/(?<=[.!?])\s+(?=\S)/).map((one) => one.trim()).filter(Boolean);

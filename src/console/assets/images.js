@@ -1,0 +1,67 @@
+// One image of a map: its picture and what is known of it, removing it, and adding another.
+
+import { address, call, contentOf, isAbort, picture } from "./api.js";
+import { announce, confirm, facts, failure, fill, h } from "./dom.js";
+import { ago, moment, pose } from "./format.js";
+
+export function imageCard(map, image, { signal, removed, close }) {
+  const said = h("div");
+  const remove = async () => {
+    const sure = await confirm({ title: "Delete this image?", text: `${image.id} leaves the map ${map.name}. Jobs that compared it keep their texts.`, action: "Delete the image" });
+    if (!sure) return;
+    try {
+      await call(address(["maps", map.name, "images", image.id]), { method: "DELETE", signal });
+      announce("The image is deleted.");
+      removed();
+    } catch (problem) { if (!isAbort(problem)) fill(said, failure(problem)); }
+  };
+  const time = (at) => at && h("span", {}, ago(at), h("span", { class: "muted small" }, ` · ${moment(at)}`));
+  return [
+    h("div", { class: "heading" }, h("h2", { class: "wrap" }, image.id), h("button", { type: "button", class: "quiet heading-end", onclick: close }, "Close")),
+    picture(contentOf(map.name, image.id, 800), `The image ${image.id}`, { signal, gone: "The picture is gone." }),
+    facts(["Pose", pose(image.pose)], ["Taken", time(image.captured_at)], ["Stored", time(image.created_at)],
+      ["Size", `${image.width} × ${image.height} pixels`],
+      ["Tags", image.tags?.length ? h("span", { class: "tags" }, image.tags.map((tag) => h("span", { class: "tag" }, tag))) : null]),
+    said, h("button", { type: "button", class: "danger", onclick: remove }, "Delete the image…"),
+  ];
+}
+
+export function uploadCard(map, { signal, added, centre }) {
+  const field = (name, label, attributes = {}) => {
+    const input = h("input", { type: "text", id: `up-${name}`, name, autocomplete: "off", ...attributes });
+    return h("label", { for: `up-${name}` }, label, input);
+  };
+  const number = { type: "number", step: "any", inputmode: "decimal" };
+  const geographic = map.frame === "wgs84";
+  const said = h("div", { role: "status" });
+  const send = h("button", { type: "submit", class: "primary" }, "Add the image");
+  const form = h("form", {},
+    h("label", { for: "up-file" }, "Picture (JPEG, PNG or WebP)", h("input", { type: "file", id: "up-file", accept: "image/jpeg,image/png,image/webp", required: true })),
+    h("div", { class: "grid-2" },
+      geographic ? [field("lat", "Latitude, degrees", { ...number, min: "-90", max: "90" }), field("lon", "Longitude, degrees", { ...number, min: "-180", max: "180" }), field("heading", "Heading, degrees", { ...number, min: "0", max: "360" })]
+        : [field("x", "x, metres", number), field("y", "y, metres", number)],
+      field("id", "Id", { placeholder: "from the picture" })),
+    field("tags", "Tags, separated by commas"),
+    h("div", { class: "actions" }, send, h("button", { type: "button", onclick: () => {
+      const middle = centre();
+      if (!middle) { said.textContent = "The plan is empty, so it has no middle yet."; return; }
+      for (const [name, value] of Object.entries(middle)) form.elements[name].value = value.toFixed(geographic ? 7 : 3);
+    } }, "Pose from the middle of the plan")), said);
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const [file] = form.elements["up-file"].files;
+    const query = {};
+    for (const name of ["lat", "lon", "heading", "x", "y", "id", "tags"]) if (form.elements[name]) query[name] = form.elements[name].value.trim();
+    send.disabled = true;
+    said.textContent = "Sending…";
+    try {
+      const image = await call(address(["maps", map.name, "images"], query), { method: "POST", body: file, headers: { "Content-Type": file.type || "image/jpeg" }, signal });
+      said.textContent = `Added as ${image.id}.`;
+      form.reset();
+      added(image);
+    } catch (problem) { if (!isAbort(problem)) fill(said, failure(problem)); }
+    send.disabled = false;
+  });
+  return h("section", { class: "card" }, h("h2", {}, "Add an image"), h("details", {}, h("summary", {}, "Upload a picture"), form,
+    h("p", { class: "muted small" }, "Without a pose, the image is found but says no place. For a whole folder: "), h("code", { class: "small" }, `whereabouts index FOLDER --map ${map.name}`)));
+}

@@ -1,0 +1,172 @@
+// One map: its images on a plan, what they cover and how old they are, a query on top, and single images.
+
+import { address, call, isAbort } from "./api.js";
+import { announce, command, confirm, empty, facts, failure, fill, h, loading } from "./dom.js";
+import { ago, count, metres, moment, percent, plural, pose } from "./format.js";
+import { imageCard, uploadCard } from "./images.js";
+import { reindexed, searched } from "./maps.js";
+import { Plan } from "./plan.js";
+import { AGES } from "./points.js";
+
+const PAGE = 1000;
+const MOST = 100_000; // images that are loaded without being asked
+const LISTED = 100;
+
+export async function show({ root, argument: name, query, signal, setQuery, title, fail }) {
+  title(`Map ${name}`);
+  fill(root, h("h1", {}, name), loading("the map"));
+  const [map, status] = await Promise.all([
+    call(address(["maps", name]), { signal }),
+    call("status", { signal }).catch((problem) => { if (isAbort(problem) || problem.status === 401) throw problem; return null; }),
+  ]);
+  const tiles = map.frame === "wgs84" ? status?.tiles : null;
+
+  let images = [];
+  let chosen = null;
+  const canvas = h("canvas", { tabindex: "0", role: "application", "aria-label": `Plan of the images of ${name}`, "aria-describedby": "plan-keys" });
+  const progress = h("p", { class: "muted", role: "status" });
+  const covered = h("div");
+  const asked = h("section", { class: "card", hidden: true, "aria-label": "The query" });
+  const single = h("section", { class: "card chosen-image", hidden: true, "aria-label": "The chosen image", tabindex: "-1" });
+  const legend = h("div", { class: "over legend" });
+  const tool = (label, sign, act) => h("button", { type: "button", "aria-label": label, title: label, onclick: act }, sign);
+  const overlay = h("input", { type: "checkbox", id: "coverage", onchange: () => { plan.coverage = overlay.checked; plan.touch(); } });
+  const search = h("input", { id: "image-q", type: "search", placeholder: "id or tag", spellcheck: "false", oninput: listSoon });
+  const listed = h("p", { class: "muted small", role: "status" });
+  const list = h("ul", { class: "images", tabindex: "-1" });
+  const planCard = h("section", { class: "card plan", "aria-label": "Plan" }, canvas,
+    h("div", { class: "plan-tools" }, tool("Zoom in", "+", () => plan.zoom(1.6)), tool("Zoom out", "−", () => plan.zoom(1 / 1.6)), tool("Show everything", "⤢", () => plan.fit(true))),
+    legend, tiles && h("div", { class: "over attribution" }, tiles.attribution ?? ""));
+  fill(root,
+    h("p", { class: "crumbs" }, h("a", { href: "#/maps" }, "Maps")),
+    h("div", { class: "heading" }, h("h1", {}, name), h("span", { class: "muted" }, plural(map.images, "image")),
+      h("div", { class: "heading-end" }, h("a", { class: "button", href: `#/try?map=${encodeURIComponent(name)}` }, "Try a picture"), h("a", { class: "button", href: `#/jobs?map=${encodeURIComponent(name)}` }, "Its jobs"))),
+    map.description && h("p", {}, map.description),
+    progress,
+    h("div", { class: "map-body" },
+      h("div", {}, planCard, h("p", { id: "plan-keys", class: "muted small" }, "Drag or use the arrow keys to move, the wheel, two fingers or + and − to zoom, 0 to see everything. Click a point for its picture; the list holds the same images.")),
+      h("div", { class: "map-side" }, single, asked,
+        h("section", { class: "card" }, h("h2", {}, "Images in view"), h("label", { for: "image-q" }, "Search all images", search), listed, list),
+        h("section", { class: "card" }, h("h2", {}, "Coverage and age"), h("label", { class: "check", for: "coverage" }, overlay, "Mark 10 m around each image"), covered),
+        uploadCard(map, { signal, centre: () => plan.poseOfCentre(), added(image) { images = [...images.filter((one) => one.id !== image.id), image]; changed(); choose(image); } }),
+        settings())));
+
+  const plan = new Plan(canvas, { signal, picked: choose, moved: listSoon, tiles: tiles?.url ?? null });
+
+  function settings() {
+    return h("section", { class: "card" }, h("h2", {}, "This map"), facts(
+      ["Place", map.scene], ["Poses", map.frame], ["Model", `${map.model}, ${map.precision} precision`], ["Descriptor", `${map.descriptor}, ${count(map.dim)} numbers`],
+      ["Search", searched(map)], ["Reindex", reindexed(map)],
+      ["Confidence", map.calibration ? `measured on ${plural(map.calibration.asked, "image")}` : "not measured yet"], ["Made", moment(map.created_at)]),
+      h("details", {}, h("summary", {}, "Delete this map"), h("p", {}, "Takes the role admin, and all images with it."),
+        h("button", { type: "button", class: "danger", onclick: remove }, "Delete the map…")));
+  }
+
+  async function remove() {
+    const sure = await confirm({ title: `Delete the map ${name}?`, text: `Its ${plural(map.images, "image")} go with it. There is no way back but a backup.`, action: "Delete the map", word: name });
+    if (!sure) return;
+    try {
+      await call(address(["maps", name]), { method: "DELETE", signal });
+      announce("The map is deleted.");
+      location.hash = "#/maps";
+    } catch (problem) { if (!isAbort(problem)) fill(progress, failure(problem)); }
+  }
+
+  function choose(image, { focus = false } = {}) {
+    chosen = image;
+    plan.choose(image);
+    setQuery({ image: image?.id });
+    single.hidden = !image;
+    for (const button of list.querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.dataset.id === image?.id));
+    if (!image) return;
+    if (image.pose) plan.goTo(image.pose);
+    fill(single, imageCard(map, image, { signal, close: () => { choose(null); canvas.focus(); }, removed() {
+      images = images.filter((one) => one.id !== image.id);
+      choose(null);
+      changed();
+    } }));
+    if (focus) single.focus();
+    else announce(`Image ${image.id}, ${pose(image.pose)}`);
+  }
+
+  let listing = 0;
+  function listSoon() {
+    // Not with each frame of a drag: the list follows when the plan rests.
+    clearTimeout(listing);
+    listing = setTimeout(drawList, 200);
+  }
+  signal.addEventListener("abort", () => clearTimeout(listing));
+  function drawList() {
+    const text = search.value.trim().toLowerCase();
+    const found = text ? images.filter((image) => [image.id, ...(image.tags ?? [])].join("\n").toLowerCase().includes(text)) : [...plan.inView(), ...images.filter((image) => !image.pose)];
+    found.sort((a, b) => (a.id < b.id ? -1 : 1));
+    const what = text ? `${plural(found.length, "image")} found` : `${plural(found.length, "image")} of ${count(images.length)}`;
+    const told = found.length > LISTED ? `${what}; the first ${LISTED} are listed, zoom in or search for the others` : what;
+    if (listed.textContent !== told) listed.textContent = told;
+    fill(list, found.slice(0, LISTED).map((image) => h("li", {}, h("button", { type: "button", "data-id": image.id, "aria-pressed": String(image.id === chosen?.id), onclick: () => choose(image, { focus: true }) },
+      h("span", {}, image.id), h("span", { class: "muted" }, image.pose ? ago(image.captured_at ?? image.created_at) : "no pose")))));
+  }
+
+  function changed() {
+    plan.setImages(images);
+    const posed = plan.points.length;
+    const cover = plan.points.coverage();
+    fill(legend, h("div", { class: "muted" }, "Age of the image"), h("ul", {}, AGES.map(([label], age) => {
+      const many = plan.points.byAge[age].length;
+      return many > 0 && h("li", { class: `age-${age + 1}` }, `${label} (${count(many)})`);
+    })));
+    legend.hidden = !posed;
+    fill(covered, cover ? facts(
+      ["On the plan", plural(posed, "image")],
+      ["Without pose", images.length - posed ? count(images.length - posed) : null],
+      ["Extent", `${metres(cover.width)} × ${metres(cover.height)}`],
+      ["Squares of 10 m", `${count(cover.cells)} with an image`],
+      ["Spacing", cover.spacing === null ? null : `${metres(cover.spacing)} in the middle`],
+      ["Newest", ago(new Date(cover.newest).toISOString())], ["Oldest", ago(new Date(cover.oldest).toISOString())],
+    ) : h("p", { class: "muted" }, images.length ? "No image has a pose; the list holds them all." : "There is no image yet."));
+    listSoon();
+  }
+
+  async function load() {
+    let cursor = null;
+    do {
+      const answer = await call(address(["maps", name, "images"], { limit: PAGE, cursor }), { signal });
+      images.push(...answer.images);
+      cursor = answer.next_cursor;
+      // Drawing again costs with all there is, so the pages are shown in ever larger steps.
+      if (!cursor || images.length === PAGE || images.length % (10 * PAGE) === 0) changed();
+      progress.textContent = cursor ? `${count(images.length)} of ${plural(map.images, "image")} loaded…` : "";
+    } while (cursor && images.length < MOST);
+    if (cursor) progress.textContent = `The first ${count(images.length)} of ${plural(map.images, "image")} are shown.`;
+    progress.hidden = !progress.textContent;
+    if (!images.length) fill(progress, empty("No images yet", h("p", {}, "Put pictures in, with the form on this page or from a folder:"), command(`whereabouts index FOLDER --map ${name}`)));
+    progress.hidden = images.length > 0 && !cursor;
+    const wanted = images.find((image) => image.id === query.get("image"));
+    if (wanted) choose(wanted);
+  }
+
+  async function drawQuery() {
+    const id = query.get("query");
+    if (!id) return;
+    asked.hidden = false;
+    fill(asked, loading("the query"));
+    try {
+      const job = await call(address(["jobs", id]), { signal });
+      const best = job.estimate?.image_id;
+      const ranking = job.ranking ?? [];
+      plan.setMarkers(ranking.map((candidate) => ({ pose: candidate.pose, label: String(candidate.rank), kind: candidate.image_id === best ? "estimate" : "candidate" })));
+      const known = (image) => images.find((one) => one.id === image);
+      fill(asked, h("div", { class: "heading" }, h("h2", {}, "Query"), h("a", { class: "heading-end", href: `#/jobs/${encodeURIComponent(id)}` }, "Its job")),
+        job.estimate && h("p", {}, "Estimate ", h("code", {}, best), `, ${percent(job.estimate.confidence)} confidence, ${job.estimate.known ? "known" : "perhaps not in the map"}. It has a ring on the plan.`),
+        ranking.length ? h("ol", { class: "images" }, ranking.map((candidate) => h("li", {}, h("button", { type: "button", onclick: () => { const image = known(candidate.image_id); if (image) choose(image, { focus: true }); } },
+          h("span", {}, `${candidate.rank}. ${candidate.image_id}`), h("span", { class: "muted" }, candidate.pose ? "" : "no pose"))))) : h("p", { class: "muted" }, "The job has no ranking, so there are no candidates to show."));
+    } catch (problem) {
+      if (isAbort(problem)) return;
+      fill(asked, h("p", {}, problem.status === 404 ? "This job is not kept any more." : problem.detail));
+    }
+  }
+
+  drawQuery();
+  changed();
+  load().catch(fail);
+}

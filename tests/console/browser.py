@@ -1,0 +1,109 @@
+"""A browser, a console in it, and what must be true of every page that a test opens."""
+
+import json
+import os
+import pathlib
+import unittest
+import urllib.request
+
+from playwright.sync_api import expect, sync_playwright
+
+URL = os.environ["URL"]
+TOWN = pathlib.Path(os.environ["TOWN"])
+KEYS = {role: json.loads((pathlib.Path(os.environ["KEYS"]) / f"{role}.json").read_text())["token"]
+        for role in ("admin", "robot")}
+MARKUP = "<img src=x onerror=\"window.pwned=1\">"
+
+WATCH = """
+addEventListener("securitypolicyviolation", (event) => violated(event.violatedDirective + " " + event.blockedURI));
+"""
+
+expect.set_options(timeout=15_000)
+
+
+def frame(number=0):
+    return TOWN / "frames" / f"frame-{number:04}.jpg"
+
+
+def call(method, path, body=None, media_type="application/json"):
+    """A call to the API, as the admin."""
+    if isinstance(body, dict):
+        body = json.dumps(body).encode()
+    headers = {"Authorization": f"Bearer {KEYS['admin']}", "Content-Type": media_type}
+    request = urllib.request.Request(URL + path, body, headers, method=method)
+    with urllib.request.urlopen(request, timeout=60) as answer:
+        text = answer.read()
+    return json.loads(text) if text else None
+
+
+def localize(number=0, refine="async"):
+    return call("POST", f"/localize?map=town&refine={refine}", frame(number).read_bytes(), "image/jpeg")
+
+
+class Console(unittest.TestCase):
+    """Tests on pages that are signed in, unless they say otherwise."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.playwright = sync_playwright().start()
+        # Root has no sandbox to give.
+        cls.chromium = cls.playwright.chromium.launch(executable_path=os.environ["CHROMIUM"], args=["--no-sandbox"])
+
+    @classmethod
+    def tearDownClass(cls):
+        cls.chromium.close()
+        cls.playwright.stop()
+
+    def setUp(self):
+        self.violations = []
+        self.errors = []
+
+    def tearDown(self):
+        for page in getattr(self, "pages", []):
+            if not page.is_closed():
+                self.assertIsNone(page.evaluate("window.pwned ?? null"), "script of others ran")
+                page.context.close()
+        self.assertEqual(self.violations, [], "the content security policy was violated")
+        self.assertEqual(self.errors, [], "the browser's console has errors")
+
+    def page(self, path="", key="admin", width=1280, height=800, **options):
+        """A new page of a new visitor."""
+        context = self.chromium.new_context(viewport={"width": width, "height": height}, **options)
+        context.expose_function("violated", lambda what: self.violations.append(what))
+        context.add_init_script(WATCH)
+        if key:
+            # Once: who has signed out stays signed out.
+            context.add_init_script(f"""if (!sessionStorage.getItem("test")) {{
+                sessionStorage.setItem("test", "1"); sessionStorage.setItem("whereabouts-key", "{KEYS[key]}"); }}""")
+        page = context.new_page()
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        # A status that is not 200 is told there too; what comes of it is what the tests look at.
+        page.on("console", lambda said: self.errors.append(said.text)
+                if said.type == "error" and "Failed to load resource" not in said.text else None)
+        self.pages = [*getattr(self, "pages", []), page]
+        page.goto(f"{URL}/{path}")
+        return page
+
+    def ended_job(self):
+        return call("GET", "/jobs?state=succeeded&limit=1")["jobs"][0]
+
+    def views(self):
+        """The address of each view, with something to see in it."""
+        job = self.ended_job()["id"]
+        return {"jobs": "#/jobs", "job": f"#/jobs/{job}", "maps": "#/maps", "map": f"#/maps/town?query={job}",
+                "try": "#/try", "health": "#/health"}
+
+    def until(self, page, expression):
+        """Waits until an expression is true; what the driver has for that needs `eval`, which the policy forbids."""
+        for _ in range(150):
+            found = page.evaluate(expression)
+            if found:
+                return found
+            page.wait_for_timeout(100)
+        return self.fail(f"this did not become true: {expression}")
+
+    def settled(self, page, view):
+        """Waits until a view shows what it is for."""
+        sign = {"jobs": "table.jobs tbody tr", "job": ".answer .picture.here", "maps": ".cards li", "map": ".images button",
+                "try": ".drop", "health": ".stats .value"}[view]
+        page.locator(sign).first.wait_for()

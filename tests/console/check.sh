@@ -1,0 +1,49 @@
+#!/usr/bin/env bash
+# Opens the operator's console in a real browser and uses it: signs in, localizes a picture and watches its job,
+# looks at jobs, maps and health, on a wide screen and on a phone, in light and dark.
+#
+#     check.sh BINARY VENV
+#
+# VENV is a folder for a Python environment with playwright (requirements.txt); it is made if it is not there.
+# The browser is Debian's chromium, or the one that CHROMIUM names. With SCREENSHOTS=FOLDER, pictures of the
+# views are left there. Takes about a minute. Ends with 1 if anything fails.
+set -euo pipefail
+
+if [ $# -ne 2 ]; then
+    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/console-venv" >&2
+    exit 2
+fi
+if ! CHROMIUM=$(command -v "${CHROMIUM:-chromium}"); then
+    echo "there is no chromium to open the console in; install it: apt-get install chromium" >&2
+    exit 1
+fi
+binary=$(realpath "$1")
+venv=$(realpath -m "$2")
+screenshots=
+if [ -n "${SCREENSHOTS:-}" ]; then
+    mkdir -p "$SCREENSHOTS"
+    screenshots=$(realpath "$SCREENSHOTS")
+fi
+cd "$(dirname "$0")"
+
+# shellcheck source-path=SCRIPTDIR source=../server.sh
+. ../server.sh
+environment "$venv" requirements.txt
+
+# The town's own data folder: a map with images, and the jobs of its frames.
+if ! "$binary" demo --offline --json --places 12 --out "$scratch/town" > "$scratch/demo" 2>&1; then
+    cat "$scratch/demo" >&2
+    exit 1
+fi
+mv "$scratch/town/data" "$scratch/data"
+export WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_AUTH__KEYS=required
+for role in admin robot; do
+    "$binary" keys create --data "$scratch/data" --name "$role" --role "$role" --json > "$scratch/$role.json"
+done
+serve "$binary"
+TOWN=$scratch/town URL=$url KEYS=$scratch CHROMIUM=$CHROMIUM SCREENSHOTS=$screenshots PYTHONDONTWRITEBYTECODE=1 \
+    timeout 400 "$venv/bin/python" -m unittest
+if grep -q panicked "$scratch/log"; then
+    grep panicked "$scratch/log" >&2
+    exit 1
+fi

@@ -1,0 +1,318 @@
+"""The console as its users meet it."""
+
+import json
+import re
+import time
+import urllib.parse
+import uuid
+
+from playwright.sync_api import expect
+
+from browser import KEYS, MARKUP, URL, Console, call, frame, localize
+
+
+class SigningIn(Console):
+    def test_a_key_is_asked_for_and_kept_until_signing_out(self):
+        page = self.page("#/jobs?state=succeeded", key=None)
+        expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
+        expect(page.locator("#key")).to_be_focused()
+        expect(page.get_by_text("whereabouts keys create").first).to_be_visible()
+        page.fill("#key", "wb_nobody_knows_this")
+        page.keyboard.press("Enter")
+        expect(page.locator(".form-error")).to_contain_text("does not know this key")
+        page.fill("#key", KEYS["admin"])
+        page.keyboard.press("Enter")
+        expect(page.locator("table.jobs tbody tr").first).to_be_visible()
+        self.assertIn("state=succeeded", page.url)
+        page.reload()
+        expect(page.locator("table.jobs tbody tr").first).to_be_visible()
+        self.assertNotIn(KEYS["admin"], page.url + page.evaluate("JSON.stringify(localStorage) + document.cookie"))
+        page.get_by_role("button", name="Sign out").click()
+        expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
+
+    def test_a_key_of_too_small_a_role_is_told_which_role_it_takes(self):
+        page = self.page("#/jobs", key="robot")
+        expect(page.get_by_role("alert")).to_contain_text("operator")
+
+
+class Jobs(Console):
+    def test_the_first_view_is_small_and_quick(self):
+        times, sizes = [], []
+        for _ in range(4):
+            page = self.page("docs")
+            page.evaluate("0")
+            session = page.context.new_cdp_session(page)
+            session.send("Network.enable")
+            session.send("Network.setCacheDisabled", {"cacheDisabled": True})
+            taken = []
+            session.on("Network.loadingFinished", lambda event: taken.append(event["encodedDataLength"]))
+            page.add_init_script("""new MutationObserver((_, observer) => {
+                if (!document.querySelector("table.jobs tbody tr")) return;
+                observer.disconnect();
+                window.shownAt = performance.now();
+            }).observe(document, { childList: true, subtree: true });""")
+            page.goto(URL + "/")
+            self.until(page, "window.shownAt")
+            page.wait_for_timeout(500)
+            times.append(page.evaluate("window.shownAt"))
+            sizes.append(sum(taken))
+        print(f"\nfirst view: {min(times):.0f} ms at best of {[round(at) for at in times]}, {max(sizes) / 1000:.0f} kB")
+        self.assertLess(max(sizes), 200_000)
+        self.assertLess(min(times), 300)
+
+    def test_the_list_is_live(self):
+        page = self.page("#/jobs")
+        expect(page.locator(".live.live")).to_have_text("live")
+        page.evaluate("window.same = true")
+        job = localize(2)["job"]["id"]
+        row = page.locator("table.jobs tbody tr", has=page.locator(f'a[href="#/jobs/{job}"]'))
+        expect(row.locator(".badge")).to_have_text("succeeded")
+        expect(row).to_contain_text(re.compile(r"\d (ms|s)\b"))
+        expect(page.locator("table.jobs tbody tr").first.locator("a")).to_have_attribute("href", f"#/jobs/{job}")
+        self.assertTrue(page.evaluate("window.same"), "the page was loaded again")
+
+    def test_filter_and_search_are_in_the_address_and_survive_a_reload(self):
+        job = self.ended_job()["id"]
+        page = self.page("#/jobs")
+        self.settled(page, "jobs")
+        page.select_option("#f-map", "town")
+        page.select_option("#f-state", "succeeded")
+        page.fill("#f-q", job[-8:])
+        for _ in range(2):
+            rows = page.locator("table.jobs tbody tr")
+            expect(rows).to_have_count(1)
+            expect(rows.locator("a")).to_have_attribute("href", f"#/jobs/{job}")
+            expect(page.locator("#f-state")).to_have_value("succeeded")
+            expect(page.locator("#f-map")).to_have_value("town")
+            expect(page.locator("#f-q")).to_have_value(job[-8:])
+            for part in ("map=town", "state=succeeded", f"q={job[-8:]}"):
+                self.assertIn(part, page.url)
+            page.reload()
+        page.fill("#f-q", "")
+        page.select_option("#f-state", "failed")
+        expect(page.get_by_text("No such jobs")).to_be_visible()
+        page.go_back()
+        expect(page.locator("#f-state")).to_have_value("succeeded")
+        expect(page.locator("table.jobs tbody tr").first).to_be_visible()
+
+    def test_one_job_shows_pictures_ranks_and_words(self):
+        job = call("GET", f"/jobs/{localize(3, 'wait')['job']['id']}")
+        page = self.page(f"#/jobs/{job['id']}")
+        expect(page.locator(".pair .picture.here")).to_have_count(2)
+        candidates = page.locator(".candidates a")
+        expect(candidates).to_have_count(len(job["ranking"]))
+        for at, ranked in enumerate(job["ranking"][:5]):
+            expect(candidates.nth(at)).to_contain_text(f"{ranked['rank']} from {ranked['coarse_rank']}")
+            expect(candidates.nth(at)).to_contain_text(ranked["image_id"])
+        expect(page.locator(".apart .agree li").first).to_contain_text("have a counterpart")
+        expect(page.locator(".apart .differ li").first).to_be_visible()
+        expect(page.locator(".verdict")).to_contain_text("agreement")
+        page.get_by_role("button", name="Next").click()
+        second = job["ranking"][1]["image_id"]
+        expect(page.locator(".pair")).to_contain_text(second)
+        self.assertIn(f"pair={urllib.parse.quote(second)}", page.url)
+        page.reload()
+        expect(page.locator('.candidates a[aria-current="true"]')).to_contain_text(second)
+
+    def test_lines_join_the_matched_regions_of_both_pictures(self):
+        job = localize(4, "wait")["job"]["id"]
+        first = call("GET", f"/jobs/{job}")["ranking"][0]["image_id"]
+        matches = call("GET", f"/jobs/{job}/matches/{urllib.parse.quote(first)}")
+        self.assertGreater(len(matches["regions"]), 0)
+        page = self.page(f"#/jobs/{job}")
+        expect(page.locator(".pair-bar")).to_contain_text(f"{len(matches['regions'])} region")
+        expect(page.locator(".pair .picture.here")).to_have_count(2)
+        inked = """() => { const canvas = document.querySelector(".lines");
+            const all = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+            let inked = 0; for (let at = 3; at < all.length; at += 4) inked += all[at] > 0; return inked; }"""
+        self.until(page, f"({inked})() > 100")
+        page.get_by_label("Lines between matched regions").uncheck()
+        self.assertEqual(page.evaluate(inked), 0)
+
+    def test_a_job_that_is_not_there_is_told_in_plain_words(self):
+        page = self.page(f"#/jobs/{uuid.uuid4()}")
+        expect(page.get_by_role("alert")).to_contain_text("Not found")
+
+
+class TryIt(Console):
+    def test_a_picture_is_localized_and_its_job_watched_until_it_ends(self):
+        page = self.page("#/try?map=town")
+        page.set_input_files("#try-file", frame(1))
+        expect(page.locator(".guess .big")).to_contain_text("%")
+        expect(page.locator(".guess .picture.here")).to_have_count(2)
+        expect(page.locator(".answers li").first).to_be_visible()
+        expect(page.locator("main .badge.succeeded")).to_be_visible()
+        expect(page.locator(".answers .verdict").first).to_contain_text("agreement")
+        expect(page.locator(".answers li.first")).to_contain_text("1. place-0001.jpg")
+        expect(page.locator(".guess")).to_contain_text("Refined estimate")
+        page.get_by_role("link", name="Open the job").click()
+        expect(page.locator(".heading .badge")).to_have_text("succeeded")
+        expect(page.locator(".pair .picture.here")).to_have_count(2)
+
+    def test_what_is_no_picture_is_refused_in_plain_words(self):
+        page = self.page("#/try?map=town")
+        page.set_input_files("#try-file", {"name": "a.jpg", "mimeType": "image/jpeg", "buffer": b"no picture"})
+        expect(page.get_by_role("alert")).to_contain_text(re.compile("decode|picture|image"))
+
+
+class Maps(Console):
+    def test_the_plan_shows_the_images_and_a_click_the_picture(self):
+        page = self.page("#/maps")
+        page.get_by_role("link", name="town", exact=True).click()
+        self.settled(page, "map")
+        expect(page.locator(".legend")).to_contain_text("(12)")
+        # Where a point is, is asked of the canvas itself: a pixel in the colour of the youngest images.
+        find = """() => { const canvas = document.querySelector(".plan canvas");
+            const probe = document.createElement("span"); probe.style.color = "var(--age-1)"; document.body.append(probe);
+            const colour = getComputedStyle(probe).color.match(/\\d+/g).map(Number); probe.remove();
+            const { width, height } = canvas;
+            const all = canvas.getContext("2d").getImageData(0, 0, width, height).data;
+            for (let at = 0; at < all.length; at += 4)
+                if (all[at] === colour[0] && all[at + 1] === colour[1] && all[at + 2] === colour[2])
+                    return { x: (at / 4) % width, y: Math.floor(at / 4 / width) };
+            return null; }"""
+        page.locator(".plan canvas").click(position=self.until(page, find))
+        expect(page.locator(".chosen-image .picture.here")).to_be_visible()
+        self.assertIn("image=place-", page.url)
+        page.reload()
+        expect(page.locator(".chosen-image h2")).to_contain_text("place-")
+        page.get_by_role("button", name="place-0007.jpg").click()
+        expect(page.locator(".chosen-image h2")).to_have_text("place-0007.jpg")
+
+    def test_the_plan_moves_by_keys(self):
+        page = self.page("#/maps/town")
+        self.settled(page, "map")
+        canvas = page.locator(".plan canvas")
+        canvas.focus()
+        page.wait_for_timeout(300)
+        drawn = "document.querySelector('.plan canvas').toDataURL()"
+        pictures = [page.evaluate(drawn)]
+        for key in ("+", "ArrowRight", "-", "0"):
+            page.keyboard.press(key)
+            page.wait_for_timeout(150)
+            pictures.append(page.evaluate(drawn))
+        self.assertEqual(pictures[0], pictures[-1], "0 shows everything again")
+        self.assertEqual(len(set(pictures[:-1])), 4)
+
+    def test_a_query_is_marked_on_the_plan(self):
+        job = self.ended_job()
+        page = self.page(f"#/maps/town?query={job['id']}")
+        asked = page.get_by_role("region", name="The query")
+        expect(asked).to_contain_text(job["estimate"]["image_id"])
+        expect(asked.get_by_role("button")).to_have_count(len(job["ranking"]))
+        asked.get_by_role("button").first.click()
+        expect(page.locator(".chosen-image h2")).to_have_text(job["ranking"][0]["image_id"])
+
+    def test_an_image_is_uploaded_and_deleted(self):
+        call("PUT", "/maps/yard", {"frame": "metric"})
+        page = self.page("#/maps/yard")
+        expect(page.get_by_text("whereabouts index FOLDER --map yard").first).to_be_visible()
+        page.get_by_text("Upload a picture").click()
+        page.set_input_files("#up-file", frame(5))
+        page.fill("#up-x", "1.5")
+        page.fill("#up-y", "-2")
+        page.fill("#up-id", "gate")
+        page.get_by_role("button", name="Add the image").click()
+        expect(page.locator(".chosen-image")).to_contain_text("x 1.50 m, y -2.00 m")
+        page.get_by_role("button", name="Delete the image…").click()
+        page.get_by_role("dialog").get_by_role("button", name="Delete the image").click()
+        expect(page.get_by_text("There is no image yet.")).to_be_visible()
+        self.assertEqual(call("GET", "/maps/yard/images")["images"], [])
+        call("DELETE", "/maps/yard")
+
+    def test_five_thousand_points_move_without_lag(self):
+        def images(route):
+            start = int(urllib.parse.parse_qs(urllib.parse.urlparse(route.request.url).query).get("cursor", ["0"])[0])
+            made = [{"id": f"i{at}", "digest": "", "pose": {"lat": 48 + (at * 7919 % 5000) / 1e5, "lon": 11 + (at * 104729 % 4999) / 1e5, "heading": at % 360},
+                     "tags": [], "media_type": "image/jpeg", "width": 640, "height": 480, "created_at": "2026-01-01T00:00:00Z"} for at in range(start, start + 1000)]
+            route.fulfill(json={"images": made, "next_cursor": str(start + 1000) if start < 4000 else None})
+
+        page = self.page()
+        page.route("**/maps/town/images?*", images)
+        page.goto(f"{URL}/#/maps/town")
+        expect(page.locator(".legend")).to_contain_text("(5,000)")
+        took = page.evaluate("""async () => {
+            const canvas = document.querySelector(".plan canvas");
+            const press = (key) => canvas.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+            const frames = [];
+            for (let last = performance.now(), n = 0; n < 60; n += 1) {
+                press(n % 2 ? "ArrowLeft" : "ArrowRight");
+                await new Promise(requestAnimationFrame);
+                const now = performance.now();
+                frames.push(now - last);
+                last = now;
+            }
+            return frames.sort((a, b) => a - b)[30];
+        }""")
+        print(f"\na frame with 5,000 points: {took:.1f} ms in the median")
+        self.assertLess(took, 25)
+
+
+class Health(Console):
+    def test_the_last_hour_and_what_is_configured_are_told(self):
+        localize(6, "off")
+        page = self.page("#/health")
+        self.settled(page, "health")
+        for name in ("Latency", "Throughput", "Jobs open", "Pictures waiting"):
+            expect(page.locator(".stat", has_text=name)).to_contain_text(re.compile(r"\d|–"))
+        expect(page.locator(".chart svg[role=img]")).to_have_count(3)
+        page.get_by_text("All settings").click()
+        expect(page.locator("pre.settings")).to_contain_text("[")
+        expect(page.locator("pre.settings")).not_to_contain_text(KEYS["admin"])
+
+
+class Trouble(Console):
+    def test_while_the_server_is_away_the_page_says_so_and_comes_back_by_itself(self):
+        page = self.page("#/jobs")
+        self.settled(page, "jobs")
+        page.context.set_offline(True)
+        page.goto(f"{URL}/#/maps")
+        expect(page.locator("#outage")).to_contain_text("does not answer")
+        self.errors.clear()
+        page.context.set_offline(False)
+        expect(page.locator("#outage")).to_be_hidden()
+        expect(page.locator(".cards li").first).to_be_visible()
+
+    def test_what_others_wrote_is_shown_as_text(self):
+        path = f"/maps/hostile/images?id={urllib.parse.quote(MARKUP)}&lat=1&lon=1&tags={urllib.parse.quote(MARKUP)}"
+        call("PUT", "/maps/hostile", {"description": MARKUP})
+        call("POST", path, frame(7).read_bytes(), "image/jpeg")
+        answer = call("POST", "/localize?map=hostile&refine=wait", frame(7).read_bytes(), "image/jpeg")
+        job = call("GET", f"/jobs/{answer['job']['id']}")
+        text = f"OBJECTS. {MARKUP}\nMATCHES.\n- {MARKUP} same sign\n- door: no counterpart\nCOMPARISON. {MARKUP}"
+        job |= {"reasoning": MARKUP, "error": MARKUP, "state": "degraded", "refiner": "mllm"}
+        job["descriptions"] = [description | {"text": text} for description in job["descriptions"]]
+        page = self.page()
+        page.route(f"**/jobs/{job['id']}", lambda route: route.fulfill(json=job))
+        quoted = urllib.parse.quote(MARKUP)
+        for address, told in [(f"#/jobs/{job['id']}", ".apart .agree"), ("#/maps", ".cards"), (f"#/maps/hostile?image={quoted}&query={job['id']}", ".chosen-image"),
+                              (f"#/jobs?q={quoted}&map={quoted}", "#f-map"), (f"#/{quoted}", "main"), (f"#/maps/{quoted}", "[role=alert]"), ("#/try?map=hostile", "#try-map")]:
+            with self.subTest(address=address):
+                page.goto(f"{URL}/{address}")
+                page.locator(told).first.wait_for()
+                page.wait_for_timeout(200)
+                self.assertEqual(page.locator('img[src="x"], [onerror]').count(), 0)
+        page.goto(f"{URL}/#/jobs/{job['id']}")
+        expect(page.locator(".apart .differ li")).to_have_text("door: no counterpart")
+        expect(page.locator(".apart .agree li")).to_have_text(f"{MARKUP} same sign")
+        page.goto(f"{URL}/#/try?map=hostile")
+        page.set_input_files("#try-file", frame(8))
+        expect(page.locator(".answers")).to_contain_text(MARKUP)
+        expect(page.locator("main .badge")).to_be_visible()
+        self.assertEqual(page.locator('img[src="x"], [onerror]').count(), 0)
+        page.close()
+        call("DELETE", "/maps/hostile")
+
+    def test_the_page_may_run_and_load_nothing_but_its_own(self):
+        page = self.page("#/jobs")
+        answer = page.request.get(URL + "/")
+        policy = answer.headers["content-security-policy"]
+        for rule in ("default-src 'none'", "script-src 'self'", "style-src 'self'", "base-uri 'none'", "frame-ancestors 'none'"):
+            self.assertIn(rule, policy)
+        self.assertNotIn("unsafe", policy)
+        strangers = []
+        page.on("request", lambda request: strangers.append(request.url) if not request.url.startswith((URL, "blob:")) else None)
+        for view, address in self.views().items():
+            page.goto(f"{URL}/{address}")
+            self.settled(page, view)
+        self.assertEqual(strangers, [])
