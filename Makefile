@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino test conformance examples crash fuzz lint format bench load soak openapi clean
+.PHONY: help demo build assets nasm openvino chromium test conformance console examples crash fuzz lint format bench load soak openapi clean
 
 help: ## Say what can be made
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
@@ -24,14 +24,21 @@ nasm:
 openvino: ## Get ONNX Runtime with OpenVINO too, the faster one on many x86-64 processors
 	deploy/setup/assets.sh --openvino assets
 
-test: assets nasm ## Set up, build and run every test
+chromium:
+	@deploy/setup/chromium.sh
+
+test: assets nasm chromium ## Set up, build and run every test
 	$(CARGO) test --release --locked
 	tests/api/conformance.sh $(BINARY) target/api-venv
 	tests/grpc/check.sh $(BINARY) target/grpc-venv
+	tests/console/check.sh $(BINARY) target/console-venv
 	examples/check.sh $(BINARY) target/examples-venv
 
 conformance: build ## Hold the server against its own description with thousands of made-up requests
 	tests/api/conformance.sh $(BINARY) target/api-venv 150
+
+console: build chromium ## Open the operator's console in a browser and use it
+	tests/console/check.sh $(BINARY) target/console-venv
 
 examples: build ## Check the clients, the calls in curl and the load tests against the service
 	examples/check.sh $(BINARY) target/examples-venv

@@ -512,6 +512,9 @@ impl Config {
 
     fn contradiction_of_a_section(&self) -> Option<String> {
         let track = || self.track.contradiction();
+        if self.bulk.memory_bytes < self.server.body_limit_bytes {
+            return Some("bulk.memory_bytes must not be less than server.body_limit_bytes".into());
+        }
         self.server.contradiction().or_else(track).or_else(|| self.console.contradiction())
     }
 

@@ -8,6 +8,7 @@ use anyhow::Context;
 use jiff::Timestamp;
 use tokio::net::TcpListener;
 use tokio::runtime::Handle;
+use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
@@ -119,7 +120,7 @@ fn http_settings(config: &Config) -> HttpSettings {
         max_requests: config.server.max_requests,
         max_streams: config.server.max_streams,
         stream_idle: Duration::from_secs(config.server.stream_idle_s),
-        bulk_in_flight: config.bulk.in_flight,
+        bulk_memory_bytes: config.bulk.memory_bytes,
         keys_required: config.keys_required(),
     }
 }
@@ -187,7 +188,8 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
     let pool = CpuPool::new("frames", cores_unless(config.image.threads), admission.permits)?;
     let job_pace = JobPace::default();
-    let refining = CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?;
+    // Beside the workers, calibration and whoever looks at matches come to it, one at a time each.
+    let refining = CpuPool::new("refine", config.jobs.workers, config.jobs.workers + 2)?;
     let pools = [pool.clone(), refining.clone()];
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
     let local = Arc::new(LocalRefiner {
@@ -279,6 +281,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             once: once(config),
             bulk: config.bulk,
         },
+        matching: Semaphore::new(1),
     };
     let model = service.models.default_model();
     tracing::info!(model, %why, "the model of maps that name none");

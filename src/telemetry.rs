@@ -360,6 +360,11 @@ impl Metrics {
         self.requests.get_or_create(&RequestLabels { method: method.into(), route, status }).inc();
     }
 
+    /// Counts a frame of a stream of gRPC that was localized.
+    pub fn frame_of_stream(&self, took: Duration) {
+        self.last_hour.answered(Timestamp::now(), 200, Some(took));
+    }
+
     /// Counts what was refused.
     pub fn refused(&self, reason: RefusedFor) {
         self.refused.get_or_create(&RefusedLabels { reason: reason.as_str() }).inc();

@@ -11,6 +11,8 @@ pub struct Call {
     pub role: Option<Role>,
     /// Whether messages stream one way or both, so that it may take any time.
     pub streams: bool,
+    /// Whether its messages have pictures in them.
+    pub pictures: bool,
     /// Whether many of its messages are worked on at a time.
     pub many: bool,
     /// Whether it may wait for a job.
@@ -19,12 +21,12 @@ pub struct Call {
     pub changes: bool,
 }
 
+/// A call that robots may make, and every other thing is not.
 const fn robot(path: &'static str) -> Call {
     Call {
         path,
         role: Some(Role::Robot),
-        streams: false,
-        many: false,
+        streams: false, pictures: false, many: false,
         waits: false,
         changes: false,
     }
@@ -40,15 +42,18 @@ const fn admin(path: &'static str) -> Call {
 
 /// All calls but those of reflection, which are [`REFLECTION`] and [`REFLECTION_ALPHA`].
 pub const CALLS: &[Call] = &[
-    Call { waits: true, ..robot("/whereabouts.v1.LocalizationService/Localize") },
-    Call { streams: true, ..robot("/whereabouts.v1.LocalizationService/LocalizeStream") },
+    Call { pictures: true, waits: true, ..robot("/whereabouts.v1.LocalizationService/Localize") },
+    Call {
+        streams: true,
+        pictures: true,
+        ..robot("/whereabouts.v1.LocalizationService/LocalizeStream")
+    },
     robot("/whereabouts.v1.MapService/ListMaps"),
     robot("/whereabouts.v1.MapService/GetMap"),
     admin("/whereabouts.v1.MapService/PutMap"),
     admin("/whereabouts.v1.MapService/DeleteMap"),
     Call {
-        streams: true,
-        many: true,
+        streams: true, pictures: true, many: true,
         changes: true,
         ..operator("/whereabouts.v1.MapService/AddImages")
     },
@@ -57,10 +62,13 @@ pub const CALLS: &[Call] = &[
     operator("/whereabouts.v1.JobService/ListJobs"),
     Call { changes: true, ..operator("/whereabouts.v1.JobService/CancelJob") },
     Call { changes: true, ..operator("/whereabouts.v1.JobService/RetryJob") },
-    Call { role: None, ..robot("/grpc.health.v1.Health/Check") },
+    Call { role: None, ..robot(HEALTH_CHECK) },
     // It holds a stream, of which there are only so many.
     Call { streams: true, ..robot("/grpc.health.v1.Health/Watch") },
 ];
+
+/// What a load balancer asks, of an overloaded server too.
+pub const HEALTH_CHECK: &str = "/grpc.health.v1.Health/Check";
 
 pub(super) const REFLECTION: &str = "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo";
 pub(super) const REFLECTION_ALPHA: &str =

@@ -102,7 +102,7 @@ fn moment_to(moment: Timestamp) -> prost_types::Timestamp {
 }
 
 /// A pose in the form in which the service checks it against the map.
-pub(super) fn pose(pose: proto::Pose) -> Value {
+pub(super) fn pose(pose: proto::Pose) -> Result<Value, ServiceError> {
     let fields = match pose.frame {
         None => Vec::new(),
         Some(proto::pose::Frame::Geographic(pose)) => vec![
@@ -124,11 +124,17 @@ pub(super) fn pose(pose: proto::Pose) -> Value {
             ]
         }
     };
-    let given: JsonObject<String, Value> = fields
-        .into_iter()
-        .filter_map(|(field, value)| Some((field.to_owned(), value?.into())))
-        .collect();
-    Value::Object(given)
+    let mut given = JsonObject::new();
+    for (field, value) in fields {
+        let Some(value) = value else { continue };
+        // JSON has no word for it.
+        if !value.is_finite() {
+            let detail = format!("{field} is {value}; it must be a number");
+            return Err(ServiceError::unprocessable(detail));
+        }
+        given.insert(field.to_owned(), value.into());
+    }
+    Ok(Value::Object(given))
 }
 
 impl From<Pose> for proto::Pose {
@@ -351,10 +357,13 @@ mod tests {
                 orientation: Some(proto::Quaternion { x: 0.0, y: 0.0, z: 0.6, w: 0.8 }),
             })),
         };
-        let read = Pose::from_json(Frame::Metric, pose(sent)).unwrap();
+        let read = Pose::from_json(Frame::Metric, pose(sent).unwrap()).unwrap();
         assert_eq!(proto::Pose::from(read), sent);
-        assert!(Pose::from_json(Frame::Wgs84, pose(sent)).is_err());
-        assert!(Pose::from_json(Frame::Metric, pose(proto::Pose { frame: None })).is_err());
+        assert!(Pose::from_json(Frame::Wgs84, pose(sent).unwrap()).is_err());
+        assert!(Pose::from_json(Frame::Metric, pose(proto::Pose { frame: None }).unwrap()).is_err());
+        let nowhere = proto::MetricPose { x: 0.0, y: 0.0, z: Some(f64::NAN), orientation: None };
+        let nowhere = proto::Pose { frame: Some(proto::pose::Frame::Metric(nowhere)) };
+        assert!(pose(nowhere).unwrap_err().detail.contains('z'));
     }
 
     #[test]

@@ -19,6 +19,9 @@ use crate::domain::Job;
 use crate::service::{ErrorKind, JobEvent, ServiceError};
 use crate::store::JobFilter;
 
+/// Jobs in a page unless more are asked for: clients take no more than four megabytes at a time by themselves.
+const PAGE_SIZE: usize = 20;
+
 #[tonic::async_trait]
 impl JobService for Api {
     type WatchJobStream = Answers<WatchJobResponse>;
@@ -125,8 +128,11 @@ impl Asked {
         }
         let filter = JobFilter { map, state: convert::job_state(state)? };
         let cursor = (!page_token.is_empty()).then(|| job_id(&page_token)).transpose()?;
-        let limit = (page_size > 0).then_some(page_size as usize);
-        let page = self.service.list_jobs(filter, cursor, limit).await?;
+        let limit = match page_size {
+            0 => PAGE_SIZE,
+            size => size as usize,
+        };
+        let page = self.service.list_jobs(filter, cursor, Some(limit)).await?;
         Ok(ListJobsResponse {
             jobs: page.jobs.into_iter().map(Into::into).collect(),
             next_page_token: page.next_cursor.map(|id| id.to_string()).unwrap_or_default(),

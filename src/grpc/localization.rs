@@ -1,8 +1,10 @@
 //! Localizing: one frame, or the newest of many.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use futures_util::{FutureExt, stream};
+use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::proto::localization_service_server::LocalizationService;
@@ -74,7 +76,7 @@ impl Asked {
 /// The frames of a stream, of which the newest is localized next.
 struct Frames {
     coming: Streaming<LocalizeStreamRequest>,
-    newest: Option<LocalizeStreamRequest>,
+    newest: Option<(LocalizeStreamRequest, Option<OwnedSemaphorePermit>)>,
     /// Frames that newer ones have replaced since the last answer.
     skipped: u32,
     /// Whether one has been counted, as the request that the stream began with.
@@ -97,12 +99,12 @@ impl Frames {
         {
             self.take(next);
         }
-        let Some(frame) = self.newest.take() else {
+        let Some((frame, _memory)) = self.newest.take() else {
             return self.ended.replace(Ok(()))?.err().map(Err);
         };
         let skipped = std::mem::take(&mut self.skipped);
         let LocalizeStreamRequest { frame_number, frame } = frame;
-        let asked = Arc::clone(&self.asked);
+        let (asked, begun) = (Arc::clone(&self.asked), Instant::now());
         let counted = std::mem::replace(&mut self.counted, true);
         let mut working = std::pin::pin!(async move {
             // Each frame counts as a request of the key, of which the first is counted already.
@@ -117,8 +119,12 @@ impl Frames {
                 next = self.coming.message(), if self.ended.is_none() => self.take(next),
             }
         };
+        let metrics = &self.asked.service.metrics;
         let outcome = match answer {
-            Ok(answer) => Outcome::Answer(answer),
+            Ok(answer) => {
+                metrics.frame_of_stream(begun.elapsed());
+                Outcome::Answer(answer)
+            }
             Err(error) => Outcome::Problem(status::problem(error)),
         };
         let outcome = Some(outcome);
@@ -128,7 +134,7 @@ impl Frames {
     fn take(&mut self, next: Result<Option<LocalizeStreamRequest>, Status>) {
         match next {
             Ok(Some(frame)) => {
-                let replaced = self.newest.replace(frame).is_some();
+                let replaced = self.newest.replace((frame, self.asked.held.take())).is_some();
                 self.skipped += u32::from(replaced);
             }
             Ok(None) => self.ended = Some(Ok(())),

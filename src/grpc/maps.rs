@@ -1,6 +1,7 @@
 //! Maps: list, show, change, remove, fill.
 
 use futures_util::{StreamExt, TryStreamExt, stream};
+use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::proto::add_image_result::Outcome;
@@ -66,9 +67,11 @@ impl MapService for Api {
             return Ok(Response::new(AddImagesResponse { results: Vec::new() }));
         };
         let map = asked.map(&first.map).map_err(status::of)?;
+        asked.service.get_map(&map).await.map_err(status::of)?;
         let images = stream::iter([Ok(first)]).chain(coming);
-        let images = images.map_ok(|next| image(&map, next));
-        let results = asked.service.add_images(&map, &asked.caller, images).await?;
+        let images = images.map_ok(|next| image(&map, next, asked.held.take()));
+        let until = asked.service.over(&self.door, asked.caller.clone(), asked.deadline);
+        let results = asked.service.add_images(&map, &asked.caller, images, until).await?;
         Ok(Response::new(AddImagesResponse { results: results.into_iter().map(result).collect() }))
     }
 }
@@ -89,7 +92,11 @@ impl Asked {
 }
 
 /// The next image of a stream, if it can be one.
-fn image(map: &MapName, next: AddImagesRequest) -> Result<BulkImage, ServiceError> {
+fn image(
+    map: &MapName,
+    next: AddImagesRequest,
+    memory: Option<OwnedSemaphorePermit>,
+) -> Result<BulkImage, ServiceError> {
     let AddImagesRequest { map: named, image, id, pose, captured_at, tags } = next;
     if !named.is_empty() && named != map.as_str() {
         return Err(ServiceError::malformed(format!(
@@ -98,12 +105,11 @@ fn image(map: &MapName, next: AddImagesRequest) -> Result<BulkImage, ServiceErro
     }
     let meta = ImageMeta {
         id,
-        pose: pose.map(convert::pose),
+        pose: pose.map(convert::pose).transpose()?,
         captured_at: captured_at.map(convert::moment).transpose()?,
         tags,
     };
-    // Its memory is counted as it comes in.
-    Ok(BulkImage { bytes: image, meta, memory: None })
+    Ok(BulkImage { bytes: image, meta, memory })
 }
 
 fn result(result: BulkResult) -> AddImageResult {
@@ -112,7 +118,8 @@ fn result(result: BulkResult) -> AddImageResult {
         Ok(Added::Present(image)) => (image, true),
         Err((id, error)) => {
             let outcome = Some(Outcome::Problem(status::problem(error)));
-            return AddImageResult { id: id.unwrap_or_default(), outcome };
+            let id = id.map(Into::into).unwrap_or_default();
+            return AddImageResult { id, outcome };
         }
     };
     let stored = Stored {

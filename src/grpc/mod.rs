@@ -6,6 +6,7 @@
 mod calls;
 mod convert;
 mod health;
+mod held;
 mod jobs;
 mod localization;
 mod maps;
@@ -19,7 +20,8 @@ use axum::http::header::CONTENT_TYPE;
 use axum::http::{HeaderMap, HeaderValue};
 use tonic::Extensions;
 
-pub use self::calls::{CALLS, Call, call};
+pub use self::calls::{CALLS, Call, HEALTH_CHECK, call};
+pub use self::held::Held;
 use self::proto::job_service_server::JobServiceServer;
 use self::proto::localization_service_server::LocalizationServiceServer;
 use self::proto::map_service_server::MapServiceServer;
@@ -85,6 +87,7 @@ struct Asked {
     service: Arc<Service>,
     caller: Caller,
     deadline: Deadline,
+    held: Held,
 }
 
 impl Api {
@@ -94,7 +97,8 @@ impl Api {
         let caller = extensions.get::<Caller>().cloned().ok_or_else(|| {
             ServiceError::new(ErrorKind::Internal, "a call was not checked; see the server's log")
         })?;
-        Ok(Asked { service: self.door.service()?, caller, deadline })
+        let held = extensions.get::<Held>().cloned().unwrap_or_default();
+        Ok(Asked { service: self.door.service()?, caller, deadline, held })
     }
 }
 

@@ -2,11 +2,11 @@
 
 use std::pin::Pin;
 
-use futures_util::{Stream, StreamExt, future, stream};
+use futures_util::{FutureExt, Stream, StreamExt, future, stream};
 use tonic::Status;
 
 use super::{Asked, status};
-use crate::service::{Door, ErrorKind};
+use crate::service::Door;
 
 /// Answers, one after another.
 pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
@@ -17,26 +17,8 @@ pub(super) fn until_over<T: Send + 'static>(
     door: &Door,
     asked: Asked,
 ) -> Answers<T> {
-    let draining = door.draining();
-    let Asked { service, caller, deadline } = asked;
-    let over = async move {
-        let deadline = async {
-            match deadline.0 {
-                Some(end) => tokio::time::sleep_until(end.into()).await,
-                None => future::pending().await,
-            }
-        };
-        let (kind, detail) = tokio::select! {
-            () = draining.cancelled() => {
-                (ErrorKind::Unavailable, "the server ends; call again, perhaps another one answers")
-            }
-            () = service.keys.ended(caller) => {
-                (ErrorKind::Unauthorized, "the key was revoked or has expired; ask an admin for another")
-            }
-            () = deadline => (ErrorKind::DeadlinePassed, "the deadline of the call has passed"),
-        };
-        Err(status::status(kind, detail, kind.retry_after()))
-    };
+    let Asked { service, caller, deadline, .. } = asked;
+    let over = service.over(door, caller, deadline).map(|why| Err(status::of(why)));
     // The end of either ends both: what is over is told once.
     let answers = answers.map(Some).chain(stream::iter([None]));
     let over = stream::once(over).map(Some).chain(stream::iter([None]));

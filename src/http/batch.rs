@@ -5,23 +5,27 @@ mod form;
 
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use axum::body::Body;
+use axum::body::{Body, BodyDataStream};
 use axum::extract::{Request, State};
 use axum::http::header::CONTENT_TYPE;
 use axum::{Extension, Json};
+use bytes::Bytes;
 use futures_util::{Stream, StreamExt, stream};
 use serde::{Deserialize, Serialize};
+use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use utoipa::ToSchema;
 
 use super::body::Segments;
-use super::guard::too_large;
+use super::guard::{discard, too_large};
 use super::maps::map_name;
+use super::messages::no_bulk_memory;
 use super::problem::Problem;
 use super::state::{AppState, HttpSettings, Ready};
-use crate::service::{BulkImage, BulkResult, Caller, ErrorKind, ImageMeta, ServiceError};
+use crate::service::{BulkImage, BulkResult, Caller, Deadline, ErrorKind, ImageMeta, ServiceError};
 use crate::store::Added;
 
 /// The route.
@@ -83,39 +87,63 @@ pub struct BatchProblem {
 /// The images of a request, each as it came in or why it cannot be stored; the first problem ends it.
 type Images = Pin<Box<dyn Stream<Item = Result<Result<BulkImage, ServiceError>, Problem>> + Send>>;
 
+/// What an image may come to without getting any further, in bytes: names, heads of parts, and what lies between.
+const ASIDE: usize = 1 << 20;
+
+/// The largest first step of an image whose size is not known before, in bytes; few are larger.
+const STEP: usize = 4 << 20;
+
 /// The room that there is for an image that comes in.
 #[derive(Clone)]
 struct Room {
     settings: Arc<HttpSettings>,
     memory: Arc<Semaphore>,
+    /// How many bytes of the body may still come before whoever reads it gets on.
+    allowance: Arc<AtomicUsize>,
 }
 
 impl Room {
-    /// Refuses an image of so many bytes if that is too large.
-    fn check(&self, bytes: usize) -> Result<(), Problem> {
-        let limit = self.settings.body_limit_bytes;
-        match bytes > limit {
-            true => Err(Problem::new(ErrorKind::TooLarge, too_large(limit))),
-            false => Ok(()),
-        }
+    fn is_too_small(&self, bytes: usize) -> bool {
+        bytes > self.settings.body_limit_bytes
     }
 
-    /// So many bytes of the memory for bodies, once images before this one have given them back.
+    fn too_large(&self) -> ServiceError {
+        ServiceError::new(ErrorKind::TooLarge, too_large(self.settings.body_limit_bytes))
+    }
+
+    /// So many bytes of the memory for bulk uploads, once images before this one have given them back.
     async fn take(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Problem> {
-        self.check(bytes)?;
         let count = u32::try_from(bytes).unwrap_or(u32::MAX);
         let taking = Arc::clone(&self.memory).acquire_many_owned(count);
         let taken = tokio::time::timeout(self.settings.request_timeout, taking).await;
-        taken.ok().and_then(Result::ok).ok_or_else(|| {
-            let detail = format!(
-                "the bodies of all requests in progress hold {} bytes, the bound \
-                 (server.bodies_limit_bytes); try again in a moment",
-                self.settings.bodies_limit_bytes
-            );
-            Problem::new(ErrorKind::Overloaded, detail)
-        })
+        taken.ok().and_then(Result::ok).ok_or_else(no_bulk_memory)
+    }
+
+    /// The reader has got on: so much may come now, and what lies between.
+    fn allow(&self, bytes: usize) {
+        self.allowance.store(bytes.saturating_add(ASIDE), Ordering::Relaxed);
+    }
+
+    /// A body that breaks off when its reader does not get on.
+    fn over(&self, body: Body) -> Body {
+        self.allow(0);
+        let allowance = Arc::clone(&self.allowance);
+        let bounded = body.into_data_stream().map(move |chunk| {
+            let chunk = chunk?;
+            let take = |left: usize| left.checked_sub(chunk.len());
+            match allowance.fetch_update(Ordering::Relaxed, Ordering::Relaxed, take) {
+                Ok(_) => Ok(chunk),
+                Err(_) => Err(axum::Error::new(Endless)),
+            }
+        });
+        Body::from_stream(bounded)
     }
 }
+
+/// A body in which nothing ends.
+#[derive(Debug, thiserror::Error)]
+#[error("there is more than {ASIDE} bytes of it between two images; is it a form, or an archive of pictures?")]
+struct Endless;
 
 /// The form of many images.
 #[derive(ToSchema)]
@@ -153,13 +181,15 @@ pub(super) async fn add_images(
     Ready(service): Ready,
     Extension(caller): Extension<Caller>,
     Segments(map): Segments<String>,
+    deadline: Deadline,
     request: Request,
 ) -> Result<Json<BatchAnswer>, Problem> {
     let map = map_name(&map)?;
-    let room = Room { settings: state.settings, memory: state.bodies_memory };
-    let images = images(request, room).await?;
     service.get_map(&map).await?;
-    let results = service.add_images(&map, &caller, images).await?;
+    let until = service.over(&state.door, caller.clone(), deadline);
+    let (settings, memory) = (state.settings, state.bulk_memory);
+    let images = images(request, Room { settings, memory, allowance: Arc::default() }).await?;
+    let results = service.add_images(&map, &caller, images, until).await?;
     let results: Vec<BatchResult> = results.into_iter().map(BatchResult::from).collect();
     let count = |of| results.iter().filter(|result| result.outcome == of).count();
     Ok(Json(BatchAnswer {
@@ -173,13 +203,15 @@ pub(super) async fn add_images(
 async fn images(request: Request, room: Room) -> Result<Images, Problem> {
     let header = request.headers().get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let essence = header.unwrap_or("").split(';').next().unwrap_or("").trim().to_ascii_lowercase();
+    let of_kind = header.map(str::to_owned);
+    let request = request.map(|body| room.over(body));
     match essence.as_str() {
         "multipart/form-data" => Ok(Box::pin(form::images(request, room).await?)),
         "application/x-tar" => Ok(Box::pin(archive::images(request.into_body(), room))),
         _ => Err(Problem::new(
             ErrorKind::UnsupportedMedia,
             format!(
-                "the Content-Type is {header:?}; send a form (with curl: -F image=@a.jpg -F image=@b.jpg), \
+                "the Content-Type is {of_kind:?}; send a form (with curl: -F image=@a.jpg -F image=@b.jpg), \
                  or a tar archive (tar c *.jpg | curl -H 'Content-Type: application/x-tar' --data-binary \
                  @- …)"
             ),
@@ -189,13 +221,37 @@ async fn images(request: Request, room: Room) -> Result<Images, Problem> {
 
 /// A body that may take any time, if nothing of it waits for long.
 pub(super) fn unhurried(body: Body, pause: Duration) -> Body {
-    Body::from_stream(stream::unfold(Some(body.into_data_stream()), move |body| async move {
-        let mut body = body?;
-        match tokio::time::timeout(pause, body.next()).await {
-            Ok(next) => Some((next?, Some(body))),
-            Err(_) => Some((Err(axum::Error::new(Paused(pause))), None)),
-        }
+    let unhurried = Unhurried { body: Some(body.into_data_stream()), pause };
+    Body::from_stream(stream::unfold(unhurried, |mut unhurried| async move {
+        let next = unhurried.next().await?;
+        Some((next, unhurried))
     }))
+}
+
+/// What of a body is still to come. What nobody reads is thrown away for a while, or the client, which is still
+/// sending, would see a reset connection instead of the answer.
+struct Unhurried {
+    body: Option<BodyDataStream>,
+    pause: Duration,
+}
+
+impl Unhurried {
+    async fn next(&mut self) -> Option<Result<Bytes, axum::Error>> {
+        let next = tokio::time::timeout(self.pause, self.body.as_mut()?.next()).await;
+        let next = next.unwrap_or_else(|_| Some(Err(axum::Error::new(Paused(self.pause)))));
+        if !matches!(next, Some(Ok(_))) {
+            self.body = None;
+        }
+        next
+    }
+}
+
+impl Drop for Unhurried {
+    fn drop(&mut self) {
+        if let (Some(body), Ok(runtime)) = (self.body.take(), Handle::try_current()) {
+            runtime.spawn(discard(body));
+        }
+    }
 }
 
 /// Nothing of a body came for so long.
@@ -239,7 +295,7 @@ impl From<BulkResult> for BatchResult {
                 let pause = error.retry_after.or(error.kind.retry_after());
                 let retry_after_s = pause.map(|pause| pause.as_secs_f64());
                 let problem = BatchProblem { kind, detail: error.detail, retry_after_s };
-                (id, BatchOutcome::Failed, Some(problem))
+                (id.map(Into::into), BatchOutcome::Failed, Some(problem))
             }
         };
         Self { id, outcome, problem }

@@ -19,7 +19,7 @@ use super::incoming::Watch;
 use super::messages;
 use super::problem::Problem;
 use super::state::AppState;
-use crate::grpc::{self, Call};
+use crate::grpc::{self, Call, HEALTH_CHECK, Held};
 use crate::service::{Deadline, ErrorKind};
 use crate::telemetry::RefusedFor;
 
@@ -77,15 +77,20 @@ pub(super) async fn bound(
     next: Next,
 ) -> Response {
     let arrival = Instant::now();
-    // An operator looks here when the server is overloaded.
-    if matches!(request.uri().path(), "/livez" | "/readyz" | "/metrics") {
-        return next.run(request).await;
-    }
     let call = grpc::call(request.uri().path());
     if call.is_some() && !grpc::is_call(request.headers()) {
         let detail = "this is a call of gRPC, whose Content-Type is application/grpc; GET /docs lists the calls \
                       of HTTP";
         return refuse(request, ErrorKind::UnsupportedMedia, detail.into());
+    }
+    // An operator looks here when the server is overloaded.
+    match (request.uri().path(), call) {
+        ("/livez" | "/readyz" | "/metrics", _) => return next.run(request).await,
+        (HEALTH_CHECK, Some(call)) => {
+            let bounded = |body| messages::bounded(body, call, &state, Held::default());
+            return next.run(request.map(bounded)).await;
+        }
+        _ => {}
     }
     let route = request.extensions().get::<MatchedPath>().map(MatchedPath::as_str);
     if call.is_some_and(|call| call.streams) || route == Some(batch::PATH) {
@@ -110,14 +115,16 @@ pub(super) async fn bound(
     };
     request.extensions_mut().insert(Deadline(wanted_for.map(|wait| arrival + wait)));
     let watch = Watch::default();
+    let held = Held::default();
     let request = request.map(|body| match call {
-        Some(call) => messages::bounded(body, call, &state.settings, &state.bodies_memory),
+        Some(call) => messages::bounded(body, call, &state, held.clone()),
         None => watch.over(body, &state.settings, &state.bodies_memory),
     });
     let longest = time_allowed(&state, &request, call);
     let allowed = wanted_for.map_or(longest, |wait| wait.min(longest));
     let answered = tokio::time::timeout(allowed, next.run(request)).await;
     watch.answered();
+    held.answered();
     if let Some((problem, reason)) = watch.problem() {
         state.metrics.refused(reason);
         return hanging_up(problem);
@@ -144,19 +151,28 @@ async fn bound_stream(
     arrival: Instant,
     call: Option<Call>,
 ) -> Response {
-    let permit = match state.stream() {
-        Ok(permit) => permit,
-        Err(problem) => return problem.into_response(),
+    let (permit, wait) = match (state.stream(), deadline::allowed(request.headers())) {
+        (Ok(permit), Ok(wait)) => (permit, wait),
+        (Err(problem), _) | (_, Err(problem)) => {
+            throw_away(request);
+            return hanging_up(problem);
+        }
     };
-    match deadline::allowed(request.headers()) {
-        Ok(wait) => request.extensions_mut().insert(Deadline(wait.map(|wait| arrival + wait))),
-        Err(problem) => return problem.into_response(),
-    };
+    let held = Held::default();
+    request.extensions_mut().insert(Deadline(wait.map(|wait| arrival + wait)));
+    request.extensions_mut().insert(held.clone());
     let request = request.map(|body| match call {
-        Some(call) => messages::bounded(body, call, &state.settings, &state.bodies_memory),
+        Some(call) => messages::bounded(body, call, &state, held.clone()),
         None => batch::unhurried(body, state.settings.body_pause),
     });
-    let response = next.run(request).await;
+    let mut response = next.run(request).await;
+    // What was refused, and what is answered once, has been answered.
+    if call.is_none_or(|call| call.many) || grpc::status::as_http(&response).is_some() {
+        held.answered();
+    }
+    if call.is_none() && !response.status().is_success() {
+        response.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
+    }
     response.map(|body| {
         Body::new(body.map_frame(move |frame| {
             // Given back when the answers end or the client has gone.

@@ -106,6 +106,7 @@ pub(super) async fn frame(
     params(("id" = Uuid, Path), ("image" = String, Path)), responses(
     (status = 200, body = PairRegions),
     (status = 404, body = Problem, description = "No such job, or no such matches", content_type = "application/problem+json"),
+    (status = 503, body = Problem, description = "Starting, or the model is not there just now", content_type = "application/problem+json"),
 ))]
 pub(super) async fn matches(
     Ready(service): Ready,

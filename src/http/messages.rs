@@ -1,64 +1,59 @@
 //! The messages of a gRPC call as they come in: bounded one by one in size and time, and all together by
 //! memory.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
 use axum::body::{Body, BodyDataStream};
 use bytes::Bytes;
 use futures_util::{StreamExt, stream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::Semaphore;
 use tokio::time::{Instant, timeout};
 
 use super::guard::too_large;
 use super::problem::Problem;
-use super::state::HttpSettings;
-use crate::grpc::Call;
+use super::state::{AppState, HttpSettings};
+use crate::grpc::{Call, Held};
 use crate::service::ErrorKind;
-
-/// Messages of one call that are counted as in memory, beside those that are worked on: the newest behind
-/// them, and the one that is coming.
-const BEHIND: usize = 2;
+use crate::telemetry::{Metrics, RefusedFor};
 
 /// The bytes before a message: whether it is compressed, and its length.
 const PREFIX: usize = 5;
 
+/// The largest message of a call that carries no picture, in bytes.
+const LARGEST_PLAIN: usize = 64 << 10;
+
 /// Reads along.
 struct Messages {
     body: BodyDataStream,
+    call: Call,
     settings: Arc<HttpSettings>,
+    metrics: Arc<Metrics>,
+    /// Of all bodies, or of those of bulk uploads.
     memory: Arc<Semaphore>,
-    /// The longest pause between two messages.
-    idle: Duration,
+    held: Held,
     prefix: [u8; PREFIX],
     /// Bytes of the prefix that have come.
     prefix_bytes: usize,
     /// Bytes of the message that are still to come.
     left: usize,
-    /// The memory of the last messages, of so many at the most.
-    held: VecDeque<OwnedSemaphorePermit>,
-    most_held: usize,
     failed: bool,
 }
 
-/// Bounds the messages of a call. Its reader hears of what is wrong as a status.
-pub(super) fn bounded(
-    body: Body,
-    call: Call,
-    settings: &Arc<HttpSettings>,
-    memory: &Arc<Semaphore>,
-) -> Body {
+/// Bounds the messages of a call. Its reader hears of what is wrong as a status. What they take of the memory
+/// is in `held`, until the reader takes it from there or the call has been answered.
+pub(super) fn bounded(body: Body, call: Call, state: &AppState, held: Held) -> Body {
+    let memory = if call.many { &state.bulk_memory } else { &state.bodies_memory };
     let messages = Messages {
         body: body.into_data_stream(),
-        settings: Arc::clone(settings),
+        call,
+        settings: Arc::clone(&state.settings),
+        metrics: Arc::clone(&state.metrics),
         memory: Arc::clone(memory),
-        idle: if call.streams { settings.stream_idle } else { settings.body_pause },
+        held,
         prefix: [0; PREFIX],
         prefix_bytes: 0,
         left: 0,
-        held: VecDeque::new(),
-        most_held: BEHIND + if call.many { settings.bulk_in_flight } else { 1 },
         failed: false,
     };
     Body::from_stream(stream::unfold(messages, |mut messages| async {
@@ -73,68 +68,94 @@ impl Messages {
             return None;
         }
         let within = self.left > 0 || self.prefix_bytes > 0;
-        let pause = if within { self.settings.body_pause } else { self.idle };
+        let pause = match self.call.streams && !within {
+            true => self.settings.stream_idle,
+            false => self.settings.body_pause,
+        };
         let begun = Instant::now();
         let chunk = match timeout(pause, self.body.next()).await {
             Ok(next) => next?,
             Err(_) => return Some(Err(self.fail(slow(begun.elapsed(), within)))),
         };
         let Ok(chunk) = chunk else { return Some(chunk) };
-        Some(match self.count(&chunk) {
+        Some(match self.count(&chunk).await {
             Ok(()) => Ok(chunk),
             Err(problem) => Err(self.fail(problem)),
         })
     }
 
-    /// Follows the prefixes and messages of a chunk; takes memory for each message that begins.
-    fn count(&mut self, mut chunk: &[u8]) -> Result<(), Problem> {
-        while !chunk.is_empty() {
+    /// Follows the prefixes and messages of a chunk, and takes memory: of many messages for the whole of each
+    /// before it has come, or uploads would wait for one another; else for what has come.
+    async fn count(&mut self, chunk: &[u8]) -> Result<(), Problem> {
+        let mut rest = chunk;
+        while !rest.is_empty() {
             if self.left > 0 {
-                let of_message = self.left.min(chunk.len());
+                let of_message = self.left.min(rest.len());
                 self.left -= of_message;
-                chunk = &chunk[of_message..];
+                rest = &rest[of_message..];
                 continue;
             }
-            let of_prefix = (PREFIX - self.prefix_bytes).min(chunk.len());
-            self.prefix[self.prefix_bytes..][..of_prefix].copy_from_slice(&chunk[..of_prefix]);
+            let of_prefix = (PREFIX - self.prefix_bytes).min(rest.len());
+            self.prefix[self.prefix_bytes..][..of_prefix].copy_from_slice(&rest[..of_prefix]);
             self.prefix_bytes += of_prefix;
-            chunk = &chunk[of_prefix..];
+            rest = &rest[of_prefix..];
             if self.prefix_bytes == PREFIX {
-                let [_, length @ ..] = self.prefix;
-                self.begin(u32::from_be_bytes(length))?;
+                self.begin().await?;
             }
         }
-        Ok(())
+        let taken = self.call.many || self.held.try_add(&self.memory, chunk.len());
+        if taken { Ok(()) } else { Err(no_memory(&self.settings)) }
     }
 
-    fn begin(&mut self, length: u32) -> Result<(), Problem> {
+    /// A message begins.
+    async fn begin(&mut self) -> Result<(), Problem> {
+        let [_, length @ ..] = self.prefix;
+        let length = u32::from_be_bytes(length);
         (self.prefix_bytes, self.left) = (0, length as usize);
-        let limit = self.settings.body_limit_bytes;
+        let limit = match self.call.pictures {
+            true => self.settings.body_limit_bytes,
+            false => LARGEST_PLAIN,
+        };
         if self.left > limit {
             return Err(Problem::new(ErrorKind::TooLarge, too_large(limit)));
         }
-        if self.held.len() == self.most_held {
-            self.held.pop_front();
+        if !self.call.many || self.held.is_answered() {
+            return Ok(());
         }
-        match Arc::clone(&self.memory).try_acquire_many_owned(length) {
-            Ok(more) => self.held.push_back(more),
-            Err(_) => {
-                let detail = format!(
-                    "the bodies of all requests in progress hold {} bytes, the bound \
-                     (server.bodies_limit_bytes); try again in a moment",
-                    self.settings.bodies_limit_bytes
-                );
-                return Err(Problem::new(ErrorKind::Overloaded, detail));
-            }
+        let taking = Arc::clone(&self.memory).acquire_many_owned(length);
+        match timeout(self.settings.request_timeout, taking).await {
+            Ok(Ok(taken)) => self.held.add(taken),
+            _ => return Err(no_bulk_memory()),
         }
         Ok(())
     }
 
     fn fail(&mut self, problem: Problem) -> axum::Error {
         self.failed = true;
+        match problem.kind() {
+            ErrorKind::TooSlow => self.metrics.refused(RefusedFor::Slow),
+            ErrorKind::Overloaded => self.metrics.refused(RefusedFor::Bodies),
+            _ => {}
+        }
         // Who reads the body passes a status on as it is.
         axum::Error::new(tonic::Status::from(problem))
     }
+}
+
+fn no_memory(settings: &HttpSettings) -> Problem {
+    let detail = format!(
+        "the bodies of all requests in progress hold {} bytes, the bound (server.bodies_limit_bytes); try \
+         again in a moment",
+        settings.bodies_limit_bytes
+    );
+    Problem::new(ErrorKind::Overloaded, detail)
+}
+
+/// The images of bulk uploads have filled the memory that there is for them, for too long.
+pub(super) fn no_bulk_memory() -> Problem {
+    let detail = "the images of uploads in progress fill the memory that there is for them \
+                  (bulk.memory_bytes); try again in a moment";
+    Problem::new(ErrorKind::Overloaded, detail)
 }
 
 fn slow(pause: Duration, within: bool) -> Problem {
@@ -156,18 +177,21 @@ mod tests {
     use super::*;
     use crate::grpc;
 
-    fn settings() -> Arc<HttpSettings> {
-        Arc::new(HttpSettings {
+    const STREAM: &str = "/whereabouts.v1.LocalizationService/LocalizeStream";
+    const IMAGES: &str = "/whereabouts.v1.MapService/AddImages";
+
+    fn state() -> AppState {
+        AppState::for_tests(HttpSettings {
             body_limit_bytes: 100,
             bodies_limit_bytes: 250,
+            bulk_memory_bytes: 150,
             body_timeout: Duration::from_secs(1),
-            body_pause: Duration::from_millis(40),
-            request_timeout: Duration::from_secs(1),
+            body_pause: Duration::from_millis(60),
+            request_timeout: Duration::from_millis(200),
             max_wait: Duration::from_secs(1),
             max_requests: 1,
             max_streams: 1,
-            stream_idle: Duration::from_millis(40),
-            bulk_in_flight: 1,
+            stream_idle: Duration::from_millis(60),
             keys_required: false,
         })
     }
@@ -179,13 +203,23 @@ mod tests {
         message
     }
 
-    async fn read(chunks: Vec<Vec<u8>>, memory: &Arc<Semaphore>) -> Result<usize, String> {
+    /// Reads until nothing more comes, and takes what each chunk holds if it is told to.
+    async fn read(
+        path: &str,
+        chunks: Vec<Vec<u8>>,
+        state: &AppState,
+        takes: bool,
+    ) -> Result<usize, String> {
         let chunks = stream::iter(chunks).map(|chunk| Ok::<_, axum::Error>(Bytes::from(chunk)));
         let body = Body::from_stream(chunks.chain(stream::pending()));
-        let call = grpc::call("/whereabouts.v1.LocalizationService/LocalizeStream").unwrap();
-        let mut body = bounded(body, call, &settings(), memory).into_data_stream();
+        let held = Held::default();
+        let call = grpc::call(path).unwrap();
+        let mut body = bounded(body, call, state, held.clone()).into_data_stream();
         let mut bytes = 0;
         while let Some(chunk) = body.next().await {
+            if takes {
+                drop(held.take());
+            }
             match chunk {
                 Ok(chunk) => bytes += chunk.len(),
                 Err(error) if error.to_string().contains("no message came") => return Ok(bytes),
@@ -199,27 +233,38 @@ mod tests {
     async fn messages_are_followed_however_they_are_cut() {
         let all = [message(100), message(0), message(3)].concat();
         for cut in [1, 4, 7, 200] {
-            let memory = Arc::new(Semaphore::new(250));
-            let chunks = all.chunks(cut).map(<[u8]>::to_vec).collect();
-            assert_eq!(read(chunks, &memory).await, Ok(all.len()));
-            assert_eq!(memory.available_permits(), 250, "all is given back");
+            let state = state();
+            let chunks = || all.chunks(cut).map(<[u8]>::to_vec).collect();
+            assert_eq!(read(STREAM, chunks(), &state, false).await, Ok(all.len()));
+            assert_eq!(read(IMAGES, chunks(), &state, false).await, Ok(all.len()));
+            assert_eq!(state.bodies_memory.available_permits(), 250, "all is given back");
+            assert_eq!(state.bulk_memory.available_permits(), 150);
         }
-        let memory = Arc::new(Semaphore::new(250));
-        let many = (0..20).map(|_| message(80)).collect();
-        assert_eq!(read(many, &memory).await, Ok(20 * 85), "old ones are not counted for ever");
+        let many = || (0..20).map(|_| message(80)).collect();
+        assert_eq!(read(STREAM, many(), &state(), true).await, Ok(20 * 85));
+        assert_eq!(read(IMAGES, many(), &state(), true).await, Ok(20 * 85));
     }
 
     #[tokio::test]
     async fn what_is_too_large_or_too_slow_or_too_much_is_refused() {
-        let memory = Arc::new(Semaphore::new(250));
-        let refused = read(vec![message(101)], &memory).await.unwrap_err();
+        let state = state();
+        let refused = read(STREAM, vec![message(101)], &state, true).await.unwrap_err();
         assert!(refused.contains("server.body_limit_bytes"), "{refused}");
-        let refused = read(vec![message(50)[..20].to_vec()], &memory).await.unwrap_err();
+        let cut = message(50)[..20].to_vec();
+        let refused = read(STREAM, vec![cut], &state, true).await.unwrap_err();
         assert!(refused.contains("nothing of the message"), "{refused}");
-        let taken = Arc::clone(&memory).try_acquire_many_owned(200).unwrap();
-        let refused = read(vec![message(51)], &memory).await.unwrap_err();
+        let many = || (0..4).map(|_| message(80)).collect();
+        let refused = read(STREAM, many(), &state, false).await.unwrap_err();
         assert!(refused.contains("server.bodies_limit_bytes"), "{refused}");
+        let refused = read(IMAGES, many(), &state, false).await.unwrap_err();
+        assert!(refused.contains("bulk.memory_bytes"), "{refused}");
+        // A prefix alone takes nothing.
+        let prefix = message(100)[..PREFIX].to_vec();
+        let taken = Arc::clone(&state.bodies_memory).try_acquire_many_owned(240).unwrap();
+        let refused = read(STREAM, vec![prefix], &state, false).await.unwrap_err();
+        assert!(refused.contains("nothing of the message"), "{refused}");
         drop(taken);
-        assert_eq!(memory.available_permits(), 250);
+        assert_eq!(state.bodies_memory.available_permits(), 250);
+        assert_eq!(state.bulk_memory.available_permits(), 150);
     }
 }

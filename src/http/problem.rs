@@ -52,6 +52,13 @@ impl Problem {
     }
 }
 
+impl Problem {
+    /// Its kind.
+    pub fn kind(&self) -> ErrorKind {
+        self.of
+    }
+}
+
 /// The request hit a defect of the server.
 pub(super) fn defect() -> Problem {
     Problem::new(ErrorKind::Internal, "the request hit a defect of the server; see its log")

@@ -10,15 +10,17 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use super::problem::Problem;
 use super::status::About;
 use crate::service::{Door, ErrorKind, Service};
-use crate::telemetry::Metrics;
+use crate::telemetry::{Metrics, RefusedFor};
 
 /// Bounds of the HTTP layer.
 #[derive(Debug, Clone)]
 pub struct HttpSettings {
     /// The largest body, in bytes.
     pub body_limit_bytes: usize,
-    /// The most memory for all bodies, in bytes.
+    /// The most memory for all bodies but those of bulk uploads, in bytes.
     pub bodies_limit_bytes: usize,
+    /// The most memory for the images of bulk uploads, in bytes.
+    pub bulk_memory_bytes: usize,
     /// The longest time that a body takes.
     pub body_timeout: Duration,
     /// The longest pause within a body.
@@ -33,8 +35,6 @@ pub struct HttpSettings {
     pub max_streams: usize,
     /// The longest pause between two messages of a gRPC stream.
     pub stream_idle: Duration,
-    /// Images of one upload that are worked on at a time.
-    pub bulk_in_flight: usize,
     /// Whether callers need a key.
     pub keys_required: bool,
 }
@@ -48,6 +48,7 @@ pub struct AppState {
     pub(super) permits: Arc<Semaphore>,
     pub(super) streams: Arc<Semaphore>,
     pub(super) bodies_memory: Arc<Semaphore>,
+    pub(super) bulk_memory: Arc<Semaphore>,
     pub(super) door: Door,
 }
 
@@ -58,11 +59,24 @@ impl AppState {
             permits: Arc::new(Semaphore::new(settings.max_requests)),
             streams: Arc::new(Semaphore::new(settings.max_streams)),
             bodies_memory: Arc::new(Semaphore::new(settings.bodies_limit_bytes)),
+            bulk_memory: Arc::new(Semaphore::new(settings.bulk_memory_bytes)),
             settings: Arc::new(settings),
             about: Arc::new(about),
             metrics,
             door: Door::default(),
         }
+    }
+
+    #[cfg(test)]
+    pub(super) fn for_tests(settings: HttpSettings) -> Self {
+        let about = About {
+            started_at: jiff::Timestamp::now(),
+            settings: String::new(),
+            pictures: 0,
+            tiles: None,
+            troubles: Arc::default(),
+        };
+        Self::new(settings, about, Arc::default())
     }
 
     /// What stands between the callers and the service.
@@ -73,6 +87,7 @@ impl AppState {
     /// The right to one of the streams that may be open.
     pub(super) fn stream(&self) -> Result<OwnedSemaphorePermit, Problem> {
         Arc::clone(&self.streams).try_acquire_owned().map_err(|_| {
+            self.metrics.refused(RefusedFor::Requests);
             let detail = format!(
                 "{} streams are open, the bound (server.max_streams); ask with GET /jobs or \
                  GET /jobs/{{id}}?wait= instead",

@@ -10,7 +10,7 @@ use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
 
 use super::{Caller, ErrorKind, ImageMeta, NewImage, Service, ServiceError};
-use crate::domain::MapName;
+use crate::domain::{ImageId, MapName};
 use crate::retrieve::{Class, Demand};
 use crate::store::Added;
 
@@ -24,6 +24,8 @@ pub struct BulkSettings {
     pub patience_s: u64,
     /// The most images in one upload.
     pub max_images: usize,
+    /// The most memory for the images of all uploads, in bytes.
+    pub memory_bytes: usize,
 }
 
 /// An image of an upload.
@@ -38,55 +40,42 @@ pub struct BulkImage {
 }
 
 /// What became of an image of an upload: it is stored, or why not, with its id if the caller gave one.
-pub type BulkResult = Result<Added, (Option<String>, ServiceError)>;
+pub type BulkResult = Result<Added, (Option<ImageId>, ServiceError)>;
 
 impl Service {
     /// Stores images as they come; the results are in the same order. What is wrong with one image does
-    /// not keep the others back. Images beyond the bound are refused one by one. An error of the stream
-    /// itself ends it, when those before it are done.
-    pub async fn add_images<E>(
+    /// not keep the others back. An upload ends with the first image beyond the bound, with an error of the
+    /// stream itself, or when `until` does; those before are then done.
+    pub async fn add_images<E, O>(
         &self,
         map: &MapName,
         caller: &Caller,
         images: impl Stream<Item = Result<Result<BulkImage, ServiceError>, E>> + Send,
+        until: impl Future<Output = O> + Send,
     ) -> Result<Vec<BulkResult>, E> {
         let BulkSettings { in_flight, max_images, .. } = self.settings.bulk;
         let mut broken = None;
         // The last image so far of each id, and whether it is done: of two with one id the first counts.
-        let mut last_of: HashMap<String, CancellationToken> = HashMap::new();
-        let whole = images
-            .scan((), |(), next| future::ready(next.map_err(|error| broken = Some(error)).ok()));
+        let mut last_of: HashMap<ImageId, CancellationToken> = HashMap::new();
+        let whole = images.scan((), |(), next| {
+            future::ready(next.map_err(|error| broken = Some(error)).ok())
+        });
         let results = whole
+            .take_until(Box::pin(until))
+            .take(max_images + 1)
             .enumerate()
-            .map(|(index, image)| {
-                let image = image.map_err(|error| (None, error))?;
-                let refuse = |error| Err((image.meta.id.clone(), error));
-                if index >= max_images {
-                    let detail = format!(
-                        "an upload has at most {max_images} images (bulk.max_images); send the rest in another"
-                    );
-                    return refuse(ServiceError::new(ErrorKind::TooLarge, detail));
-                }
-                // Each image counts as a request of the key, of which the first is counted already.
-                let counted = match index {
-                    0 => Ok(()),
-                    _ => self.keys.limits.take_one_more(caller),
-                };
-                match counted {
-                    Ok(()) => Ok(image),
-                    Err(error) => refuse(error),
-                }
-            })
+            .map(|(index, image)| self.checked(caller, index, image))
             .map(|image| {
                 let done = CancellationToken::new();
-                let id = image.as_ref().ok().and_then(|image| image.meta.id.clone());
+                let id = image.as_ref().ok().and_then(|(_, id)| id.clone());
                 let before = id.and_then(|id| last_of.insert(id, done.clone()));
                 async move {
                     let _done = done.drop_guard();
                     if let Some(before) = before {
                         before.cancelled().await;
                     }
-                    self.add_patiently(map, image?).await
+                    let (image, id) = image?;
+                    self.add_patiently(map, image).await.map_err(|error| (id, error))
                 }
             })
             .buffered(in_flight)
@@ -95,10 +84,38 @@ impl Service {
         broken.map_or(Ok(results), Err)
     }
 
+    /// An image with the id that the caller gave it, if it is to be stored.
+    fn checked(
+        &self,
+        caller: &Caller,
+        index: usize,
+        image: Result<BulkImage, ServiceError>,
+    ) -> Result<(BulkImage, Option<ImageId>), (Option<ImageId>, ServiceError)> {
+        let image = image.map_err(|error| (None, error))?;
+        let id = image.meta.id.as_deref().map(str::parse::<ImageId>).transpose();
+        let id = id.map_err(|error| (None, error.into()))?;
+        let max_images = self.settings.bulk.max_images;
+        if index >= max_images {
+            let detail = format!(
+                "an upload has at most {max_images} images (bulk.max_images); send this one and the rest in \
+                 another"
+            );
+            return Err((id, ServiceError::new(ErrorKind::TooLarge, detail)));
+        }
+        // Each image counts as a request of the key, of which the first is counted already.
+        let counted = match index {
+            0 => Ok(()),
+            _ => self.keys.limits.take_one_more(caller),
+        };
+        match counted {
+            Ok(()) => Ok((image, id)),
+            Err(error) => Err((id, error)),
+        }
+    }
+
     /// Stores an image when there is room for it.
-    async fn add_patiently(&self, map: &MapName, image: BulkImage) -> BulkResult {
+    async fn add_patiently(&self, map: &MapName, image: BulkImage) -> Result<Added, ServiceError> {
         const LONGEST: Duration = Duration::from_secs(1);
-        let id = image.meta.id.clone();
         let demand = Demand { class: Class::Index, deadline: None };
         let until = Instant::now() + Duration::from_secs(self.settings.bulk.patience_s);
         loop {
@@ -107,7 +124,7 @@ impl Service {
                 Err(error) if error.kind == ErrorKind::Overloaded && Instant::now() < until => {
                     tokio::time::sleep(error.retry_after.unwrap_or(LONGEST).min(LONGEST)).await;
                 }
-                added => return added.map_err(|error| (id, error)),
+                added => return added,
             }
         }
     }

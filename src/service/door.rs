@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use super::{ErrorKind, Service, ServiceError};
+use super::{Caller, Deadline, ErrorKind, Service, ServiceError};
 
 /// Whether requests are answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,6 +33,37 @@ impl Default for Door {
             service: Arc::default(),
             phase: watch::Sender::new(Phase::Starting),
             draining: CancellationToken::new(),
+        }
+    }
+}
+
+impl Service {
+    /// Ends when what a caller has begun is to be ended: the server drains, the caller may ask no more, or
+    /// wants no more. Says why.
+    pub fn over(
+        self: &Arc<Self>,
+        door: &Door,
+        caller: Caller,
+        deadline: Deadline,
+    ) -> impl Future<Output = ServiceError> + Send + use<> {
+        let (service, draining) = (Arc::clone(self), door.draining());
+        async move {
+            let deadline = async {
+                match deadline.0 {
+                    Some(end) => tokio::time::sleep_until(end.into()).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let (kind, detail) = tokio::select! {
+                () = draining.cancelled() => {
+                    (ErrorKind::Unavailable, "the server ends; call again, perhaps another one answers")
+                }
+                () = service.keys.ended(caller) => {
+                    (ErrorKind::Unauthorized, "the key was revoked or has expired; ask an admin for another")
+                }
+                () = deadline => (ErrorKind::DeadlinePassed, "the deadline of the call has passed"),
+            };
+            ServiceError::new(kind, detail)
         }
     }
 }

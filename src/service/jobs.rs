@@ -91,6 +91,7 @@ impl Service {
     pub async fn matches(&self, id: Uuid, image: &ImageId) -> Result<PairRegions, ServiceError> {
         let record = self.jobs.job(id).await?.ok_or_else(|| no_job(id))?;
         let refiner = self.refiner.as_ref().filter(|refiner| refiner.kind() == record.job.refiner);
+        let _turn = self.matching.acquire().await;
         let regions = match refiner {
             Some(refiner) => {
                 refiner.regions(&record, image).await.map_err(|error| match error {

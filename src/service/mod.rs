@@ -129,6 +129,8 @@ pub struct Service {
     pub refiner: Option<Arc<dyn Refiner>>,
     /// Dense features that a job will need soon.
     pub dense: Arc<DenseCache>,
+    /// Matches are compared one pair after another: jobs go first.
+    pub matching: tokio::sync::Semaphore,
     /// Where they are all kept.
     pub retention: Arc<dyn Retention>,
     /// What is counted.

@@ -146,8 +146,8 @@ async fn the_time_of_a_refusal_does_not_tell_how_much_of_a_key_is_right() {
     println!(
         "medians in µs, of a key that is wrong at the end (twice), at the start, and unknown: {medians:.1?}"
     );
-    let base = medians[0];
-    for other in &medians[1..] {
-        assert!((other - base).abs() < 0.15 * base, "{medians:?}");
+    let (base, noise) = (medians[0], (medians[0] - medians[1]).abs());
+    for other in &medians[2..] {
+        assert!((other - base).abs() < 0.15 * base + 3.0 * noise, "{medians:?}");
     }
 }

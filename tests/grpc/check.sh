@@ -26,6 +26,7 @@ if ! "$binary" demo --offline --json --places 12 --out "$scratch/town" > "$scrat
     exit 1
 fi
 export WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_SERVER__BODY_LIMIT_BYTES=2000000
+export WHEREABOUTS_SERVER__BODIES_LIMIT_BYTES=80000000
 export WHEREABOUTS_SERVER__BODY_PAUSE_S=2 WHEREABOUTS_SERVER__STREAM_IDLE_S=4
 export WHEREABOUTS_AUTH__KEYS=required
 "$binary" keys create --data "$scratch/data" --name test --role admin --json > "$scratch/key.json"

@@ -416,6 +416,38 @@ class Contract(unittest.TestCase):
         self.assertLess(time.monotonic() - begun, 3)
         requests.set()
 
+    def test_an_upload_ends_with_its_key_and_tells_of_what_it_has_done(self) -> None:
+        id, token = make_key(name="brief", role="operator")
+        go_on = threading.Event()
+
+        def images() -> Iterator[Any]:
+            yield self.message("AddImagesRequest", map="brief", id="a", image=pictures("map")[0][1])
+            go_on.wait(20)
+
+        self.call("MapService", "PutMap", self.message("PutMapRequest", map="brief"))
+        threading.Timer(1, lambda: over_http("DELETE", f"/keys/{id}")).start()
+        begun = time.monotonic()
+        answer = Services(token).call("MapService", "AddImages", images())
+        self.assertEqual([result.id for result in answer.results], ["a"])
+        self.assertLess(time.monotonic() - begun, 4)
+        go_on.set()
+        nowhere = self.message("AddImagesRequest", map="nowhere", image=pictures("map")[0][1])
+        self.refused(
+            grpc.StatusCode.NOT_FOUND, lambda: self.call("MapService", "AddImages", iter([nowhere]))
+        )
+
+    def test_memory_is_given_back(self) -> None:
+        # A prefix that announces a megabyte, many times over, on calls that are then given up.
+        for _ in range(3):
+            streams = []
+            for _ in range(30):
+                frame = self.message("LocalizeRequest", map="town", image=bytes(1_900_000), refine=3)
+                request = self.message("LocalizeStreamRequest", frame=frame)
+                streams.append(self.call("LocalizationService", "LocalizeStream", iter([request])))
+            for stream in streams:
+                self.assertEqual(next(stream).problem.kind, "unprocessable")
+        self.test_a_frame_is_answered_as_over_http()
+
     def test_each_frame_of_a_stream_counts(self) -> None:
         _, token = make_key(name="few", role="robot", limits={"requests_per_minute": 3})
         frame = pictures("frames")[0][1]

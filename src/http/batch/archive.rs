@@ -55,6 +55,11 @@ impl Entries {
         let mut archive = tar::Archive::new(reader);
         for entry in archive.entries().map_err(broken)? {
             let mut entry = entry.map_err(broken)?;
+            let size = usize::try_from(entry.size()).unwrap_or(usize::MAX);
+            self.room.allow(size);
+            if self.images.is_closed() {
+                return Ok(());
+            }
             if !entry.header().entry_type().is_file() {
                 continue;
             }
@@ -64,7 +69,6 @@ impl Entries {
                 Problem::new(ErrorKind::Malformed, detail)
             })?;
             let name: Arc<str> = name.strip_prefix("./").unwrap_or(name).into();
-            let size = usize::try_from(entry.size()).unwrap_or(usize::MAX);
             let go_on = match name.strip_suffix(META) {
                 Some(of) => {
                     if size > LARGEST_META {
@@ -75,13 +79,15 @@ impl Entries {
                     entry.read_to_end(&mut text).map_err(broken)?;
                     self.meta(of.into(), text)
                 }
-                None if self.makes_way_for(&name) => {
+                None if self.makes_way_for(&name) && self.room.is_too_small(size) => {
+                    self.images.blocking_send(Ok(Err(self.room.too_large()))).is_ok()
+                }
+                None => {
                     let memory = self.runtime.block_on(self.room.take(size))?;
                     let mut bytes = Vec::with_capacity(size);
                     entry.read_to_end(&mut bytes).map_err(broken)?;
                     self.picture(name, bytes.into(), memory)
                 }
-                None => false,
             };
             if !go_on {
                 return Ok(());

@@ -6,12 +6,9 @@ use bytes::{Bytes, BytesMut};
 use futures_util::{Stream, stream};
 use tokio::sync::OwnedSemaphorePermit;
 
-use super::{LARGEST_META, Room, described, unreadable};
+use super::{LARGEST_META, Room, STEP, described, unreadable};
 use crate::http::problem::Problem;
 use crate::service::{BulkImage, ErrorKind, ServiceError};
-
-/// How much memory is taken at a time for a picture whose size is not known before, in bytes.
-const STEP: usize = 256 << 10;
 
 /// The images of a form, as its parts come in.
 pub(super) async fn images(
@@ -50,10 +47,12 @@ impl Parts {
                 }
                 "image" => {
                     let file = part.file_name().map(str::to_owned);
-                    let (bytes, memory) = picture(&self.room, part).await?;
+                    let picture = picture(&self.room, part).await?;
+                    self.room.allow(0);
                     let meta = described(meta.as_deref(), file.as_deref());
-                    let image = meta.map(|meta| BulkImage { bytes, meta, memory: Some(memory) });
-                    return Ok(Some(image));
+                    return Ok(Some(picture.and_then(|(bytes, memory)| {
+                        Ok(BulkImage { bytes, meta: meta?, memory: Some(memory) })
+                    })));
                 }
                 other => {
                     return Err(malformed(format!(
@@ -71,24 +70,28 @@ impl Parts {
     }
 }
 
-/// The bytes of a picture, and the memory that they take.
+/// The bytes of a picture, and the memory that they take. Of one that is too large the rest is left out.
 async fn picture(
     room: &Room,
     mut part: Field<'_>,
-) -> Result<(Bytes, OwnedSemaphorePermit), Problem> {
-    let mut held = room.take(0).await?;
-    let mut bytes = BytesMut::new();
+) -> Result<Result<(Bytes, OwnedSemaphorePermit), ServiceError>, Problem> {
+    let limit = room.settings.body_limit_bytes;
+    let mut held = room.take(STEP.min(limit)).await?;
+    let (mut bytes, mut too_large) = (BytesMut::new(), false);
     while let Some(chunk) = part.chunk().await.map_err(broken)? {
+        room.allow(0);
         let so_far = bytes.len() + chunk.len();
-        room.check(so_far)?;
+        too_large |= room.is_too_small(so_far);
+        if too_large {
+            continue;
+        }
         if held.num_permits() < so_far {
-            let missing = so_far - held.num_permits();
-            let step = STEP.min(room.settings.body_limit_bytes - held.num_permits());
-            held.merge(room.take(missing.max(step)).await?);
+            held.merge(room.take(limit - held.num_permits()).await?);
         }
         bytes.extend_from_slice(&chunk);
     }
-    Ok((bytes.freeze(), held))
+    drop(held.split(held.num_permits().saturating_sub(bytes.len())));
+    Ok(if too_large { Err(room.too_large()) } else { Ok((bytes.freeze(), held)) })
 }
 
 /// A whole part of at most so many bytes.

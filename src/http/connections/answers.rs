@@ -14,7 +14,7 @@ use super::slots::Slot;
 
 /// The largest piece that is handed over at once, in bytes: what comes in one piece could not be seen to
 /// be taken slowly.
-const PIECE: usize = 64 << 10;
+const PIECE: usize = 16 << 10;
 
 /// The answers of one connection. Clones share them.
 #[derive(Debug, Clone)]
@@ -64,7 +64,7 @@ impl InProgress {
     /// The body of the answer to this request, which is in progress as long as there is more of it.
     pub fn over(self, body: Body) -> Body {
         self.wait_for_client();
-        Body::new(Watched { body, rest: Bytes::new(), request: self })
+        Body::new(Watched { body, rest: Bytes::new(), handed: false, request: self })
     }
 
     fn wait_for_client(&self) {
@@ -89,6 +89,8 @@ struct Watched {
     body: Body,
     /// What is left of the last piece.
     rest: Bytes,
+    /// Whether anything was handed over: then the end comes by itself, when the client has room for more.
+    handed: bool,
     request: InProgress,
 }
 
@@ -112,12 +114,13 @@ impl HttpBody for Watched {
         }
         let piece = PIECE.min(self.rest.len());
         let piece = self.rest.split_to(piece);
+        self.handed = true;
         self.request.wait_for_client();
         Poll::Ready(Some(Ok(Frame::data(piece))))
     }
 
     fn is_end_stream(&self) -> bool {
-        self.rest.is_empty() && self.body.is_end_stream()
+        !self.handed && self.rest.is_empty() && self.body.is_end_stream()
     }
 
     fn size_hint(&self) -> SizeHint {
