@@ -45,16 +45,27 @@ const ASSETS: &[(&str, &str)] = assets![
     "words.js",
 ];
 
+/// What a browser is told to allow the page.
+#[derive(Debug, Clone)]
+struct Guarded {
+    policy: Option<HeaderValue>,
+    referrer: &'static str,
+}
+
 /// The routes of the page. `tiles` is the address of map tiles, from whose host pictures may come.
 pub fn routes<S: Clone + Send + Sync + 'static>(tiles: Option<&str>) -> Router<S> {
-    let policy = HeaderValue::from_str(&policy(tiles)).ok();
-    let of_page = policy.clone();
+    let guarded = Guarded {
+        policy: HeaderValue::from_str(&policy(tiles)).ok(),
+        // Servers of tiles want to know who asks.
+        referrer: if tiles.is_some() { "strict-origin" } else { "no-referrer" },
+    };
+    let of_page = guarded.clone();
     Router::new()
         .route("/", get(move |headers: HeaderMap| async move { file(PAGE, &headers, of_page) }))
         .route(
             "/console/{file}",
             get(move |Path(name): Path<String>, headers: HeaderMap| async move {
-                file(&name, &headers, policy)
+                file(&name, &headers, guarded)
             }),
         )
 }
@@ -72,7 +83,7 @@ fn policy(tiles: Option<&str>) -> String {
     )
 }
 
-fn file(name: &str, headers: &HeaderMap, policy: Option<HeaderValue>) -> Response {
+fn file(name: &str, headers: &HeaderMap, guarded: Guarded) -> Response {
     let Some((_, text)) = ASSETS.iter().find(|(known, _)| *known == name) else {
         return StatusCode::NOT_FOUND.into_response();
     };
@@ -86,9 +97,9 @@ fn file(name: &str, headers: &HeaderMap, policy: Option<HeaderValue>) -> Respons
     // Asked for each time, and sent again only when it has changed.
     told.insert(CACHE_CONTROL, HeaderValue::from_static("no-cache"));
     told.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    told.insert(REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
+    told.insert(REFERRER_POLICY, HeaderValue::from_static(guarded.referrer));
     told.extend(HeaderValue::from_str(&tag).ok().map(|tag| (ETAG, tag)));
-    told.extend(policy.map(|policy| (CONTENT_SECURITY_POLICY, policy)));
+    told.extend(guarded.policy.map(|policy| (CONTENT_SECURITY_POLICY, policy)));
     response
 }
 

@@ -200,6 +200,11 @@ pub struct Job {
 }
 
 impl Job {
+    /// The same without what refinement found out.
+    pub fn brief(self) -> Self {
+        Self { descriptions: Vec::new(), ranking: None, reasoning: None, ..self }
+    }
+
     /// A new job, queued.
     pub fn queued(map: MapName, query_id: Uuid, refiner: RefinerKind, now: Timestamp) -> Self {
         Self {

@@ -26,7 +26,9 @@ const fn robot(path: &'static str) -> Call {
     Call {
         path,
         role: Some(Role::Robot),
-        streams: false, pictures: false, many: false,
+        streams: false,
+        pictures: false,
+        many: false,
         waits: false,
         changes: false,
     }
@@ -53,7 +55,9 @@ pub const CALLS: &[Call] = &[
     admin("/whereabouts.v1.MapService/PutMap"),
     admin("/whereabouts.v1.MapService/DeleteMap"),
     Call {
-        streams: true, pictures: true, many: true,
+        streams: true,
+        pictures: true,
+        many: true,
         changes: true,
         ..operator("/whereabouts.v1.MapService/AddImages")
     },

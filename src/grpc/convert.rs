@@ -360,7 +360,9 @@ mod tests {
         let read = Pose::from_json(Frame::Metric, pose(sent).unwrap()).unwrap();
         assert_eq!(proto::Pose::from(read), sent);
         assert!(Pose::from_json(Frame::Wgs84, pose(sent).unwrap()).is_err());
-        assert!(Pose::from_json(Frame::Metric, pose(proto::Pose { frame: None }).unwrap()).is_err());
+        assert!(
+            Pose::from_json(Frame::Metric, pose(proto::Pose { frame: None }).unwrap()).is_err()
+        );
         let nowhere = proto::MetricPose { x: 0.0, y: 0.0, z: Some(f64::NAN), orientation: None };
         let nowhere = proto::Pose { frame: Some(proto::pose::Frame::Metric(nowhere)) };
         assert!(pose(nowhere).unwrap_err().detail.contains('z'));

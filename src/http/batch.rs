@@ -142,7 +142,9 @@ impl Room {
 
 /// A body in which nothing ends.
 #[derive(Debug, thiserror::Error)]
-#[error("there is more than {ASIDE} bytes of it between two images; is it a form, or an archive of pictures?")]
+#[error(
+    "there is more than {ASIDE} bytes of it between two images; is it a form, or an archive of pictures?"
+)]
 struct Endless;
 
 /// The form of many images.

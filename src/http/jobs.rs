@@ -30,6 +30,10 @@ pub(super) struct ListParams {
     limit: Option<usize>,
     /// `next_cursor` of the page before.
     cursor: Option<String>,
+    /// Leave out `descriptions`, `ranking` and `reasoning`, which are most of a job.
+    #[serde(default)]
+    #[param(required = false)]
+    brief: bool,
 }
 
 /// List jobs, newest first
@@ -45,7 +49,11 @@ pub(super) async fn list_jobs(
     let filter =
         JobFilter { map: params.map.as_deref().map(map_name).transpose()?, state: params.state };
     let cursor = params.cursor.as_deref().map(job_id).transpose()?;
-    Ok(Json(service.list_jobs(filter, cursor, params.limit).await?))
+    let mut page = service.list_jobs(filter, cursor, params.limit).await?;
+    if params.brief {
+        page.jobs = page.jobs.into_iter().map(Job::brief).collect();
+    }
+    Ok(Json(page))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]

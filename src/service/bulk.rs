@@ -57,9 +57,8 @@ impl Service {
         let mut broken = None;
         // The last image so far of each id, and whether it is done: of two with one id the first counts.
         let mut last_of: HashMap<ImageId, CancellationToken> = HashMap::new();
-        let whole = images.scan((), |(), next| {
-            future::ready(next.map_err(|error| broken = Some(error)).ok())
-        });
+        let whole = images
+            .scan((), |(), next| future::ready(next.map_err(|error| broken = Some(error)).ok()));
         let results = whole
             .take_until(Box::pin(until))
             .take(max_images + 1)

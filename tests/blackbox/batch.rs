@@ -202,7 +202,10 @@ async fn the_whole_is_unbounded_and_each_image_is_not() {
     {
         let answer = answer.expect(200);
         let [large, last] = &answer["results"].as_array().unwrap()[..] else { panic!("{answer}") };
-        assert_eq!((large["problem"]["kind"].as_str(), last["outcome"].as_str()), (Some("too-large"), Some(after)));
+        assert_eq!(
+            (large["problem"]["kind"].as_str(), last["outcome"].as_str()),
+            (Some("too-large"), Some(after))
+        );
     }
 
     // It takes longer than a request may, and more slowly than a body may come, but never pauses for long.
@@ -242,7 +245,8 @@ async fn a_body_in_which_nothing_ends_is_not_kept() {
         let chunk = bytes::Bytes::from(vec![b'x'; 1 << 20]);
         let chunks = std::iter::once(head).chain(std::iter::repeat_n(chunk, 1024));
         let body = futures_util::stream::iter(chunks.map(Ok::<_, std::io::Error>));
-        let request = server.request(Method::POST, "/maps/m/images:batch").header("content-type", kind);
+        let request =
+            server.request(Method::POST, "/maps/m/images:batch").header("content-type", kind);
         // The server hangs up; whether the answer is seen before is a matter of luck.
         if let Ok(response) = request.body(reqwest::Body::wrap_stream(body)).send().await {
             assert_eq!(response.status(), 400, "{kind}");

@@ -28,6 +28,22 @@ async fn the_page_comes_with_a_policy_and_is_not_sent_again_unchanged() {
 }
 
 #[tokio::test]
+async fn jobs_can_be_listed_without_what_was_found_out() {
+    let (_dir, server) = server();
+    server.town("m", 3).await;
+    server.post_jpeg("/localize?map=m&refine=wait", frame(0, 0)).await.expect(200);
+    let whole = server.get("/jobs").await.expect(200)["jobs"][0].clone();
+    let mut brief = server.get("/jobs?brief=true").await.expect(200)["jobs"][0].clone();
+    assert_eq!(brief["descriptions"], serde_json::json!([]));
+    assert!(brief["ranking"].is_null() && brief["reasoning"].is_null());
+    for field in ["descriptions", "ranking", "reasoning"] {
+        assert_ne!(brief[field], whole[field]);
+        brief[field] = whole[field].clone();
+    }
+    assert_eq!(brief, whole);
+}
+
+#[tokio::test]
 async fn tiles_are_of_a_configured_server_alone() {
     let dir = tempfile::tempdir().unwrap();
     let url = "https://tiles.example/{z}/{x}/{y}.png";

@@ -97,7 +97,8 @@ impl Client {
             let stream = u32::from_be_bytes([head[5], head[6], head[7], head[8]]);
             Some((head[3], head[4], stream, payload))
         };
-        let came = tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open")?;
+        let came =
+            tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open")?;
         if let (PING, 0, 0, payload) = &came {
             // It may have hung up since.
             let _ = self.0.write_all(&frame(PING, ACK, 0, payload)).await;

@@ -11,7 +11,7 @@ async fn a_ready_server_says_so_and_shows_its_docs() {
     let (_dir, server) = server();
     server.get("/livez").await.expect(200);
     server.get("/readyz").await.expect(200);
-    let docs = server.get("/").await;
+    let docs = server.get("/docs").await;
     assert!(String::from_utf8(docs.bytes).unwrap().contains("/openapi.json"));
 }
 

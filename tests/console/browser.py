@@ -73,7 +73,7 @@ class Console(unittest.TestCase):
         context.add_init_script(WATCH)
         if key:
             # Once: who has signed out stays signed out.
-            context.add_init_script(f"""if (!sessionStorage.getItem("test")) {{
+            context.add_init_script(f"""if (location.protocol !== "about:" && !sessionStorage.getItem("test")) {{
                 sessionStorage.setItem("test", "1"); sessionStorage.setItem("whereabouts-key", "{KEYS[key]}"); }}""")
         page = context.new_page()
         page.on("pageerror", lambda error: self.errors.append(str(error)))

@@ -6,7 +6,7 @@
 #
 # VENV is a folder for a Python environment with playwright (requirements.txt); it is made if it is not there.
 # The browser is Debian's chromium, or the one that CHROMIUM names. With SCREENSHOTS=FOLDER, pictures of the
-# views are left there. Takes about a minute. Ends with 1 if anything fails.
+# views are left there. Takes about two minutes. Ends with 1 if anything fails.
 set -euo pipefail
 
 if [ $# -ne 2 ]; then

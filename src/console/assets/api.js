@@ -65,6 +65,10 @@ export const isAbort = (error) => error?.name === "AbortError";
 
 /** An address of a path and a query; what has no value is left out. */
 export function address(parts, query = {}) {
+  // Browsers resolve `..` in a path, in whatever form; a request about an image of that name would go elsewhere.
+  if (parts.some((part) => part === "." || part === "..")) {
+    throw new Problem({ status: 400, title: "This name cannot be asked for from a browser", detail: "It is a dot or two. Use another client, such as curl --path-as-is." });
+  }
   const path = parts.map(encodeURIComponent).join("/");
   const given = new URLSearchParams(Object.entries(query).filter(([, value]) => value !== null && value !== undefined && value !== ""));
   return given.size ? `${path}?${given}` : path;

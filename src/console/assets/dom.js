@@ -71,6 +71,7 @@ export function loading(what) {
 
 /** A share of a limit. */
 export function meter(value, limit, label) {
+  value ??= 0;
   const share = limit ? Math.min(1, value / limit) : 0;
   const bar = h("div", { class: share > 0.8 ? "meter high" : "meter", role: "meter", "aria-label": label,
     "aria-valuemin": "0", "aria-valuemax": String(limit || 1), "aria-valuenow": String(value) }, h("div"));

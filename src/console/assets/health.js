@@ -21,14 +21,18 @@ export async function show({ root, signal, title }) {
     const [status, usage] = await Promise.all([optional("status"), optional("usage?days=30")]);
     const print = JSON.stringify([status, usage], (name, value) => (name === "now" ? undefined : value));
     if (print === printed) return;
-    printed = print;
+    const stops = () => [...body.querySelectorAll("summary, a, [tabindex]")];
+    const before = stops().map((one) => one.scrollTop);
+    const focused = stops().indexOf(document.activeElement);
     opened = new Set([...body.querySelectorAll("details[open]")].map((one) => one.dataset.name ?? one.closest("section")?.querySelector("h2")?.textContent));
-    const focused = body.contains(document.activeElement);
-    if (focused) return; // nothing is pulled from under a reader; the next turn will do
+    printed = print;
     fill(body, status instanceof Error ? without(status, usage) : drawn(status, usage));
     for (const one of body.querySelectorAll("details")) {
       if (opened.has(one.dataset.name ?? one.closest("section")?.querySelector("h2")?.textContent)) one.open = true;
     }
+    // A reader stays where they were: nothing is pulled from under them by new numbers.
+    stops().forEach((one, at) => { if (before[at]) one.scrollTop = before[at]; });
+    if (focused >= 0) stops()[focused]?.focus({ preventScroll: true });
   }
 
   const turn = async () => {
@@ -75,7 +79,7 @@ function drawn(status, usage) {
       stat("Latency", slow.length ? duration(middle()) : "–", small(slow.length ? `median of the last hour; worst p95 of a minute ${duration(worst)}` : "no frames in the last hour")),
       stat("Throughput", plural(frames, "frame"), small(`in the last hour; ${plural(requests, "request")}, ${plural(errors, "error")}`)),
       stat("Jobs open", count(jobs.open), small(`of ${count(jobs.limit)}; ${count(ended)} ended in the last hour, ${count(failed)} failed`), meter(jobs.open, jobs.limit, "Jobs open")),
-      stat("Pictures waiting", count(pictures.waiting), small(`of ${count(pictures.limit)}`), meter(pictures.waiting, pictures.limit, "Pictures waiting")),
+      stat("Pictures waiting", count(pictures.open), small(`of ${count(pictures.limit)}`), meter(pictures.open, pictures.limit, "Pictures waiting")),
       stat("On disk", bytes(status.db_bytes), small(status.free_bytes === null || status.free_bytes === undefined ? "" : `${bytes(status.free_bytes)} free`)),
       stat("Up", ago(status.started_at, now).replace(" ago", ""), small(`version ${status.version}`))),
     h("div", { class: "charts" },

@@ -34,7 +34,8 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
       fill(said);
       announce(`The job is ${job.state}.`);
       drawAll();
-      if (!ended()) watch();
+      if (ended()) watching?.abort();
+      else watch();
     } catch (problem) {
       if (!isAbort(problem)) fill(said, failure(problem));
       button.disabled = false;
@@ -89,7 +90,7 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
         links.set(image, { thumb, ranks: h("span", { class: "ranks" }) });
       }
       const { thumb, ranks } = links.get(image);
-      if (candidate.rank) fill(ranks, h("b", {}, `${candidate.rank}`), h("span", { class: "muted" }, ` from ${candidate.coarse_rank} `), moved(candidate));
+      if (candidate.rank) fill(ranks, h("b", {}, `${candidate.rank}`), h("span", { class: "muted" }, candidate.rank === candidate.coarse_rank ? " " : ` from ${candidate.coarse_rank} `), moved(candidate));
       else fill(ranks, h("span", { class: "muted" }, "not ranked yet"));
       const link = h("a", { href: here(image), "aria-current": image === chosen ? "true" : null, onclick: (event) => {
         if (event.metaKey || event.ctrlKey || event.shiftKey) return;
@@ -122,7 +123,7 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
     if (print === staged) return;
     const sameImage = staged && JSON.parse(staged)[0] === chosen && JSON.parse(staged)[3] === ended();
     staged = print;
-    const step = (by, name) => h("button", { type: "button", disabled: !all[at + by], onclick: () => { choose(all[at + by].image_id); stage.querySelector(by > 0 ? ".next" : ".prior")?.focus(); }, class: by > 0 ? "next" : "prior" }, name);
+    const step = (by, name) => h("button", { type: "button", disabled: !all[at + by], onclick: () => { choose(all[at + by].image_id); stage.querySelector(all[at + 2 * by] ? `.${by > 0 ? "next" : "prior"}` : ".step:enabled")?.focus(); }, class: by > 0 ? "step next" : "step prior" }, name);
     const heading = h("div", { class: "heading" },
       h("h2", {}, candidate.rank ? `Rank ${candidate.rank}` : "Compared"),
       candidate.rank && h("span", {}, h("span", { class: "muted" }, `coarse rank ${candidate.coarse_rank} `), moved(candidate)),
@@ -159,9 +160,12 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
 
   function drawAll() { drawHead(); drawList(); drawStage(); drawCalls(); }
 
+  let watching = null;
   function watch() {
+    watching?.abort();
+    watching = new AbortController();
     follow(address(["jobs", id, "events"]), {
-      signal,
+      signal: AbortSignal.any([signal, watching.signal]),
       on(name, data) {
         if (name === "state") {
           const news = data.state !== job.state || data.error !== job.error || data.attempts !== job.attempts;

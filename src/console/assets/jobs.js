@@ -80,6 +80,9 @@ export async function show({ root, query, signal, setQuery, title }) {
   }
 
   function nothing(loaded) {
+    if (/^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$/i.test(filter.q)) {
+      return empty("Not among the jobs loaded", h("p", {}, h("a", { href: `#/jobs/${filter.q.toLowerCase()}` }, "Open the job of this id")));
+    }
     if (loaded) return empty("No match", h("p", {}, "Nothing that is loaded matches. Search looks at ids, maps, states, refiners and errors."));
     if (filter.map || filter.state) {
       return empty("No such jobs", h("p", {}, "No job fits these filters. ", h("a", { href: "#/jobs" }, "Show all jobs")));
@@ -122,15 +125,20 @@ export async function show({ root, query, signal, setQuery, title }) {
   // How many pairs are described is told by events alone; it outlives the row that a reload replaces.
   const progress = new Map();
   let reload = null;
+  let frame = 0;
   const soon = () => { reload ??= setTimeout(() => { reload = null; load(); }, brief ? 1500 : 5000); };
   let ended = 0;
+  let said = 0; // a busy server is not read out job by job
   function changed(change) {
     if (filter.map && change.map !== filter.map) return;
     const { described, of, state, attempts, error } = change;
     if (ENDED.has(state)) {
       progress.delete(change.id);
       ended += 1;
-      announce(`${plural(ended, "job")} ended since this page was opened; the last one: ${state}`);
+      if (Date.now() - said > 15_000) {
+        said = Date.now();
+        announce(`${plural(ended, "job")} ended since this page was opened; the last one: ${state}`);
+      }
       soon();
     } else {
       progress.set(change.id, { described, of });
@@ -138,10 +146,15 @@ export async function show({ root, query, signal, setQuery, title }) {
     const job = jobs.get(change.id);
     if (!job) return soon();
     Object.assign(job, { state, attempts, error, described, of });
-    draw();
+    frame ||= requestAnimationFrame(() => { frame = 0; draw(); }); // many changes, one drawing
   }
 
-  signal.addEventListener("abort", () => clearTimeout(reload));
+  controls();
+  table.parentElement.hidden = true;
+  fill(before, loading("the jobs"));
+  const first = load(); // before all else that asks: it is what the page is for
+
+  signal.addEventListener("abort", () => { clearTimeout(reload); cancelAnimationFrame(frame); });
   follow("events", {
     signal,
     on(name, data) { if (name === "job") changed(data); else if (name === "missed") load(); },
@@ -159,10 +172,7 @@ export async function show({ root, query, signal, setQuery, title }) {
     controls();
   }).catch(() => { /* the list of jobs tells what is wrong */ });
 
-  controls();
-  table.parentElement.hidden = true;
-  fill(before, loading("the jobs"));
-  await load();
+  await first;
 
   return (changedQuery) => {
     const next = read(changedQuery);

@@ -101,7 +101,8 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
     const found = text ? images.filter((image) => [image.id, ...(image.tags ?? [])].join("\n").toLowerCase().includes(text)) : [...plan.inView(), ...images.filter((image) => !image.pose)];
     found.sort((a, b) => (a.id < b.id ? -1 : 1));
     const what = text ? `${plural(found.length, "image")} found` : `${plural(found.length, "image")} of ${count(images.length)}`;
-    const told = found.length > LISTED ? `${what}; the first ${LISTED} are listed, zoom in or search for the others` : what;
+    let told = found.length > LISTED ? `${what}; the first ${LISTED} are listed, zoom in or search for the others` : what;
+    if (!found.length && images.length) told += text ? "" : "; 0 on the plan, or ⤢, shows everything";
     if (listed.textContent !== told) listed.textContent = told;
     fill(list, found.slice(0, LISTED).map((image) => h("li", {}, h("button", { type: "button", "data-id": image.id, "aria-pressed": String(image.id === chosen?.id), onclick: () => choose(image, { focus: true }) },
       h("span", {}, image.id), h("span", { class: "muted" }, image.pose ? ago(image.captured_at ?? image.created_at) : "no pose")))));
@@ -120,8 +121,8 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
       ["On the plan", plural(posed, "image")],
       ["Without pose", images.length - posed ? count(images.length - posed) : null],
       ["Extent", `${metres(cover.width)} × ${metres(cover.height)}`],
-      ["Squares of 10 m", `${count(cover.cells)} with an image`],
-      ["Spacing", cover.spacing === null ? null : `${metres(cover.spacing)} in the middle`],
+      ["Covered", `${plural(cover.cells, "square")} of 10 m`],
+      ["Spacing", cover.spacing === null ? null : `${metres(cover.spacing)} in the median`],
       ["Newest", ago(new Date(cover.newest).toISOString())], ["Oldest", ago(new Date(cover.oldest).toISOString())],
     ) : h("p", { class: "muted" }, images.length ? "No image has a pose; the list holds them all." : "There is no image yet."));
     listSoon();

@@ -2,17 +2,19 @@
 
 import { address, call, contentOf, frameOf, isAbort, picture } from "./api.js";
 import { fill, h } from "./dom.js";
-import { cost, plural } from "./format.js";
+import { cost, count, plural } from "./format.js";
 import { apart } from "./words.js";
 
 const EDGE = 1024;
+const FIRST = 150; // lines at first; all of them hide the pictures
 
 /** The two pictures of a pair. */
 export function pictures(job, imageId, { signal }) {
   const lines = h("canvas", { class: "lines", "aria-hidden": "true" });
   const note = h("span", { class: "muted small" });
   const box = h("input", { type: "checkbox", id: "lines-on", checked: true });
-  const bar = h("div", { class: "pair-bar", hidden: true }, h("label", { class: "check", for: "lines-on" }, box, "Lines between matched regions"), note);
+  const many = h("input", { type: "range", id: "lines-many", min: "1", "aria-label": "How many lines, the most telling first" });
+  const bar = h("div", { class: "pair-bar", hidden: true }, h("label", { class: "check", for: "lines-on" }, box, "Lines between matched regions"), many, note);
   let redraw = () => {};
   const options = { signal, loaded: () => redraw() };
   const frame = picture(frameOf(job.id, EDGE), "The frame", { ...options, gone: "The frame is not kept any more, or this server does not show frames." });
@@ -25,13 +27,22 @@ export function pictures(job, imageId, { signal }) {
 
   call(address(["jobs", job.id, "matches", imageId]), { signal }).then((matches) => {
     bar.hidden = false;
-    if (!matches.regions.length) { box.parentElement.hidden = true; note.textContent = "No regions agree."; return; }
-    note.textContent = plural(matches.regions.length, "region");
+    const all = matches.regions;
+    if (!all.length) { box.parentElement.hidden = many.hidden = true; note.textContent = "No regions agree."; return; }
+    many.max = String(all.length);
+    many.value = String(Math.min(all.length, FIRST));
+    many.hidden = all.length === 1;
     let near = -1;
-    redraw = () => draw(lines, stage, frame, image, matches, box.checked, near);
+    let regions = all;
+    redraw = () => {
+      regions = all.slice(0, Number(many.value));
+      note.textContent = regions.length < all.length ? `${count(regions.length)} of ${plural(all.length, "region")}, the most telling` : plural(all.length, "region");
+      draw(lines, stage, frame, image, regions, box.checked, near);
+    };
     box.addEventListener("change", redraw);
+    many.addEventListener("input", redraw);
     stage.addEventListener("pointermove", (event) => {
-      const found = nearest(event, frame, image, matches);
+      const found = nearest(event, frame, image, regions);
       if (found !== near) { near = found; redraw(); }
     });
     stage.addEventListener("pointerleave", () => { near = -1; redraw(); });
@@ -42,7 +53,7 @@ export function pictures(job, imageId, { signal }) {
   }).catch((problem) => {
     if (isAbort(problem)) return;
     bar.hidden = false;
-    box.parentElement.hidden = true;
+    box.parentElement.hidden = many.hidden = true;
     note.textContent = problem.status === 404 ? "Matched regions cannot be shown: the frame or the image is gone, or this server does not tell them." : `Matched regions cannot be shown: ${problem.detail}`;
   });
   return all;
@@ -51,7 +62,7 @@ export function pictures(job, imageId, { signal }) {
 // Before it has loaded, a picture has the size of its alternative text.
 const boxOf = (picture) => picture.classList.contains("here") && picture.querySelector("img").getBoundingClientRect();
 
-function draw(canvas, stage, frame, image, matches, on, near) {
+function draw(canvas, stage, frame, image, regions, on, near) {
   const here = stage.getBoundingClientRect();
   const ratio = devicePixelRatio || 1;
   canvas.width = Math.round(here.width * ratio);
@@ -61,12 +72,12 @@ function draw(canvas, stage, frame, image, matches, on, near) {
   if (!on || !a || !b) return;
   ink.scale(ratio, ratio);
   ink.translate(-here.left, -here.top);
-  const many = matches.regions.length;
+  const many = regions.length;
   const line = (region, at) => {
-    const [x0, y0] = place(region.frame, a, matches.frame);
-    const [x1, y1] = place(region.image, b, matches.image);
+    const [x0, y0] = place(region.frame, a);
+    const [x1, y1] = place(region.image, b);
     // The hue goes with the place in the frame: what moved together has lines that run together.
-    const hue = 20 + 300 * (region.frame[1] / matches.frame.height);
+    const hue = 20 + 300 * region.frame[1];
     ink.strokeStyle = ink.fillStyle = at === near ? "#fff" : `hsl(${hue} 90% 62% / ${many > 300 ? 0.3 : many > 100 ? 0.45 : 0.75})`;
     ink.lineWidth = at === near ? 3 : 1;
     ink.beginPath();
@@ -79,19 +90,20 @@ function draw(canvas, stage, frame, image, matches, on, near) {
       ink.fill();
     }
   };
-  matches.regions.forEach(line);
-  if (near >= 0) line(matches.regions[near], near);
+  regions.forEach(line);
+  if (near >= 0 && near < many) line(regions[near], near);
 }
 
-const place = ([x, y], box, size) => [box.left + (x / size.width) * box.width, box.top + (y / size.height) * box.height];
+// Regions are told in shares of the width and the height.
+const place = ([x, y], box) => [box.left + x * box.width, box.top + y * box.height];
 
-function nearest(event, frame, image, matches) {
+function nearest(event, frame, image, regions) {
   let best = 14 ** 2;
   let found = -1;
   for (const [side, box] of [["frame", boxOf(frame)], ["image", boxOf(image)]]) {
     if (!box) continue;
-    matches.regions.forEach((region, at) => {
-      const [x, y] = place(region[side], box, matches[side]);
+    regions.forEach((region, at) => {
+      const [x, y] = place(region[side], box);
       const far = (x - event.clientX) ** 2 + (y - event.clientY) ** 2;
       if (far < best) { best = far; found = at; }
     });

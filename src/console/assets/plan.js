@@ -62,13 +62,20 @@ export class Plan {
     this.touch();
   }
 
-  zoom(by, at = [this.size[0] / 2, this.size[1] / 2]) {
+  /** Without a place to zoom at, it is the chosen image, if that can be seen. */
+  zoom(by, at = this.middle()) {
     const before = this.toWorld(...at);
     this.scale = Math.min(400, Math.max(1e-5, this.scale * by));
     const after = this.toWorld(...at);
     this.centre = [this.centre[0] + before[0] - after[0], this.centre[1] + before[1] - after[1]];
     this.fitted = false;
     this.touch();
+  }
+
+  middle() {
+    const [w, h] = this.size;
+    const [x, y] = this.chosen?.pose ? this.toScreen(...this.plane.project(this.chosen.pose)) : [-1, -1];
+    return x > 0 && y > 0 && x < w && y < h ? [x, y] : [w / 2, h / 2];
   }
 
   pan(dx, dy) {
@@ -186,6 +193,7 @@ export class Plan {
       return [name, getComputedStyle(probe).color];
     }));
     probe.remove();
+    this.dark = Number(this.colours.card.match(/\d+/)) < 128;
     this.touch();
   }
 
@@ -232,7 +240,7 @@ export class Plan {
         const y = h / 2 - (points.y[at] - cy) * scale;
         if (x < -20 || y < -20 || x > w + 20 || y > h + 20) continue;
         ink.moveTo(x, y);
-        ink.lineTo(x + Math.sin(turn) * (radius + 9), y - Math.cos(turn) * (radius + 9));
+        ink.lineTo(x + Math.sin(turn) * (radius + 13), y - Math.cos(turn) * (radius + 13));
       }
       ink.stroke();
     });
@@ -307,6 +315,10 @@ export class Plan {
   drawScale(colours) {
     const { ink } = this;
     const length = this.span();
+    ink.fillStyle = colours.card;
+    ink.globalAlpha = 0.85;
+    ink.fillRect(6, 3, length * this.scale + 16, 27);
+    ink.globalAlpha = 1;
     ink.strokeStyle = ink.fillStyle = colours.muted;
     ink.lineWidth = 1.5;
     ink.beginPath();
@@ -342,6 +354,7 @@ export class Plan {
     const [left, right] = [x0, x1].map((x) => Math.floor((x / span + mx) * many));
     const [top, bottom] = [y1, y0].map((y) => Math.max(0, Math.min(many - 1, Math.floor((my - y / span) * many))));
     if (right - left > 40 || bottom - top > 40) return;
+    ink.globalAlpha = this.dark ? 0.35 : 1; // tiles are made for the day
     for (let column = left; column <= right; column += 1) {
       for (let line = top; line <= bottom; line += 1) {
         const tile = this.tile(zoom, ((column % many) + many) % many, line);
@@ -350,6 +363,7 @@ export class Plan {
         ink.drawImage(tile, x, y, edge + 0.5, edge + 0.5);
       }
     }
+    ink.globalAlpha = 1;
   }
 
   tile(z, x, y) {

@@ -54,6 +54,11 @@ function ofModel(text) {
   for (const raw of text.split("\n")) {
     const told = heading(raw.trim());
     let line = raw;
+    if (told?.after && (told.section === "agree" || told.section === "differ")) {
+      // "Missing from the frame: a bench." says it all in its line.
+      found[told.section].push(raw.trim().replace(/^[\s\-*•–]+/, "").replace(/\*\*/g, ""));
+      continue;
+    }
     if (told) { section = told.section; headed = true; line = told.after; }
     line = line.replace(/^[\s\-*•–]+/, "").replace(/^\d+[.)]\s+/, "").replace(/\*\*/g, "").trim();
     if (!line || section === "objects" || section === "rest") continue;
