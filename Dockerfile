@@ -1,30 +1,47 @@
 # syntax=docker/dockerfile:1
-# The server in one image: binary, ONNX Runtime, the built-in model. Data lives in /data.
+# The server in one image: binary, ONNX Runtime, the built-in model. All that it writes is in /data.
+# Needs BuildKit, which is what `docker build` uses since version 23.
 
 FROM rust:1.95-bookworm AS build
+# Unpinned, so that a new build has Debian's security updates.
+# hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends nasm python3 python3-pip \
     && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
-COPY deploy deploy
-COPY Makefile ./
-RUN make assets
+# Only what decides the assets, so that a change elsewhere does not fetch them again.
+COPY deploy/setup deploy/setup
+COPY deploy/models deploy/models
+RUN deploy/setup/assets.sh assets
 COPY . .
-RUN make build
+# Crates and what was compiled of them outlive a change of the sources. The sources get the time of now,
+# because cargo goes by times, and those of another checkout may be older than what it has.
+RUN --mount=type=cache,id=whereabouts-crates,target=/usr/local/cargo/registry,sharing=locked \
+    --mount=type=cache,id=whereabouts-target,target=/src/target,sharing=locked \
+    find . -path ./assets -prune -o -path ./target -prune -o -type f -exec touch {} + \
+    && make build \
+    && strip -o /whereabouts target/release/whereabouts
 
 FROM debian:bookworm-slim
+# hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends ca-certificates \
     && rm -rf /var/lib/apt/lists/* \
-    && useradd --system --uid 10001 --home-dir /data whereabouts \
-    && install -d -o whereabouts /data
-COPY --from=build /src/assets /usr/lib/whereabouts
-COPY --from=build /src/target/release/whereabouts /usr/bin/whereabouts
+    && groupadd --gid 10001 whereabouts \
+    && useradd --uid 10001 --gid whereabouts --home-dir /data --no-create-home \
+        --shell /usr/sbin/nologin whereabouts \
+    && install -d -o whereabouts -g whereabouts -m 0750 /data
+COPY --from=build /src/assets/onnxruntime /usr/lib/whereabouts/onnxruntime
+COPY --from=build /src/assets/models /usr/lib/whereabouts/models
 COPY LICENSE /usr/share/doc/whereabouts/LICENSE
-USER whereabouts
+COPY --from=build /whereabouts /usr/bin/whereabouts
+# By number, so that Kubernetes can see that it is not root.
+USER 10001:10001
 VOLUME /data
 EXPOSE 8080
+# Models that are installed later go to the volume; the built-in one and ONNX Runtime are found all the same.
 ENV WHEREABOUTS_DATA__DIR=/data \
+    WHEREABOUTS_MODEL__ASSETS=/data/assets \
     WHEREABOUTS_SERVER__LISTEN=0.0.0.0:8080 \
     WHEREABOUTS_LOG__FORMAT=json
 HEALTHCHECK --interval=10s --timeout=3s --start-period=30s CMD ["whereabouts", "healthcheck"]

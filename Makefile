@@ -32,6 +32,7 @@ test: assets nasm chromium ## Set up, build and run every test
 	tests/api/conformance.sh $(BINARY) target/api-venv
 	tests/grpc/check.sh $(BINARY) target/grpc-venv
 	tests/console/check.sh $(BINARY) target/console-venv
+	tests/deploy/check.sh $(BINARY) target/deploy-venv
 	examples/check.sh $(BINARY) target/examples-venv
 
 conformance: build ## Hold the server against its own description with thousands of made-up requests

@@ -43,7 +43,7 @@ types=(mypy --strict --python-version 3.10 --cache-dir "$venv/mypy-cache")
 (cd ros2 && "${types[@]}" --ignore-missing-imports --allow-subclassing-any whereabouts_node.py)
 
 step shellcheck
-shellcheck -x ./*.sh "$load"/*.sh ../tests/*.sh ../tests/api/*.sh ../tests/grpc/*.sh ../tests/console/*.sh
+shellcheck -x ./*.sh "$load"/*.sh ../tests/*.sh ../tests/api/*.sh ../tests/grpc/*.sh ../tests/console/*.sh ../tests/deploy/*.sh
 
 step "tests of the localizer of the ROS 2 node"
 (cd ros2 && timeout 60 python -m unittest)

@@ -1,0 +1,66 @@
+#!/usr/bin/env bash
+# Holds the files of deploy/ against the server that they run: starts it as they do, makes traffic until every
+# metric is there, and checks that each query of the rules and of the dashboard finds its metric and labels,
+# that every setting exists, that files agree on names, ports and times, and that each is valid for what it is.
+#
+#     check.sh BINARY VENV
+#
+# VENV is a folder for a Python environment (requirements.txt); it is made if it is not there. Takes about
+# half a minute once it is. Ends with 1 if anything fails, and says at its end what could not be run here.
+# Uses docker compose, kubectl (or kustomize), promtool and systemd-analyze where they are installed.
+set -euo pipefail
+
+if [ $# -ne 2 ]; then
+    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/deploy-venv" >&2
+    exit 2
+fi
+binary=$(realpath "$1")
+venv=$(realpath -m "$2")
+cd "$(dirname "$0")"
+
+# shellcheck source-path=SCRIPTDIR source=../server.sh
+. ../server.sh
+environment "$venv" requirements.txt
+
+"$venv/bin/shellcheck" --external-sources check.sh
+echo "check.sh: shellcheck finds nothing"
+"$venv/bin/hadolint" ../../Dockerfile
+echo "Dockerfile: hadolint finds nothing"
+
+# What the server asks outside: an MLLM, and two receivers of webhooks.
+export PYTHONDONTWRITEBYTECODE=1
+"$venv/bin/python" outside.py "$scratch/outside" &
+outside=$!
+trap 'kill "$outside" 2> /dev/null || true; finish' EXIT
+
+if ! "$binary" demo --offline --json --places 6 --out "$scratch/town" > "$scratch/demo" 2>&1; then
+    cat "$scratch/demo" >&2
+    exit 1
+fi
+cp -r "$scratch/town/data" "$scratch/data"
+"$binary" config --defaults > "$scratch/defaults.toml"
+for role in admin operator robot; do
+    "$binary" keys create --data "$scratch/data" --name "$role" --role "$role" 2> /dev/null > "$scratch/$role.key"
+done
+# All that makes metrics appear within seconds which otherwise take days.
+export WHEREABOUTS_AUTH__KEYS=required WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_JOBS__SWEEP_S=1
+export WHEREABOUTS_REFINE__REFINER=mllm WHEREABOUTS_REFINE__CANDIDATES=2
+WHEREABOUTS_MLLM__BASE_URL=$(cat "$scratch/outside")/v1
+export WHEREABOUTS_MLLM__BASE_URL
+export WHEREABOUTS_WEBHOOKS__ALLOW_PRIVATE=true WHEREABOUTS_WEBHOOKS__RETRY_S='[1]'
+serve "$binary"
+BINARY=$binary SCRATCH=$scratch URL=$url OUTSIDE=$(cat "$scratch/outside") \
+    timeout 120 "$venv/bin/python" -m unittest
+if grep -q panicked "$scratch/log"; then
+    grep panicked "$scratch/log" >&2
+    exit 1
+fi
+
+echo
+echo "Not run, because nothing here can: no container engine built the image or started compose.yaml, no"
+echo "cluster took the manifests, no systemd started the unit, no Grafana drew the dashboard."
+missing() { echo "Not run, because $1 is not installed: $2."; }
+command -v kubectl kustomize > /dev/null || missing kubectl "the manifests as kustomize builds them"
+command -v promtool > /dev/null || missing promtool "its check of prometheus.yml, and alerts_test.yaml"
+command -v systemd-analyze > /dev/null || missing systemd-analyze "its look at the unit"
+docker compose version > /dev/null 2>&1 || missing "docker compose" "its look at compose.yaml"

@@ -1,0 +1,193 @@
+"""The rules and the dashboard against what a server tells at /metrics."""
+
+import json
+import re
+import shutil
+import subprocess
+import unittest
+
+import traffic
+from files import (
+    DEFAULTS,
+    DEPLOY,
+    METRIC,
+    ROOT,
+    SCRATCH,
+    check_settings,
+    dashboard,
+    documents,
+    read,
+    seconds,
+    told,
+)
+from queries import OF_TARGET, Query, Wrong
+
+RULES = "deploy/prometheus/alerts.yaml"
+METRICS = {}
+
+
+def setUpModule():
+    METRICS.update(traffic.make())
+    told(f"/metrics: {len(METRICS)} names, all of which the traffic made appear")
+
+
+def words(name, label):
+    """Values that need not have been seen: those that the help of a metric or the reference tells."""
+    known = set(re.findall(r"\w+", METRICS[name].help))
+    if (name, label) == ("whereabouts_refused_total", "reason"):
+        [row] = [line for line in read("docs/operations.md").splitlines() if f"{name}{{{label}}}" in line]
+        known |= set(re.findall(r"`(\w+)`", row))
+    if (name, label) == ("whereabouts_jobs_ended_total", "state"):
+        states = json.loads(read("docs/openapi.json"))["components"]["schemas"]["JobState"]
+        known |= set(states.get("enum", [])) | {one.get("const") for one in states.get("oneOf", [])}
+        known |= {value for one in states.get("oneOf", []) for value in one.get("enum", [])}
+    if label == "status":
+        known |= {"500", "503", "504", "507"}
+    return known
+
+
+def families():
+    """The names of metrics without what tells the parts of a histogram."""
+    return {re.sub(r"_(bucket|sum|count)$", "", name) for name in METRICS}
+
+
+def query(text):
+    return Query(text, METRICS, words)
+
+
+class Rules(unittest.TestCase):
+    def setUp(self):
+        [file] = documents(RULES)
+        self.assertEqual(list(file), ["groups"])
+        self.rules = [rule for group in file["groups"] for rule in group["rules"]]
+
+    def test_every_rule_has_what_a_rule_needs(self):
+        for rule in self.rules:
+            with self.subTest(rule.get("alert")):
+                self.assertLessEqual(set(rule), {"alert", "expr", "for", "labels", "annotations"})
+                self.assertRegex(rule["alert"], r"^Whereabouts[A-Z]\w+$")
+                self.assertRegex(rule.get("for", "0m"), r"^\d+[smh]$")
+                self.assertIn(rule["labels"]["severity"], ("critical", "warning"))
+                self.assertLessEqual({"summary", "action"}, set(rule["annotations"]))
+        names = [rule["alert"] for rule in self.rules]
+        self.assertEqual(len(names), len(set(names)), "two rules of one name")
+        named = re.findall(r"Whereabouts[A-Z]\w+", json.dumps(self.rules) + read("docs/deploy.md"))
+        self.assertEqual(set(named) - set(names), set(), "rules that are named and are not there")
+
+    def test_every_query_finds_its_metrics_and_labels(self):
+        asked = set()
+        for rule in self.rules:
+            with self.subTest(rule["alert"]):
+                try:
+                    found = query(rule["expr"])
+                except Wrong as wrong:
+                    self.fail(f"{RULES}: {rule['alert']}: {wrong}")
+                asked |= found.asked
+                told_of = set(re.findall(r"\$labels\.(\w+)", json.dumps(rule["annotations"])))
+                self.assertEqual(told_of - found.labels, set(), "labels that the alert does not have")
+        told(f"{RULES}: {len(self.rules)} rules ask for {len(asked)} metrics, all there")
+
+    def test_numbers_that_repeat_a_setting_are_its_default(self):
+        for rule in self.rules:
+            if "setting" not in rule["annotations"]:
+                continue
+            section, key = rule["annotations"]["setting"].split(".")
+            with self.subTest(rule["alert"]):
+                self.assertIn(key, DEFAULTS[section], "there is no such setting")
+                self.assertIn(
+                    DEFAULTS[section][key], query(rule["expr"]).numbers, f"default of {section}.{key}"
+                )
+
+    def test_what_it_says_names_settings_and_metrics_that_exist(self):
+        text = read(RULES)
+        check_settings(self, RULES, "docs/deploy.md")
+        named = set(METRIC.findall(text + read("docs/deploy.md")))
+        self.assertEqual(named - set(METRICS) - families(), set(), "metrics that are named and are not there")
+
+    @unittest.skipUnless(shutil.which("promtool"), "promtool is not installed")
+    def test_promtool_takes_the_rules_and_they_fire_when_they_should(self):
+        # The key's file is there only in the container.
+        config = read("deploy/prometheus/prometheus.yml").replace(
+            "/run/secrets/metrics_key", str(SCRATCH / "operator.key")
+        )
+        (SCRATCH / "prometheus.yml").write_text(config)
+        shutil.copy(ROOT / RULES, SCRATCH)
+        for what in (
+            ["check", "config", SCRATCH / "prometheus.yml"],
+            ["test", "rules", ROOT / "tests/deploy/alerts_test.yaml"],
+        ):
+            ran = subprocess.run(["promtool", *what], capture_output=True, text=True, check=False)
+            self.assertEqual(ran.returncode, 0, ran.stdout + ran.stderr)
+        told("promtool: takes prometheus.yml and the rules, which fire in alerts_test.yaml as expected")
+
+
+class Dashboard(unittest.TestCase):
+    def setUp(self):
+        self.board = dashboard()
+        self.panels = [panel for panel in self.board["panels"] if panel["type"] != "row"]
+
+    def test_it_is_laid_out_well(self):
+        self.assertGreaterEqual(self.board["schemaVersion"], 41)
+        ids = [panel["id"] for panel in self.board["panels"]]
+        self.assertEqual(len(ids), len(set(ids)), "two panels of one id")
+        taken = {}
+        for panel in self.board["panels"]:
+            place = panel["gridPos"]
+            self.assertLessEqual(place["x"] + place["w"], 24, panel["title"])
+            for x in range(place["x"], place["x"] + place["w"]):
+                for y in range(place["y"], place["y"] + place["h"]):
+                    self.assertNotIn((x, y), taken, f"{panel['title']} lies over {taken.get((x, y))}")
+                    taken[x, y] = panel["title"]
+
+    def test_every_query_of_every_panel_finds_its_metrics_and_labels(self):
+        asked, queries = set(), 0
+        for panel in self.panels:
+            with self.subTest(panel["title"]):
+                self.assertTrue(panel["targets"], "it asks for nothing")
+                self.assertEqual(panel["datasource"]["uid"], "${datasource}")
+                for target in panel["targets"]:
+                    try:
+                        found = query(target["expr"])
+                    except Wrong as wrong:
+                        self.fail(f"whereabouts.json: {panel['title']}: {wrong}")
+                    legend = set(re.findall(r"{{\s*(\w+)\s*}}", target["legendFormat"]))
+                    self.assertEqual(legend - found.labels, set(), "labels of the legend that the query lacks")
+                    asked |= found.asked
+                    queries += 1
+        for annotation in self.board["annotations"]["list"]:
+            query(annotation["expr"])
+        for variable in self.board["templating"]["list"]:
+            if variable["type"] == "query":
+                series, label = re.fullmatch(r"label_values\((.*), (\w+)\)", variable["definition"]).groups()
+                self.assertIn(label, query(series).labels | OF_TARGET)
+        told(f"whereabouts.json: {len(self.panels)} panels, {queries} queries, {len(asked)} metrics, all there")
+        missing = families() - {re.sub(r"_(bucket|sum|count)$", "", name) for name in asked}
+        self.assertEqual(missing, set(), "metrics that no panel shows")
+
+    def test_what_it_says_names_settings_that_exist(self):
+        check_settings(self, "deploy/grafana/whereabouts.json")
+
+
+class Scraping(unittest.TestCase):
+    def test_metrics_take_the_key_of_an_operator(self):
+        for role, status in ((None, 401), ("robot", 403), ("operator", 200)):
+            self.assertEqual(traffic.ask("GET", "/metrics", role=role)[0], status, role)
+        [job] = documents("deploy/prometheus/prometheus.yml")[0]["scrape_configs"]
+        self.assertEqual(job["authorization"]["type"], "Bearer")
+        told("/metrics: 401 without a key, 403 with a robot's, 200 with an operator's")
+
+    def test_the_job_of_the_rules_is_the_job_that_is_scraped(self):
+        [config] = documents("deploy/prometheus/prometheus.yml")
+        [job] = config["scrape_configs"]
+        self.assertEqual(job["metrics_path"], "/metrics")
+        named = set(re.findall(r'job="(\w+)"', read(RULES) + json.dumps(dashboard()).replace('\\"', '"')))
+        self.assertEqual(named, {job["job_name"]})
+        for file in config["rule_files"]:
+            self.assertTrue((DEPLOY / "prometheus" / file).is_file(), file)
+        self.assertLess(
+            seconds(config["global"]["scrape_timeout"]), seconds(config["global"]["scrape_interval"])
+        )
+
+
+if __name__ == "__main__":
+    unittest.main()
