@@ -258,7 +258,7 @@ mod tests {
 
         hour.answered(at(60 * 61), 200, None);
         let minutes = hour.minutes(at(60 * 61));
-        assert_eq!((minutes.len(), minutes[0].p50_ms), (2, None));
+        assert_eq!((minutes.len(), minutes[1].p50_ms), (2, None));
         assert_eq!(hour.minutes(at(60 * 62)).len(), 1);
         for minute in 0..200 {
             hour.answered(at(60 * (100 + minute)), 200, Some(Duration::from_secs(1000)));
