@@ -399,3 +399,17 @@ async fn the_commands_take_the_key_from_the_environment() {
     let (ok, _, said) = run(None, &["keys", "list", "--data", data]);
     assert!(!ok && said.contains("leave --data out"), "{said}");
 }
+
+#[tokio::test]
+async fn no_other_page_is_let_in() {
+    let (_dir, server) = super::support::server();
+    for method in [Method::OPTIONS, Method::GET, Method::DELETE] {
+        let request =
+            server.request(method.clone(), "/maps/yard").header("origin", "https://other.example");
+        let request = request.header("access-control-request-method", "DELETE");
+        let answer =
+            Answer::of(request.header("access-control-request-headers", "authorization")).await;
+        let told = answer.headers.keys().find(|name| name.as_str().starts_with("access-control-"));
+        assert_eq!(told, None, "{method}");
+    }
+}
