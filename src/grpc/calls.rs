@@ -21,7 +21,7 @@ pub struct Call {
     pub changes: bool,
 }
 
-/// A call that robots may make, and every other thing is not.
+/// A call that robots may make: one small message, answered by one.
 const fn robot(path: &'static str) -> Call {
     Call {
         path,

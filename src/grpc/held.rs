@@ -1,11 +1,11 @@
-//! The memory that the messages of a call take.
+//! The memory that the messages of a call, or a body, take.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-/// What the messages that have come hold of the memory for bodies, until somebody takes it over together with a
-/// message, or the call has been answered. Clones share it.
+/// What the messages, or a body, that have come hold of the memory for bodies, until somebody takes it over
+/// together with a message, or the request has been answered. Clones share it.
 #[derive(Debug, Clone, Default)]
 pub struct Held(Arc<Mutex<State>>);
 

@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use futures_util::StreamExt;
 use tonic::{Request, Response, Status};
-use uuid::Uuid;
 
 use super::proto::job_service_server::JobService;
 use super::proto::watch_job_response::Event;
@@ -16,7 +15,7 @@ use super::proto::{
 use super::streams::{Answers, until_over};
 use super::{Api, Asked, convert, status};
 use crate::domain::Job;
-use crate::service::{ErrorKind, JobEvent, ServiceError};
+use crate::service::{ErrorKind, JobEvent, ServiceError, uuid};
 use crate::store::JobFilter;
 
 /// Jobs in a page unless more are asked for: clients take no more than four megabytes at a time by themselves.
@@ -104,7 +103,7 @@ impl JobService for Api {
 impl Asked {
     /// A job of a map that the caller may use, at once or when it has ended.
     async fn job(&self, id: &str, wait_s: f64) -> Result<Job, ServiceError> {
-        let id = job_id(id)?;
+        let id = uuid("job", id)?;
         let job = self.service.get_job(id, None).await?;
         self.caller.check_map(&job.map)?;
         if wait_s == 0.0 {
@@ -127,7 +126,7 @@ impl Asked {
             ));
         }
         let filter = JobFilter { map, state: convert::job_state(state)? };
-        let cursor = (!page_token.is_empty()).then(|| job_id(&page_token)).transpose()?;
+        let cursor = (!page_token.is_empty()).then(|| uuid("job", &page_token)).transpose()?;
         let limit = match page_size {
             0 => PAGE_SIZE,
             size => size as usize,
@@ -138,11 +137,4 @@ impl Asked {
             next_page_token: page.next_cursor.map(|id| id.to_string()).unwrap_or_default(),
         })
     }
-}
-
-fn job_id(text: &str) -> Result<Uuid, ServiceError> {
-    text.parse().map_err(|_| {
-        let shown: String = text.chars().take(80).collect();
-        ServiceError::malformed(format!("a job id is a UUID; got {shown:?}"))
-    })
 }

@@ -46,18 +46,16 @@ pub(super) fn of(error: ServiceError) -> Status {
     if error.kind == ErrorKind::Internal {
         tracing::error!(detail = error.detail, "a call failed");
     }
-    let retry_after = error.retry_after.or(error.kind.retry_after());
-    status(error.kind, &error.detail, retry_after)
+    status(error.kind, &error.detail, error.retry_after)
 }
 
 /// The same of one thing among several.
 pub(super) fn problem(error: ServiceError) -> proto::Problem {
-    let retry_after = error.retry_after.or(error.kind.retry_after());
     proto::Problem {
         kind: error.kind.word().to_owned(),
         detail: error.detail,
         // None is too long for a duration of protobuf.
-        retry_after: retry_after.and_then(|pause| pause.try_into().ok()),
+        retry_after: error.retry_after.and_then(|pause| pause.try_into().ok()),
     }
 }
 

@@ -10,7 +10,6 @@ use std::time::Duration;
 
 use axum::body::{Body, BodyDataStream};
 use axum::extract::{Request, State};
-use axum::http::header::CONTENT_TYPE;
 use axum::{Extension, Json};
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt, stream};
@@ -19,7 +18,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use utoipa::ToSchema;
 
-use super::body::Segments;
+use super::body::{Segments, content_type};
 use super::guard::{discard, too_large};
 use super::maps::map_name;
 use super::messages::no_bulk_memory;
@@ -203,9 +202,8 @@ pub(super) async fn add_images(
 }
 
 async fn images(request: Request, room: Room) -> Result<Images, Problem> {
-    let header = request.headers().get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
-    let essence = header.unwrap_or("").split(';').next().unwrap_or("").trim().to_ascii_lowercase();
-    let of_kind = header.map(str::to_owned);
+    let (header, essence) = content_type(request.headers());
+    let header = header.to_owned();
     let request = request.map(|body| room.over(body));
     match essence.as_str() {
         "multipart/form-data" => Ok(Box::pin(form::images(request, room).await?)),
@@ -213,7 +211,7 @@ async fn images(request: Request, room: Room) -> Result<Images, Problem> {
         _ => Err(Problem::new(
             ErrorKind::UnsupportedMedia,
             format!(
-                "the Content-Type is {of_kind:?}; send a form (with curl: -F image=@a.jpg -F image=@b.jpg), \
+                "the Content-Type is {header:?}; send a form (with curl: -F image=@a.jpg -F image=@b.jpg), \
                  or a tar archive (tar c *.jpg | curl -H 'Content-Type: application/x-tar' --data-binary \
                  @- …)"
             ),
@@ -294,8 +292,7 @@ impl From<BulkResult> for BatchResult {
             Ok(Added::Present(image)) => (Some(image.id.into()), BatchOutcome::Present, None),
             Err((id, error)) => {
                 let kind = error.kind.word().to_owned();
-                let pause = error.retry_after.or(error.kind.retry_after());
-                let retry_after_s = pause.map(|pause| pause.as_secs_f64());
+                let retry_after_s = error.retry_after.map(|pause| pause.as_secs_f64());
                 let problem = BatchProblem { kind, detail: error.detail, retry_after_s };
                 (id.map(Into::into), BatchOutcome::Failed, Some(problem))
             }

@@ -90,9 +90,14 @@ enum BodyType {
     Form,
 }
 
-fn body_type(headers: &HeaderMap) -> Result<BodyType, Problem> {
+/// The `Content-Type` as it was sent, and what it comes to without its parameters.
+pub(super) fn content_type(headers: &HeaderMap) -> (&str, String) {
     let header = headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or("");
-    let essence = header.split(';').next().unwrap_or("").trim().to_ascii_lowercase();
+    (header, header.split(';').next().unwrap_or("").trim().to_ascii_lowercase())
+}
+
+fn body_type(headers: &HeaderMap) -> Result<BodyType, Problem> {
+    let (header, essence) = content_type(headers);
     match essence.as_str() {
         "image/jpeg" | "image/png" | "image/webp" | "application/octet-stream" => Ok(BodyType::Raw),
         "multipart/form-data" => Ok(BodyType::Form),

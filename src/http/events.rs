@@ -1,6 +1,5 @@
 //! `/jobs/{id}/events` and `/events`: a job as it goes on, and all of them, as server-sent events.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Extension;
@@ -8,7 +7,6 @@ use axum::extract::State;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::{Stream, StreamExt};
 use serde::Deserialize;
-use tokio_util::sync::CancellationToken;
 use utoipa::IntoParams;
 
 use super::body::{Params, Segments};
@@ -16,7 +14,7 @@ use super::jobs::job_id;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
-use crate::service::{AnyJobEvent, Caller, JobEvent, Service};
+use crate::service::{AnyJobEvent, Caller, Deadline, JobEvent, ServiceError};
 
 /// A comment is sent after so long without an event, so that nothing on the way hangs up.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -48,7 +46,7 @@ pub(super) async fn follow_job(
             JobEvent::Ended(job) => Event::default().event("end").json_data(job),
         }
     });
-    Ok(streamed(events, state.door.draining(), service, caller))
+    Ok(streamed(events, service.over(&state.door, caller, Deadline::default())))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -84,18 +82,15 @@ pub(super) async fn follow_jobs(
             AnyJobEvent::Missed(missed) => Event::default().event("missed").json_data(missed),
         }
     });
-    Ok(streamed(events, state.door.draining(), service, caller))
+    Ok(streamed(events, service.over(&state.door, caller, Deadline::default())))
 }
 
 /// Sends events until they end, the server drains, or the caller may ask no more. A drain does not wait for
 /// jobs that nobody may finish before the next start.
 fn streamed(
     events: impl Stream<Item = Result<Event, axum::Error>> + Send + 'static,
-    draining: CancellationToken,
-    service: Arc<Service>,
-    caller: Caller,
+    over: impl Future<Output = ServiceError> + Send + 'static,
 ) -> Sse<impl Stream<Item = Result<Event, axum::Error>>> {
-    let events = events.take_until(draining.cancelled_owned());
-    let events = events.take_until(async move { service.keys.ended(caller).await });
+    let events = events.take_until(Box::pin(over));
     Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE))
 }

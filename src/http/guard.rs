@@ -115,16 +115,14 @@ pub(super) async fn bound(
     };
     request.extensions_mut().insert(Deadline(wanted_for.map(|wait| arrival + wait)));
     let watch = Watch::default();
-    let held = Held::default();
     let request = request.map(|body| match call {
-        Some(call) => messages::bounded(body, call, &state, held.clone()),
+        Some(call) => messages::bounded(body, call, &state, watch.held.clone()),
         None => watch.over(body, &state.settings, &state.bodies_memory),
     });
     let longest = time_allowed(&state, &request, call);
     let allowed = wanted_for.map_or(longest, |wait| wait.min(longest));
     let answered = tokio::time::timeout(allowed, next.run(request)).await;
-    watch.answered();
-    held.answered();
+    watch.held.answered();
     if let Some((problem, reason)) = watch.problem() {
         state.metrics.refused(reason);
         return hanging_up(problem);

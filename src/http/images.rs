@@ -15,7 +15,7 @@ use super::body::{Params, PictureBody, Segments};
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
-use crate::domain::{Image, ImageId};
+use crate::domain::{Image, ImageId, MediaType};
 use crate::retrieve::{Class, Demand};
 use crate::service::{Deadline, ErrorKind, ImageMeta, ImagePage, NewImage, ServiceError};
 use crate::store::Added;
@@ -212,7 +212,7 @@ pub(super) async fn get_image(
 #[serde(deny_unknown_fields)]
 pub(super) struct ContentParams {
     /// The longest edge in pixels, 16 to 4096; without it the picture comes as it was sent.
-    max_edge: Option<u32>,
+    pub max_edge: Option<u32>,
 }
 
 /// The picture of an image
@@ -230,12 +230,13 @@ pub(super) async fn image_content(
 ) -> Result<impl IntoResponse, Problem> {
     let (media_type, bytes) =
         service.image_content(&map_name(&map)?, &image_id(&id)?, content.max_edge).await?;
-    let headers = [
-        (CONTENT_TYPE, media_type.as_str()),
-        // An id keeps its bytes until it is deleted.
-        (CACHE_CONTROL, "private, max-age=3600"),
-    ];
-    Ok((headers, bytes))
+    Ok(picture(media_type, bytes))
+}
+
+/// A picture, which an id keeps until it is deleted.
+pub(super) fn picture(media_type: MediaType, bytes: Bytes) -> impl IntoResponse {
+    let headers = [(CONTENT_TYPE, media_type.as_str()), (CACHE_CONTROL, "private, max-age=3600")];
+    (headers, bytes)
 }
 
 /// Remove an image

@@ -1,37 +1,26 @@
 //! Bodies as they come in: bounded by time, and all together by memory.
 
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use axum::body::{Body, BodyDataStream, HttpBody};
 use bytes::Bytes;
 use futures_util::{StreamExt, stream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::Semaphore;
 use tokio::time::{Instant, timeout_at};
 
 use super::problem::Problem;
 use super::state::HttpSettings;
+use crate::grpc::Held;
 use crate::service::ErrorKind;
 use crate::telemetry::RefusedFor;
 
 /// Watches one body. What it takes of the common memory is given back when the request is answered.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Watch {
-    shared: Arc<Shared>,
-}
-
-#[derive(Debug, Default)]
-struct Shared {
-    fault: OnceLock<Fault>,
-    memory: Mutex<Memory>,
-}
-
-/// What one body holds of the memory of all.
-#[derive(Debug, Default)]
-struct Memory {
-    held: Option<OwnedSemaphorePermit>,
-    /// Whether the request has been answered, so that what still comes is thrown away.
-    answered: bool,
+    fault: Arc<OnceLock<Fault>>,
+    /// What it holds of the memory of all.
+    pub held: Held,
 }
 
 /// Why a body was not read to its end.
@@ -55,13 +44,17 @@ impl std::fmt::Display for Fault {
                 "nothing of the body came for {} s (server.body_pause_s); send it again in one go",
                 longest.as_secs()
             ),
-            Self::NoMemory(most) => write!(
-                f,
-                "the bodies of all requests in progress hold {most} bytes, the bound \
-                 (server.bodies_limit_bytes); try again in a moment"
-            ),
+            Self::NoMemory(most) => f.write_str(&no_memory(*most)),
         }
     }
+}
+
+/// All bodies together hold as much as they may.
+pub(super) fn no_memory(most: usize) -> String {
+    format!(
+        "the bodies of all requests in progress hold {most} bytes, the bound (server.bodies_limit_bytes); try \
+         again in a moment"
+    )
 }
 
 impl std::error::Error for Fault {}
@@ -99,7 +92,7 @@ impl Watch {
 
     /// What is to be answered in the place of any other answer, and what it counts as.
     pub fn problem(&self) -> Option<(Problem, RefusedFor)> {
-        let fault = self.shared.fault.get()?;
+        let fault = self.fault.get()?;
         let (kind, reason) = match fault {
             Fault::TookTooLong(_) | Fault::Paused(_) => (ErrorKind::TooSlow, RefusedFor::Slow),
             Fault::NoMemory(_) => (ErrorKind::Overloaded, RefusedFor::Bodies),
@@ -108,38 +101,14 @@ impl Watch {
     }
 
     fn fail(&self, fault: Fault) -> axum::Error {
-        let _ = self.shared.fault.set(fault);
+        let _ = self.fault.set(fault);
         axum::Error::new(fault)
-    }
-
-    /// Takes so much of the common memory; `false` if there is no more.
-    fn hold(&self, memory: &Arc<Semaphore>, bytes: usize) -> bool {
-        let Ok(bytes) = u32::try_from(bytes) else { return false };
-        let Ok(more) = Arc::clone(memory).try_acquire_many_owned(bytes) else { return false };
-        let mut memory = self.memory();
-        if memory.answered {
-            return true;
-        }
-        match memory.held.as_mut() {
-            Some(held) => held.merge(more),
-            None => memory.held = Some(more),
-        }
-        true
-    }
-
-    /// Gives the memory back: the request has been answered.
-    pub fn answered(&self) {
-        *self.memory() = Memory { held: None, answered: true };
-    }
-
-    fn memory(&self) -> MutexGuard<'_, Memory> {
-        self.shared.memory.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Chunks {
     async fn next(&mut self) -> Option<Result<Bytes, axum::Error>> {
-        if self.watch.shared.fault.get().is_some() {
+        if self.watch.fault.get().is_some() {
             return None;
         }
         let HttpSettings { body_timeout, body_pause, body_limit_bytes, .. } = *self.settings;
@@ -155,7 +124,7 @@ impl Chunks {
         // Of a body that is too large no more than that is kept.
         if self.counted <= body_limit_bytes {
             self.counted += chunk.len();
-            if !self.watch.hold(&self.memory, chunk.len()) {
+            if !self.watch.held.try_add(&self.memory, chunk.len()) {
                 let most = self.settings.bodies_limit_bytes;
                 return Some(Err(self.watch.fail(Fault::NoMemory(most))));
             }

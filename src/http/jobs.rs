@@ -3,19 +3,18 @@
 use std::time::Duration;
 
 use axum::Json;
-use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::IntoResponse;
 use serde::Deserialize;
 use utoipa::IntoParams;
 use uuid::Uuid;
 
 use super::body::{Params, Segments};
-use super::images::image_id;
+use super::images::{ContentParams, image_id, picture};
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::Ready;
 use crate::domain::{Job, JobState};
-use crate::service::{ErrorKind, JobPage, PairRegions};
+use crate::service::{self, ErrorKind, JobPage, PairRegions};
 use crate::store::JobFilter;
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -80,17 +79,9 @@ pub(super) async fn get_job(
     Ok(Json(service.get_job(job_id(&id)?, wait).await?))
 }
 
-#[derive(Debug, Deserialize, IntoParams)]
-#[into_params(parameter_in = Query)]
-#[serde(deny_unknown_fields)]
-pub(super) struct FrameParams {
-    /// The longest edge in pixels, 16 to 4096; without it the picture comes as it was sent.
-    max_edge: Option<u32>,
-}
-
 /// The frame of a job
 #[utoipa::path(get, path = "/jobs/{id}/frame", tag = "jobs",
-    params(("id" = Uuid, Path), FrameParams), responses(
+    params(("id" = Uuid, Path), ContentParams), responses(
     (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"))),
     (status = 404, body = Problem, description = "No such job, or its frame is no longer there", content_type = "application/problem+json"),
     (status = 422, body = Problem, description = "max_edge is out of range", content_type = "application/problem+json"),
@@ -99,11 +90,10 @@ pub(super) struct FrameParams {
 pub(super) async fn frame(
     Ready(service): Ready,
     Segments(id): Segments<String>,
-    Params(params): Params<FrameParams>,
+    Params(params): Params<ContentParams>,
 ) -> Result<impl IntoResponse, Problem> {
     let (media_type, bytes) = service.frame_of(job_id(&id)?, params.max_edge).await?;
-    let headers = [(CONTENT_TYPE, media_type.as_str()), (CACHE_CONTROL, "private, max-age=3600")];
-    Ok((headers, bytes))
+    Ok(picture(media_type, bytes))
 }
 
 /// What a job's frame and a candidate have in common
@@ -151,10 +141,7 @@ pub(super) async fn retry_job(
 }
 
 pub(super) fn job_id(text: &str) -> Result<Uuid, Problem> {
-    text.parse().map_err(|_| {
-        let shown: String = text.chars().take(80).collect();
-        Problem::new(ErrorKind::Malformed, format!("a job id is a UUID; got {shown:?}"))
-    })
+    Ok(service::uuid("job", text)?)
 }
 
 fn seconds(seconds: f64) -> Result<Duration, Problem> {

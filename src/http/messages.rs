@@ -11,6 +11,7 @@ use tokio::sync::Semaphore;
 use tokio::time::{Instant, timeout};
 
 use super::guard::too_large;
+use super::incoming::no_memory;
 use super::problem::Problem;
 use super::state::{AppState, HttpSettings};
 use crate::grpc::{Call, Held};
@@ -103,8 +104,11 @@ impl Messages {
                 self.begin().await?;
             }
         }
-        let taken = self.call.many || self.held.try_add(&self.memory, chunk.len());
-        if taken { Ok(()) } else { Err(no_memory(&self.settings)) }
+        if self.call.many || self.held.try_add(&self.memory, chunk.len()) {
+            return Ok(());
+        }
+        let detail = no_memory(self.settings.bodies_limit_bytes);
+        Err(Problem::new(ErrorKind::Overloaded, detail))
     }
 
     /// A message begins.
@@ -140,15 +144,6 @@ impl Messages {
         // Who reads the body passes a status on as it is.
         axum::Error::new(tonic::Status::from(problem))
     }
-}
-
-fn no_memory(settings: &HttpSettings) -> Problem {
-    let detail = format!(
-        "the bodies of all requests in progress hold {} bytes, the bound (server.bodies_limit_bytes); try \
-         again in a moment",
-        settings.bodies_limit_bytes
-    );
-    Problem::new(ErrorKind::Overloaded, detail)
 }
 
 /// The images of bulk uploads have filled the memory that there is for them, for too long.

@@ -87,9 +87,7 @@ fn status_of(kind: ErrorKind) -> (StatusCode, &'static str) {
 
 impl From<ServiceError> for Problem {
     fn from(error: ServiceError) -> Self {
-        let mut problem = Self::new(error.kind, error.detail);
-        problem.retry_after = error.retry_after.or(problem.retry_after);
-        problem
+        Self { retry_after: error.retry_after, ..Self::new(error.kind, error.detail) }
     }
 }
 

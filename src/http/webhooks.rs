@@ -10,7 +10,7 @@ use super::body::{JsonBody, Params, Segments};
 use super::problem::Problem;
 use super::state::Ready;
 use crate::domain::{Delivery, DeliveryState, Webhook};
-use crate::service::{DeliveryPage, ErrorKind, MadeWebhook, NewWebhook};
+use crate::service::{self, DeliveryPage, MadeWebhook, NewWebhook};
 
 /// All webhooks.
 #[derive(Debug, Serialize, ToSchema)]
@@ -135,8 +135,5 @@ pub(super) async fn redeliver(
 }
 
 fn uuid(of: &str, text: &str) -> Result<Uuid, Problem> {
-    text.parse().map_err(|_| {
-        let shown: String = text.chars().take(80).collect();
-        Problem::new(ErrorKind::Malformed, format!("a {of} id is a UUID; got {shown:?}"))
-    })
+    Ok(service::uuid(of, text)?)
 }

@@ -85,7 +85,7 @@ pub struct ServiceError {
 impl ServiceError {
     /// An error of the given kind.
     pub fn new(kind: ErrorKind, detail: impl Into<String>) -> Self {
-        Self { kind, detail: detail.into(), retry_after: None }
+        Self { kind, detail: detail.into(), retry_after: kind.retry_after() }
     }
 
     /// The same, with when it is worth trying again.

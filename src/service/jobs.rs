@@ -139,6 +139,14 @@ impl Service {
     }
 }
 
+/// The id of a job, or of another thing, that a text is.
+pub fn uuid(of: &str, text: &str) -> Result<Uuid, ServiceError> {
+    text.parse().map_err(|_| {
+        let shown: String = text.chars().take(80).collect();
+        ServiceError::malformed(format!("a {of} id is a UUID; got {shown:?}"))
+    })
+}
+
 pub(super) fn no_job(id: Uuid) -> ServiceError {
     ServiceError::not_found(format!(
         "there is no job {id}; one that has ended is removed in time (jobs.keep_days, \

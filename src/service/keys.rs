@@ -5,6 +5,7 @@ use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
+use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 use utoipa::ToSchema;
@@ -253,15 +254,17 @@ impl Keys {
 }
 
 fn random_token() -> Result<Token, ServiceError> {
-    let mut random = [0; 38];
-    let source = rustls::crypto::ring::default_provider().secure_random;
-    match source.fill(&mut random) {
-        Ok(()) => Ok(Token::new(&random)),
-        Err(_) => {
-            let detail = "the system gives no random numbers; the key was not made";
-            Err(ServiceError::new(ErrorKind::Internal, detail))
-        }
-    }
+    Ok(Token::new(&random("key")?))
+}
+
+/// Random bytes for a thing that is being made.
+pub(super) fn random<const N: usize>(of: &str) -> Result<[u8; N], ServiceError> {
+    let mut random = [0; N];
+    SystemRandom::new().fill(&mut random).map_err(|_| {
+        let detail = format!("the system gives no random numbers; the {of} was not made");
+        ServiceError::new(ErrorKind::Internal, detail)
+    })?;
+    Ok(random)
 }
 
 #[cfg(test)]

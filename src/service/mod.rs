@@ -35,7 +35,7 @@ pub use self::door::{Door, Phase};
 pub use self::error::{ErrorKind, ServiceError};
 pub use self::events::{AnyJobEvent, JobChange, JobEvent, JobStatus, Missed, PairDescribed};
 pub use self::images::{ImageMeta, ImagePage, NewImage};
-pub use self::jobs::{JobPage, PairRegions};
+pub use self::jobs::{JobPage, PairRegions, uuid};
 pub use self::keys::{Caller, Keys, MadeKey, NewKey};
 pub use self::limits::{Allowance, Allowances, Limits};
 pub use self::localize::{

@@ -79,14 +79,18 @@ impl Entries {
                     entry.read_to_end(&mut text).map_err(broken)?;
                     self.meta(of.into(), text)
                 }
-                None if self.makes_way_for(&name) && self.room.is_too_small(size) => {
-                    self.images.blocking_send(Ok(Err(self.room.too_large()))).is_ok()
-                }
                 None => {
-                    let memory = self.runtime.block_on(self.room.take(size))?;
-                    let mut bytes = Vec::with_capacity(size);
-                    entry.read_to_end(&mut bytes).map_err(broken)?;
-                    self.picture(name, bytes.into(), memory)
+                    if !self.makes_way_for(&name) {
+                        return Ok(());
+                    }
+                    if self.room.is_too_small(size) {
+                        self.images.blocking_send(Ok(Err(self.room.too_large()))).is_ok()
+                    } else {
+                        let memory = self.runtime.block_on(self.room.take(size))?;
+                        let mut bytes = Vec::with_capacity(size);
+                        entry.read_to_end(&mut bytes).map_err(broken)?;
+                        self.picture(name, bytes.into(), memory)
+                    }
                 }
             };
             if !go_on {

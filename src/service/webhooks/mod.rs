@@ -12,7 +12,6 @@ mod signature;
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
@@ -20,6 +19,7 @@ use uuid::Uuid;
 pub use self::dispatcher::Dispatcher;
 pub use self::settings::WebhookSettings;
 use super::images::page_size;
+use super::keys::random;
 use super::{ErrorKind, ServiceError};
 use crate::domain::{
     Delivery, DeliveryState, MapName, Message, StoredWebhook, Webhook, WebhookEvent, WebhookSecret,
@@ -97,7 +97,7 @@ impl Webhooks {
             disabled_at: None,
             disabled_reason: None,
         };
-        let stored = StoredWebhook { webhook, secret: random_secret()? };
+        let stored = StoredWebhook { webhook, secret: WebhookSecret::new(&random("webhook")?) };
         self.store.add_webhook(stored.clone(), self.settings.max).await?;
         let StoredWebhook { webhook, secret } = stored;
         tracing::info!(target: "audit", made = %webhook.id, "a webhook was made");
@@ -163,15 +163,4 @@ fn no_webhook(id: Uuid) -> ServiceError {
     ServiceError::not_found(format!(
         "there is no webhook {id}; GET /webhooks lists those there are"
     ))
-}
-
-fn random_secret() -> Result<WebhookSecret, ServiceError> {
-    let mut random = [0; 32];
-    match SystemRandom::new().fill(&mut random) {
-        Ok(()) => Ok(WebhookSecret::new(&random)),
-        Err(_) => {
-            let detail = "the system gives no random numbers; the webhook was not made";
-            Err(ServiceError::new(ErrorKind::Internal, detail))
-        }
-    }
 }
