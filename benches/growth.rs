@@ -24,7 +24,7 @@ use whereabouts::domain::{
 };
 use whereabouts::retrieve::index::IndexSettings;
 use whereabouts::store::embedded::{
-    DescriptionBounds, EmbeddedSettings, EmbeddedStore, Examination, compact, examine,
+    EmbeddedSettings, EmbeddedStore, Examination, compact, examine,
 };
 use whereabouts::store::{
     BlobStore, JobRecord, JobStore, KeepJobs, MapStore, Query, Retention, Step,

@@ -18,7 +18,7 @@ use whereabouts::domain::{
 };
 use whereabouts::retrieve::index::IndexSettings;
 use whereabouts::store::MapStore;
-use whereabouts::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
+use whereabouts::store::embedded::{EmbeddedSettings, EmbeddedStore};
 
 const IMAGES: usize = 76_000;
 const DIM: usize = 384;

@@ -26,8 +26,8 @@ use crate::service::{
     Dispatcher, Janitor, Keys, OnceSettings, Reindexes, RetentionSettings, Service,
     ServiceSettings, Tracks, Webhooks,
 };
-use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
-use crate::store::{JobStore, UsageStore};
+use crate::store::embedded::{EmbeddedSettings, EmbeddedStore};
+use crate::store::{DescriptionBounds, JobStore, UsageStore};
 use crate::telemetry::{Metrics, Troubles};
 
 /// Serves on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200; `troubles`

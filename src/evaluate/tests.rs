@@ -8,7 +8,7 @@ use crate::domain::{
 };
 use crate::retrieve::index::{IndexSettings, SearchMode};
 use crate::store::MapStore;
-use crate::store::embedded::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
+use crate::store::embedded::{EmbeddedSettings, EmbeddedStore};
 
 const DIM: usize = 24;
 const REFERENCES: usize = 400;

@@ -129,6 +129,7 @@ impl From<StoreError> for RefineError {
             }
             StoreError::QueueFull { .. }
             | StoreError::Full { .. }
+            | StoreError::Unavailable(_)
             | StoreError::Failed(_)
             | StoreError::Superseded(_) => Self::Passing(error.to_string()),
         }

@@ -116,6 +116,7 @@ impl From<StoreError> for ServiceError {
             StoreError::Conflict(_) | StoreError::Superseded(_) => ErrorKind::Conflict,
             StoreError::QueueFull { .. } => ErrorKind::Overloaded,
             StoreError::Full { .. } => ErrorKind::Full,
+            StoreError::Unavailable(_) => ErrorKind::Unavailable,
             StoreError::Failed(_) | StoreError::Damaged(_) => ErrorKind::Internal,
         };
         Self::new(kind, error.to_string())

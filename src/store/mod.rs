@@ -1,27 +1,34 @@
 //! What must outlive the process: maps, images, descriptors, image bytes, queries and jobs.
 //!
-//! The traits say what a store promises; `embedded` keeps the promise with sled and plain files.
-//! Every call that returns `Ok` after a change means that the change is on disk.
+//! The traits say what a store promises; `embedded` keeps the promise for one process with sled and plain
+//! files, `postgres` for many with PostgreSQL and an object store. Every call that returns `Ok` after a
+//! change means that the change is on disk.
 
+mod changes;
 pub mod embedded;
+mod objects;
+pub mod postgres;
 mod webhooks;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
 use jiff::Timestamp;
 use jiff::civil::Date;
 use serde::{Deserialize, Serialize};
-use tokio::sync::broadcast;
+use tokio::sync::{broadcast, watch};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
+pub use self::objects::{ObjectSettings, Objects};
 pub use self::webhooks::{ForgottenDeliveries, KeepDeliveries, StoredDelivery, WebhookStore};
 use crate::domain::{
     Calibration, CalibrationSettings, Candidate, DayUsage, Description, Descriptor, Digest, Image,
     ImageId, Job, JobState, Map, MapName, MediaType, Pose, StoredKey, Usage,
 };
+use crate::refine::mllm::DescriptionCache;
 use crate::retrieve::index::SearchMode;
 
 /// Why a store did not do what it was asked.
@@ -53,12 +60,55 @@ pub enum StoreError {
         /// The bound.
         kept: u64,
     },
+    /// What the store is made of cannot be reached, or is too busy.
+    #[error("{0}")]
+    Unavailable(String),
     /// The disk or the database failed.
     #[error("the store failed: {0}")]
     Failed(String),
     /// What is stored is not what was written.
     #[error("the store is damaged: {0}")]
     Damaged(String),
+}
+
+/// All that a store does.
+pub trait Store:
+    MapStore
+    + ExportStore
+    + DraftStore
+    + BlobStore
+    + JobStore
+    + UsageStore
+    + KeyStore
+    + AnswerStore
+    + WebhookStore
+    + DescriptionCache
+    + Retention
+{
+}
+
+impl<T> Store for T where
+    T: MapStore
+        + ExportStore
+        + DraftStore
+        + BlobStore
+        + JobStore
+        + UsageStore
+        + KeyStore
+        + AnswerStore
+        + WebhookStore
+        + DescriptionCache
+        + Retention
+{
+}
+
+/// Bounds of the cache of descriptions.
+#[derive(Debug, Clone, Copy)]
+pub struct DescriptionBounds {
+    /// The most bytes of records.
+    pub max_bytes: u64,
+    /// Older descriptions are not used any more.
+    pub max_age: Duration,
 }
 
 /// What became of an image that was sent.
@@ -271,19 +321,6 @@ impl JobRecord {
     pub fn is_held_by(&self, claim: Claim) -> bool {
         self.job.state == JobState::Running && self.claim() == claim
     }
-
-    /// Adds a step: its cost, and its description in the place of one of the same image.
-    pub fn add(&mut self, step: Step) {
-        let Self { job, candidates, .. } = self;
-        job.usage += step.usage;
-        if let Some(description) = step.description {
-            job.descriptions.retain(|known| known.image_id != description.image_id);
-            job.descriptions.push(description);
-            job.descriptions.sort_by_key(|description| {
-                candidates.iter().position(|candidate| candidate.image_id == description.image_id)
-            });
-        }
-    }
 }
 
 /// Which jobs to list.
@@ -370,6 +407,10 @@ pub trait KeyStore: Send + Sync {
     async fn put_key(&self, key: StoredKey) -> Result<(), StoreError>;
     /// All keys, in no order.
     async fn keys(&self) -> Result<Vec<StoredKey>, StoreError>;
+    /// Told when keys were made or revoked, where other processes do that too.
+    fn changed_keys(&self) -> Option<watch::Receiver<()>> {
+        None
+    }
 }
 
 /// What became of a request that may be sent again.

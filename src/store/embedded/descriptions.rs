@@ -6,13 +6,12 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
 
 use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
 
-use super::super::StoreError;
+use super::super::{DescriptionBounds, StoreError};
 use super::trees::{Trees, decode, encode, failed, put};
 use super::{EmbeddedStore, blocking};
 use crate::domain::{Descriptor, Digest, StandIn};
@@ -22,15 +21,6 @@ use crate::refine::mllm::{
 
 /// As many similar frames are looked at, at the most: a pair that none of them has is bought.
 const SIMILAR_FRAMES: usize = 4;
-
-/// Bounds of the cache.
-#[derive(Debug, Clone, Copy)]
-pub struct DescriptionBounds {
-    /// The most bytes of records.
-    pub max_bytes: u64,
-    /// Older descriptions are not used any more.
-    pub max_age: Duration,
-}
 
 /// Which descriptions there are, and in which order they were used.
 pub(super) struct DescriptionUse {

@@ -12,6 +12,7 @@ use sled::Transactional;
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
+use super::super::changes::{ended_at, no_job};
 use super::super::{Claim, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
 use super::trees::{
     BlobOwner, Lease, Trees, blob_ref_key, decode, encode, ended_key, failed, put, queue_key,
@@ -19,7 +20,7 @@ use super::trees::{
 };
 use super::webhooks::WebhookTrees;
 use super::{EmbeddedStore, blocking};
-use crate::domain::{Job, JobState, Usage};
+use crate::domain::Job;
 
 impl EmbeddedStore {
     /// Applies a change to one job and tells the listeners.
@@ -134,11 +135,7 @@ impl JobStore for EmbeddedStore {
             .commit(
                 move |trees, _| {
                     let Some(mut record) = next_waiting(trees, now)? else { return Ok(None) };
-                    record.job.state = JobState::Running;
-                    record.job.error = None;
-                    record.job.started_at.get_or_insert(now);
-                    record.job.attempts += 1;
-                    record.claims += 1;
+                    record.take(now);
                     write_job(trees, &record, Place::Queue(Some(lease_until)))?;
                     Ok(Some(record))
                 },
@@ -166,11 +163,7 @@ impl JobStore for EmbeddedStore {
     async fn release(&self, claim: Claim, release: Release) -> Result<(), StoreError> {
         self.change(claim.job, move |trees, mut record| {
             if record.is_held_by(claim) {
-                record.job.state = JobState::Queued;
-                record.job.error = Some(release.why);
-                if !release.counts {
-                    record.job.attempts = record.job.attempts.saturating_sub(1);
-                }
+                record.give_back(&release);
                 write_job(trees, &record, Place::Queue(release.not_before))?;
             }
             Ok(record)
@@ -193,9 +186,7 @@ impl JobStore for EmbeddedStore {
 
     async fn cancel(&self, id: Uuid) -> Result<Job, StoreError> {
         self.change(id, move |trees, mut record| {
-            if !record.job.state.is_final() {
-                record.job.state = JobState::Cancelled;
-                record.job.finished_at = Some(Timestamp::now());
+            if record.cancel(Timestamp::now()) {
                 write_job(trees, &record, Place::Ended(ended_at(&record.job)))?;
             }
             Ok(record)
@@ -205,18 +196,8 @@ impl JobStore for EmbeddedStore {
 
     async fn retry(&self, id: Uuid) -> Result<Job, StoreError> {
         self.change(id, move |trees, mut record| {
-            let (ended, job) = (ended_at(&record.job), &mut record.job);
-            match job.state {
-                JobState::Failed | JobState::Cancelled | JobState::Degraded => {}
-                state => {
-                    return Err(StoreError::Conflict(format!(
-                        "the job is {state}; only a failed, degraded or cancelled one is retried"
-                    )));
-                }
-            }
-            job.state = JobState::Queued;
-            (job.attempts, job.usage, job.finished_at, job.error) =
-                (0, Usage::default(), None, None);
+            let ended = ended_at(&record.job);
+            record.queue_again()?;
             write_job(trees, &record, Place::Again { ended })?;
             Ok(record)
         })
@@ -226,10 +207,6 @@ impl JobStore for EmbeddedStore {
     fn changes(&self) -> broadcast::Receiver<Uuid> {
         self.inner.changes.subscribe()
     }
-}
-
-fn no_job(id: Uuid) -> StoreError {
-    StoreError::NotFound(format!("there is no job {id}"))
 }
 
 /// No job is held or kept waiting longer than this, budgets of a day included. An entry that says so
@@ -282,11 +259,6 @@ enum Place {
     Again { ended: Timestamp },
     /// Among those that have ended, by when that was.
     Ended(Timestamp),
-}
-
-/// When a job ended that has ended.
-pub(super) fn ended_at(job: &Job) -> Timestamp {
-    job.finished_at.unwrap_or(job.created_at)
 }
 
 /// Writes a job and its place; and with its end, what webhooks are told of that.

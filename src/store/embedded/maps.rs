@@ -8,6 +8,7 @@ use bytes::Bytes;
 use sled::Transactional;
 use uuid::Uuid;
 
+use super::super::changes::{changed_map, removed, same_bytes};
 use super::super::{Added, BlobPin, BlobStore, IndexState, LookAlikes, MapStore, StoreError};
 use super::blobs::Blobs;
 use super::live_map::{LiveMap, folder_of};
@@ -61,31 +62,10 @@ impl Inner {
         let stored: Option<Map> = get(&trees.maps, wanted.name.as_str().as_bytes())?;
         let (map, new) = match stored {
             None => (wanted, true),
-            Some(stored) if stored.revision != wanted.revision => {
-                return Err(StoreError::Superseded(stored.name));
-            }
             Some(stored) => {
-                let same = stored.model == wanted.model
-                    && stored.model_digest == wanted.model_digest
-                    && stored.precision == wanted.precision
-                    && stored.descriptor == wanted.descriptor
-                    && stored.frame == wanted.frame;
-                let has_images = trees.images.scan_prefix(stored.uid.as_bytes()).next().is_some();
-                if !same && has_images {
-                    return Err(StoreError::Conflict(format!(
-                        "the map {} has images, so its model ({} at {} precision), descriptor ({}) \
-                         and frame ({}) are fixed; `whereabouts index --reindex` changes model and \
-                         descriptor, a new map has any frame",
-                        stored.name,
-                        stored.model,
-                        stored.precision,
-                        stored.descriptor,
-                        stored.frame
-                    )));
-                }
-                // Descriptors of another shape go to another folder.
-                let uid = if same { stored.uid } else { wanted.uid };
-                (Map { uid, created_at: stored.created_at, ..wanted }, false)
+                let uid = stored.uid;
+                let has_images = || trees.images.scan_prefix(uid.as_bytes()).next().is_some();
+                (changed_map(stored, wanted, has_images)?, false)
             }
         };
         put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
@@ -184,7 +164,9 @@ impl MapStore for EmbeddedStore {
             .commit(
                 move |trees, touched| {
                     if let Some(present) = trees.image(uid, &image.id)? {
-                        return same_bytes(present, &image).map(|present| (present, false));
+                        let slot = present.slot;
+                        let image = same_bytes(present.image, &image)?;
+                        return Ok((StoredImage { image, slot }, false));
                     }
                     still_there(trees, &map)?;
                     let slot = writing.take_slot();
@@ -317,22 +299,6 @@ pub(super) fn still_there(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
         Some(stored) if stored.uid == map.uid => Err(StoreError::Superseded(stored.name)),
         _ => Err(removed(map)),
     }
-}
-
-fn removed(map: &Map) -> StoreError {
-    StoreError::NotFound(format!("the map {} was removed", map.name))
-}
-
-fn same_bytes(present: StoredImage, sent: &Image) -> Result<StoredImage, StoreError> {
-    if present.image.digest == sent.digest {
-        return Ok(present);
-    }
-    Err(StoreError::Conflict(format!(
-        "the image id {:?} is taken by other bytes ({}); choose another id, or delete that image \
-         first",
-        sent.id.as_str(),
-        present.image.digest
-    )))
 }
 
 fn insert_image(trees: &Trees, uid: Uuid, stored: &StoredImage) -> Result<(), StoreError> {

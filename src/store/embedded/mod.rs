@@ -45,7 +45,6 @@ use uuid::Uuid;
 
 use self::blobs::Blobs;
 pub use self::compact::{Compacted, compact};
-pub use self::descriptions::DescriptionBounds;
 use self::descriptions::DescriptionUse;
 pub use self::doctor::{Examination, Finding, MapReport, Report, Sizes, examine};
 use self::indexer::Indexer;
@@ -53,7 +52,7 @@ use self::live_map::LiveMap;
 use self::mark::CommitMark;
 use self::trees::Trees;
 use self::writer::Writer;
-use super::StoreError;
+use super::{DescriptionBounds, StoreError};
 use crate::domain::MapName;
 use crate::retrieve::index::IndexSettings;
 

@@ -17,8 +17,8 @@ use uuid::Uuid;
 use walkdir::WalkDir;
 
 use super::super::StoreError;
+use super::super::changes::ended_at;
 use super::blobs::replace_durably;
-use super::jobs::ended_at;
 use super::trees::{Lease, Trees, decode, ended_key, failed, put, queue_key};
 use crate::store::JobRecord;
 

@@ -12,13 +12,14 @@ use jiff::Timestamp;
 use tokio::sync::watch;
 use uuid::Uuid;
 
+use super::super::changes::{check_ended, no_delivery, no_webhook, too_many_webhooks};
 use super::super::{ForgottenDeliveries, KeepDeliveries, StoreError, StoredDelivery, WebhookStore};
 use super::trees::{Trees, decode, failed, put};
 use super::{EmbeddedStore, blocking};
 use crate::domain::{Attempt, Delivery, DeliveryState, StoredWebhook, Then};
 
 pub(super) use self::trees::WebhookTrees;
-use self::trees::{News, key, no_webhook};
+use self::trees::{News, key};
 
 /// Deliveries removed in one change when their webhook is.
 const REMOVED_AT_ONCE: usize = 256;
@@ -50,9 +51,7 @@ impl WebhookStore for EmbeddedStore {
     async fn add_webhook(&self, webhook: StoredWebhook, most: usize) -> Result<(), StoreError> {
         self.change_webhooks(move |trees| {
             if trees.webhooks.len() >= most {
-                return Err(StoreError::Conflict(format!(
-                    "there are {most} webhooks, the most (webhooks.max); delete one first"
-                )));
+                return Err(too_many_webhooks(most));
             }
             put(&trees.webhooks, webhook.webhook.id.as_bytes(), &webhook)
         })
@@ -123,17 +122,10 @@ impl WebhookStore for EmbeddedStore {
         let queued = self.change_webhooks(move |trees| {
             let Some(known) = trees.delivery(&key(webhook, id))? else {
                 trees.webhook(webhook)?.ok_or_else(|| no_webhook(webhook))?;
-                return Err(StoreError::NotFound(format!(
-                    "the webhook has no delivery {id}; one that has ended is removed in time \
-                     (webhooks.keep_days, webhooks.max_deliveries)"
-                )));
+                return Err(no_delivery(id));
             };
             trees.enabled(webhook)?;
-            if let (DeliveryState::Waiting, Some(next)) = (known.state, known.next_attempt_at) {
-                return Err(StoreError::Conflict(format!(
-                    "the delivery waits anyway, and is tried at {next:.0}; there is nothing to do"
-                )));
-            }
+            check_ended(&known)?;
             let again = known.clone().again(now);
             trees.replace(&known, &again)?;
             Ok(again)

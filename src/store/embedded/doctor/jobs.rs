@@ -1,6 +1,6 @@
 //! Jobs: each is where its state says, and has its frame.
 
-use super::super::jobs::ended_at;
+use super::super::super::changes::ended_at;
 use super::super::trees::{
     BlobOwner, Lease, blob_ref_key, decode, ended_job, ended_key, failed, put, queue_key,
     queued_job,

@@ -5,9 +5,10 @@ use sled::Transactional;
 use sled::transaction::{ConflictableTransactionResult, TransactionalTree};
 use uuid::Uuid;
 
+use super::super::super::changes::{check_enabled, news_of, no_webhook};
 use super::super::super::{KeepDeliveries, StoreError};
 use super::super::trees::{decode, encode, failed, get, transaction_failed};
-use crate::domain::{Delivery, DeliveryState, Job, Message, StoredWebhook, WebhookEvent};
+use crate::domain::{Delivery, DeliveryState, Job, StoredWebhook};
 
 /// The sled trees of webhooks.
 #[derive(Clone)]
@@ -44,36 +45,19 @@ impl WebhookTrees {
         get(&self.deliveries, key)
     }
 
-    /// The webhook, if it may be told something.
+    /// Refuses a webhook that is not there or is to be told nothing.
     pub fn enabled(&self, id: Uuid) -> Result<(), StoreError> {
-        match self.webhook(id)? {
-            None => Err(no_webhook(id)),
-            Some(StoredWebhook { webhook, .. }) if webhook.disabled_at.is_some() => {
-                let why = webhook.disabled_reason.unwrap_or_default();
-                let why = format!("the webhook is disabled ({why}); make another one");
-                Err(StoreError::Conflict(why))
-            }
-            Some(_) => Ok(()),
-        }
+        check_enabled(&self.webhook(id)?.ok_or_else(|| no_webhook(id))?)
     }
 
     /// What is to be written because a job has ended.
     pub fn news_of(&self, job: &Job) -> Result<Vec<News>, StoreError> {
-        let (Some(event), false) = (WebhookEvent::of(job.state), self.webhooks.is_empty()) else {
+        if self.webhooks.is_empty() {
             return Ok(Vec::new());
-        };
-        let now = Timestamp::now();
-        let timestamp = job.finished_at.unwrap_or(now);
-        let body = encode(&Message { event, timestamp, data: job })?;
-        let mut news = Vec::new();
-        for value in self.webhooks.iter().values() {
-            let StoredWebhook { webhook, .. } = decode(&value.map_err(failed)?)?;
-            if webhook.wants(event, job) {
-                let delivery = Delivery::queued(webhook.id, event, Some(job.id), now);
-                news.push(News::of(&delivery, body.clone())?);
-            }
         }
-        Ok(news)
+        let webhooks = self.webhooks.iter().values().map(|value| decode(&value.map_err(failed)?));
+        let news = news_of(job, webhooks.collect::<Result<Vec<_>, _>>()?)?;
+        news.into_iter().map(|new| News::of(&new.delivery, new.body)).collect()
     }
 
     pub fn queue(&self, news: &News) -> Result<(), StoreError> {
@@ -185,10 +169,6 @@ impl News {
         due.insert(self.due.as_slice(), &[])?;
         Ok(())
     }
-}
-
-pub(super) fn no_webhook(id: Uuid) -> StoreError {
-    StoreError::NotFound(format!("there is no webhook {id}; GET /webhooks lists those there are"))
 }
 
 pub(super) fn key(webhook: Uuid, id: Uuid) -> [u8; 32] {

@@ -1,0 +1,170 @@
+//! What a change makes of a record, whichever store keeps it.
+
+use jiff::Timestamp;
+
+use super::{JobRecord, Release, Step, StoreError, StoredDelivery};
+use crate::domain::{
+    Delivery, Image, Job, JobState, Map, Message, StoredWebhook, Usage, WebhookEvent,
+};
+
+impl JobRecord {
+    /// Gives the job to a worker.
+    pub(super) fn take(&mut self, now: Timestamp) {
+        self.job.state = JobState::Running;
+        self.job.error = None;
+        self.job.started_at.get_or_insert(now);
+        self.job.attempts += 1;
+        self.claims += 1;
+    }
+
+    /// Gives the job back to the queue.
+    pub(super) fn give_back(&mut self, release: &Release) {
+        self.job.state = JobState::Queued;
+        self.job.error = Some(release.why.clone());
+        if !release.counts {
+            self.job.attempts = self.job.attempts.saturating_sub(1);
+        }
+    }
+
+    /// Ends a job that has not ended; `false` if it has.
+    pub(super) fn cancel(&mut self, now: Timestamp) -> bool {
+        if self.job.state.is_final() {
+            return false;
+        }
+        self.job.state = JobState::Cancelled;
+        self.job.finished_at = Some(now);
+        true
+    }
+
+    /// Queues a job again that ended without success.
+    pub(super) fn queue_again(&mut self) -> Result<(), StoreError> {
+        let job = &mut self.job;
+        match job.state {
+            JobState::Failed | JobState::Cancelled | JobState::Degraded => {}
+            state => {
+                return Err(StoreError::Conflict(format!(
+                    "the job is {state}; only a failed, degraded or cancelled one is retried"
+                )));
+            }
+        }
+        job.state = JobState::Queued;
+        (job.attempts, job.usage, job.finished_at, job.error) = (0, Usage::default(), None, None);
+        Ok(())
+    }
+
+    /// Adds a step: its cost, and its description in the place of one of the same image.
+    pub fn add(&mut self, step: Step) {
+        let Self { job, candidates, .. } = self;
+        job.usage += step.usage;
+        if let Some(description) = step.description {
+            job.descriptions.retain(|known| known.image_id != description.image_id);
+            job.descriptions.push(description);
+            job.descriptions.sort_by_key(|description| {
+                candidates.iter().position(|candidate| candidate.image_id == description.image_id)
+            });
+        }
+    }
+}
+
+/// When a job ended that has ended.
+pub(super) fn ended_at(job: &Job) -> Timestamp {
+    job.finished_at.unwrap_or(job.created_at)
+}
+
+/// What webhooks are to be told of a job that has just ended.
+pub(super) fn news_of(
+    job: &Job,
+    webhooks: impl IntoIterator<Item = StoredWebhook>,
+) -> Result<Vec<StoredDelivery>, StoreError> {
+    let Some(event) = WebhookEvent::of(job.state) else { return Ok(Vec::new()) };
+    let now = Timestamp::now();
+    let timestamp = job.finished_at.unwrap_or(now);
+    let message = Message { event, timestamp, data: job };
+    let body =
+        serde_json::to_vec(&message).map_err(|error| StoreError::Failed(error.to_string()))?;
+    let wanting = webhooks.into_iter().filter(|stored| stored.webhook.wants(event, job));
+    let delivery = |stored: StoredWebhook| StoredDelivery {
+        delivery: Delivery::queued(stored.webhook.id, event, Some(job.id), now),
+        body: body.clone(),
+    };
+    Ok(wanting.map(delivery).collect())
+}
+
+/// The map that is stored when `wanted` is put in the place of `stored`.
+pub(super) fn changed_map(
+    stored: Map,
+    wanted: Map,
+    has_images: impl FnOnce() -> bool,
+) -> Result<Map, StoreError> {
+    if stored.revision != wanted.revision {
+        return Err(StoreError::Superseded(stored.name));
+    }
+    let same = stored.is_like(&wanted) && stored.frame == wanted.frame;
+    if !same && has_images() {
+        return Err(StoreError::Conflict(format!(
+            "the map {} has images, so its model ({} at {} precision), descriptor ({}) and frame ({}) \
+             are fixed; `whereabouts index --reindex` changes model and descriptor, a new map has any \
+             frame",
+            stored.name, stored.model, stored.precision, stored.descriptor, stored.frame
+        )));
+    }
+    // Descriptors of another shape go elsewhere.
+    let uid = if same { stored.uid } else { wanted.uid };
+    Ok(Map { uid, created_at: stored.created_at, ..wanted })
+}
+
+/// The image that is there already, if it has the bytes that were sent.
+pub(super) fn same_bytes(present: Image, sent: &Image) -> Result<Image, StoreError> {
+    if present.digest == sent.digest {
+        return Ok(present);
+    }
+    Err(StoreError::Conflict(format!(
+        "the image id {:?} is taken by other bytes ({}); choose another id, or delete that image first",
+        sent.id.as_str(),
+        present.digest
+    )))
+}
+
+pub(super) fn removed(map: &Map) -> StoreError {
+    StoreError::NotFound(format!("the map {} was removed", map.name))
+}
+
+pub(super) fn no_job(id: uuid::Uuid) -> StoreError {
+    StoreError::NotFound(format!("there is no job {id}"))
+}
+
+pub(super) fn no_webhook(id: uuid::Uuid) -> StoreError {
+    StoreError::NotFound(format!("there is no webhook {id}; GET /webhooks lists those there are"))
+}
+
+pub(super) fn no_delivery(id: uuid::Uuid) -> StoreError {
+    StoreError::NotFound(format!(
+        "the webhook has no delivery {id}; one that has ended is removed in time (webhooks.keep_days, \
+         webhooks.max_deliveries)"
+    ))
+}
+
+/// Refuses to tell a webhook something that is to be told nothing.
+pub(super) fn check_enabled(stored: &StoredWebhook) -> Result<(), StoreError> {
+    if stored.webhook.disabled_at.is_none() {
+        return Ok(());
+    }
+    let why = stored.webhook.disabled_reason.as_deref().unwrap_or_default();
+    Err(StoreError::Conflict(format!("the webhook is disabled ({why}); make another one")))
+}
+
+pub(super) fn too_many_webhooks(most: usize) -> StoreError {
+    StoreError::Conflict(format!(
+        "there are {most} webhooks, the most (webhooks.max); delete one first"
+    ))
+}
+
+/// Refuses to queue a delivery again that waits anyway.
+pub(super) fn check_ended(delivery: &Delivery) -> Result<(), StoreError> {
+    match delivery.next_attempt_at {
+        None => Ok(()),
+        Some(next) => Err(StoreError::Conflict(format!(
+            "the delivery waits anyway, and is tried at {next:.0}; there is nothing to do"
+        ))),
+    }
+}

@@ -1,0 +1,177 @@
+//! Image bytes in an object store: any that speaks S3, or a folder.
+
+use std::path::Path as Folder;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use object_store::aws::AmazonS3Builder;
+use object_store::local::LocalFileSystem;
+use object_store::path::Path;
+use object_store::{
+    BackoffConfig, ClientOptions, Error, ObjectStore, ObjectStoreExt, PutMode, PutOptions,
+    RetryConfig,
+};
+
+use super::StoreError;
+use crate::domain::Digest;
+
+/// Where an object store is.
+#[derive(Debug, Clone)]
+pub struct ObjectSettings {
+    /// `s3://bucket/prefix`, or `file:///folder`.
+    pub url: String,
+    /// The address of a server that speaks S3; empty for Amazon's.
+    pub endpoint: String,
+    /// The region; empty for the default one.
+    pub region: String,
+    /// Whether the server may be spoken to without TLS.
+    pub allow_http: bool,
+    /// The longest a call may take, all its tries together.
+    pub timeout: Duration,
+}
+
+/// An object store, or part of one.
+#[derive(Debug, Clone)]
+pub struct Objects {
+    store: Arc<dyn ObjectStore>,
+    prefix: Path,
+    timeout: Duration,
+}
+
+/// The shortest pause before a call is tried again.
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+
+impl Objects {
+    /// The store of these settings. Nothing is sent yet.
+    pub fn open(settings: &ObjectSettings) -> Result<Self, StoreError> {
+        let unusable = |why: String| {
+            StoreError::Failed(format!(
+                "objects.url: {why}; write s3://bucket/prefix or file:///folder"
+            ))
+        };
+        let (scheme, rest) = settings
+            .url
+            .split_once("://")
+            .ok_or_else(|| unusable(format!("{:?} is no address", settings.url)))?;
+        match scheme {
+            "file" => Self::folder(Folder::new(rest), settings.timeout),
+            "s3" => {
+                let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
+                let prefix = Path::parse(prefix).map_err(|error| unusable(error.to_string()))?;
+                let store = Arc::new(s3(settings, bucket)?);
+                Ok(Self { store, prefix, timeout: settings.timeout })
+            }
+            other => Err(unusable(format!("{other}:// is not known"))),
+        }
+    }
+
+    /// A folder, which is made if it is not there.
+    pub fn folder(folder: &Folder, timeout: Duration) -> Result<Self, StoreError> {
+        let failed = |error: &dyn std::fmt::Display| {
+            let folder = folder.display();
+            StoreError::Failed(format!("cannot keep pictures in {folder}: {error} (objects.url)"))
+        };
+        std::fs::create_dir_all(folder).map_err(|error| failed(&error))?;
+        let store = LocalFileSystem::new_with_prefix(folder)
+            .map_err(|error| failed(&error))?
+            .with_fsync(true);
+        Ok(Self { store: Arc::new(store), prefix: Path::default(), timeout })
+    }
+
+    /// Stores bytes, unless they are there.
+    pub async fn put(&self, digest: &Digest, bytes: Bytes) -> Result<(), StoreError> {
+        let path = self.path(digest);
+        let length = bytes.len() as u64;
+        self.call(async {
+            match self.store.head(&path).await {
+                // Objects come whole or not at all.
+                Ok(found) if found.size == length => return Ok(()),
+                Ok(_) | Err(Error::NotFound { .. }) => {}
+                Err(error) => return Err(error),
+            }
+            let put = PutOptions { mode: PutMode::Overwrite, ..PutOptions::default() };
+            self.store.put_opts(&path, bytes.into(), put).await.map(drop)
+        })
+        .await
+    }
+
+    /// The bytes of that digest.
+    pub async fn get(&self, digest: &Digest) -> Result<Option<Bytes>, StoreError> {
+        let path = self.path(digest);
+        self.call(async {
+            match self.store.get(&path).await {
+                Ok(found) => found.bytes().await.map(Some),
+                Err(Error::NotFound { .. }) => Ok(None),
+                Err(error) => Err(error),
+            }
+        })
+        .await
+    }
+
+    /// Removes bytes; none is no error.
+    pub async fn remove(&self, digest: &Digest) -> Result<(), StoreError> {
+        let path = self.path(digest);
+        self.call(async {
+            match self.store.delete(&path).await {
+                Ok(()) | Err(Error::NotFound { .. }) => Ok(()),
+                Err(error) => Err(error),
+            }
+        })
+        .await
+    }
+
+    fn path(&self, digest: &Digest) -> Path {
+        let hex = digest.hex();
+        self.prefix.clone().join(&hex[..2]).join(&hex[2..])
+    }
+
+    async fn call<T>(&self, work: impl Future<Output = Result<T, Error>>) -> Result<T, StoreError> {
+        let unavailable = |why: &dyn std::fmt::Display| {
+            StoreError::Unavailable(format!(
+                "the object store is not available: {why}; try again in a moment"
+            ))
+        };
+        match tokio::time::timeout(self.timeout, work).await {
+            Ok(Ok(done)) => Ok(done),
+            Err(_) => {
+                let limit = self.timeout.as_millis();
+                Err(unavailable(&format!(
+                    "it did not answer within {limit} ms (objects.timeout_ms)"
+                )))
+            }
+            Ok(Err(error @ (Error::PermissionDenied { .. } | Error::Unauthenticated { .. }))) => {
+                Err(StoreError::Failed(format!(
+                    "the object store lets nobody in with these credentials: {error}; check \
+                     AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they may do"
+                )))
+            }
+            Ok(Err(error)) => Err(unavailable(&error)),
+        }
+    }
+}
+
+fn s3(settings: &ObjectSettings, bucket: &str) -> Result<object_store::aws::AmazonS3, StoreError> {
+    // Credentials come from the environment, as for every program that speaks S3.
+    let mut builder = AmazonS3Builder::from_env()
+        .with_bucket_name(bucket)
+        .with_allow_http(settings.allow_http)
+        .with_client_options(
+            ClientOptions::new()
+                .with_timeout(settings.timeout)
+                .with_connect_timeout(settings.timeout / 2)
+                .with_allow_http(settings.allow_http),
+        )
+        .with_retry(RetryConfig {
+            backoff: BackoffConfig { init_backoff: FIRST_PAUSE, ..BackoffConfig::default() },
+            max_retries: 3,
+            retry_timeout: settings.timeout,
+        });
+    if !settings.endpoint.is_empty() {
+        builder = builder.with_endpoint(&settings.endpoint);
+    }
+    if !settings.region.is_empty() {
+        builder = builder.with_region(&settings.region);
+    }
+    builder.build().map_err(|error| StoreError::Failed(format!("objects.url: {error}")))
+}

@@ -1,0 +1,242 @@
+//! The cache of descriptions that were paid for, and the frames they are of.
+//!
+//! Bounded in bytes and in age. The least recently used go first; when one was used is noted now and then, not
+//! at every use.
+
+use std::sync::{Mutex, PoisonError};
+
+use async_trait::async_trait;
+use jiff::Timestamp;
+use sqlx::types::Json;
+use tokio::time::Instant;
+use uuid::Uuid;
+
+use super::super::StoreError;
+use super::blobs::digest_of;
+use super::{Inner, PostgresStore, count, counted, record};
+use crate::domain::{Descriptor, Digest, StandIn};
+use crate::refine::mllm::{
+    CacheLevels, CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame,
+};
+
+/// As many similar frames are looked at, at the most: a pair that none of them has is bought.
+const SIMILAR_FRAMES: i64 = 4;
+
+/// A use is noted if the last one that was is so long ago, in seconds.
+const USES_NOTED_S: f64 = 3600.0;
+
+/// The most descriptions removed in one statement.
+const REMOVED_AT_ONCE: i64 = 1000;
+
+/// How full the cache was when it was last looked at.
+#[derive(Default)]
+pub(super) struct KnownLevels(Mutex<(CacheLevels, Option<Instant>)>);
+
+impl KnownLevels {
+    fn get(&self) -> CacheLevels {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).0
+    }
+
+    fn set(&self, levels: CacheLevels) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (levels, Some(Instant::now()));
+    }
+}
+
+#[async_trait]
+impl DescriptionCache for PostgresStore {
+    async fn description(&self, key: &Digest) -> Result<Option<CachedDescription>, StoreError> {
+        let inner = &self.inner;
+        let query = sqlx::query_scalar(
+            "WITH used AS (
+                 UPDATE descriptions SET used_at = now()
+                 WHERE key = $1 AND used_at < now() - make_interval(secs => $3))
+             SELECT record FROM descriptions
+             WHERE key = $1 AND created_at > now() - make_interval(secs => $2)",
+        )
+        .bind(key.as_bytes().as_slice())
+        .bind(inner.settings.descriptions.max_age.as_secs_f64())
+        .bind(USES_NOTED_S);
+        inner
+            .call(async {
+                let found: Option<Json<CachedDescription>> =
+                    query.fetch_optional(&inner.pool).await?;
+                Ok(found.map(|Json(description)| description))
+            })
+            .await
+    }
+
+    async fn keep_description(
+        &self,
+        key: Digest,
+        value: CachedDescription,
+    ) -> Result<(), StoreError> {
+        let inner = &self.inner;
+        let text = record(&value)?;
+        let query = sqlx::query(
+            "WITH bought AS (DELETE FROM purchases WHERE key = $1)
+             INSERT INTO descriptions (key, size, created_at, used_at, record)
+             VALUES ($1, $2, now(), now(), $3::json)
+             ON CONFLICT (key) DO UPDATE SET size = EXCLUDED.size, created_at = now(),
+                 used_at = now(), record = EXCLUDED.record",
+        )
+        .bind(key.as_bytes().as_slice())
+        .bind(count(text.len() + key.as_bytes().len()))
+        .bind(text);
+        inner
+            .call(async {
+                query.execute(&inner.pool).await?;
+                Ok(())
+            })
+            .await
+    }
+
+    async fn begin_purchase(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
+        let inner = &self.inner;
+        let for_s = until.duration_since(Timestamp::now()).as_secs_f64().max(0.0);
+        let query = sqlx::query(
+            "INSERT INTO purchases (key, holder, until)
+             VALUES ($1, $2, now() + make_interval(secs => $3))
+             ON CONFLICT (key) DO UPDATE SET holder = EXCLUDED.holder, until = EXCLUDED.until
+             WHERE purchases.holder = $2 OR purchases.until <= now()
+                 OR NOT is_alive(purchases.holder, make_interval(secs => $4))",
+        )
+        .bind(key.as_bytes().as_slice())
+        .bind(inner.process)
+        .bind(for_s)
+        .bind(inner.lifetime());
+        inner.call(async { Ok(query.execute(&inner.pool).await?.rows_affected() > 0) }).await
+    }
+
+    async fn end_purchase(&self, key: &Digest) -> Result<(), StoreError> {
+        let inner = &self.inner;
+        let query = sqlx::query("DELETE FROM purchases WHERE key = $1 AND holder = $2")
+            .bind(key.as_bytes().as_slice())
+            .bind(inner.process);
+        inner
+            .call(async {
+                query.execute(&inner.pool).await?;
+                Ok(())
+            })
+            .await
+    }
+
+    async fn similar_frames(
+        &self,
+        map: Uuid,
+        to: &Descriptor,
+        at_least: f32,
+    ) -> Result<Vec<SimilarFrame>, StoreError> {
+        let inner = &self.inner;
+        // A map that changed its model while it was empty keeps frames of the old one.
+        let query = sqlx::query_as(
+            "SELECT query_id, digest, similarity FROM (
+                 SELECT query_id, digest, 1 - (descriptor <=> $2::real[]::vector) AS similarity
+                 FROM (SELECT * FROM frames WHERE map_uid = $1 AND vector_dims(descriptor) = $3
+                       OFFSET 0) alike) compared
+             WHERE similarity >= $4 ORDER BY similarity DESC LIMIT $5",
+        )
+        .bind(map)
+        .bind(to.as_slice())
+        .bind(i32::try_from(to.dim()).unwrap_or(0))
+        .bind(f64::from(at_least))
+        .bind(SIMILAR_FRAMES);
+        inner
+            .call(async {
+                let found: Vec<(Uuid, Vec<u8>, f64)> = query.fetch_all(&inner.pool).await?;
+                let similar = |(query_id, digest, similarity): (Uuid, Vec<u8>, f64)| {
+                    let stand_in = StandIn { query_id, similarity: similarity as f32 };
+                    Ok(SimilarFrame { digest: digest_of(&digest)?, stand_in })
+                };
+                found.into_iter().map(similar).collect()
+            })
+            .await
+    }
+
+    async fn keep_frame(
+        &self,
+        map: Uuid,
+        frame: DescribedFrame,
+        most: usize,
+    ) -> Result<(), StoreError> {
+        let inner = &self.inner;
+        let keep = sqlx::query(
+            "INSERT INTO frames (map_uid, query_id, digest, descriptor)
+             VALUES ($1, $2, $3, $4::real[]::vector) ON CONFLICT DO NOTHING",
+        )
+        .bind(map)
+        .bind(frame.query_id)
+        .bind(frame.digest.as_bytes().as_slice())
+        .bind(frame.descriptor.as_slice());
+        // Ids sort by age.
+        let forget = sqlx::query(
+            "DELETE FROM frames WHERE map_uid = $1 AND query_id <= (
+                 SELECT query_id FROM frames WHERE map_uid = $1
+                 ORDER BY query_id DESC OFFSET $2 LIMIT 1)",
+        )
+        .bind(map)
+        .bind(count(most));
+        inner
+            .call(async {
+                let mut tx = inner.begin().await?;
+                keep.execute(&mut *tx).await?;
+                forget.execute(&mut *tx).await?;
+                Ok(tx.commit().await?)
+            })
+            .await
+    }
+
+    fn levels(&self) -> CacheLevels {
+        self.inner.levels.get()
+    }
+}
+
+impl Inner {
+    /// Removes descriptions that are too old or too many, and notes how full the cache is.
+    pub(super) async fn tidy_descriptions(&self) -> Result<(), StoreError> {
+        let bounds = self.settings.descriptions;
+        let broken_off = sqlx::query("DELETE FROM purchases WHERE until <= now()");
+        self.call(async { Ok(broken_off.execute(&self.pool).await?) }).await?;
+        loop {
+            let gone = sqlx::query(
+                "DELETE FROM descriptions WHERE key IN (
+                     SELECT key FROM descriptions
+                     WHERE created_at <= now() - make_interval(secs => $1) LIMIT $2)",
+            )
+            .bind(bounds.max_age.as_secs_f64())
+            .bind(REMOVED_AT_ONCE);
+            let gone = self.call(async { Ok(gone.execute(&self.pool).await?) }).await?;
+            if gone.rows_affected() < REMOVED_AT_ONCE.unsigned_abs() {
+                break;
+            }
+        }
+        loop {
+            let levels = self.call(self.cache_levels()).await?;
+            self.levels.set(levels);
+            let over = levels.bytes.saturating_sub(bounds.max_bytes);
+            if over == 0 {
+                return Ok(());
+            }
+            // The least recently used, as long as they are needed to make room.
+            let gone = sqlx::query(
+                "DELETE FROM descriptions WHERE key IN (
+                     SELECT key FROM (
+                         SELECT key, sum(size) OVER (ORDER BY used_at, key) - size AS before
+                         FROM (SELECT key, size, used_at FROM descriptions
+                               ORDER BY used_at, key LIMIT $2) oldest) summed
+                     WHERE before < $1)",
+            )
+            .bind(i64::try_from(over).unwrap_or(i64::MAX))
+            .bind(REMOVED_AT_ONCE);
+            let gone = self.call(async { Ok(gone.execute(&self.pool).await?) }).await?;
+            if gone.rows_affected() == 0 {
+                return Ok(());
+            }
+        }
+    }
+
+    async fn cache_levels(&self) -> Result<CacheLevels, StoreError> {
+        let query = "SELECT count(*), coalesce(sum(size), 0)::bigint FROM descriptions";
+        let (entries, bytes): (i64, i64) = sqlx::query_as(query).fetch_one(&self.pool).await?;
+        Ok(CacheLevels { entries: counted(entries), bytes: bytes.unsigned_abs() })
+    }
+}

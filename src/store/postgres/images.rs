@@ -1,0 +1,206 @@
+//! The images of maps. One statement adds an image with its descriptor, its count and its claim to the
+//! bytes, and one removes it with all of that.
+
+use async_trait::async_trait;
+use jiff::Timestamp;
+use sqlx::AssertSqlSafe;
+use sqlx::Row;
+use sqlx::types::Json;
+use uuid::Uuid;
+
+use super::super::changes::{removed, same_bytes};
+use super::super::{Added, ExportStore, ExportedImage, StoreError};
+use super::descriptors::{descriptor_of, image_id, table};
+use super::{Inner, PostgresStore, blobs, count, is_missing_table, record};
+use crate::domain::{Descriptor, Image, ImageId, Map, Pose};
+
+/// Counts of a map are kept in so many parts.
+const PARTS: i16 = 16;
+
+/// How often something is tried again that another process was quicker with.
+const TRIES: usize = 3;
+
+impl Inner {
+    pub(super) async fn add_image(
+        &self,
+        map: &Map,
+        image: Image,
+        descriptor: &Descriptor,
+    ) -> Result<Added, StoreError> {
+        let table = table(map.uid, map.revision);
+        let sql = format!(
+            "WITH map AS (
+                 SELECT uid FROM maps WHERE uid = $1 AND revision = $2 FOR SHARE),
+             added AS (
+                 INSERT INTO images (map_uid, id, digest, record)
+                 SELECT uid, $3, $4, $5::json FROM map ON CONFLICT DO NOTHING RETURNING slot),
+             described AS (
+                 INSERT INTO {table} (slot, descriptor) SELECT slot, $6::real[]::vector FROM added),
+             counted AS (
+                 INSERT INTO image_counts (map_uid, part, images, changes)
+                 SELECT $1, $7, 1, 1 FROM added ON CONFLICT (map_uid, part) DO UPDATE
+                 SET images = image_counts.images + 1, changes = image_counts.changes + 1),
+             needed AS (
+                 UPDATE blobs SET needed = needed + 1
+                 WHERE digest = $4 AND EXISTS (SELECT FROM added) RETURNING digest)
+             SELECT (SELECT count(*) FROM added) AS added, (SELECT count(*) FROM needed) AS needed"
+        );
+        let text = record(&image)?;
+        for _ in 0..TRIES {
+            // One transaction, so that nothing stays of an image without bytes.
+            let mut tx = self.begin().await?;
+            let added = sqlx::query(AssertSqlSafe(sql.clone()))
+                .bind(map.uid)
+                .bind(i64::from(map.revision))
+                .bind(image.id.as_str())
+                .bind(image.digest.as_bytes().as_slice())
+                .bind(&text)
+                .bind(descriptor.as_slice())
+                .bind(part())
+                .fetch_one(&mut *tx)
+                .await;
+            let row = match added {
+                Ok(row) => row,
+                Err(error) => {
+                    drop(tx);
+                    return Err(self.explain(map, error).await);
+                }
+            };
+            match (row.try_get::<i64, _>("added")?, row.try_get::<i64, _>("needed")?) {
+                (0, _) => {}
+                (_, 0) => return Err(blobs::not_stored(&image.digest)),
+                _ => {
+                    tx.commit().await?;
+                    return Ok(Added::Created(image));
+                }
+            }
+            drop(tx);
+            if let Some(present) = self.image(map.uid, &image.id).await? {
+                return Ok(Added::Present(same_bytes(present, &image)?));
+            }
+            self.check_revision(map).await?;
+            // The image was there and has just been removed.
+        }
+        Err(super::unavailable("others change the same image"))
+    }
+
+    pub(super) async fn image(
+        &self,
+        map_uid: Uuid,
+        id: &ImageId,
+    ) -> Result<Option<Image>, StoreError> {
+        let found = sqlx::query_scalar("SELECT record FROM images WHERE map_uid = $1 AND id = $2");
+        let found: Option<Json<Image>> =
+            found.bind(map_uid).bind(id.as_str()).fetch_optional(&self.pool).await?;
+        Ok(found.map(|Json(image)| image))
+    }
+
+    pub(super) async fn images(
+        &self,
+        map: &Map,
+        after: Option<&ImageId>,
+        limit: usize,
+    ) -> Result<Vec<Image>, StoreError> {
+        let images: Vec<Json<Image>> = sqlx::query_scalar(
+            "SELECT record FROM images WHERE map_uid = $1 AND id > $2 ORDER BY id LIMIT $3",
+        )
+        .bind(map.uid)
+        .bind(after.map_or("", ImageId::as_str))
+        .bind(count(limit))
+        .fetch_all(&self.pool)
+        .await?;
+        Ok(images.into_iter().map(|Json(image)| image).collect())
+    }
+
+    pub(super) async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
+        let positions: Vec<(String, Json<Option<Pose>>)> = sqlx::query_as(
+            "SELECT id, record->'pose' FROM images WHERE map_uid = $1 ORDER BY slot",
+        )
+        .bind(map.uid)
+        .fetch_all(&self.pool)
+        .await?;
+        let known = positions.into_iter().filter_map(|(id, Json(pose))| Some((id, pose?)));
+        known.map(|(id, pose)| Ok((image_id(id)?, pose))).collect()
+    }
+
+    pub(super) async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {
+        for _ in 0..TRIES {
+            let revision = sqlx::query_scalar("SELECT revision FROM maps WHERE uid = $1");
+            let revision: Option<i64> = revision.bind(map.uid).fetch_optional(&self.pool).await?;
+            let revision = revision.ok_or_else(|| removed(map))?;
+            let table = table(map.uid, u32::try_from(revision).unwrap_or_default());
+            let sql = format!(
+                "WITH map AS (
+                     SELECT uid FROM maps WHERE uid = $1 AND revision = $2 FOR SHARE),
+                 gone AS (
+                     DELETE FROM images USING map WHERE map_uid = map.uid AND id = $3
+                     RETURNING slot, digest),
+                 described AS (DELETE FROM {table} WHERE slot IN (SELECT slot FROM gone)),
+                 counted AS (
+                     INSERT INTO image_counts (map_uid, part, images, changes)
+                     SELECT $1, $4, -1, 1 FROM gone ON CONFLICT (map_uid, part) DO UPDATE
+                     SET images = image_counts.images - 1, changes = image_counts.changes + 1),
+                 needed AS (
+                     UPDATE blobs b SET needed = b.needed - 1 FROM gone WHERE b.digest = gone.digest)
+                 SELECT (SELECT count(*) FROM gone) AS gone, (SELECT count(*) FROM map) AS map"
+            );
+            let deleted = sqlx::query(AssertSqlSafe(sql))
+                .bind(map.uid)
+                .bind(revision)
+                .bind(id.as_str())
+                .bind(part())
+                .fetch_one(&self.pool)
+                .await;
+            match deleted {
+                Ok(row) if row.try_get::<i64, _>("map")? > 0 => {
+                    return Ok(row.try_get::<i64, _>("gone")? > 0);
+                }
+                // It was reindexed meanwhile.
+                Ok(_) => {}
+                Err(error) if is_missing_table(&error) => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Err(super::unavailable("the map is being reindexed"))
+    }
+}
+
+#[async_trait]
+impl ExportStore for PostgresStore {
+    async fn export(
+        &self,
+        map: &Map,
+        after: Option<&ImageId>,
+        limit: usize,
+    ) -> Result<Vec<ExportedImage>, StoreError> {
+        let inner = &self.inner;
+        let table = table(map.uid, map.revision);
+        let sql = format!(
+            "SELECT i.record, d.descriptor::real[] FROM images i
+             LEFT JOIN {table} d ON d.slot = i.slot
+             WHERE i.map_uid = $1 AND i.id > $2 ORDER BY i.id LIMIT $3"
+        );
+        let query = sqlx::query_as(AssertSqlSafe(sql))
+            .bind(map.uid)
+            .bind(after.map_or("", ImageId::as_str))
+            .bind(count(limit));
+        inner
+            .call(async {
+                let found: Vec<(Json<Image>, Option<Vec<f32>>)> =
+                    match query.fetch_all(&inner.pool).await {
+                        Ok(found) => found,
+                        Err(error) => return Err(inner.explain(map, error).await),
+                    };
+                let exported = |(Json(image), numbers): (Json<Image>, Option<Vec<f32>>)| {
+                    ExportedImage { image, descriptor: numbers.and_then(descriptor_of) }
+                };
+                Ok(found.into_iter().map(exported).collect())
+            })
+            .await
+    }
+}
+
+/// Any part of a map's counts.
+fn part() -> i16 {
+    (Timestamp::now().subsec_nanosecond() / 1000 % i32::from(PARTS)) as i16
+}

@@ -1,0 +1,302 @@
+//! Jobs and their queue.
+//!
+//! A worker takes a job in a transaction of its own, which passes over jobs that others are taking
+//! (`SKIP LOCKED`), and holds it by a mark: its process, the number of the claim, and until when. A job
+//! whose holder is dead is free at once.
+
+use async_trait::async_trait;
+use jiff::{SignedDuration, Timestamp};
+use jiff_sqlx::ToSqlx;
+use sqlx::types::Json;
+use sqlx::{Postgres, Transaction};
+use tokio::sync::broadcast;
+use uuid::Uuid;
+
+use super::super::changes::{ended_at, news_of, no_job};
+use super::super::{Claim, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
+use super::listener::{DELIVERIES, JOBS};
+use super::{Inner, PostgresStore, count, counted, record, seconds};
+use crate::domain::{Job, JobState, Priority, StoredWebhook};
+
+/// So close to its bound the length of the queue is counted by one submission after another; before that,
+/// as many submissions at once may do no harm.
+const SUBMITTED_AT_ONCE: usize = 256;
+
+/// The advisory lock of those who count.
+const QUEUE_LOCK: i64 = 0x7768_6572_6561_0001;
+
+/// What a change does to a job's row, beside its record.
+enum Place {
+    /// It stays as it is.
+    Same,
+    /// In the queue; nobody takes it for so many seconds.
+    Queue { for_s: f64 },
+    /// Held by this process for so many seconds.
+    Held { for_s: f64 },
+    /// It has ended.
+    Ended,
+}
+
+impl PostgresStore {
+    /// Applies a change to one job, unless the change says `None`.
+    async fn change<F>(&self, id: Uuid, change: F) -> Result<Job, StoreError>
+    where
+        F: FnOnce(&mut JobRecord) -> Result<Option<Place>, StoreError> + Send,
+    {
+        let inner = &self.inner;
+        inner
+            .call(async {
+                let mut tx = inner.begin().await?;
+                let found = sqlx::query_scalar("SELECT record FROM jobs WHERE id = $1 FOR UPDATE");
+                let found = found.bind(id).fetch_optional(&mut *tx).await?;
+                let Json(mut known): Json<JobRecord> = found.ok_or_else(|| no_job(id))?;
+                if let Some(place) = change(&mut known)? {
+                    inner.write_job(&mut tx, &known, place).await?;
+                    tx.commit().await?;
+                }
+                Ok(known.job)
+            })
+            .await
+    }
+}
+
+impl Inner {
+    /// Writes a job that is there and tells of it; and with its end, what webhooks are told of that.
+    async fn write_job(
+        &self,
+        tx: &mut Transaction<'_, Postgres>,
+        changed: &JobRecord,
+        place: Place,
+    ) -> Result<(), StoreError> {
+        let job = &changed.job;
+        let (same, for_s, held, end) = match place {
+            Place::Same => (true, 0.0, false, None),
+            Place::Queue { for_s } => (false, for_s, false, None),
+            Place::Held { for_s } => (false, for_s, true, None),
+            Place::Ended => (false, 0.0, false, Some(ended_at(job))),
+        };
+        sqlx::query(
+            "WITH changed AS (
+                 UPDATE jobs SET record = $2::json, state = $3, changed_at = now(),
+                     held_until = CASE WHEN $4 THEN held_until
+                         WHEN $5 > 0 THEN now() + make_interval(secs => $5) END,
+                     holder = CASE WHEN $4 THEN holder WHEN $6 THEN $7 END,
+                     ended_at = CASE WHEN $4 THEN ended_at ELSE $8 END
+                 WHERE id = $1)
+             SELECT pg_notify($9, $1::text)",
+        )
+        .bind(job.id)
+        .bind(record(changed)?)
+        .bind(job.state.as_str())
+        .bind(same)
+        .bind(for_s)
+        .bind(held)
+        .bind(self.process)
+        .bind(end.map(|at| at.to_sqlx()))
+        .bind(JOBS)
+        .execute(&mut **tx)
+        .await?;
+        if end.is_some() {
+            self.queue_news(tx, job).await?;
+        }
+        Ok(())
+    }
+
+    async fn queue_news(
+        &self,
+        tx: &mut Transaction<'_, Postgres>,
+        job: &Job,
+    ) -> Result<(), StoreError> {
+        let webhooks: Vec<Json<StoredWebhook>> =
+            sqlx::query_scalar("SELECT record FROM webhooks ORDER BY id FOR KEY SHARE")
+                .fetch_all(&mut **tx)
+                .await?;
+        let news = news_of(job, webhooks.into_iter().map(|Json(stored)| stored))?;
+        for delivery in &news {
+            self.insert_delivery(tx, delivery).await?;
+        }
+        if !news.is_empty() {
+            sqlx::query("SELECT pg_notify($1, '')").bind(DELIVERIES).execute(&mut **tx).await?;
+        }
+        Ok(())
+    }
+
+    /// Jobs that wait or run.
+    async fn waiting<'a>(
+        &self,
+        executor: impl sqlx::PgExecutor<'a>,
+        limit: usize,
+    ) -> Result<usize, StoreError> {
+        let waiting = "SELECT count(*) FROM (SELECT FROM jobs WHERE ended_at IS NULL LIMIT $1)";
+        Ok(counted(sqlx::query_scalar(waiting).bind(count(limit)).fetch_one(executor).await?))
+    }
+}
+
+#[async_trait]
+impl JobStore for PostgresStore {
+    async fn submit(&self, new: JobRecord, limit: usize) -> Result<(), StoreError> {
+        let inner = &self.inner;
+        let (job, text) = (&new.job, record(&new)?);
+        inner
+            .call(async {
+                let mut tx = inner.begin().await?;
+                if inner.waiting(&mut *tx, limit).await? + SUBMITTED_AT_ONCE > limit {
+                    let lock = sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(QUEUE_LOCK);
+                    lock.execute(&mut *tx).await?;
+                    if inner.waiting(&mut *tx, limit).await? >= limit {
+                        return Err(StoreError::QueueFull { limit });
+                    }
+                }
+                let inserted = sqlx::query(
+                    "WITH needed AS (
+                         UPDATE blobs SET needed = needed + 1 WHERE digest = $5 RETURNING digest),
+                     told AS (SELECT pg_notify($7, $1::text))
+                     INSERT INTO jobs (id, map, state, place, digest, record)
+                     SELECT $1, $2, $3, $4, digest, $6::json FROM needed, told",
+                )
+                .bind(job.id)
+                .bind(job.map.as_str())
+                .bind(job.state.as_str())
+                .bind(place(job.priority))
+                .bind(new.query.digest.as_bytes().as_slice())
+                .bind(text)
+                .bind(JOBS)
+                .execute(&mut *tx)
+                .await?;
+                if inserted.rows_affected() == 0 {
+                    return Err(super::blobs::not_stored(&new.query.digest));
+                }
+                Ok(tx.commit().await?)
+            })
+            .await
+    }
+
+    async fn queued(&self) -> Result<usize, StoreError> {
+        let inner = &self.inner;
+        inner.call(inner.waiting(&inner.pool, usize::MAX)).await
+    }
+
+    async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {
+        let inner = &self.inner;
+        inner
+            .call(async {
+                let found = sqlx::query_scalar("SELECT record FROM jobs WHERE id = $1").bind(id);
+                let found: Option<Json<JobRecord>> = found.fetch_optional(&inner.pool).await?;
+                Ok(found.map(|Json(known)| known))
+            })
+            .await
+    }
+
+    async fn jobs(
+        &self,
+        filter: &JobFilter,
+        before: Option<Uuid>,
+        limit: usize,
+    ) -> Result<Vec<Job>, StoreError> {
+        let inner = &self.inner;
+        let query = sqlx::query_scalar(
+            "SELECT record FROM jobs
+             WHERE id < $1 AND ($2::text IS NULL OR map = $2) AND ($3::text IS NULL OR state = $3)
+             ORDER BY id DESC LIMIT $4",
+        )
+        .bind(before.unwrap_or(Uuid::max()))
+        .bind(filter.map.as_ref().map(|map| map.as_str()))
+        .bind(filter.state.map(JobState::as_str))
+        .bind(count(limit));
+        inner
+            .call(async {
+                let found: Vec<Json<JobRecord>> = query.fetch_all(&inner.pool).await?;
+                Ok(found.into_iter().map(|Json(known)| known.job).collect())
+            })
+            .await
+    }
+
+    async fn claim(
+        &self,
+        now: Timestamp,
+        lease_until: Timestamp,
+    ) -> Result<Option<JobRecord>, StoreError> {
+        let inner = &self.inner;
+        let for_s = seconds(lease_until.duration_since(now).max(SignedDuration::ZERO));
+        inner
+            .call(async {
+                let mut tx = inner.begin().await?;
+                let found = sqlx::query_scalar(
+                    "SELECT record FROM jobs
+                     WHERE ended_at IS NULL AND (held_until IS NULL OR held_until <= now()
+                         OR (holder IS NOT NULL AND holder <> $1
+                             AND NOT is_alive(holder, make_interval(secs => $2))))
+                     ORDER BY place, id LIMIT 1 FOR UPDATE SKIP LOCKED",
+                )
+                .bind(inner.process)
+                .bind(inner.lifetime());
+                let found: Option<Json<JobRecord>> = found.fetch_optional(&mut *tx).await?;
+                let Some(Json(mut known)) = found else { return Ok(None) };
+                known.take(now);
+                inner.write_job(&mut tx, &known, Place::Held { for_s }).await?;
+                tx.commit().await?;
+                Ok(Some(known))
+            })
+            .await
+    }
+
+    async fn progress(&self, claim: Claim, step: Step) -> Result<(), StoreError> {
+        self.change(claim.job, move |known| {
+            Ok(known.is_held_by(claim).then(|| {
+                known.add(step);
+                Place::Same
+            }))
+        })
+        .await
+        .map(drop)
+    }
+
+    async fn release(&self, claim: Claim, release: Release) -> Result<(), StoreError> {
+        let wait = release.not_before.map(|at| at.duration_since(Timestamp::now()));
+        let for_s = wait.map_or(0.0, seconds).max(0.0);
+        self.change(claim.job, move |known| {
+            Ok(known.is_held_by(claim).then(|| {
+                known.give_back(&release);
+                Place::Queue { for_s }
+            }))
+        })
+        .await
+        .map(drop)
+    }
+
+    async fn finish(&self, claim: Claim, job: Job) -> Result<(), StoreError> {
+        self.change(claim.job, move |known| {
+            Ok(known.is_held_by(claim).then(|| {
+                known.job = job;
+                Place::Ended
+            }))
+        })
+        .await
+        .map(drop)
+    }
+
+    async fn cancel(&self, id: Uuid) -> Result<Job, StoreError> {
+        self.change(id, |known| Ok(known.cancel(Timestamp::now()).then_some(Place::Ended))).await
+    }
+
+    async fn retry(&self, id: Uuid) -> Result<Job, StoreError> {
+        self.change(id, |known| {
+            known.queue_again()?;
+            Ok(Some(Place::Queue { for_s: 0.0 }))
+        })
+        .await
+    }
+
+    fn changes(&self) -> broadcast::Receiver<Uuid> {
+        self.inner.changes.subscribe()
+    }
+}
+
+/// A job's place in the queue; those of a lower number go first.
+fn place(priority: Priority) -> i16 {
+    match priority {
+        Priority::High => 0,
+        Priority::Normal => 1,
+        Priority::Low => 2,
+    }
+}

@@ -1,0 +1,46 @@
+//! API keys.
+
+use async_trait::async_trait;
+use sqlx::types::Json;
+use tokio::sync::watch;
+
+use super::super::{KeyStore, StoreError};
+use super::listener::KEYS;
+use super::{PostgresStore, record};
+use crate::domain::StoredKey;
+
+#[async_trait]
+impl KeyStore for PostgresStore {
+    async fn put_key(&self, key: StoredKey) -> Result<(), StoreError> {
+        let inner = &self.inner;
+        let query = sqlx::query(
+            "WITH told AS (SELECT pg_notify($3, ''))
+             INSERT INTO keys (id, record) SELECT $1, $2::json FROM told
+             ON CONFLICT (id) DO UPDATE SET record = EXCLUDED.record",
+        )
+        .bind(key.key.id.clone())
+        .bind(record(&key)?)
+        .bind(KEYS);
+        inner
+            .call(async {
+                query.execute(&inner.pool).await?;
+                Ok(())
+            })
+            .await
+    }
+
+    async fn keys(&self) -> Result<Vec<StoredKey>, StoreError> {
+        let inner = &self.inner;
+        inner
+            .call(async {
+                let keys = sqlx::query_scalar("SELECT record FROM keys");
+                let keys: Vec<Json<StoredKey>> = keys.fetch_all(&inner.pool).await?;
+                Ok(keys.into_iter().map(|Json(key)| key).collect())
+            })
+            .await
+    }
+
+    fn changed_keys(&self) -> Option<watch::Receiver<()>> {
+        Some(self.inner.keys.subscribe())
+    }
+}

@@ -1,0 +1,302 @@
+//! Maps.
+
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use sqlx::types::Json;
+use sqlx::{PgConnection, Row};
+use uuid::Uuid;
+
+use super::super::changes::{changed_map, removed};
+use super::super::{Added, IndexState, LookAlikes, MapStore, StoreError};
+use super::descriptors::{drop_table, make_table};
+use super::{Inner, PostgresStore, counted, record, unavailable};
+use crate::domain::{
+    Calibration, CalibrationSettings, Candidate, Descriptor, Image, ImageId, Map, MapName, Pose,
+};
+use crate::retrieve::index::SearchMode;
+
+#[async_trait]
+impl MapStore for PostgresStore {
+    async fn put_map(&self, map: Map) -> Result<(Map, bool), StoreError> {
+        self.inner.call(self.inner.put_map(map)).await
+    }
+
+    async fn map(&self, name: &MapName) -> Result<Option<Map>, StoreError> {
+        let inner = &self.inner;
+        let query = sqlx::query_scalar("SELECT record FROM maps WHERE name = $1");
+        let query = query.bind(name.as_str());
+        inner
+            .call(async {
+                let found: Option<Json<Map>> = query.fetch_optional(&inner.pool).await?;
+                Ok(found.map(|Json(map)| map))
+            })
+            .await
+    }
+
+    async fn maps(&self) -> Result<Vec<Map>, StoreError> {
+        let inner = &self.inner;
+        inner
+            .call(async {
+                let maps = sqlx::query_scalar("SELECT record FROM maps ORDER BY name");
+                let maps: Vec<Json<Map>> = maps.fetch_all(&inner.pool).await?;
+                Ok(maps.into_iter().map(|Json(map)| map).collect())
+            })
+            .await
+    }
+
+    async fn delete_map(&self, name: &MapName) -> Result<bool, StoreError> {
+        let inner = &self.inner;
+        let Some(uid) = inner.call(inner.delete_map(name)).await? else { return Ok(false) };
+        inner.graphs.forget(uid);
+        // The map is gone for every caller; what it leaves behind is cleared away in small steps, and by
+        // whoever removes what has had its time, if this process ends before.
+        while inner.call(inner.sweep(uid)).await? {}
+        Ok(true)
+    }
+
+    async fn index_state(&self, map: &Map) -> Result<IndexState, StoreError> {
+        let inner = &self.inner;
+        let query = sqlx::query(
+            "SELECT m.graph, coalesce(sum(c.images), 0)::bigint AS images,
+                 coalesce(sum(c.changes), 0)::bigint AS changes
+             FROM maps m LEFT JOIN image_counts c ON c.map_uid = m.uid
+             WHERE m.uid = $1 GROUP BY m.uid",
+        )
+        .bind(map.uid);
+        inner
+            .call(async {
+                let row = query.fetch_optional(&inner.pool).await?.ok_or_else(|| removed(map))?;
+                Ok(IndexState {
+                    images: counted(row.try_get("images")?),
+                    graph: row.try_get("graph")?,
+                    // PostgreSQL's index holds every image from the moment that it is stored.
+                    behind: false,
+                    changes: row.try_get::<i64, _>("changes")?.unsigned_abs(),
+                })
+            })
+            .await
+    }
+
+    async fn add_image(
+        &self,
+        map: &Map,
+        image: Image,
+        descriptor: Descriptor,
+    ) -> Result<Added, StoreError> {
+        self.inner.call(self.inner.add_image(map, image, &descriptor)).await
+    }
+
+    async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
+        self.inner.call(self.inner.image(map.uid, id)).await
+    }
+
+    async fn images(
+        &self,
+        map: &Map,
+        after: Option<&ImageId>,
+        limit: usize,
+    ) -> Result<Vec<Image>, StoreError> {
+        self.inner.call(self.inner.images(map, after, limit)).await
+    }
+
+    async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
+        self.inner.call(self.inner.positions(map)).await
+    }
+
+    async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {
+        self.inner.call(self.inner.delete_image(map, id)).await
+    }
+
+    async fn search(
+        &self,
+        map: &Map,
+        query: Descriptor,
+        k: usize,
+        mode: SearchMode,
+    ) -> Result<Vec<Candidate>, StoreError> {
+        if query.dim() != map.dim {
+            return Err(StoreError::Conflict(format!(
+                "a descriptor of {} numbers cannot be searched in a map of {}",
+                query.dim(),
+                map.dim
+            )));
+        }
+        self.inner.call(self.inner.candidates(map, &query, k, mode)).await
+    }
+
+    async fn look_alikes(
+        &self,
+        map: &Map,
+        settings: CalibrationSettings,
+        k: usize,
+    ) -> Result<Vec<LookAlikes>, StoreError> {
+        let inner = &self.inner;
+        inner.call(inner.measure(map)).await?;
+        // Many searches, and nobody waits for them.
+        inner.similar_places(map, settings, k).await
+    }
+
+    async fn calibration(&self, map: &Map) -> Result<Option<Arc<Calibration>>, StoreError> {
+        let inner = &self.inner;
+        let query =
+            sqlx::query_scalar("SELECT calibration FROM maps WHERE uid = $1 AND revision = $2")
+                .bind(map.uid)
+                .bind(i64::from(map.revision));
+        inner
+            .call(async {
+                let found: Option<Option<Json<Calibration>>> =
+                    query.fetch_optional(&inner.pool).await?;
+                Ok(found.flatten().map(|Json(measured)| Arc::new(measured)))
+            })
+            .await
+    }
+
+    async fn put_calibration(&self, map: &Map, measured: Calibration) -> Result<(), StoreError> {
+        let inner = &self.inner;
+        let sql = "UPDATE maps SET calibration = $3::json WHERE uid = $1 AND revision = $2";
+        let query =
+            sqlx::query(sql).bind(map.uid).bind(i64::from(map.revision)).bind(record(&measured)?);
+        inner
+            .call(async {
+                match query.execute(&inner.pool).await?.rows_affected() {
+                    0 => inner.check_revision(map).await,
+                    _ => Ok(()),
+                }
+            })
+            .await
+    }
+}
+
+impl Inner {
+    async fn put_map(&self, wanted: Map) -> Result<(Map, bool), StoreError> {
+        let mut tx = self.begin().await?;
+        let stored = sqlx::query_scalar("SELECT record FROM maps WHERE name = $1 FOR UPDATE");
+        let stored = stored.bind(wanted.name.as_str()).fetch_optional(&mut *tx).await?;
+        let (map, new) = match stored {
+            None => {
+                let inserted = sqlx::query(
+                    "INSERT INTO maps (uid, name, revision, record) VALUES ($1, $2, $3, $4::json)
+                     ON CONFLICT (name) DO NOTHING",
+                )
+                .bind(wanted.uid)
+                .bind(wanted.name.as_str())
+                .bind(i64::from(wanted.revision))
+                .bind(record(&wanted)?)
+                .execute(&mut *tx)
+                .await?;
+                if inserted.rows_affected() == 0 {
+                    return Err(unavailable("another process is making the same map"));
+                }
+                make_table(&mut tx, &wanted).await?;
+                (wanted, true)
+            }
+            Some(Json(stored)) => {
+                let stored: Map = stored;
+                let before = (stored.uid, stored.revision);
+                let has_images = has_images(&mut tx, stored.uid).await?;
+                let map = changed_map(stored, wanted, || has_images)?;
+                if map.uid != before.0 {
+                    leave(&mut tx, before.0).await?;
+                    drop_table(&mut tx, before.0, before.1).await?;
+                    make_table(&mut tx, &map).await?;
+                }
+                let changed = sqlx::query(
+                    "UPDATE maps SET uid = $2, record = $3::json,
+                         graph = graph AND uid = $2,
+                         calibration = CASE WHEN uid = $2 THEN calibration END
+                     WHERE uid = $1",
+                );
+                changed.bind(before.0).bind(map.uid).bind(record(&map)?).execute(&mut *tx).await?;
+                (map, false)
+            }
+        };
+        tx.commit().await?;
+        Ok((map, new))
+    }
+
+    async fn delete_map(&self, name: &MapName) -> Result<Option<Uuid>, StoreError> {
+        let mut tx = self.begin().await?;
+        let gone = sqlx::query_as("DELETE FROM maps WHERE name = $1 RETURNING uid, revision");
+        let gone: Option<(Uuid, i64)> = gone.bind(name.as_str()).fetch_optional(&mut *tx).await?;
+        let Some((uid, revision)) = gone else { return Ok(None) };
+        leave(&mut tx, uid).await?;
+        drop_table(&mut tx, uid, u32::try_from(revision).unwrap_or_default()).await?;
+        tx.commit().await?;
+        Ok(Some(uid))
+    }
+
+    /// Takes upon this process to measure the map.
+    async fn measure(&self, map: &Map) -> Result<(), StoreError> {
+        let taken = sqlx::query(
+            "UPDATE maps SET measured_by = $3 WHERE uid = $1 AND revision = $2
+                 AND (measured_by IS NULL OR measured_by = $3
+                     OR NOT is_alive(measured_by, make_interval(secs => $4)))",
+        )
+        .bind(map.uid)
+        .bind(i64::from(map.revision))
+        .bind(self.process)
+        .bind(self.lifetime())
+        .execute(&self.pool)
+        .await?;
+        if taken.rows_affected() == 0 {
+            self.check_revision(map).await?;
+            let name = &map.name;
+            return Err(StoreError::Conflict(format!("another process measures the map {name}")));
+        }
+        Ok(())
+    }
+
+    /// Clears away some of what a deleted map has left; `false` once nothing is left.
+    async fn sweep(&self, uid: Uuid) -> Result<bool, StoreError> {
+        let mut tx = self.begin().await?;
+        let gone: i64 = sqlx::query_scalar(
+            "WITH gone AS (
+                 DELETE FROM images WHERE map_uid = $1 AND id IN (
+                     SELECT id FROM images WHERE map_uid = $1 ORDER BY id LIMIT 256
+                     FOR UPDATE SKIP LOCKED)
+                 RETURNING digest),
+             needed AS (
+                 UPDATE blobs b SET needed = b.needed - g.images
+                 FROM (SELECT digest, count(*) AS images FROM gone GROUP BY digest) g
+                 WHERE b.digest = g.digest)
+             SELECT count(*) FROM gone",
+        )
+        .bind(uid)
+        .fetch_one(&mut *tx)
+        .await?;
+        if gone == 0 {
+            for rest in [
+                "DELETE FROM frames WHERE map_uid = $1",
+                "DELETE FROM image_counts WHERE map_uid = $1",
+                "DELETE FROM deleted_maps WHERE uid = $1",
+            ] {
+                sqlx::query(rest).bind(uid).execute(&mut *tx).await?;
+            }
+        }
+        tx.commit().await?;
+        Ok(gone > 0)
+    }
+
+    /// Clears away what processes that ended too soon have left of deleted maps.
+    pub(super) async fn sweep_deleted(&self) -> Result<(), StoreError> {
+        let left = sqlx::query_scalar("SELECT uid FROM deleted_maps");
+        let left: Vec<Uuid> = self.call(async { Ok(left.fetch_all(&self.pool).await?) }).await?;
+        for uid in left {
+            while self.call(self.sweep(uid)).await? {}
+        }
+        Ok(())
+    }
+}
+
+/// Notes that a map is gone and that what belonged to it is to be cleared away.
+async fn leave(connection: &mut PgConnection, uid: Uuid) -> Result<(), StoreError> {
+    let note = sqlx::query("INSERT INTO deleted_maps (uid) VALUES ($1) ON CONFLICT DO NOTHING");
+    note.bind(uid).execute(connection).await?;
+    Ok(())
+}
+
+async fn has_images(connection: &mut PgConnection, uid: Uuid) -> Result<bool, StoreError> {
+    let some = sqlx::query_scalar("SELECT EXISTS (SELECT FROM images WHERE map_uid = $1)");
+    Ok(some.bind(uid).fetch_one(connection).await?)
+}

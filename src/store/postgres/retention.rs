@@ -1,0 +1,79 @@
+//! Forgetting what has had its time. Every server does it; what one is removing the others pass over.
+
+use async_trait::async_trait;
+use jiff::civil::Date;
+use jiff_sqlx::ToSqlx;
+
+use super::super::{KeepJobs, RemovedJobs, Retention, StoreError};
+use super::{Inner, PostgresStore, count, counted};
+
+#[async_trait]
+impl Retention for PostgresStore {
+    async fn remove_ended(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError> {
+        let inner = &self.inner;
+        let removed = inner.call(inner.remove_jobs(keep, batch)).await?;
+        let bytes = inner.remove_unneeded().await?;
+        Ok(RemovedJobs { bytes, ..removed })
+    }
+
+    async fn forget_usage(&self, before: Date) -> Result<(), StoreError> {
+        let inner = &self.inner;
+        let query = sqlx::query("DELETE FROM usage WHERE day < $1").bind(before.to_sqlx());
+        inner
+            .call(async {
+                query.execute(&inner.pool).await?;
+                Ok(())
+            })
+            .await?;
+        inner.sweep_deleted().await?;
+        inner.tidy_descriptions().await
+    }
+
+    async fn db_bytes(&self) -> Result<u64, StoreError> {
+        let inner = &self.inner;
+        inner
+            .call(async {
+                let size = "SELECT pg_database_size(current_database())";
+                let size: i64 = sqlx::query_scalar(size).fetch_one(&inner.pool).await?;
+                Ok(size.unsigned_abs())
+            })
+            .await
+    }
+
+    async fn free_bytes(&self) -> Option<u64> {
+        // An object store does not say.
+        None
+    }
+}
+
+impl Inner {
+    /// Removes the rows of jobs that are not to be kept, and their claim to the bytes of their frames.
+    async fn remove_jobs(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError> {
+        let ended = "SELECT count(*) FROM jobs WHERE ended_at IS NOT NULL";
+        let ended: i64 = sqlx::query_scalar(ended).fetch_one(&self.pool).await?;
+        let surplus = keep.most.map_or(0, |most| (ended - count(most)).max(0));
+        let (by_age, by_count): (i64, i64) = sqlx::query_as(
+            "WITH first AS (
+                 SELECT id, digest, coalesce(ended_at < $1, false) AS old,
+                     row_number() OVER (ORDER BY ended_at, id) <= $2 AS many
+                 FROM (SELECT id, digest, ended_at FROM jobs
+                       WHERE ended_at IS NOT NULL AND ended_at <= $3
+                       ORDER BY ended_at, id LIMIT $4 FOR UPDATE SKIP LOCKED) locked),
+             gone AS (
+                 DELETE FROM jobs USING first WHERE jobs.id = first.id AND (old OR many)
+                 RETURNING first.digest, first.old),
+             needed AS (
+                 UPDATE blobs b SET needed = b.needed - g.jobs
+                 FROM (SELECT digest, count(*) AS jobs FROM gone GROUP BY digest) g
+                 WHERE b.digest = g.digest)
+             SELECT count(*) FILTER (WHERE old), count(*) FILTER (WHERE NOT old) FROM gone",
+        )
+        .bind(keep.since.map(|since| since.to_sqlx()))
+        .bind(surplus)
+        .bind(keep.settled.to_sqlx())
+        .bind(count(batch))
+        .fetch_one(&self.pool)
+        .await?;
+        Ok(RemovedJobs { by_age: counted(by_age), by_count: counted(by_count), bytes: 0 })
+    }
+}
