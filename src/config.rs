@@ -2,6 +2,7 @@
 //!
 //! Defaults (`deploy/whereabouts.toml`) < the file of `--config` < environment < flags.
 
+mod database;
 mod server;
 
 use std::net::SocketAddr;
@@ -12,6 +13,7 @@ use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
+pub use self::database::{Database, ObjectStore};
 pub use self::server::Server;
 use crate::domain::{Precision, RefinerKind};
 use crate::http::Tiles;
@@ -31,6 +33,10 @@ pub struct Config {
     pub server: Server,
     /// The embedded store.
     pub data: Data,
+    /// The store of many processes.
+    pub database: Database,
+    /// Where it keeps pictures.
+    pub objects: ObjectStore,
     /// The model.
     pub model: Model,
     /// Decoding.
@@ -317,7 +323,7 @@ pub struct Jobs {
     pub queue: usize,
     /// The share of `image.queue` from which frames get no job.
     pub shed_at: f64,
-    /// Jobs refined side by side.
+    /// Jobs refined side by side in this process; 0: others refine.
     pub workers: usize,
     /// The lease of a job, in seconds.
     pub lease_s: u64,
@@ -423,6 +429,8 @@ pub struct Overrides {
     mllm: Option<serde_json::Value>,
     #[serde(skip_serializing_if = "Option::is_none")]
     auth: Option<serde_json::Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    jobs: Option<serde_json::Value>,
 }
 
 impl Overrides {
@@ -453,6 +461,12 @@ impl Overrides {
     /// Sets `[auth] keys` to off.
     pub fn no_keys(mut self, off: bool) -> Self {
         self.auth = off.then(|| serde_json::json!({ "keys": KeysWanted::Off }));
+        self
+    }
+
+    /// Sets `[jobs] workers` to 0.
+    pub fn no_workers(mut self, none: bool) -> Self {
+        self.jobs = none.then(|| serde_json::json!({ "workers": 0 }));
         self
     }
 
@@ -515,7 +529,18 @@ impl Config {
         if self.bulk.memory_bytes < self.server.body_limit_bytes {
             return Some("bulk.memory_bytes must not be less than server.body_limit_bytes".into());
         }
-        self.server.contradiction().or_else(track).or_else(|| self.console.contradiction())
+        if self.jobs.workers == 0 && !self.database.is_set() {
+            return Some(
+                "jobs.workers must be at least 1: only with a database (database.url) do other processes \
+                 refine"
+                    .into(),
+            );
+        }
+        let timeout = self.server.request_timeout().as_secs();
+        let console = || self.console.contradiction();
+        let scale =
+            || self.database.contradiction().or_else(|| self.objects.contradiction(timeout));
+        self.server.contradiction().or_else(track).or_else(console).or_else(scale)
     }
 
     fn contradiction(&self) -> Option<String> {
@@ -546,7 +571,6 @@ impl Config {
             ("bulk.in_flight", self.bulk.in_flight),
             ("bulk.max_images", self.bulk.max_images),
             ("jobs.queue", self.jobs.queue),
-            ("jobs.workers", self.jobs.workers),
             ("jobs.attempts", self.jobs.attempts as usize),
             ("jobs.sweep_s", self.jobs.sweep_s as usize),
             ("jobs.sweep_batch", self.jobs.sweep_batch),

@@ -15,7 +15,7 @@ use uuid::Uuid;
 
 use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
 use crate::domain::{CalibrationSettings, utc_day};
-use crate::http::{About, AppState, Connections, HttpSettings, router};
+use crate::http::{About, AppState, Connections, HttpSettings, router, worker_router};
 use crate::refine::local::{LocalMatcher, LocalSettings};
 use crate::refine::mllm::{MllmParts, MllmRefiner};
 use crate::refine::{DenseCache, JobPace, LocalRefiner, Refiner, Worker, WorkerSettings};
@@ -27,12 +27,23 @@ use crate::service::{
     ServiceSettings, Tracks, Webhooks,
 };
 use crate::store::embedded::{EmbeddedSettings, EmbeddedStore};
-use crate::store::{DescriptionBounds, JobStore, UsageStore};
+use crate::store::postgres::{PostgresSettings, PostgresStore};
+use crate::store::{DescriptionBounds, JobStore, ObjectSettings, Objects, Store};
 use crate::telemetry::{Metrics, Troubles};
 
-/// Serves on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200; `troubles`
+/// What a process does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Role {
+    /// It takes requests, and refines unless `jobs.workers` is 0.
+    Serve,
+    /// It refines, and answers nobody but those who look after it.
+    Worker,
+}
+
+/// Works on `listener` until `shutdown`, then drains. `on_ready` runs once `/readyz` answers 200; `troubles`
 /// are those of the log.
-pub async fn serve(
+pub async fn run(
+    role: Role,
     config: Config,
     troubles: Arc<Troubles>,
     listener: TcpListener,
@@ -45,7 +56,10 @@ pub async fn serve(
         AppState::new(http_settings(&config), about(&config, troubles)?, Arc::clone(&metrics));
     let connections = Connections {
         settings: config.server.connections(),
-        router: router(state.clone()),
+        router: match role {
+            Role::Serve => router(state.clone()),
+            Role::Worker => worker_router(state.clone()),
+        },
         metrics: Arc::clone(&metrics),
         tls: config.server.tls()?.map(Arc::new),
     };
@@ -66,11 +80,13 @@ pub async fn serve(
     let service = Arc::new(service);
     state.door().open(Arc::clone(&service));
     let mut running = JoinSet::new();
-    let until = shutdown.clone();
-    running.spawn(async move { janitor.run(until).await });
-    running.spawn(dispatcher.run(shutdown.clone()));
-    let until = shutdown.clone();
-    running.spawn(async move { service.keep_calibrated(until).await });
+    if role == Role::Serve {
+        let until = shutdown.clone();
+        running.spawn(async move { janitor.run(until).await });
+        running.spawn(dispatcher.run(shutdown.clone()));
+        let until = shutdown.clone();
+        running.spawn(async move { service.keep_calibrated(until).await });
+    }
     for worker in workers {
         let shutdown = shutdown.clone();
         running.spawn(async move { worker.run(shutdown).await });
@@ -155,17 +171,67 @@ pub struct Parts {
     pub pools: [CpuPool; 2],
 }
 
-/// Opens the embedded store, which belongs to one process. Blocks.
-pub fn store(config: &Config) -> anyhow::Result<EmbeddedStore> {
+/// Opens the configured store for a process of that id. Blocks.
+pub fn store(config: &Config, process: Uuid) -> anyhow::Result<Arc<dyn Store>> {
+    if !config.database.is_set() {
+        return Ok(Arc::new(embedded(config)?));
+    }
+    let objects = objects(config)?;
+    let opening = PostgresStore::open(postgres(config), objects, process);
+    Ok(Arc::new(Handle::current().block_on(opening)?))
+}
+
+/// How the store in PostgreSQL works.
+pub fn postgres(config: &Config) -> PostgresSettings {
+    let database = &config.database;
+    PostgresSettings {
+        url: database.url.expose().to_owned(),
+        max_connections: database.max_connections,
+        timeout: database.timeout(),
+        lifetime: Duration::from_secs(database.lifetime_s),
+        pin: Duration::from_secs(config.objects.keep_unneeded_s),
+        index: index(config),
+        index_memory_mib: database.index_memory_mib,
+        descriptions: descriptions(config),
+    }
+}
+
+fn objects(config: &Config) -> anyhow::Result<Objects> {
+    let objects = &config.objects;
+    if objects.url.is_empty() {
+        return Ok(Objects::folder(&config.data.dir.join("images"), objects.timeout())?);
+    }
+    Ok(Objects::open(&ObjectSettings {
+        url: objects.url.clone(),
+        endpoint: objects.endpoint.clone(),
+        region: objects.region.clone(),
+        allow_http: objects.allow_http,
+        timeout: objects.timeout(),
+    })?)
+}
+
+fn index(config: &Config) -> IndexSettings {
+    IndexSettings {
+        exact_up_to: config.index.exact_up_to,
+        m: config.index.m,
+        ef_construction: config.index.ef_construction,
+        ef_search: config.index.ef_search,
+        max_dead_share: config.index.max_dead_share,
+    }
+}
+
+fn descriptions(config: &Config) -> DescriptionBounds {
+    DescriptionBounds {
+        max_bytes: config.data.description_cache_bytes,
+        max_age: Duration::from_secs(config.data.description_cache_days * 24 * 3600),
+    }
+}
+
+/// Opens the embedded store, which belongs to one process.
+fn embedded(config: &Config) -> anyhow::Result<EmbeddedStore> {
     Ok(EmbeddedStore::open(&EmbeddedSettings {
         dir: config.data.dir.clone(),
-        index: IndexSettings {
-            exact_up_to: config.index.exact_up_to,
-            m: config.index.m,
-            ef_construction: config.index.ef_construction,
-            ef_search: config.index.ef_search,
-            max_dead_share: config.index.max_dead_share,
-        },
+        index: index(config),
         index_threads: match config.index.threads {
             0 => (cores_unless(0) / 2).max(1),
             threads => threads,
@@ -173,23 +239,21 @@ pub fn store(config: &Config) -> anyhow::Result<EmbeddedStore> {
         min_free_bytes: config.data.min_free_bytes,
         db_cache_bytes: config.data.db_cache_bytes,
         commit_batch: config.data.commit_batch,
-        descriptions: DescriptionBounds {
-            max_bytes: config.data.description_cache_bytes,
-            max_age: Duration::from_secs(config.data.description_cache_days * 24 * 3600),
-        },
+        descriptions: descriptions(config),
     })?)
 }
 
 /// Opens the store, loads the model, and puts the service together. Blocks.
 pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
-    let store = Arc::new(store(config)?);
+    let process = Uuid::now_v7();
+    let store = store(config, process)?;
     let (models, why) = models(config)?;
     let admission = config.image.admission(config.model.layout());
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
     let pool = CpuPool::new("frames", cores_unless(config.image.threads), admission.permits)?;
     let job_pace = JobPace::default();
     // Beside the workers, calibration and whoever looks at matches come to it, one at a time each.
-    let refining = CpuPool::new("refine", config.jobs.workers, config.jobs.workers + 2)?;
+    let refining = CpuPool::new("refine", config.jobs.workers.max(1), config.jobs.workers + 2)?;
     let pools = [pool.clone(), refining.clone()];
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
     let local = Arc::new(LocalRefiner {
@@ -245,7 +309,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         keys,
         webhooks: Webhooks { store: store.clone(), settings: config.webhooks.clone() },
         answers: store.clone(),
-        process: Uuid::now_v7(),
+        process,
         maps: store.clone(),
         drafts: store.clone(),
         reindexes: Reindexes::default(),

@@ -1,11 +1,11 @@
 //! `whereabouts keys`: over HTTP, or in the data folder of a server that does not run.
 
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use anyhow::{Context, bail};
 use clap::Subcommand;
 use serde::Deserialize;
+use uuid::Uuid;
 
 use super::client::{Client, ServerArg};
 use crate::config::{Config, Overrides};
@@ -81,18 +81,19 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         Some(data) => {
             let flags = Overrides::default().data(Some(data));
             let config = Config::load(args.config.as_deref(), &flags)?;
-            let new = !config.data.dir.join("version").exists();
+            let new = !config.database.is_set() && !config.data.dir.join("version").exists();
             if new && !matches!(args.action, Action::Create { .. }) {
                 bail!(
                     "{} is no data folder; only the first key makes one",
                     config.data.dir.display()
                 );
             }
-            let opening = tokio::task::spawn_blocking(move || startup::store(&config));
+            let opening =
+                tokio::task::spawn_blocking(move || startup::store(&config, Uuid::now_v7()));
             let store = opening.await.context("the folder could not be opened")?.context(
                 "while its server runs, leave --data out, so that the server is asked over HTTP",
             )?;
-            Place::Folder(Keys::load(Arc::new(store)).await?)
+            Place::Folder(Keys::load(store).await?)
         }
     };
     match args.action {

@@ -11,6 +11,7 @@ mod index;
 mod jobs;
 mod keys;
 mod localize;
+mod migrate;
 mod model;
 mod openapi;
 mod progress;
@@ -21,6 +22,8 @@ use std::future::Future;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+
+use crate::startup::Role;
 
 /// Tells a robot where it is from one camera frame.
 #[derive(Debug, Parser)]
@@ -34,6 +37,10 @@ pub struct Cli {
 enum Command {
     /// Run the server
     Serve(serve::Args),
+    /// Refine the jobs of servers that share a database, and do nothing else
+    Worker(serve::Args),
+    /// Make the tables of the database, or bring them up to date
+    Migrate(migrate::Args),
     /// Add a folder of images to a map on a server
     Index(index::Args),
     /// Localize a picture on a server
@@ -68,7 +75,9 @@ impl Cli {
         // Only the first call sets it; a library user may have chosen another.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let outcome = match self.command {
-            Command::Serve(args) => block_on(serve::run(args)),
+            Command::Serve(args) => block_on(serve::run(Role::Serve, args)),
+            Command::Worker(args) => block_on(serve::run(Role::Worker, args)),
+            Command::Migrate(args) => block_on(migrate::run(args)),
             Command::Index(args) => block_on(index::run(args)),
             Command::Localize(args) => block_on(localize::run(args)),
             Command::Jobs(args) => block_on(jobs::run(args)),

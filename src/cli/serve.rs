@@ -1,14 +1,15 @@
-//! `whereabouts serve`.
+//! `whereabouts serve` and `whereabouts worker`: the same process in two roles.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use crate::config::{Config, Overrides, Refiner};
+use crate::startup::Role;
 use crate::{startup, telemetry};
 
 /// The settings that a flag can set; all others are in the file and the environment.
@@ -35,31 +36,55 @@ pub struct Args {
     /// Ask nobody for a key, whatever the server listens on: whoever reaches it may do everything
     #[arg(long)]
     no_keys: bool,
+    /// Refine nothing here; other processes do (`whereabouts worker`). Needs a database (database.url)
+    #[arg(long)]
+    no_workers: bool,
     /// A server that speaks the OpenAI chat-completions format, for --refiner mllm; its key comes
     /// from WHEREABOUTS_MLLM__API_KEY
     #[arg(long, value_name = "URL")]
     mllm_base_url: Option<String>,
 }
 
-pub async fn run(args: Args) -> anyhow::Result<()> {
+pub async fn run(role: Role, args: Args) -> anyhow::Result<()> {
     let flags = Overrides::default()
         .listen(args.listen)
         .data(args.data)
         .model(args.model)
         .refiner(args.refiner)
         .no_keys(args.no_keys)
+        .no_workers(args.no_workers)
         .mllm_base_url(args.mllm_base_url);
     let config = Config::load(args.config.as_deref(), &flags)?;
+    if role == Role::Worker {
+        check_worker(&config)?;
+    }
     let troubles = telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
     let listener = TcpListener::bind(config.server.listen).await.with_context(|| {
         format!("cannot listen on {}; choose another with --listen", config.server.listen)
     })?;
     let shutdown = CancellationToken::new();
     tokio::spawn(cancel_on_signal(shutdown.clone()));
-    startup::serve(config, troubles, listener, shutdown, |address| {
+    startup::run(role, config, troubles, listener, shutdown, |address| {
         args.address_file.as_deref().map_or(Ok(()), |file| write_address(file, address))
     })
     .await
+}
+
+/// A worker that could not find a job, or would do nothing with one, does not start.
+fn check_worker(config: &Config) -> anyhow::Result<()> {
+    if !config.database.is_set() {
+        bail!(
+            "a worker shares a database with servers: set database.url (WHEREABOUTS_DATABASE__URL); a \
+             server with the embedded store refines by itself"
+        );
+    }
+    if config.jobs.workers == 0 {
+        bail!("a worker refines: leave --no-workers out, and set jobs.workers to 1 or more");
+    }
+    if config.refine.refiner == Refiner::Off {
+        bail!("a worker refines: set refine.refiner to local or mllm, as the servers have it");
+    }
+    Ok(())
 }
 
 async fn cancel_on_signal(shutdown: CancellationToken) {

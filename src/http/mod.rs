@@ -130,6 +130,22 @@ pub fn router(state: AppState) -> Router {
         .with_state(state)
 }
 
+/// What a process answers that only refines: whether it is alive and ready, and its metrics.
+pub fn worker_router(state: AppState) -> Router {
+    Router::new()
+        .route("/livez", axum::routing::get(health::livez))
+        .route("/readyz", axum::routing::get(health::readyz))
+        .route("/metrics", axum::routing::get(health::metrics))
+        .fallback(problem::no_such_path)
+        .method_not_allowed_fallback(problem::no_such_method)
+        .layer(CatchPanicLayer::custom(problem::panicked))
+        .layer(from_fn_with_state(state.clone(), auth::admit))
+        .layer(from_fn_with_state(state.clone(), guard::bound))
+        .layer(from_fn(problem::render))
+        .layer(from_fn_with_state(state.clone(), guard::observe))
+        .with_state(state)
+}
+
 /// Whether a request is a form that an upload can be: a part `image`, and perhaps one `meta`.
 pub async fn is_picture_form(request: axum::extract::Request) -> bool {
     body::from_form(request, usize::MAX).await.is_ok()

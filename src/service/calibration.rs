@@ -1,7 +1,7 @@
 //! Measures in each map how far chance resemblance goes; see [`crate::domain::confidence`].
 
 use std::collections::BTreeMap;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use tokio_util::sync::CancellationToken;
@@ -16,6 +16,12 @@ use crate::store::{IndexState, LookAlikes};
 
 /// How often it is looked for maps that have changed.
 const LOOK: Duration = Duration::from_millis(500);
+
+/// Where a look takes long, because there are many maps, the pause is so many times as long.
+const PAUSE_PER_LOOK: u32 = 10;
+
+/// But no longer than this: measuring takes long too.
+const LONGEST_PAUSE: Duration = Duration::from_secs(10);
 
 /// The pause when those who refine jobs have no time, and how often that may happen for one image.
 const PAUSE: Duration = Duration::from_millis(200);
@@ -47,11 +53,13 @@ impl Service {
     /// Measures maps when their images have changed, until `shutdown`.
     pub async fn keep_calibrated(&self, shutdown: CancellationToken) {
         let mut seen = BTreeMap::new();
+        let mut pause = LOOK;
         loop {
             tokio::select! {
                 () = shutdown.cancelled() => return,
-                () = tokio::time::sleep(LOOK) => {}
+                () = tokio::time::sleep(pause) => {}
             }
+            let began = Instant::now();
             let measured = tokio::select! {
                 () = shutdown.cancelled() => return,
                 measured = self.calibrate_settled(&mut seen) => measured,
@@ -60,6 +68,7 @@ impl Service {
                 // A map was removed or reindexed meanwhile; the next look sees to it.
                 tracing::debug!(%error, "a map could not be measured");
             }
+            pause = LOOK.max(began.elapsed() * PAUSE_PER_LOOK).min(LONGEST_PAUSE);
         }
     }
 

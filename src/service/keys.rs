@@ -1,7 +1,7 @@
 //! API keys: making, listing and revoking them, and who a token belongs to.
 
 use std::collections::HashMap;
-use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
+use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard, Weak};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
@@ -13,7 +13,7 @@ use utoipa::ToSchema;
 use super::limits::Limits;
 use super::{ErrorKind, ServiceError};
 use crate::domain::{ApiKey, Digest, KeyLimits, MapName, Role, StoredKey, Token};
-use crate::store::KeyStore;
+use crate::store::{KeyStore, StoreError};
 
 /// The most keys, revoked ones included: they are all held in memory.
 const MOST_KEYS: usize = 10_000;
@@ -23,6 +23,9 @@ const MOST_BYTES: u64 = 999_999_999_999_999;
 
 /// How long it is waited at a time for a key to expire.
 const LONGEST_SLEEP: Duration = Duration::from_secs(3600);
+
+/// The pause before keys that changed and cannot be read are read again.
+const READ_AGAIN: Duration = Duration::from_secs(1);
 
 /// The longest name of a key, in bytes.
 const MOST_NAME_BYTES: usize = 100;
@@ -105,9 +108,9 @@ impl Caller {
 /// All keys, and what each may still ask for.
 pub struct Keys {
     store: Arc<dyn KeyStore>,
-    known: Arc<RwLock<HashMap<String, StoredKey>>>,
+    known: Arc<Known>,
     /// Told when a key was revoked.
-    revoked: watch::Sender<()>,
+    revoked: Arc<watch::Sender<()>>,
     /// How much each may ask for.
     pub limits: Limits,
 }
@@ -115,10 +118,15 @@ pub struct Keys {
 impl Keys {
     /// The keys of a store.
     pub async fn load(store: Arc<dyn KeyStore>) -> Result<Self, ServiceError> {
-        let known = store.keys().await?;
-        let known = known.into_iter().map(|stored| (stored.key.id.clone(), stored)).collect();
-        let known = Arc::new(RwLock::new(known));
-        Ok(Self { store, known, revoked: watch::Sender::new(()), limits: Limits::default() })
+        // Before they are read, so that no change is missed.
+        let changed = store.changed_keys();
+        let known = Arc::new(RwLock::new(read_all(store.as_ref()).await?));
+        let revoked = Arc::new(watch::Sender::new(()));
+        if let Some(changed) = changed {
+            let (known, revoked) = (Arc::downgrade(&known), Arc::clone(&revoked));
+            tokio::spawn(keep_up(Arc::clone(&store), known, revoked, changed));
+        }
+        Ok(Self { store, known, revoked, limits: Limits::default() })
     }
 
     /// Makes a key. What comes back is the only place where its token is.
@@ -253,6 +261,38 @@ impl Keys {
     }
 }
 
+type Known = RwLock<HashMap<String, StoredKey>>;
+
+async fn read_all(store: &dyn KeyStore) -> Result<HashMap<String, StoredKey>, StoreError> {
+    let known = store.keys().await?;
+    Ok(known.into_iter().map(|stored| (stored.key.id.clone(), stored)).collect())
+}
+
+/// Reads the keys again whenever another process has changed some, as long as somebody needs them.
+async fn keep_up(
+    store: Arc<dyn KeyStore>,
+    known: Weak<Known>,
+    revoked: Arc<watch::Sender<()>>,
+    mut changed: watch::Receiver<()>,
+) {
+    while changed.changed().await.is_ok() {
+        loop {
+            let Some(known) = known.upgrade() else { return };
+            match read_all(store.as_ref()).await {
+                Ok(now) => {
+                    *known.write().unwrap_or_else(PoisonError::into_inner) = now;
+                    revoked.send_replace(());
+                    break;
+                }
+                Err(error) => {
+                    tracing::warn!(%error, "changed keys cannot be read; trying again");
+                    tokio::time::sleep(READ_AGAIN).await;
+                }
+            }
+        }
+    }
+}
+
 fn random_token() -> Result<Token, ServiceError> {
     Ok(Token::new(&random("key")?))
 }
@@ -270,7 +310,6 @@ pub(super) fn random<const N: usize>(of: &str) -> Result<[u8; N], ServiceError> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::StoreError;
     use async_trait::async_trait;
     use std::sync::Mutex;
 

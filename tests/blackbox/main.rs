@@ -9,6 +9,7 @@
     reason = "clippy lets tests do this, but not what tests call"
 )]
 
+mod deployment;
 mod support;
 
 mod backup;
@@ -41,6 +42,7 @@ mod real_images;
 mod receiver;
 mod reindex;
 mod retention;
+mod scale_out;
 mod schema;
 mod service;
 mod slow_clients;

@@ -12,6 +12,8 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 use whereabouts::demo::{Town, TownSpec};
 
+use crate::deployment;
+
 /// The binary under test.
 pub const BINARY: &str = env!("CARGO_BIN_EXE_whereabouts");
 
@@ -40,6 +42,17 @@ impl Server {
 
     /// The same; gives the log of a server that does not start.
     pub fn try_start(data: &Path, settings: &[(&str, &str)]) -> Result<Self, String> {
+        Self::try_start_as("serve", data, settings)
+    }
+
+    /// Starts a process that refines and does nothing else, for the servers of that data folder.
+    #[allow(dead_code, reason = "not every test binary has workers")]
+    pub fn start_worker(data: &Path, settings: &[(&str, &str)]) -> Self {
+        Self::try_start_as("worker", data, settings)
+            .unwrap_or_else(|log| panic!("the worker did not start: {log}"))
+    }
+
+    fn try_start_as(role: &str, data: &Path, settings: &[(&str, &str)]) -> Result<Self, String> {
         // reqwest has no cryptography of its own; the binary chooses the same.
         let _ = rustls::crypto::ring::default_provider().install_default();
         // Connections are not kept, so that a drain never waits for an idle one.
@@ -47,7 +60,7 @@ impl Server {
         let address_file =
             std::env::temp_dir().join(format!("whereabouts-{}.address", uuid::Uuid::now_v7()));
         let mut child = Command::new(BINARY)
-            .args(["serve", "--listen", "127.0.0.1:0", "--data"])
+            .args([role, "--listen", "127.0.0.1:0", "--data"])
             .arg(data)
             .arg("--address-file")
             .arg(&address_file)
@@ -55,6 +68,7 @@ impl Server {
             .env("WHEREABOUTS_MODEL__THREADS", "1")
             // Whatever else is installed in the checkout.
             .env("WHEREABOUTS_MODEL__NAME", "xfeat")
+            .envs(deployment::settings(data))
             .envs(settings.iter().copied())
             .stderr(Stdio::piped())
             .spawn()

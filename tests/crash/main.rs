@@ -8,6 +8,9 @@ mod disk;
 mod faults;
 mod kill;
 mod ledger;
+#[path = "../blackbox/deployment.rs"]
+#[allow(dead_code)]
+mod deployment;
 #[path = "../blackbox/support.rs"]
 #[allow(dead_code)]
 mod support;

@@ -25,7 +25,8 @@ use crate::config::{Config, Overrides};
 use crate::demo::TownSpec;
 use crate::domain::{Job, Scene};
 use crate::service::Answer;
-use crate::{startup, telemetry};
+use crate::startup::{self, Role};
+use crate::telemetry;
 
 /// The map's name.
 const MAP: &str = "town";
@@ -152,10 +153,11 @@ impl Server {
         let (announce, ready) = oneshot::channel();
         let shutdown = CancellationToken::new();
         let until = shutdown.clone();
-        let running = tokio::spawn(startup::serve(config, troubles, listener, until, |address| {
-            let _ = announce.send(address);
-            Ok(())
-        }));
+        let running =
+            tokio::spawn(startup::run(Role::Serve, config, troubles, listener, until, |address| {
+                let _ = announce.send(address);
+                Ok(())
+            }));
         match ready.await {
             Ok(address) => {
                 let address = ServerArg { server: format!("http://{address}"), api_key: None };

@@ -2,13 +2,14 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use futures_util::{StreamExt, stream};
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use tokio::sync::OnceCell;
 
 use super::budget::{Exceeded, JobBudget};
-use super::cache::{CachedDescription, DescribedFrame, SimilarFrame};
+use super::cache::{CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame};
 use super::client::{Answer, Call, estimate_tokens};
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Switches, clean};
@@ -18,6 +19,12 @@ use super::{MllmRefiner, Progress, RefineError};
 use crate::domain::{Candidate, Description, Descriptor, Digest, Map, Scene, StandIn, Usage};
 use crate::store::{JobRecord, Step, StoreError};
 use crate::telemetry::CacheLookup;
+
+/// The pause between two looks for a description that another process is buying.
+const PURCHASE_LOOK: Duration = Duration::from_millis(250);
+
+/// After so long another process may buy what this one has not bought.
+const LONGEST_PURCHASE: SignedDuration = SignedDuration::from_mins(10);
 
 /// What one refinement goes along with.
 pub(super) struct Work<'a> {
@@ -137,6 +144,23 @@ pub(super) fn cost_of(answer: &Answer) -> Usage {
     }
 }
 
+/// The right of this process to buy a description. It ends when this is dropped.
+struct Purchase {
+    cache: Arc<dyn DescriptionCache>,
+    key: Digest,
+}
+
+impl Drop for Purchase {
+    fn drop(&mut self) {
+        let (cache, key) = (Arc::clone(&self.cache), self.key);
+        tokio::spawn(async move {
+            if let Err(error) = cache.end_purchase(&key).await {
+                tracing::warn!(%error, "other processes wait for a description that was not bought");
+            }
+        });
+    }
+}
+
 impl MllmRefiner {
     /// The candidates that are still in the map, in coarse order.
     pub(super) async fn pairs(
@@ -243,10 +267,37 @@ impl MllmRefiner {
                 return Ok(Found { description, stands_in: Some(frame.stand_in) });
             }
         }
+        let _purchase = match self.purchase(&pair.key).await? {
+            Ok(purchase) => purchase,
+            Err(description) => {
+                self.metrics.description_lookup(CacheLookup::Hit);
+                return Ok(Found { description, stands_in: None });
+            }
+        };
         self.metrics.description_lookup(CacheLookup::Miss);
         let description = self.buy(work, pair).await?;
         bought.store(true, Ordering::Relaxed);
         Ok(Found { description, stands_in: None })
+    }
+
+    /// The right to buy a description; or the description, if another process was buying it.
+    async fn purchase(
+        &self,
+        key: &Digest,
+    ) -> Result<Result<Purchase, CachedDescription>, CallError> {
+        loop {
+            let until = Timestamp::now().saturating_add(LONGEST_PURCHASE).unwrap_or(Timestamp::MAX);
+            let begun = self.cache.begin_purchase(key, until).await.map_err(passing)?;
+            let purchase = begun.then(|| Purchase { cache: Arc::clone(&self.cache), key: *key });
+            // Whoever was at it a moment ago may have ended just now.
+            if let Some(known) = self.cache.description(key).await.map_err(passing)? {
+                return Ok(Err(known));
+            }
+            if let Some(purchase) = purchase {
+                return Ok(Ok(purchase));
+            }
+            tokio::time::sleep(PURCHASE_LOOK).await;
+        }
     }
 
     async fn buy(&self, work: &Work<'_>, pair: &Pair) -> Result<CachedDescription, CallError> {

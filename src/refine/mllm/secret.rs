@@ -23,8 +23,8 @@ impl Secret {
         self.0.is_empty()
     }
 
-    /// The key itself, for the one header that carries it.
-    pub(super) fn expose(&self) -> &str {
+    /// The key itself, for the one place that needs it.
+    pub(crate) fn expose(&self) -> &str {
         &self.0
     }
 

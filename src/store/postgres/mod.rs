@@ -40,7 +40,8 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use uuid::Uuid;
 
 use self::descriptions::KnownLevels;
-pub use self::schema::{SchemaState, migrate, schema_state};
+use self::schema::schema_state;
+pub use self::schema::{SchemaState, migrate, schema_of};
 use super::{DescriptionBounds, Objects, StoreError};
 use crate::retrieve::index::IndexSettings;
 

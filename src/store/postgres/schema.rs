@@ -57,8 +57,13 @@ pub async fn migrate(settings: &PostgresSettings) -> Result<usize, StoreError> {
     Ok(missing)
 }
 
+/// How far the schema of the database of these settings is.
+pub async fn schema_of(settings: &PostgresSettings) -> Result<SchemaState, StoreError> {
+    schema_state(&connect(settings)?).await
+}
+
 /// How far the schema is.
-pub async fn schema_state(pool: &PgPool) -> Result<SchemaState, StoreError> {
+pub(super) async fn schema_state(pool: &PgPool) -> Result<SchemaState, StoreError> {
     let known = steps();
     let mut connection = pool.acquire().await?;
     let there = "SELECT to_regclass('_sqlx_migrations') IS NOT NULL";

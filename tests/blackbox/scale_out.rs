@@ -1,0 +1,244 @@
+//! Several servers and workers share a database: what happens when processes die, and when the database
+//! does.
+//!
+//! These need WHEREABOUTS_TEST_DEPLOYMENT=scale-out; `make test` runs them with `--include-ignored`.
+
+use std::collections::HashSet;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use crate::deployment;
+use crate::mock_mllm::{MockMllm, Script};
+use crate::support::{Server, frame};
+
+/// Calls of one process to the mock at a time.
+const CONCURRENCY: usize = 8;
+
+/// Settings that every process has; a process that gives no sign of life is soon dead.
+fn settings(mock: &MockMllm) -> Vec<(&'static str, String)> {
+    let given = [
+        ("WHEREABOUTS_REFINE__REFINER", "mllm"),
+        ("WHEREABOUTS_MLLM__REQUESTS_PER_MINUTE", "0"),
+        ("WHEREABOUTS_MLLM__BREAKER_FAILURES", "1000"),
+        ("WHEREABOUTS_JOBS__ATTEMPTS", "10"),
+        ("WHEREABOUTS_JOBS__RETRY_PAUSE_S", "0"),
+        ("WHEREABOUTS_DATABASE__TIMEOUT_MS", "1000"),
+        ("WHEREABOUTS_DATABASE__LIFETIME_S", "2"),
+    ];
+    let mut settings: Vec<_> = given.into_iter().map(|(key, value)| (key, value.into())).collect();
+    settings.push(("WHEREABOUTS_MLLM__BASE_URL", mock.url()));
+    settings.push(("WHEREABOUTS_MLLM__CONCURRENCY", CONCURRENCY.to_string()));
+    settings
+}
+
+fn with<'a>(
+    settings: &'a [(&'static str, String)],
+    more: &[(&'static str, &'a str)],
+) -> Vec<(&'static str, &'a str)> {
+    let given = settings.iter().map(|(key, value)| (*key, value.as_str()));
+    given.chain(more.iter().copied()).collect()
+}
+
+fn serve(dir: &TempDir, settings: &[(&'static str, String)]) -> Server {
+    Server::start(dir.path(), &with(settings, &[("WHEREABOUTS_JOBS__WORKERS", "0")]))
+}
+
+fn worker(dir: &TempDir, settings: &[(&'static str, String)]) -> Server {
+    Server::start_worker(dir.path(), &with(settings, &[("WHEREABOUTS_JOBS__WORKERS", "2")]))
+}
+
+/// Does something to the PostgreSQL of these tests.
+fn database(what: &str) {
+    let control = std::env::var("WHEREABOUTS_TEST_POSTGRES").expect(
+        "this test stops PostgreSQL and starts it again: run it through tests/postgres.sh",
+    );
+    let done = Command::new(control).arg(what).output().unwrap();
+    assert!(done.status.success(), "{done:?}");
+}
+
+async fn ended(server: &Server, jobs: usize) -> Vec<Value> {
+    let mut all = Vec::new();
+    for state in ["succeeded", "degraded", "failed"] {
+        let path = format!("/jobs?state={state}&limit={jobs}&brief=true");
+        let answer = server.get(&path).await;
+        if answer.status == 200 {
+            all.extend(answer.expect(200)["jobs"].as_array().unwrap().clone());
+        }
+    }
+    all
+}
+
+/// Posts a frame until a server takes it; a server that cannot says so, and soon.
+async fn localize(servers: &[Server], number: usize) -> Value {
+    let began = Instant::now();
+    for attempt in 0.. {
+        let server = &servers[(number + attempt) % servers.len()];
+        let asked = Instant::now();
+        let answer = server.post_jpeg("/localize?map=m", frame(number, 0)).await;
+        assert!(asked.elapsed() < Duration::from_secs(8), "an answer took {:?}", asked.elapsed());
+        if answer.status == 200 {
+            return answer.expect(200);
+        }
+        answer.problem(503);
+        assert!(answer.headers.contains_key("retry-after"));
+        assert!(began.elapsed() < Duration::from_secs(60), "no server took the frame");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    unreachable!()
+}
+
+#[tokio::test]
+#[ignore = "needs the scale-out deployment and a PostgreSQL that may be restarted"]
+async fn five_hundred_jobs_survive_the_death_of_processes_and_a_restart_of_the_database() {
+    const JOBS: usize = 500;
+    const KILLS: usize = 4;
+    assert!(deployment::is_scale_out());
+    let dir = TempDir::new().unwrap();
+    let script = Script { latency: Duration::from_millis(20), ..Script::default() };
+    let mock = MockMllm::start(script).await;
+    let settings = settings(&mock);
+    let mut servers = vec![serve(&dir, &settings), serve(&dir, &settings)];
+    let mut workers: Vec<Server> = (0..3).map(|_| worker(&dir, &settings)).collect();
+    servers[0].town("m", 10).await;
+
+    let mut ids = HashSet::new();
+    for number in 0..JOBS {
+        match number {
+            100 | 200 => {
+                workers.remove(0).kill();
+                workers.push(worker(&dir, &settings));
+            }
+            150 => {
+                // The other server goes on.
+                servers.remove(0).kill();
+                localize(&servers, number + JOBS).await;
+                servers.push(serve(&dir, &settings));
+            }
+            250 => {
+                database("kill");
+                let down = servers[0].post_jpeg("/localize?map=m", frame(1, 0)).await;
+                assert!(down.problem(503).contains("database"), "{}", down.problem(503));
+                database("start");
+            }
+            350 => {
+                workers.remove(0).kill();
+                workers.push(worker(&dir, &settings));
+            }
+            _ => {}
+        }
+        let answer = localize(&servers, number).await;
+        ids.insert(answer["job"]["id"].as_str().unwrap().to_owned());
+    }
+    assert_eq!(ids.len(), JOBS);
+    let began = Instant::now();
+    let jobs = loop {
+        let jobs = ended(&servers[0], 2 * JOBS).await;
+        let mine = jobs.iter().filter(|job| ids.contains(job["id"].as_str().unwrap()));
+        if mine.count() == JOBS {
+            break jobs;
+        }
+        assert!(began.elapsed() < Duration::from_secs(180), "{} jobs ended", jobs.len());
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    };
+    let bad: Vec<_> = jobs.iter().filter(|job| job["state"] != "succeeded").collect();
+    assert!(bad.is_empty(), "{} jobs: {}", bad.len(), bad[0]);
+    // A process that dies takes along what it has not yet written down; one that lives buys nothing twice.
+    let again = mock.asked_again();
+    eprintln!(
+        "{JOBS} jobs by 2 servers and 3 workers, {KILLS} of them killed and the database once: {} \
+         describe calls, {again} of them for pairs that had been answered",
+        mock.describe_calls()
+    );
+    assert!(again <= (KILLS + 5) * CONCURRENCY, "{again} answered pairs were asked again");
+    assert_eq!(mock.violations(), [""; 0]);
+}
+
+#[tokio::test]
+#[ignore = "needs the scale-out deployment"]
+async fn two_workers_that_want_the_same_pair_buy_it_once() {
+    let dir = TempDir::new().unwrap();
+    let script = Script { latency: Duration::from_millis(300), ..Script::default() };
+    let mock = MockMllm::start(script).await;
+    let settings = settings(&mock);
+    let server = serve(&dir, &settings);
+    let _workers: Vec<Server> = (0..2).map(|_| worker(&dir, &settings)).collect();
+    server.town("m", 10).await;
+    let mut ids = Vec::new();
+    for _ in 0..4 {
+        let answer = server.post_jpeg("/localize?map=m", frame(3, 0)).await.expect(200);
+        ids.push(answer["job"]["id"].as_str().unwrap().to_owned());
+    }
+    for id in ids {
+        let job = server.get(&format!("/jobs/{id}?wait=30")).await.expect(200);
+        assert_eq!(job["state"], "succeeded", "{job}");
+    }
+    assert_eq!((mock.describe_calls(), mock.asked_again()), (10, 0));
+}
+
+#[tokio::test]
+#[ignore = "needs the scale-out deployment"]
+async fn what_one_server_is_told_the_other_knows() {
+    let dir = TempDir::new().unwrap();
+    let (one, other) = (Server::start(dir.path(), &[]), Server::start(dir.path(), &[]));
+    one.town("m", 5).await;
+    let answer = other.post_jpeg("/localize?map=m&refine=wait", frame(2, 0)).await.expect(200);
+    assert_eq!(answer["candidates"][0]["image_id"], "place-2");
+    let id = answer["job"]["id"].as_str().unwrap();
+    let job = one.get(&format!("/jobs/{id}")).await.expect(200);
+    assert_eq!(job["state"], "succeeded");
+    other.delete("/maps/m/images/place-2").await.expect(204);
+    let answer = one.post_jpeg("/localize?map=m&refine=off", frame(2, 0)).await.expect(200);
+    assert_ne!(answer["candidates"][0]["image_id"], "place-2");
+    other.delete("/maps/m").await.expect(204);
+    one.post_jpeg("/localize?map=m&refine=off", frame(2, 0)).await.problem(404);
+}
+
+#[tokio::test]
+#[ignore = "needs the scale-out deployment"]
+async fn a_key_that_is_revoked_at_one_server_lets_nobody_into_the_other() {
+    let dir = TempDir::new().unwrap();
+    let make = |server: &Server, role: &str| {
+        let request = server.request(reqwest::Method::POST, "/keys");
+        request.json(&json!({ "name": role, "role": role }))
+    };
+    let (one, other) = (Server::start(dir.path(), &[]), Server::start(dir.path(), &[]));
+    let admin = make(&one, "admin").send().await.unwrap().json::<Value>().await.unwrap();
+    let robot = make(&one, "robot").send().await.unwrap().json::<Value>().await.unwrap();
+    drop((one, other));
+    let keys = [("WHEREABOUTS_AUTH__KEYS", "required")];
+    let (one, other) = (Server::start(dir.path(), &keys), Server::start(dir.path(), &keys));
+    let get = |server: &Server, key: &Value| {
+        let token = key["token"].as_str().unwrap().to_owned();
+        server.request(reqwest::Method::GET, "/maps").bearer_auth(token).send()
+    };
+    assert_eq!(get(&other, &robot).await.unwrap().status(), 200);
+    let path = format!("/keys/{}", robot["key"]["id"].as_str().unwrap());
+    let revoke = one.request(reqwest::Method::DELETE, &path);
+    let revoked = revoke.bearer_auth(admin["token"].as_str().unwrap()).send().await.unwrap();
+    assert_eq!(revoked.status(), 200);
+    let began = Instant::now();
+    while get(&other, &robot).await.unwrap().status() != 401 {
+        assert!(began.elapsed() < Duration::from_secs(2), "the other server still lets it in");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+#[test]
+#[ignore = "needs the scale-out deployment"]
+fn a_worker_answers_those_who_look_after_it_and_nobody_else() {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let dir = TempDir::new().unwrap();
+    let worker = Server::start_worker(dir.path(), &[]);
+    runtime.block_on(async {
+        for path in ["/livez", "/readyz", "/metrics"] {
+            assert_eq!(worker.get(path).await.status, 200, "{path}");
+        }
+        for path in ["/maps", "/jobs", "/", "/localize"] {
+            worker.get(path).await.problem(404);
+        }
+    });
+    assert!(worker.terminate().success());
+}
