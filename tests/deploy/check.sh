@@ -7,7 +7,7 @@
 #
 # VENV is a folder for a Python environment (requirements.txt); it is made if it is not there. Takes about
 # half a minute once it is. Ends with 1 if anything fails, and says at its end what could not be run here.
-# Uses docker compose, kubectl (or kustomize), promtool and systemd-analyze where they are installed.
+# Uses docker compose, haproxy, kubectl (or kustomize), promtool and systemd-analyze where they are installed.
 set -euo pipefail
 
 if [ $# -ne 2 ]; then
@@ -22,8 +22,8 @@ cd "$(dirname "$0")"
 . ../server.sh
 environment "$venv" requirements.txt
 
-"$venv/bin/shellcheck" --external-sources check.sh
-echo "check.sh: shellcheck finds nothing"
+"$venv/bin/shellcheck" --external-sources check.sh ../../deploy/database/whereabouts.sh
+echo "check.sh, whereabouts.sh: shellcheck finds nothing"
 "$venv/bin/hadolint" ../../Dockerfile
 echo "Dockerfile: hadolint finds nothing"
 
@@ -57,10 +57,11 @@ if grep -q panicked "$scratch/log"; then
 fi
 
 echo
-echo "Not run, because nothing here can: no container engine built the image or started compose.yaml, no"
-echo "cluster took the manifests, no systemd started the unit, no Grafana drew the dashboard."
+echo "Not run, because nothing here can: no container engine built the image or started a Compose file, no"
+echo "cluster took the manifests, no systemd started a unit, no Grafana drew the dashboard."
 missing() { echo "Not run, because $1 is not installed: $2."; }
 command -v kubectl kustomize > /dev/null || missing kubectl "the manifests as kustomize builds them"
-command -v promtool > /dev/null || missing promtool "its check of prometheus.yml, and alerts_test.yaml"
-command -v systemd-analyze > /dev/null || missing systemd-analyze "its look at the unit"
-docker compose version > /dev/null 2>&1 || missing "docker compose" "its look at compose.yaml"
+command -v promtool > /dev/null || missing promtool "its check of prometheus.yml and scale.yml, and alerts_test.yaml"
+command -v haproxy > /dev/null || missing haproxy "its look at haproxy.cfg"
+command -v systemd-analyze > /dev/null || missing systemd-analyze "its look at the units"
+docker compose version > /dev/null 2>&1 || missing "docker compose" "its look at the Compose files"

@@ -5,8 +5,8 @@ import re
 
 import promql_parser as promql
 
-# What Prometheus adds to each sample, and the metric that it makes itself.
-OF_TARGET = {"job", "instance"}
+# What the scrape adds to each sample, and the metric that Prometheus makes itself.
+OF_TARGET = {"job", "instance", "deployment", "role"}
 OF_PROMETHEUS = {"up"}
 # Functions of ranges: of counters, and of gauges.
 OF_COUNTERS = {"rate", "irate", "increase", "resets"}

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+import tomllib
 import unittest
 
 import traffic
@@ -55,6 +56,27 @@ def query(text):
     return Query(text, METRICS, words)
 
 
+# What is in the database, and the same whichever process tells it.
+SHARED = {
+    "whereabouts_db_bytes",
+    "whereabouts_description_cache_bytes",
+    "whereabouts_description_cache_entries",
+    "whereabouts_jobs_queued",
+    "whereabouts_map_images",
+    "whereabouts_mllm_money_today",
+    "whereabouts_mllm_tokens_today",
+    "whereabouts_webhook_deliveries_waiting",
+}
+
+
+def check_shared(case, text):
+    """Fails if what all processes of a deployment tell alike is added up, or told by each of them."""
+    bare = re.sub(r"\{[^{}]*\}|\[\w+\]", "", text)
+    for name in SHARED & set(METRIC.findall(bare)):
+        once = rf"max by \((job, )?deployment(, map)?\) \((predict_linear\()?{name}\b"
+        case.assertRegex(bare, once, f"{name} is the same number from every process")
+
+
 class Rules(unittest.TestCase):
     def setUp(self):
         [file] = documents(RULES)
@@ -83,6 +105,7 @@ class Rules(unittest.TestCase):
                 except Wrong as wrong:
                     self.fail(f"{RULES}: {rule['alert']}: {wrong}")
                 asked |= found.asked
+                check_shared(self, rule["expr"])
                 told_of = set(re.findall(r"\$labels\.(\w+)", json.dumps(rule["annotations"])))
                 self.assertEqual(told_of - found.labels, set(), "labels that the alert does not have")
         told(f"{RULES}: {len(self.rules)} rules ask for {len(asked)} metrics, all there")
@@ -104,21 +127,26 @@ class Rules(unittest.TestCase):
         named = set(METRIC.findall(text + read("docs/deploy.md")))
         self.assertEqual(named - set(METRICS) - families(), set(), "metrics that are named and are not there")
 
+    def test_the_program_has_the_settings_of_this_tree(self):
+        self.assertEqual(tomllib.loads((SCRATCH / "defaults.toml").read_text()), DEFAULTS, "another program")
+
     @unittest.skipUnless(shutil.which("promtool"), "promtool is not installed")
     def test_promtool_takes_the_rules_and_they_fire_when_they_should(self):
-        # The key's file is there only in the container.
-        config = read("deploy/prometheus/prometheus.yml").replace(
-            "/run/secrets/metrics_key", str(SCRATCH / "operator.key")
-        )
-        (SCRATCH / "prometheus.yml").write_text(config)
         shutil.copy(ROOT / RULES, SCRATCH)
+        for name in ("prometheus.yml", "scale.yml"):
+            # The key's file is there only in the container.
+            config = read(f"deploy/prometheus/{name}").replace(
+                "/run/secrets/metrics_key", str(SCRATCH / "operator.key")
+            )
+            (SCRATCH / name).write_text(config)
         for what in (
             ["check", "config", SCRATCH / "prometheus.yml"],
+            ["check", "config", SCRATCH / "scale.yml"],
             ["test", "rules", ROOT / "tests/deploy/alerts_test.yaml"],
         ):
             ran = subprocess.run(["promtool", *what], capture_output=True, text=True, check=False)
             self.assertEqual(ran.returncode, 0, ran.stdout + ran.stderr)
-        told("promtool: takes prometheus.yml and the rules, which fire in alerts_test.yaml as expected")
+        told("promtool: takes both configurations and the rules, which fire in alerts_test.yaml as expected")
 
 
 class Dashboard(unittest.TestCase):
@@ -152,6 +180,7 @@ class Dashboard(unittest.TestCase):
                         self.fail(f"whereabouts.json: {panel['title']}: {wrong}")
                     legend = set(re.findall(r"{{\s*(\w+)\s*}}", target["legendFormat"]))
                     self.assertEqual(legend - found.labels, set(), "labels of the legend that the query lacks")
+                    check_shared(self, target["expr"])
                     asked |= found.asked
                     queries += 1
         for annotation in self.board["annotations"]["list"]:
@@ -177,16 +206,25 @@ class Scraping(unittest.TestCase):
         told("/metrics: 401 without a key, 403 with a robot's, 200 with an operator's")
 
     def test_the_job_of_the_rules_is_the_job_that_is_scraped(self):
-        [config] = documents("deploy/prometheus/prometheus.yml")
-        [job] = config["scrape_configs"]
-        self.assertEqual(job["metrics_path"], "/metrics")
         named = set(re.findall(r'job="(\w+)"', read(RULES) + json.dumps(dashboard()).replace('\\"', '"')))
-        self.assertEqual(named, {job["job_name"]})
-        for file in config["rule_files"]:
-            self.assertTrue((DEPLOY / "prometheus" / file).is_file(), file)
-        self.assertLess(
-            seconds(config["global"]["scrape_timeout"]), seconds(config["global"]["scrape_interval"])
-        )
+        for name in ("prometheus.yml", "scale.yml", "kubernetes.yml"):
+            with self.subTest(name):
+                [config] = documents(f"deploy/prometheus/{name}")
+                [job] = config["scrape_configs"]
+                self.assertEqual(job["metrics_path"], "/metrics")
+                self.assertEqual(job["authorization"]["type"], "Bearer")
+                self.assertEqual(named, {job["job_name"]})
+                for file in config.get("rule_files", []):
+                    self.assertTrue((DEPLOY / "prometheus" / file).is_file(), file)
+                if times := config.get("global"):
+                    self.assertLess(seconds(times["scrape_timeout"]), seconds(times["scrape_interval"]))
+
+    def test_the_metric_of_the_autoscaler_is_there(self):
+        [rule] = documents("deploy/prometheus/adapter.yaml")[0]["rules"]["external"]
+        series = query(rule["seriesQuery"])
+        asked = rule["metricsQuery"].replace("<<.Series>>", rule["name"]["as"])
+        asked = query(asked.replace("<<.LabelMatchers>>", 'deployment="whereabouts"'))
+        self.assertEqual(series.asked, asked.asked)
 
 
 if __name__ == "__main__":

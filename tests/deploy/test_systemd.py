@@ -19,17 +19,24 @@ from files import (
 )
 
 UNIT = "deploy/systemd/whereabouts.service"
+WORKER = "deploy/systemd/whereabouts-worker.service"
 # On the scale of systemd-analyze, from 0.0 (closed) to 10.0. A server on the network cannot have less than 1.
 EXPOSURE = 2.0
 
 
+def lines(unit):
+    return re.findall(r"^(\w+)=(.*)$", read(unit), flags=re.M)
+
+
 class Unit(unittest.TestCase):
+    UNIT = UNIT
+
     def setUp(self):
-        self.lines = re.findall(r"^(\w+)=(.*)$", read(UNIT), flags=re.M)
+        self.lines = lines(self.UNIT)
         self.of = dict(self.lines)
 
     def test_its_settings_exist(self):
-        check_settings(self, UNIT, "deploy/systemd/whereabouts.env")
+        check_settings(self, self.UNIT, "deploy/systemd/whereabouts.env")
         given = dict(value.split("=", 1) for name, value in self.lines if name == "Environment")
         state = f"/var/lib/{self.of['StateDirectory']}"
         given = {name: value.replace("%S", "/var/lib") for name, value in given.items()}
@@ -37,7 +44,7 @@ class Unit(unittest.TestCase):
         settings = settings_in_force(given | file)
         self.assertEqual(settings["data"]["dir"], state)
         self.assertTrue(settings["model"]["assets"].startswith(state))
-        told(f"{UNIT}: `whereabouts config` takes its settings together with whereabouts.env")
+        told(f"{self.UNIT}: `whereabouts config` takes its settings together with whereabouts.env")
 
     def test_it_waits_for_the_end_and_leaves_room_for_connections(self):
         self.assertGreater(seconds(self.of["TimeoutStopSec"]), drain_times())
@@ -46,8 +53,8 @@ class Unit(unittest.TestCase):
 
     @unittest.skipUnless(shutil.which("systemd-analyze"), "systemd-analyze is not installed")
     def test_systemd_takes_it_and_finds_it_closed(self):
-        unit = SCRATCH / "whereabouts.service"
-        unit.write_text(read(UNIT).replace("/usr/bin/whereabouts", BINARY))
+        unit = SCRATCH / self.UNIT.rsplit("/", 1)[1]
+        unit.write_text(read(self.UNIT).replace("/usr/bin/whereabouts", BINARY))
         ran = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, check=False)
         self.assertEqual((ran.returncode, ran.stderr), (0, ""))
         rate = [
@@ -56,14 +63,33 @@ class Unit(unittest.TestCase):
             "--offline=true",
             "--no-pager",
             f"--threshold={EXPOSURE * 10:.0f}",
-            ROOT / UNIT,
+            ROOT / self.UNIT,
         ]
         ran = subprocess.run(rate, capture_output=True, text=True, check=False)
         if "unrecognized option" in ran.stderr or "Unknown" in ran.stderr:
             self.skipTest("this systemd-analyze rates no file")
         self.assertEqual(ran.returncode, 0, ran.stdout.strip().splitlines()[-1:] or ran.stderr)
         [level] = re.findall(r"exposure level .*: ([\d.]+)", ran.stdout)
-        told(f"{UNIT}: taken by systemd-analyze verify; exposure {level} of 10, at most {EXPOSURE}")
+        told(f"{self.UNIT}: taken by systemd-analyze verify; exposure {level} of 10, at most {EXPOSURE}")
+
+
+class Worker(Unit):
+    UNIT = WORKER
+
+    def test_it_is_as_closed_as_the_server_and_migrates_first(self):
+        own = {
+            "Description",
+            "ExecStartPre",
+            "ExecStart",
+            "StateDirectory",
+            "WorkingDirectory",
+            "Environment",
+        }
+        of_server = [line for line in lines(UNIT) if line[0] not in own]
+        self.assertEqual([line for line in self.lines if line[0] not in own], of_server)
+        self.assertEqual(self.of["ExecStartPre"], "/usr/bin/whereabouts migrate")
+        self.assertRegex(self.of["ExecStart"], r"^/usr/bin/whereabouts worker --listen 127\.0\.0\.1:\d+$")
+        self.assertNotIn(DEFAULTS["server"]["listen"], self.of["ExecStart"], "the port of a server beside it")
 
 
 if __name__ == "__main__":
