@@ -27,7 +27,7 @@ use whereabouts::store::embedded::{
     EmbeddedSettings, EmbeddedStore, Examination, compact, examine,
 };
 use whereabouts::store::{
-    BlobStore, JobRecord, JobStore, KeepJobs, MapStore, Query, Retention, Step,
+    BlobStore, DescriptionBounds, JobRecord, JobStore, KeepJobs, MapStore, Query, Retention, Step,
 };
 
 const KEPT: usize = 1000;

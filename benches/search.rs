@@ -7,71 +7,26 @@
 //! The peers run in Python, called with all queries at once so that Python itself costs nothing. One
 //! that this Python lacks is left out, and that is said.
 
+mod vectors;
+
 use std::io::Write;
-use std::ops::Range;
 use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
 use anyhow::Context;
 use rayon::prelude::*;
-use whereabouts::retrieve::index::{IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
+use whereabouts::retrieve::index::{IndexSettings, MapIndex, SealedGraph, SearchMode};
+
+use self::vectors::{DIM, Rows, clustered, recall};
 
 const VECTORS: usize = 76_000;
 const QUERIES: usize = 2_000;
-const DIM: usize = 384;
-const CLUSTERS: usize = 2_000;
 const K: usize = 10;
 const M: usize = 16;
 const EF_CONSTRUCTION: usize = 200;
 const EFS: [usize; 6] = [16, 24, 32, 48, 96, 192];
 const PEERS: [&str; 3] = ["hnswlib", "faiss", "usearch"];
-
-struct Rows(Vec<f32>);
-
-impl Rows {
-    fn row(&self, index: usize) -> &[f32] {
-        &self.0[index * DIM..(index + 1) * DIM]
-    }
-}
-
-impl Vectors for Rows {
-    fn dim(&self) -> usize {
-        DIM
-    }
-
-    fn scan(&self, slots: Range<usize>, visit: &mut dyn FnMut(usize, &[f32])) {
-        slots.for_each(|slot| visit(slot, self.row(slot)));
-    }
-}
-
-/// Unit vectors around common centres, as those of the places of a town are.
-fn clustered(count: usize, seed: u64) -> Rows {
-    let mut state = seed;
-    let mut random = move || {
-        // Four uniform draws make a bell.
-        (0..4)
-            .map(|_| {
-                state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
-                (state >> 40) as f32 / (1_u64 << 24) as f32 - 0.5
-            })
-            .sum::<f32>()
-    };
-    let mut shared = 1_u64;
-    let mut centre = || {
-        shared = shared.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
-        (shared >> 40) as f32 / (1_u64 << 24) as f32 - 0.5
-    };
-    let centres: Vec<f32> = (0..CLUSTERS * DIM).map(|_| centre()).collect();
-    let mut rows = Vec::with_capacity(count * DIM);
-    for index in 0..count {
-        let centre = &centres[index % CLUSTERS * DIM..][..DIM];
-        let row: Vec<f32> = centre.iter().map(|x| x + 0.35 * random()).collect();
-        let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
-        rows.extend(row.iter().map(|x| x / norm));
-    }
-    Rows(rows)
-}
 
 fn settings(ef_search: usize) -> IndexSettings {
     IndexSettings {
@@ -167,14 +122,6 @@ fn compare(peer: &str, (built, ours): (f64, &[(f64, f64)]), theirs: &Measured) {
 
 fn slots(index: &MapIndex, rows: &Rows, query: &[f32], mode: SearchMode) -> Vec<usize> {
     index.search(rows, query, K, mode).iter().map(|found| found.slot).collect()
-}
-
-fn recall(found: &[Vec<usize>], truth: &[Vec<usize>]) -> f64 {
-    let hits = found
-        .iter()
-        .zip(truth)
-        .map(|(found, truth)| found.iter().filter(|slot| truth.contains(slot)).count());
-    hits.sum::<usize>() as f64 / (K * truth.len()) as f64
 }
 
 /// What a peer did.

@@ -17,8 +17,8 @@ use whereabouts::domain::{
     Descriptor, DescriptorKind, Digest, Frame, Image, Map, MediaType, Precision, Scene,
 };
 use whereabouts::retrieve::index::IndexSettings;
-use whereabouts::store::MapStore;
 use whereabouts::store::embedded::{EmbeddedSettings, EmbeddedStore};
+use whereabouts::store::{DescriptionBounds, MapStore};
 
 const IMAGES: usize = 76_000;
 const DIM: usize = 384;

@@ -106,6 +106,25 @@ CREATE TABLE usage (
     PRIMARY KEY (day, map)
 );
 
+-- What calls in progress may cost at the most.
+CREATE TABLE set_aside (
+    day date NOT NULL,
+    holder uuid NOT NULL,
+    tokens bigint NOT NULL,
+    money double precision NOT NULL,
+    PRIMARY KEY (day, holder)
+);
+
+-- What is left of limits by the minute. After a crash of the database they begin anew.
+CREATE UNLOGGED TABLE buckets (
+    name text COLLATE "C" PRIMARY KEY,
+    first double precision NOT NULL,
+    second double precision NOT NULL,
+    at timestamptz NOT NULL,
+    -- Whether the last draw was granted.
+    taken boolean NOT NULL
+);
+
 -- Descriptions of pairs that were paid for.
 CREATE TABLE descriptions (
     key bytea PRIMARY KEY,

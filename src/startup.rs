@@ -23,12 +23,14 @@ use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
 use crate::service::{
-    Dispatcher, Janitor, Keys, OnceSettings, Reindexes, RetentionSettings, Service,
+    Dispatcher, Janitor, Keys, Limits, OnceSettings, Reindexes, RetentionSettings, Service,
     ServiceSettings, Tracks, Webhooks,
 };
 use crate::store::embedded::{EmbeddedSettings, EmbeddedStore};
 use crate::store::postgres::{PostgresSettings, PostgresStore};
-use crate::store::{DescriptionBounds, JobStore, ObjectSettings, Objects, Store};
+use crate::store::{
+    Buckets, DescriptionBounds, JobStore, ObjectSettings, Objects, SharedLimits, Store,
+};
 use crate::telemetry::{Metrics, Troubles};
 
 /// What a process does.
@@ -171,14 +173,23 @@ pub struct Parts {
     pub pools: [CpuPool; 2],
 }
 
+/// A store, and the limits that go with it.
+pub struct Opened {
+    /// The store.
+    pub store: Arc<dyn Store>,
+    /// The limits of all processes, where there may be several.
+    pub shared: Option<Arc<dyn SharedLimits>>,
+}
+
 /// Opens the configured store for a process of that id. Blocks.
-pub fn store(config: &Config, process: Uuid) -> anyhow::Result<Arc<dyn Store>> {
+pub fn store(config: &Config, process: Uuid) -> anyhow::Result<Opened> {
     if !config.database.is_set() {
-        return Ok(Arc::new(embedded(config)?));
+        return Ok(Opened { store: Arc::new(embedded(config)?), shared: None });
     }
     let objects = objects(config)?;
     let opening = PostgresStore::open(postgres(config), objects, process);
-    Ok(Arc::new(Handle::current().block_on(opening)?))
+    let store = Arc::new(Handle::current().block_on(opening)?);
+    Ok(Opened { store: store.clone(), shared: Some(store) })
 }
 
 /// How the store in PostgreSQL works.
@@ -246,7 +257,7 @@ fn embedded(config: &Config) -> anyhow::Result<EmbeddedStore> {
 /// Opens the store, loads the model, and puts the service together. Blocks.
 pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     let process = Uuid::now_v7();
-    let store = store(config, process)?;
+    let Opened { store, shared } = store(config, process)?;
     let (models, why) = models(config)?;
     let admission = config.image.admission(config.model.layout());
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
@@ -273,6 +284,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
                 blobs: store.clone(),
                 cache: store.clone(),
                 usage: store.clone(),
+                shared: shared.clone(),
                 metrics: Arc::clone(&metrics),
                 limits: models.limits(),
                 fallback: Some(local),
@@ -303,7 +315,8 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         })
     });
     let workers = workers.collect();
-    let keys = Handle::current().block_on(Keys::load(store.clone()))?;
+    let mut keys = Handle::current().block_on(Keys::load(store.clone()))?;
+    keys.limits = Limits::new(Buckets::of(shared));
     check_keys(config, &keys)?;
     let service = Service {
         keys,

@@ -74,7 +74,7 @@ unix_socket_directories = ''
 fsync = off
 full_page_writes = off
 max_connections = 500
-shared_buffers = 256MB
+shared_buffers = ${WHEREABOUTS_TEST_SHARED_BUFFERS:-256MB}
 CONF
 "$control" start >/dev/null || { cat "$dir/data/log" >&2; exit 1; }
 

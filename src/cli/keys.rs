@@ -90,10 +90,10 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
             }
             let opening =
                 tokio::task::spawn_blocking(move || startup::store(&config, Uuid::now_v7()));
-            let store = opening.await.context("the folder could not be opened")?.context(
+            let opened = opening.await.context("the folder could not be opened")?.context(
                 "while its server runs, leave --data out, so that the server is asked over HTTP",
             )?;
-            Place::Folder(Keys::load(store).await?)
+            Place::Folder(Keys::load(opened.store).await?)
         }
     };
     match args.action {

@@ -33,7 +33,9 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         match schema_of(&settings).await? {
             SchemaState::UpToDate => println!("the tables are up to date"),
             SchemaState::Behind { steps } => {
-                bail!("the tables lack {steps} steps; run `whereabouts migrate`")
+                bail!(
+                    "the tables are not up to date (steps missing: {steps}); run `whereabouts migrate`"
+                )
             }
             SchemaState::Ahead { version } => {
                 bail!("the tables are of version {version}, which this program does not know")
@@ -43,6 +45,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     }
     match migrate(&settings).await? {
         0 => println!("the tables are up to date; nothing to do"),
+        1 => println!("one step was taken; the tables are up to date"),
         steps => println!("{steps} steps were taken; the tables are up to date"),
     }
     Ok(())

@@ -7,8 +7,8 @@ use crate::domain::{
     Descriptor, DescriptorKind, Digest, Image, ImageId, Map, MediaType, Precision, Scene, Usage,
 };
 use crate::retrieve::index::{IndexSettings, SearchMode};
-use crate::store::MapStore;
 use crate::store::embedded::{EmbeddedSettings, EmbeddedStore};
+use crate::store::{DescriptionBounds, MapStore};
 
 const DIM: usize = 24;
 const REFERENCES: usize = 400;

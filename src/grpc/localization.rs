@@ -63,6 +63,7 @@ impl Asked {
             frame: image,
             deadline: self.deadline.0,
             track,
+            once: None,
         };
         Ok(self.service.localize(request).await?.into())
     }
@@ -109,7 +110,7 @@ impl Frames {
         let mut working = std::pin::pin!(async move {
             // Each frame counts as a request of the key, of which the first is counted already.
             if counted {
-                asked.service.keys.limits.take_one_more(&asked.caller)?;
+                asked.service.keys.limits.take_one_more(&asked.caller).await?;
             }
             asked.localize(frame.unwrap_or_default()).await
         });

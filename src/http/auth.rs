@@ -104,7 +104,7 @@ pub(super) async fn admit(
         }
     };
     let mut audited = audited.then(|| Audited::of(&request, &key));
-    let (allowances, taken) = service.keys.limits.take_request(&key);
+    let (allowances, taken) = service.keys.limits.take_request(&key).await;
     let allowed = match taken {
         Ok(()) => may_make(&service, &caller, role, &mut request, route.as_deref()).await,
         Err(error) => Err(error),
@@ -235,8 +235,14 @@ fn counted(request: Request, service: &Arc<Service>, key: &Arc<ApiKey>) -> Reque
     }
     let (service, key) = (Arc::clone(service), Arc::clone(key));
     request.map(|body| {
-        let count = move |chunk: &bytes::Bytes| service.keys.limits.take_bytes(&key, chunk.len());
-        Body::from_stream(body.into_data_stream().inspect_ok(count))
+        let count = move |chunk: bytes::Bytes| {
+            let (service, key) = (Arc::clone(&service), Arc::clone(&key));
+            async move {
+                service.keys.limits.take_bytes(&key, chunk.len()).await;
+                Ok(chunk)
+            }
+        };
+        Body::from_stream(body.into_data_stream().and_then(count))
     })
 }
 

@@ -29,6 +29,10 @@ pub(super) const LONGEST_KEY: usize = 255;
 /// The largest answer that is kept, in bytes; none comes near it.
 const LARGEST_ANSWER: usize = 4 << 20;
 
+/// The id of a request that has a key, for those who note what they have done for it.
+#[derive(Debug, Clone)]
+pub(super) struct OnceId(pub String);
+
 /// Whether a call can be sent again with a key. The answers of those that make an API key and a webhook are
 /// not kept, because a secret is in them; a call of gRPC is no single text; many images can be sent again
 /// anyway, and may be too many to look at before.
@@ -76,7 +80,8 @@ async fn answer(state: AppState, request: Request, next: Next) -> Result<Respons
             Ok(response)
         }
         Once::First => {
-            let request = Request::from_parts(parts, Body::from(bytes));
+            let mut request = Request::from_parts(parts, Body::from(bytes));
+            request.extensions_mut().insert(OnceId(id.clone()));
             // Goes on when the sender has gone: it will ask again.
             let doing = tokio::spawn(do_and_keep(service, id, fingerprint, request, next));
             doing.await.map_err(|_| defect())

@@ -7,6 +7,7 @@ use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody};
+use super::idempotency::OnceId;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
@@ -101,6 +102,7 @@ pub(super) async fn localize(
     Deadline(deadline): Deadline,
     request: Request,
 ) -> Result<Json<Answer>, Problem> {
+    let once = request.extensions().get().map(|OnceId(id): &OnceId| id.clone());
     let map = map_name(&params.map)?;
     let track = params.step(&caller)?;
     let demand = Demand { class: Class::Localize, deadline };
@@ -113,6 +115,7 @@ pub(super) async fn localize(
         frame: body.picture,
         deadline,
         track,
+        once,
     };
     Ok(Json(service.localize(request).await?))
 }

@@ -63,8 +63,8 @@ impl Service {
             .take_until(Box::pin(until))
             .take(max_images + 1)
             .enumerate()
-            .map(|(index, image)| self.checked(caller, index, image))
-            .map(|image| {
+            .map(|(index, image)| (index, self.checked(index, image)))
+            .map(|(index, image)| {
                 let done = CancellationToken::new();
                 let id = image.as_ref().ok().and_then(|(_, id)| id.clone());
                 let before = id.and_then(|id| last_of.insert(id, done.clone()));
@@ -74,6 +74,11 @@ impl Service {
                         before.cancelled().await;
                     }
                     let (image, id) = image?;
+                    // Each image counts as a request of the key, of which the first is counted already.
+                    if index > 0 {
+                        let counted = self.keys.limits.take_one_more(caller).await;
+                        counted.map_err(|error| (id.clone(), error))?;
+                    }
                     self.add_patiently(map, image).await.map_err(|error| (id, error))
                 }
             })
@@ -86,7 +91,6 @@ impl Service {
     /// An image with the id that the caller gave it, if it is to be stored.
     fn checked(
         &self,
-        caller: &Caller,
         index: usize,
         image: Result<BulkImage, ServiceError>,
     ) -> Result<(BulkImage, Option<ImageId>), (Option<ImageId>, ServiceError)> {
@@ -101,15 +105,7 @@ impl Service {
             );
             return Err((id, ServiceError::new(ErrorKind::TooLarge, detail)));
         }
-        // Each image counts as a request of the key, of which the first is counted already.
-        let counted = match index {
-            0 => Ok(()),
-            _ => self.keys.limits.take_one_more(caller),
-        };
-        match counted {
-            Ok(()) => Ok((image, id)),
-            Err(error) => Err((id, error)),
-        }
+        Ok((image, id))
     }
 
     /// Stores an image when there is room for it.

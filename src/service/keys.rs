@@ -362,20 +362,20 @@ mod tests {
         let limits = KeyLimits { requests_per_minute: Some(3), bytes_per_minute: Some(1000) };
         let key = keys.create(wanted(Role::Robot, limits)).await.unwrap().key;
         for left in [2, 1, 0] {
-            let (allowances, taken) = keys.limits.take_request(&key);
+            let (allowances, taken) = keys.limits.take_request(&key).await;
             taken.unwrap();
             assert_eq!(allowances.requests.unwrap().remaining, left);
         }
-        let refused = keys.limits.take_request(&key).1.unwrap_err();
+        let refused = keys.limits.take_request(&key).await.1.unwrap_err();
         assert_eq!(refused.kind, ErrorKind::Overloaded);
         let pause = refused.retry_after.unwrap().as_secs_f64();
         assert!((15.0..=20.0).contains(&pause), "{pause}");
 
         let limits = KeyLimits { requests_per_minute: None, ..limits };
         let key = keys.create(wanted(Role::Robot, limits)).await.unwrap().key;
-        keys.limits.take_request(&key).1.unwrap();
-        keys.limits.take_bytes(&key, 3000);
-        let (allowances, refused) = keys.limits.take_request(&key);
+        keys.limits.take_request(&key).await.1.unwrap();
+        keys.limits.take_bytes(&key, 3000).await;
+        let (allowances, refused) = keys.limits.take_request(&key).await;
         assert_eq!(allowances.bytes.unwrap().remaining, 0);
         let pause = refused.unwrap_err().retry_after.unwrap().as_secs_f64();
         assert!((115.0..=121.0).contains(&pause), "{pause}");

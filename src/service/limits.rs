@@ -1,14 +1,16 @@
-//! How much each API key may ask for: what has come lately, in memory.
+//! How much each API key may ask for.
 
-use std::collections::HashMap;
-use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use super::{Caller, ErrorKind, ServiceError};
 use crate::domain::ApiKey;
+use crate::store::{Buckets, Draw, Drawn};
 
 /// A bucket of a key fills up in this time.
 const WINDOW: Duration = Duration::from_secs(60);
+
+/// As good as nothing.
+const SOME: f64 = 0.01;
 
 /// What is left to a key, of one of its limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,67 +34,46 @@ pub struct Allowances {
 
 /// What each key has asked for lately, by its id.
 #[derive(Debug, Default)]
-pub struct Limits(Mutex<HashMap<String, Buckets>>);
-
-#[derive(Debug, Default)]
-struct Buckets {
-    requests: Option<Bucket>,
-    bytes: Option<Bucket>,
-}
-
-/// What is left at a moment; below zero after a body that was larger than what was left.
-#[derive(Debug, Clone, Copy)]
-struct Bucket {
-    left: f64,
-    at: Instant,
-}
-
-impl Bucket {
-    fn filled(bucket: Option<Self>, limit: f64, now: Instant) -> Self {
-        let Some(known) = bucket else { return Self { left: limit, at: now } };
-        let passed = now.duration_since(known.at).as_secs_f64() / WINDOW.as_secs_f64();
-        Self { left: (known.left + passed * limit).min(limit), at: now }
-    }
-
-    fn allowance(self, limit: f64) -> Allowance {
-        let missing = (limit - self.left) / limit;
-        Allowance {
-            limit: limit as u64,
-            remaining: self.left.max(0.0) as u64,
-            reset: WINDOW.mul_f64(missing.max(0.0)),
-        }
-    }
-}
+pub struct Limits(Buckets);
 
 impl Limits {
+    /// Limits that these buckets keep.
+    pub fn new(buckets: Buckets) -> Self {
+        Self(buckets)
+    }
+
     /// Takes a request from what is left to a key.
-    pub fn take_request(&self, key: &ApiKey) -> (Allowances, Result<(), ServiceError>) {
-        let mut buckets = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let now = Instant::now();
-        let of_key = buckets.entry(key.id.clone()).or_default();
-        let mut allowances = Allowances::default();
-        let mut refused = None;
-        if let Some(limit) = key.limits.bytes_per_minute.map(|limit| limit as f64) {
-            let bucket = Bucket::filled(of_key.bytes, limit, now);
-            of_key.bytes = Some(bucket);
-            allowances.bytes = Some(bucket.allowance(limit));
-            if bucket.left <= 0.0 {
-                let pause = WINDOW.mul_f64((1.0 - bucket.left).max(1.0) / limit);
-                refused = Some((pause, format!("{limit} bytes")));
-            }
+    pub async fn take_request(&self, key: &ApiKey) -> (Allowances, Result<(), ServiceError>) {
+        // A body may be larger than what is left: then there is less than nothing for a while.
+        let bytes = Draw { needed: SOME, ..bytes(key, 0.0) };
+        let draws = [requests(key), bytes];
+        if draws.iter().all(|draw| draw.per_minute == 0.0) {
+            return (Allowances::default(), Ok(()));
         }
-        if let Some(limit) = key.limits.requests_per_minute.map(f64::from) {
-            let mut bucket = Bucket::filled(of_key.requests, limit, now);
-            if bucket.left < 1.0 {
-                let pause = WINDOW.mul_f64((1.0 - bucket.left) / limit);
-                refused = Some((pause, format!("{limit} requests")));
-            } else if refused.is_none() {
-                bucket.left -= 1.0;
-            }
-            of_key.requests = Some(bucket);
-            allowances.requests = Some(bucket.allowance(limit));
+        let Drawn { taken, left } = match self.0.draw(&key.id, draws).await {
+            Ok(drawn) => drawn,
+            Err(error) => return (Allowances::default(), Err(error.into())),
+        };
+        let [requests, bytes] = [0, 1].map(|index| {
+            let limit = draws[index].per_minute;
+            (limit > 0.0).then(|| (limit, left[index]))
+        });
+        let allowances = Allowances {
+            requests: requests.map(|(limit, left)| allowance(limit, left)),
+            bytes: bytes.map(|(limit, left)| allowance(limit, left)),
+        };
+        if taken {
+            return (allowances, Ok(()));
         }
-        let Some((pause, what)) = refused else { return (allowances, Ok(())) };
+        let (pause, what) = match (requests, bytes) {
+            (Some((limit, left)), _) if left < 1.0 => {
+                (WINDOW.mul_f64((1.0 - left) / limit), format!("{limit} requests"))
+            }
+            (_, bytes) => {
+                let (limit, left) = bytes.unwrap_or((1.0, 0.0));
+                (WINDOW.mul_f64((1.0 - left).max(1.0) / limit), format!("{limit} bytes"))
+            }
+        };
         let detail = format!(
             "the key {} has used up its {what} a minute; wait as Retry-After says, or have an admin make \
              one with another limit",
@@ -103,19 +84,44 @@ impl Limits {
     }
 
     /// Takes one of several things that came in one request from the requests left to a key.
-    pub fn take_one_more(&self, caller: &Caller) -> Result<(), ServiceError> {
+    pub async fn take_one_more(&self, caller: &Caller) -> Result<(), ServiceError> {
         match caller {
             Caller::Anybody => Ok(()),
-            Caller::Holder(key) => self.take_request(key).1,
+            Caller::Holder(key) => self.take_request(key).await.1,
         }
     }
 
     /// Takes bytes that have come from what is left to a key.
-    pub fn take_bytes(&self, key: &ApiKey, bytes: usize) {
-        let Some(limit) = key.limits.bytes_per_minute else { return };
-        let mut buckets = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let of_key = buckets.entry(key.id.clone()).or_default();
-        let bucket = Bucket::filled(of_key.bytes, limit as f64, Instant::now());
-        of_key.bytes = Some(Bucket { left: bucket.left - bytes as f64, ..bucket });
+    pub async fn take_bytes(&self, key: &ApiKey, count: usize) {
+        if key.limits.bytes_per_minute.is_none() || count == 0 {
+            return;
+        }
+        let requests = Draw { needed: f64::MIN, taken: 0.0, ..requests(key) };
+        if let Err(error) = self.0.draw(&key.id, [requests, bytes(key, count as f64)]).await {
+            tracing::warn!(%error, "the bytes of a body are not counted");
+        }
+    }
+}
+
+fn requests(key: &ApiKey) -> Draw {
+    key.limits.requests_per_minute.map_or(Draw::UNLIMITED, |limit| Draw {
+        per_minute: f64::from(limit),
+        needed: 1.0,
+        taken: 1.0,
+    })
+}
+
+fn bytes(key: &ApiKey, taken: f64) -> Draw {
+    let bytes = |limit| Draw { per_minute: limit as f64, needed: f64::MIN, taken };
+    key.limits.bytes_per_minute.map_or(Draw::UNLIMITED, bytes)
+}
+
+fn allowance(limit: f64, left: f64) -> Allowance {
+    let missing = (limit - left) / limit;
+    Allowance {
+        limit: limit as u64,
+        // As a draw rounds.
+        remaining: (left.max(0.0) + 1e-3) as u64,
+        reset: WINDOW.mul_f64(missing.max(0.0)),
     }
 }

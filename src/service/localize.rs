@@ -50,6 +50,8 @@ pub struct LocalizeRequest {
     pub deadline: Option<Instant>,
     /// Which track the frame belongs to, if any.
     pub track: Option<TrackStep>,
+    /// The id of the request, if it is done once however often it comes ([`Service::begin_once`]).
+    pub once: Option<String>,
 }
 
 /// Where the frame was probably taken.
@@ -158,7 +160,8 @@ impl Service {
                 descriptor: extraction.descriptor,
                 dense: extraction.dense,
             };
-            match self.submit(&map, frame, compared, request.priority).await? {
+            let once = request.once.as_deref();
+            match self.submit(&map, frame, compared, request.priority, once).await? {
                 Ok(job) => (Some(job), None),
                 Err(why) if request.refine == RefineMode::Wait && why.is_shedding() => {
                     return Err(self.refuse_job(&why));

@@ -43,7 +43,7 @@ impl Service {
     pub async fn begin_once(&self, id: &str, fingerprint: Digest) -> Result<Once, ServiceError> {
         let now = Timestamp::now();
         let settings = self.settings.once;
-        let progress = Progress::Running { process: self.process };
+        let progress = Progress::Running { process: self.process, job: None };
         let reserved = FirstAnswer { fingerprint, at: now, progress };
         Ok(match self.answers.reserve_answer(id, reserved, settings.since(now)).await? {
             None => Once::First,

@@ -83,6 +83,7 @@ impl Service {
         frame: Frame,
         candidates: Vec<Candidate>,
         priority: Priority,
+        once: Option<&str>,
     ) -> Result<Result<Job, NoJob>, ServiceError> {
         let Some(refiner) = &self.refiner else {
             let detail = "the server refines nothing (refine.refiner)";
@@ -124,8 +125,15 @@ impl Service {
             }
             Err(error) => return Err(error.into()),
         };
-        match self.jobs.submit(record, self.settings.job_queue).await {
-            Ok(()) => self.metrics.job_submitted(),
+        let limit = self.settings.job_queue;
+        let submitted = match once {
+            Some(request) => self.jobs.submit_once(record, limit, request).await,
+            None => self.jobs.submit(record, limit).await.map(|()| None),
+        };
+        match submitted {
+            // A process that ended before it could answer has queued it.
+            Ok(Some(before)) => return Ok(Ok(before)),
+            Ok(None) => self.metrics.job_submitted(),
             Err(StoreError::QueueFull { limit }) => {
                 return Ok(Err(self.counted_job(NoJob::queue_full(limit))));
             }

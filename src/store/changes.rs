@@ -1,8 +1,9 @@
 //! What a change makes of a record, whichever store keeps it.
 
 use jiff::Timestamp;
+use uuid::Uuid;
 
-use super::{JobRecord, Release, Step, StoreError, StoredDelivery};
+use super::{FirstAnswer, JobRecord, Progress, Release, Step, StoreError, StoredDelivery};
 use crate::domain::{
     Delivery, Image, Job, JobState, Map, Message, StoredWebhook, Usage, WebhookEvent,
 };
@@ -62,6 +63,34 @@ impl JobRecord {
             job.descriptions.sort_by_key(|description| {
                 candidates.iter().position(|candidate| candidate.image_id == description.image_id)
             });
+        }
+    }
+}
+
+impl FirstAnswer {
+    /// What takes the place of `known`, which counts no more: what was queued for the same request is queued.
+    pub(super) fn in_place_of(mut self, known: &Self) -> Self {
+        if let (Progress::Running { job, .. }, Progress::Running { job: Some(queued), .. }) =
+            (&mut self.progress, &known.progress)
+            && self.fingerprint == known.fingerprint
+        {
+            *job = Some(*queued);
+        }
+        self
+    }
+
+    /// The job that was queued for the request, while it has no answer.
+    pub(super) fn job(&self) -> Option<Uuid> {
+        match self.progress {
+            Progress::Running { job, .. } => job,
+            Progress::Answered(_) => None,
+        }
+    }
+
+    /// Notes that a job was queued for the request.
+    pub(super) fn queued(&mut self, id: Uuid) {
+        if let Progress::Running { job, .. } = &mut self.progress {
+            *job = Some(id);
         }
     }
 }
@@ -129,15 +158,15 @@ pub(super) fn removed(map: &Map) -> StoreError {
     StoreError::NotFound(format!("the map {} was removed", map.name))
 }
 
-pub(super) fn no_job(id: uuid::Uuid) -> StoreError {
+pub(super) fn no_job(id: Uuid) -> StoreError {
     StoreError::NotFound(format!("there is no job {id}"))
 }
 
-pub(super) fn no_webhook(id: uuid::Uuid) -> StoreError {
+pub(super) fn no_webhook(id: Uuid) -> StoreError {
     StoreError::NotFound(format!("there is no webhook {id}; GET /webhooks lists those there are"))
 }
 
-pub(super) fn no_delivery(id: uuid::Uuid) -> StoreError {
+pub(super) fn no_delivery(id: Uuid) -> StoreError {
     StoreError::NotFound(format!(
         "the webhook has no delivery {id}; one that has ended is removed in time (webhooks.keep_days, \
          webhooks.max_deliveries)"

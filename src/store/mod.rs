@@ -6,6 +6,7 @@
 
 mod changes;
 pub mod embedded;
+mod limits;
 mod objects;
 pub mod postgres;
 mod webhooks;
@@ -22,6 +23,7 @@ use tokio::sync::{broadcast, watch};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
+pub use self::limits::{Buckets, Draw, Drawn, Purse, SharedLimits};
 pub use self::objects::{ObjectSettings, Objects};
 pub use self::webhooks::{ForgottenDeliveries, KeepDeliveries, StoredDelivery, WebhookStore};
 use crate::domain::{
@@ -357,6 +359,15 @@ pub struct Release {
 pub trait JobStore: Send + Sync {
     /// Queues a job unless `limit` jobs wait already ([`StoreError::QueueFull`]).
     async fn submit(&self, record: JobRecord, limit: usize) -> Result<(), StoreError>;
+    /// The same for a request that was reserved with that id ([`AnswerStore::reserve_answer`]); the job and
+    /// the note that it was queued for this request are one change. If one was queued for it before, by a
+    /// process that ended too soon to answer, gives that one and queues nothing.
+    async fn submit_once(
+        &self,
+        record: JobRecord,
+        limit: usize,
+        request: &str,
+    ) -> Result<Option<Job>, StoreError>;
     /// Jobs that wait.
     async fn queued(&self) -> Result<usize, StoreError>;
     /// One job.
@@ -432,6 +443,9 @@ pub enum Progress {
     Running {
         /// By this process.
         process: Uuid,
+        /// The job that was queued for it, by this process or by one that ended too soon to answer.
+        #[serde(default)]
+        job: Option<Uuid>,
     },
     /// It was done.
     Answered(KeptAnswer),
@@ -452,7 +466,8 @@ pub struct KeptAnswer {
 #[async_trait]
 pub trait AnswerStore: Send + Sync {
     /// What is known of the request with this id; or, if that is nothing, is older than `since`, or is of a
-    /// process that has ended, `None`, and from now on it is `reserved`.
+    /// process that has ended, `None`, and from now on it is `reserved`, together with the job that that
+    /// process queued for it.
     async fn reserve_answer(
         &self,
         id: &str,

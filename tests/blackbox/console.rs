@@ -3,6 +3,7 @@
 use reqwest::header::{CONTENT_SECURITY_POLICY, ETAG, IF_NONE_MATCH};
 use reqwest::{Method, StatusCode};
 
+use super::deployment;
 use super::support::{Answer, Server, frame, server};
 
 #[tokio::test]
@@ -119,7 +120,9 @@ async fn the_status_tells_of_the_last_hour_and_keeps_secrets() {
         (Some("local"), Some(false))
     );
     assert_eq!(status["models"][0]["name"], "xfeat");
-    assert!(status["free_bytes"].as_u64().unwrap() > 0 && status["db_bytes"].as_u64().unwrap() > 0);
+    // An object store does not say how much room it has.
+    assert!(deployment::is_scale_out() || status["free_bytes"].as_u64().unwrap() > 0);
+    assert!(status["db_bytes"].as_u64().unwrap() > 0);
     let settings = status["settings"].as_str().unwrap();
     assert!(settings.contains("[server]") && !settings.contains("very-secret"), "{settings}");
 }

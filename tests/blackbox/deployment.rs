@@ -21,7 +21,9 @@ pub fn is_scale_out() -> bool {
     match std::env::var("WHEREABOUTS_TEST_DEPLOYMENT").as_deref() {
         Err(_) | Ok("embedded") => false,
         Ok("scale-out") => true,
-        Ok(other) => panic!("WHEREABOUTS_TEST_DEPLOYMENT is {other:?}, neither embedded nor scale-out"),
+        Ok(other) => {
+            panic!("WHEREABOUTS_TEST_DEPLOYMENT is {other:?}, neither embedded nor scale-out")
+        }
     }
 }
 

@@ -8,6 +8,7 @@ use reqwest::Method;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
+use super::deployment;
 use super::support::{Answer, BINARY, Server, frame, reference};
 
 const REQUIRED: [(&str, &str); 2] =
@@ -19,6 +20,7 @@ fn create(data: &Path, args: &[&str]) -> String {
         .args(["keys", "create", "--name", "test", "--data"])
         .arg(data)
         .args(args)
+        .envs(deployment::settings(data))
         .output()
         .unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

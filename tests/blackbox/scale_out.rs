@@ -52,9 +52,8 @@ fn worker(dir: &TempDir, settings: &[(&'static str, String)]) -> Server {
 
 /// Does something to the PostgreSQL of these tests.
 fn database(what: &str) {
-    let control = std::env::var("WHEREABOUTS_TEST_POSTGRES").expect(
-        "this test stops PostgreSQL and starts it again: run it through tests/postgres.sh",
-    );
+    let control = std::env::var("WHEREABOUTS_TEST_POSTGRES")
+        .expect("this test stops PostgreSQL and starts it again: run it through tests/postgres.sh");
     let done = Command::new(control).arg(what).output().unwrap();
     assert!(done.status.success(), "{done:?}");
 }

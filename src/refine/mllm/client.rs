@@ -17,6 +17,7 @@ use super::retry::{CallError, Failure, RetryPolicy, retry_after};
 use super::secret::Secret;
 use super::settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError};
 use super::wire::{ChatAnswer, ChatRequest, ErrorAnswer, Message, Reply, Schema};
+use crate::store::Buckets;
 
 /// What is read of a refusal, in bytes, and what is told of it, in characters.
 const REFUSAL_BYTES: usize = 64 << 10;
@@ -71,8 +72,8 @@ pub struct MllmClient {
 }
 
 impl MllmClient {
-    /// A client for the server of the settings. Nothing is sent yet.
-    pub fn new(settings: &MllmSettings) -> Result<Self, MllmSettingsError> {
+    /// A client for the server of the settings, whose limits these buckets keep. Nothing is sent yet.
+    pub fn new(settings: &MllmSettings, buckets: Buckets) -> Result<Self, MllmSettingsError> {
         // reqwest panics without one. Only the first call sets it; a library user may have chosen
         // another.
         let _ = rustls::crypto::ring::default_provider().install_default();
@@ -103,7 +104,11 @@ impl MllmClient {
                 settings.breaker_failures,
                 Duration::from_secs(settings.breaker_open_s),
             ),
-            rate: RateLimiter::new(settings.requests_per_minute, settings.tokens_per_minute),
+            rate: RateLimiter::new(
+                settings.requests_per_minute,
+                settings.tokens_per_minute,
+                buckets,
+            ),
             turns: Semaphore::new(settings.concurrency.max(1)),
         })
     }
@@ -135,7 +140,7 @@ impl MllmClient {
             _ => admission.succeeded(),
         }
         if let Ok(answer) = &outcome {
-            self.rate.settle(most, answer.prompt_tokens + answer.completion_tokens);
+            self.rate.settle(most, answer.prompt_tokens + answer.completion_tokens).await;
         }
         outcome
     }
@@ -326,7 +331,7 @@ mod tests {
             api_key: Secret::new("azure-key"),
             ..defaults()
         };
-        let client = MllmClient::new(&settings).unwrap();
+        let client = MllmClient::new(&settings, Buckets::default()).unwrap();
         assert_eq!(
             client.url.as_str(),
             "https://x.openai.azure.com/openai/deployments/gpt/chat/completions\
@@ -340,14 +345,17 @@ mod tests {
     fn what_is_no_url_is_refused() {
         for base_url in ["", "api.openai.com/v1", "ftp://host/v1"] {
             let settings = MllmSettings { base_url: base_url.into(), ..defaults() };
-            assert!(matches!(MllmClient::new(&settings), Err(MllmSettingsError::Url { .. })));
+            assert!(matches!(
+                MllmClient::new(&settings, Buckets::default()),
+                Err(MllmSettingsError::Url { .. })
+            ));
         }
     }
 
     #[test]
     fn the_client_does_not_show_its_key() {
         let settings = MllmSettings { api_key: Secret::new("sk-shown"), ..defaults() };
-        let client = MllmClient::new(&settings).unwrap();
+        let client = MllmClient::new(&settings, Buckets::default()).unwrap();
         assert!(!format!("{client:?}").contains("sk-shown"));
         assert_eq!(client.told(b"{\"error\":{\"message\":\"no sk-shown\"}}"), "no [hidden]");
         assert_eq!(client.told(b"{\"error\":\"model not found\"}"), "model not found");
@@ -357,7 +365,7 @@ mod tests {
     #[test]
     fn a_key_that_no_header_can_carry_is_refused_without_showing_it() {
         let settings = MllmSettings { api_key: Secret::new("bad\nkey"), ..defaults() };
-        let error = MllmClient::new(&settings).unwrap_err();
+        let error = MllmClient::new(&settings, Buckets::default()).unwrap_err();
         assert!(!format!("{error} {error:?}").contains("bad"));
     }
 

@@ -8,7 +8,8 @@ use futures_util::{StreamExt, stream};
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::OnceCell;
 
-use super::budget::{Exceeded, JobBudget};
+use super::aside::Aside;
+use super::budget::{Exceeded, JobBudget, Spent};
 use super::cache::{CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame};
 use super::client::{Answer, Call, estimate_tokens};
 use super::pictures::{PictureError, SentPicture};
@@ -16,7 +17,9 @@ use super::prompts::{self, PROMPT_VERSION, Switches, clean};
 use super::retry::CallError;
 use super::wire::{Content, ImageUrl, Message, Part, Role};
 use super::{MllmRefiner, Progress, RefineError};
-use crate::domain::{Candidate, Description, Descriptor, Digest, Map, Scene, StandIn, Usage};
+use crate::domain::{
+    Candidate, Description, Descriptor, Digest, Map, Scene, StandIn, Usage, utc_day,
+};
 use crate::store::{JobRecord, Step, StoreError};
 use crate::telemetry::CacheLookup;
 
@@ -366,10 +369,26 @@ impl MllmRefiner {
                 Exceeded::Job => CallError::JobSpent,
                 Exceeded::Day => CallError::DaySpent,
             })?;
+        let aside = self.set_aside(call.prompt_tokens).await?;
         let answer = self.client.call(call).await?;
         reserved.settle(answer.prompt_tokens, answer.completion_tokens);
+        if let Some(aside) = aside {
+            aside.settle(self.budget.cost(answer.prompt_tokens, answer.completion_tokens));
+        }
         work.charge(cost_of(&answer));
         Ok(answer)
+    }
+
+    /// Sets aside what a call may cost, where other processes spend too and a day has a limit.
+    async fn set_aside(&self, prompt_tokens: u64) -> Result<Option<Aside>, CallError> {
+        let limit =
+            Spent { tokens: self.settings.tokens_per_day, money: self.settings.money_per_day };
+        let Some(shared) = self.shared.clone().filter(|_| limit != Spent::default()) else {
+            return Ok(None);
+        };
+        let most = self.budget.cost(prompt_tokens, self.client.max_tokens());
+        let aside = Aside::set(shared, utc_day(Timestamp::now()), most, limit).await;
+        aside.map_err(passing)?.map(Some).ok_or(CallError::DaySpent)
     }
 
     fn switches(&self) -> Switches {

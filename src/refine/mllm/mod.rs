@@ -12,6 +12,7 @@
 //!
 //! What a model says is untrusted: it can change the order of these candidates, and nothing else.
 
+mod aside;
 mod breaker;
 mod budget;
 mod cache;
@@ -59,7 +60,7 @@ use self::retry::CallError;
 use super::{Progress, RefineError, Refinement, Refiner};
 use crate::domain::{DayUsage, Evidence, Map, RefinerKind, Usage, utc_day};
 use crate::retrieve::ImageLimits;
-use crate::store::{BlobStore, JobRecord, LookAlikes, MapStore, UsageStore};
+use crate::store::{BlobStore, Buckets, JobRecord, LookAlikes, MapStore, SharedLimits, UsageStore};
 use crate::telemetry::Metrics;
 
 /// What an [`MllmRefiner`] works with.
@@ -72,6 +73,8 @@ pub struct MllmParts {
     pub cache: Arc<dyn DescriptionCache>,
     /// What was paid.
     pub usage: Arc<dyn UsageStore>,
+    /// The limits of all processes, where there are several.
+    pub shared: Option<Arc<dyn SharedLimits>>,
     /// What is counted.
     pub metrics: Arc<Metrics>,
     /// Bounds on the pictures that are decoded.
@@ -87,6 +90,7 @@ pub struct MllmRefiner {
     maps: Arc<dyn MapStore>,
     cache: Arc<dyn DescriptionCache>,
     usage: Arc<dyn UsageStore>,
+    shared: Option<Arc<dyn SharedLimits>>,
     metrics: Arc<Metrics>,
     fallback: Option<Arc<dyn Refiner>>,
     pictures: Pictures,
@@ -112,13 +116,14 @@ pub struct MllmLevels {
 impl MllmRefiner {
     /// Puts a refiner together. Reads the key; calls nobody yet.
     pub fn new(parts: MllmParts, settings: MllmSettings) -> Result<Self, MllmSettingsError> {
-        let client = MllmClient::new(&settings)?;
+        let client = MllmClient::new(&settings, Buckets::of(parts.shared.clone()))?;
         let pictures = Pictures::new(parts.blobs, parts.limits, settings.image_max_edge)
             .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
         Ok(Self {
             maps: parts.maps,
             cache: parts.cache,
             usage: parts.usage,
+            shared: parts.shared,
             metrics: parts.metrics,
             fallback: parts.fallback,
             pictures,

@@ -15,7 +15,7 @@ fn age_key(at: Timestamp, id: &[u8]) -> Vec<u8> {
     [&at.as_millisecond().to_be_bytes(), id].concat()
 }
 
-fn write(trees: &Trees, id: &[u8], answer: &FirstAnswer) -> Result<(), StoreError> {
+pub(super) fn write(trees: &Trees, id: &[u8], answer: &FirstAnswer) -> Result<(), StoreError> {
     remove(trees, id)?;
     put(&trees.answers, id, answer)?;
     put(&trees.answers_by_age, &age_key(answer.at, id), &())
@@ -42,13 +42,16 @@ impl AnswerStore for EmbeddedStore {
             let known: Option<FirstAnswer> = get(&trees.answers, id.as_bytes())?;
             let counts = |known: &FirstAnswer| match (&known.progress, &reserved.progress) {
                 // Of a process that has ended nothing more will come.
-                (Progress::Running { process }, Progress::Running { process: own }) => {
+                (Progress::Running { process, .. }, Progress::Running { process: own, .. }) => {
                     process == own
                 }
                 _ => known.at >= since,
             };
-            match known.filter(counts) {
-                Some(known) => Ok(Some(known)),
+            match known {
+                Some(known) if counts(&known) => Ok(Some(known)),
+                Some(known) => {
+                    write(trees, id.as_bytes(), &reserved.in_place_of(&known)).map(|()| None)
+                }
                 None => write(trees, id.as_bytes(), &reserved).map(|()| None),
             }
         };

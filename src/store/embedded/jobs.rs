@@ -13,13 +13,13 @@ use tokio::sync::broadcast;
 use uuid::Uuid;
 
 use super::super::changes::{ended_at, no_job};
-use super::super::{Claim, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
+use super::super::{Claim, FirstAnswer, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
 use super::trees::{
-    BlobOwner, Lease, Trees, blob_ref_key, decode, encode, ended_key, failed, put, queue_key,
+    BlobOwner, Lease, Trees, blob_ref_key, decode, encode, ended_key, failed, get, put, queue_key,
     queued_job, transaction_failed,
 };
 use super::webhooks::WebhookTrees;
-use super::{EmbeddedStore, blocking};
+use super::{EmbeddedStore, answers, blocking};
 use crate::domain::Job;
 
 impl EmbeddedStore {
@@ -58,30 +58,75 @@ impl EmbeddedStore {
     }
 }
 
-#[async_trait]
-impl JobStore for EmbeddedStore {
-    async fn submit(&self, record: JobRecord, limit: usize) -> Result<(), StoreError> {
+impl EmbeddedStore {
+    /// Queues a job, unless one was queued for the same request.
+    async fn insert(
+        &self,
+        record: JobRecord,
+        limit: usize,
+        request: Option<String>,
+    ) -> Result<Option<Job>, StoreError> {
         let (inner, id) = (Arc::clone(&self.inner), record.job.id);
         let counting = Arc::clone(&self.inner);
         self.inner
             .writer
             .commit(
                 move |trees, _| {
+                    if let Some(request) = &request
+                        && let Some(known) = queued_for(trees, request)?
+                    {
+                        return Ok(Some(known));
+                    }
                     // Counted here, on the writer thread, so that no two submissions share the
                     // last place.
                     if counting.queued.fetch_add(1, Ordering::Relaxed) >= limit {
                         counting.queued.fetch_sub(1, Ordering::Relaxed);
                         return Err(StoreError::QueueFull { limit });
                     }
-                    insert_job(trees, &record).inspect_err(|_| {
+                    let noted = request.map_or(Ok(()), |request| note(trees, &request, id));
+                    noted.and_then(|()| insert_job(trees, &record)).inspect_err(|_| {
                         counting.queued.fetch_sub(1, Ordering::Relaxed);
-                    })
+                    })?;
+                    Ok(None)
                 },
-                move |()| {
-                    let _ = inner.changes.send(id);
+                move |known| {
+                    if known.is_none() {
+                        let _ = inner.changes.send(id);
+                    }
                 },
             )
             .await
+    }
+}
+
+/// The job that was queued for a request.
+fn queued_for(trees: &Trees, request: &str) -> Result<Option<Job>, StoreError> {
+    let known: Option<FirstAnswer> = get(&trees.answers, request.as_bytes())?;
+    let job = known.and_then(|known| known.job()).map(|id| trees.job(id)).transpose()?;
+    Ok(job.flatten().map(|record| record.job))
+}
+
+/// Notes that a job is queued for a request. It is there only if the job is: whoever reads it looks.
+fn note(trees: &Trees, request: &str, job: Uuid) -> Result<(), StoreError> {
+    let known: Option<FirstAnswer> = get(&trees.answers, request.as_bytes())?;
+    let Some(mut known) = known else { return Ok(()) };
+    known.queued(job);
+    answers::write(trees, request.as_bytes(), &known)
+}
+
+#[async_trait]
+impl JobStore for EmbeddedStore {
+    async fn submit(&self, record: JobRecord, limit: usize) -> Result<(), StoreError> {
+        self.insert(record, limit, None).await.map(drop)
+    }
+
+    async fn submit_once(
+        &self,
+        record: JobRecord,
+        limit: usize,
+        request: &str,
+    ) -> Result<Option<Job>, StoreError> {
+        self.insert(record, limit, Some(request.to_owned())).await
     }
 
     async fn queued(&self) -> Result<usize, StoreError> {

@@ -6,7 +6,7 @@ use jiff_sqlx::ToSqlx;
 use sqlx::types::Json;
 
 use super::super::{AnswerStore, FirstAnswer, Progress, StoreError};
-use super::{PostgresStore, count, record};
+use super::{PostgresStore, count, record, unavailable};
 
 #[async_trait]
 impl AnswerStore for PostgresStore {
@@ -17,36 +17,54 @@ impl AnswerStore for PostgresStore {
         since: Timestamp,
     ) -> Result<Option<FirstAnswer>, StoreError> {
         let inner = &self.inner;
-        let text = record(&reserved)?;
         inner
             .call(async {
-                loop {
-                    let taken = sqlx::query(
-                        "INSERT INTO answers (id, at, holder, record) VALUES ($1, $2, $3, $4::json)
-                         ON CONFLICT (id) DO UPDATE
-                         SET at = EXCLUDED.at, holder = EXCLUDED.holder, record = EXCLUDED.record
-                         WHERE CASE WHEN answers.holder IS NULL THEN answers.at < $5
-                             ELSE NOT is_alive(answers.holder, make_interval(secs => $6)) END",
-                    )
+                let mut tx = inner.begin().await?;
+                let insert = sqlx::query(
+                    "INSERT INTO answers (id, at, holder, record) VALUES ($1, $2, $3, $4::json)
+                     ON CONFLICT DO NOTHING",
+                );
+                let inserted = insert
                     .bind(id)
                     .bind(reserved.at.to_sqlx())
                     .bind(inner.process)
-                    .bind(&text)
+                    .bind(record(&reserved)?)
+                    .execute(&mut *tx)
+                    .await?;
+                if inserted.rows_affected() > 0 {
+                    tx.commit().await?;
+                    return Ok(None);
+                }
+                let known = sqlx::query_as(
+                    "SELECT record, CASE WHEN holder IS NULL THEN at >= $2
+                         ELSE is_alive(holder, make_interval(secs => $3)) END
+                     FROM answers WHERE id = $1 FOR UPDATE",
+                );
+                let known: Option<(Json<FirstAnswer>, bool)> = known
+                    .bind(id)
                     .bind(since.to_sqlx())
                     .bind(inner.lifetime())
-                    .execute(&inner.pool)
+                    .fetch_optional(&mut *tx)
                     .await?;
-                    if taken.rows_affected() > 0 {
-                        return Ok(None);
-                    }
-                    let known = sqlx::query_scalar("SELECT record FROM answers WHERE id = $1");
-                    let known: Option<Json<FirstAnswer>> =
-                        known.bind(id).fetch_optional(&inner.pool).await?;
-                    // It may have been forgotten in between.
-                    if let Some(Json(known)) = known {
-                        return Ok(Some(known));
-                    }
+                let Some((Json(known), counts)) = known else {
+                    return Err(unavailable("an answer was forgotten at this moment"));
+                };
+                if counts {
+                    return Ok(Some(known));
                 }
+                let reserved = reserved.in_place_of(&known);
+                let replace = sqlx::query(
+                    "UPDATE answers SET at = $2, holder = $3, record = $4::json WHERE id = $1",
+                );
+                replace
+                    .bind(id)
+                    .bind(reserved.at.to_sqlx())
+                    .bind(inner.process)
+                    .bind(record(&reserved)?)
+                    .execute(&mut *tx)
+                    .await?;
+                tx.commit().await?;
+                Ok(None)
             })
             .await
     }

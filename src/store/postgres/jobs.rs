@@ -13,7 +13,7 @@ use tokio::sync::broadcast;
 use uuid::Uuid;
 
 use super::super::changes::{ended_at, news_of, no_job};
-use super::super::{Claim, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
+use super::super::{Claim, FirstAnswer, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
 use super::listener::{DELIVERIES, JOBS};
 use super::{Inner, PostgresStore, count, counted, record, seconds};
 use crate::domain::{Job, JobState, Priority, StoredWebhook};
@@ -121,13 +121,51 @@ impl Inner {
         Ok(())
     }
 
+    /// Queues a job, unless the queue is full.
+    async fn insert_job(
+        &self,
+        tx: &mut Transaction<'_, Postgres>,
+        new: &JobRecord,
+        limit: usize,
+    ) -> Result<(), StoreError> {
+        if self.waiting(&mut **tx, limit).await? + SUBMITTED_AT_ONCE > limit {
+            let lock = sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(QUEUE_LOCK);
+            lock.execute(&mut **tx).await?;
+            if self.waiting(&mut **tx, limit).await? >= limit {
+                return Err(StoreError::QueueFull { limit });
+            }
+        }
+        let job = &new.job;
+        let inserted = sqlx::query(
+            "WITH needed AS (
+                 UPDATE blobs SET needed = needed + 1 WHERE digest = $5 RETURNING digest),
+             told AS (SELECT pg_notify($7, $1::text))
+             INSERT INTO jobs (id, map, state, place, digest, record)
+             SELECT $1, $2, $3, $4, digest, $6::json FROM needed, told",
+        )
+        .bind(job.id)
+        .bind(job.map.as_str())
+        .bind(job.state.as_str())
+        .bind(place(job.priority))
+        .bind(new.query.digest.as_bytes().as_slice())
+        .bind(record(new)?)
+        .bind(JOBS)
+        .execute(&mut **tx)
+        .await?;
+        match inserted.rows_affected() {
+            0 => Err(super::blobs::not_stored(&new.query.digest)),
+            _ => Ok(()),
+        }
+    }
+
     /// Jobs that wait or run.
     async fn waiting<'a>(
         &self,
         executor: impl sqlx::PgExecutor<'a>,
         limit: usize,
     ) -> Result<usize, StoreError> {
-        let waiting = "SELECT count(*) FROM (SELECT FROM jobs WHERE ended_at IS NULL LIMIT $1)";
+        let waiting =
+            "SELECT count(*) FROM (SELECT FROM jobs WHERE ended_at IS NULL LIMIT $1) open";
         Ok(counted(sqlx::query_scalar(waiting).bind(count(limit)).fetch_one(executor).await?))
     }
 }
@@ -136,37 +174,43 @@ impl Inner {
 impl JobStore for PostgresStore {
     async fn submit(&self, new: JobRecord, limit: usize) -> Result<(), StoreError> {
         let inner = &self.inner;
-        let (job, text) = (&new.job, record(&new)?);
         inner
             .call(async {
                 let mut tx = inner.begin().await?;
-                if inner.waiting(&mut *tx, limit).await? + SUBMITTED_AT_ONCE > limit {
-                    let lock = sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(QUEUE_LOCK);
-                    lock.execute(&mut *tx).await?;
-                    if inner.waiting(&mut *tx, limit).await? >= limit {
-                        return Err(StoreError::QueueFull { limit });
-                    }
-                }
-                let inserted = sqlx::query(
-                    "WITH needed AS (
-                         UPDATE blobs SET needed = needed + 1 WHERE digest = $5 RETURNING digest),
-                     told AS (SELECT pg_notify($7, $1::text))
-                     INSERT INTO jobs (id, map, state, place, digest, record)
-                     SELECT $1, $2, $3, $4, digest, $6::json FROM needed, told",
-                )
-                .bind(job.id)
-                .bind(job.map.as_str())
-                .bind(job.state.as_str())
-                .bind(place(job.priority))
-                .bind(new.query.digest.as_bytes().as_slice())
-                .bind(text)
-                .bind(JOBS)
-                .execute(&mut *tx)
-                .await?;
-                if inserted.rows_affected() == 0 {
-                    return Err(super::blobs::not_stored(&new.query.digest));
-                }
+                inner.insert_job(&mut tx, &new, limit).await?;
                 Ok(tx.commit().await?)
+            })
+            .await
+    }
+
+    async fn submit_once(
+        &self,
+        new: JobRecord,
+        limit: usize,
+        request: &str,
+    ) -> Result<Option<Job>, StoreError> {
+        let inner = &self.inner;
+        inner
+            .call(async {
+                let mut tx = inner.begin().await?;
+                let known =
+                    sqlx::query_scalar("SELECT record FROM answers WHERE id = $1 FOR UPDATE");
+                let known: Option<Json<FirstAnswer>> =
+                    known.bind(request).fetch_optional(&mut *tx).await?;
+                if let Some(Json(mut known)) = known {
+                    let job = sqlx::query_scalar("SELECT record FROM jobs WHERE id = $1");
+                    let job: Option<Json<JobRecord>> =
+                        job.bind(known.job()).fetch_optional(&mut *tx).await?;
+                    if let Some(Json(queued)) = job {
+                        return Ok(Some(queued.job));
+                    }
+                    known.queued(new.job.id);
+                    let note = sqlx::query("UPDATE answers SET record = $2::json WHERE id = $1");
+                    note.bind(request).bind(record(&known)?).execute(&mut *tx).await?;
+                }
+                inner.insert_job(&mut tx, &new, limit).await?;
+                tx.commit().await?;
+                Ok(None)
             })
             .await
     }

@@ -18,6 +18,7 @@ mod images;
 mod indexer;
 mod jobs;
 mod keys;
+mod limits;
 mod listener;
 mod maps;
 mod processes;
@@ -177,6 +178,7 @@ fn connect(settings: &PostgresSettings) -> Result<PgPool, StoreError> {
     Ok(PgPoolOptions::new()
         .max_connections(settings.max_connections)
         .acquire_timeout(settings.timeout)
+        .acquire_slow_threshold(settings.timeout)
         .connect_lazy_with(options))
 }
 
@@ -185,8 +187,8 @@ async fn check_schema(pool: &PgPool, settings: &PostgresSettings) -> Result<(), 
     match looking.await.map_err(|_| unavailable("it did not answer".to_owned()))?? {
         SchemaState::UpToDate => Ok(()),
         SchemaState::Behind { steps } => Err(StoreError::Conflict(format!(
-            "the database lacks {steps} steps of the schema; run `whereabouts migrate` with the same \
-             settings first"
+            "the tables of the database are not up to date (steps missing: {steps}); run `whereabouts \
+             migrate` with the same settings first"
         ))),
         SchemaState::Ahead { version } => Err(StoreError::Conflict(format!(
             "the database has version {version} of the schema, and this program does not know it: a later \

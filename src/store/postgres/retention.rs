@@ -18,10 +18,12 @@ impl Retention for PostgresStore {
 
     async fn forget_usage(&self, before: Date) -> Result<(), StoreError> {
         let inner = &self.inner;
-        let query = sqlx::query("DELETE FROM usage WHERE day < $1").bind(before.to_sqlx());
+        let usage = sqlx::query("DELETE FROM usage WHERE day < $1").bind(before.to_sqlx());
+        let set_aside = sqlx::query("DELETE FROM set_aside WHERE day < current_date - 2");
         inner
             .call(async {
-                query.execute(&inner.pool).await?;
+                usage.execute(&inner.pool).await?;
+                set_aside.execute(&inner.pool).await?;
                 Ok(())
             })
             .await?;

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use sqlx::migrate::{Migrate, MigrateError, Migration, MigrationType, Migrator};
+use sqlx::migrate::{AppliedMigration, Migrate, MigrateError, Migration, MigrationType, Migrator};
 use sqlx::{PgPool, SqlSafeStr};
 
 use super::super::StoreError;
@@ -18,9 +18,9 @@ pub enum SchemaState {
         /// How many.
         steps: usize,
     },
-    /// A later program has been there.
+    /// A program has been there that is later by more than one version.
     Ahead {
-        /// Up to this version.
+        /// Its steps go up to this one.
         version: i64,
     },
 }
@@ -71,14 +71,18 @@ pub(super) async fn schema_state(pool: &PgPool) -> Result<SchemaState, StoreErro
         return Ok(SchemaState::Behind { steps: known.len() });
     }
     let applied = connection.list_applied_migrations("_sqlx_migrations").await.map_err(failed)?;
-    if let Some(unknown) =
-        applied.iter().find(|applied| known.iter().all(|step| step.version != applied.version))
-    {
-        return Ok(SchemaState::Ahead { version: unknown.version });
-    }
-    match known.len() - applied.len() {
-        0 => Ok(SchemaState::UpToDate),
-        steps => Ok(SchemaState::Behind { steps }),
+    let is_known =
+        |applied: &AppliedMigration| known.iter().any(|step| step.version == applied.version);
+    let later: Vec<_> = applied.iter().filter(|applied| !is_known(applied)).collect();
+    match (known.len() - (applied.len() - later.len()), later.as_slice()) {
+        (0, []) => Ok(SchemaState::UpToDate),
+        // Each step keeps the schema readable to the program before it.
+        (0, [step]) => {
+            tracing::warn!(step = step.version, "a later whereabouts has migrated the database");
+            Ok(SchemaState::UpToDate)
+        }
+        (_, [.., last]) => Ok(SchemaState::Ahead { version: last.version }),
+        (steps, []) => Ok(SchemaState::Behind { steps }),
     }
 }
 

@@ -15,8 +15,13 @@ impl UsageStore for PostgresStore {
     async fn add_usage(&self, spent: DayUsage) -> Result<(), StoreError> {
         let inner = &self.inner;
         let DayUsage { date, map, usage, money } = spent;
+        // What was set aside for it is set aside no more.
         let query = sqlx::query(
-            "INSERT INTO usage (day, map, calls, cached, prompt_tokens, completion_tokens, estimated,
+            "WITH settled AS (
+                 UPDATE set_aside SET tokens = greatest(tokens - $5 - $6, 0),
+                     money = greatest(money - $8, 0)
+                 WHERE day = $1 AND holder = $9)
+             INSERT INTO usage (day, map, calls, cached, prompt_tokens, completion_tokens, estimated,
                  money)
              VALUES ($1, $2, $3, $4, $5, $6, $7, $8)
              ON CONFLICT (day, map) DO UPDATE SET
@@ -34,7 +39,8 @@ impl UsageStore for PostgresStore {
         .bind(usage.prompt_tokens.cast_signed())
         .bind(usage.completion_tokens.cast_signed())
         .bind(i64::from(usage.estimated))
-        .bind(money);
+        .bind(money)
+        .bind(inner.process);
         inner
             .call(async {
                 query.execute(&inner.pool).await?;

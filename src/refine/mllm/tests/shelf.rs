@@ -87,6 +87,7 @@ fn refiner(
         blobs: Arc::new(shelf.clone()),
         cache: cache.clone(),
         usage: cache.clone(),
+        shared: None,
         metrics: Arc::new(Metrics::new()),
         limits: ImageLimits { max_pixels: 1_000_000 },
         fallback,

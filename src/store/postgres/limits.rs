@@ -1,0 +1,102 @@
+//! Limits that all processes keep together.
+//!
+//! Buckets are in a table that is not logged: it costs no wait for the disk, and after a crash of the database
+//! the buckets are full.
+
+use async_trait::async_trait;
+use jiff::civil::Date;
+use jiff_sqlx::ToSqlx;
+
+use super::super::{Draw, Drawn, Purse, SharedLimits, StoreError};
+use super::PostgresStore;
+
+/// The advisory lock of those who set something aside.
+const BUDGET_LOCK: i64 = 0x7768_6572_6561_0003;
+
+#[async_trait]
+impl SharedLimits for PostgresStore {
+    async fn draw(&self, name: &str, draws: [Draw; 2]) -> Result<Drawn, StoreError> {
+        let inner = &self.inner;
+        let [first, second] = draws;
+        let query = sqlx::query_as(
+            "INSERT INTO buckets AS b (name, first, second, at, taken)
+             VALUES ($1, $2 - $4, $5 - $7, clock_timestamp(), true)
+             ON CONFLICT (name) DO UPDATE SET (first, second, at, taken) = (
+                 SELECT CASE WHEN enough THEN first - $4 ELSE first END,
+                     CASE WHEN enough THEN second - $7 ELSE second END, now, enough
+                 FROM (SELECT first, second, now,
+                           first + 1e-3 > $3 AND second + 1e-3 > $6 AS enough
+                       FROM (SELECT now, least(b.first + minutes * $2, $2) AS first,
+                                 least(b.second + minutes * $5, $5) AS second
+                             FROM (SELECT now, extract(epoch FROM now - b.at) / 60 AS minutes
+                                   FROM clock_timestamp() now) passed) filled) compared)
+             RETURNING taken, first, second",
+        )
+        .bind(name)
+        .bind(first.per_minute)
+        .bind(first.needed)
+        .bind(first.taken)
+        .bind(second.per_minute)
+        .bind(second.needed)
+        .bind(second.taken);
+        inner
+            .call(async {
+                let (taken, first, second): (bool, f64, f64) = query.fetch_one(&inner.pool).await?;
+                Ok(Drawn { taken, left: [first, second] })
+            })
+            .await
+    }
+
+    async fn set_aside(&self, day: Date, most: Purse, limit: Purse) -> Result<bool, StoreError> {
+        let inner = &self.inner;
+        let set = sqlx::query(
+            "INSERT INTO set_aside AS a (day, holder, tokens, money)
+             SELECT $1, $2, $3, $4 FROM (
+                 SELECT coalesce(sum(tokens), 0) AS tokens, coalesce(sum(money), 0) AS money FROM (
+                     SELECT prompt_tokens + completion_tokens AS tokens, money FROM usage
+                     WHERE day = $1
+                     UNION ALL
+                     SELECT tokens, money FROM set_aside
+                     WHERE day = $1 AND is_alive(holder, make_interval(secs => $7))) used) used
+             WHERE ($5 = 0 OR tokens + $3 <= $5) AND ($6 = 0 OR money + $4 <= $6)
+             ON CONFLICT (day, holder) DO UPDATE
+             SET tokens = a.tokens + EXCLUDED.tokens, money = a.money + EXCLUDED.money",
+        )
+        .bind(day.to_sqlx())
+        .bind(inner.process)
+        .bind(most.tokens.cast_signed())
+        .bind(most.money)
+        .bind(limit.tokens.cast_signed())
+        .bind(limit.money)
+        .bind(inner.lifetime());
+        inner
+            .call(async {
+                let mut tx = inner.begin().await?;
+                // One after another, so that no two take the same rest.
+                let lock = sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(BUDGET_LOCK);
+                lock.execute(&mut *tx).await?;
+                let set = set.execute(&mut *tx).await?.rows_affected() > 0;
+                tx.commit().await?;
+                Ok(set)
+            })
+            .await
+    }
+
+    async fn give_back(&self, day: Date, unneeded: Purse) -> Result<(), StoreError> {
+        let inner = &self.inner;
+        let query = sqlx::query(
+            "UPDATE set_aside SET tokens = greatest(tokens - $3, 0), money = greatest(money - $4, 0)
+             WHERE day = $1 AND holder = $2",
+        )
+        .bind(day.to_sqlx())
+        .bind(inner.process)
+        .bind(unneeded.tokens.cast_signed())
+        .bind(unneeded.money);
+        inner
+            .call(async {
+                query.execute(&inner.pool).await?;
+                Ok(())
+            })
+            .await
+    }
+}
