@@ -46,6 +46,9 @@ pub struct Worker {
     pub settings: WorkerSettings,
 }
 
+/// The pause before a store that is away is told again.
+const TELL_AGAIN: Duration = Duration::from_millis(500);
+
 /// Why a refinement was given up.
 enum Stopped {
     Failed(RefineError),
@@ -90,12 +93,12 @@ impl Worker {
             Err(Stopped::ShuttingDown) => {
                 let why = "the server was stopped".to_owned();
                 let release = Release { why, not_before: None, counts: false };
-                self.jobs.release(claim, release).await?;
+                self.release(claim, release).await?;
             }
             Err(Stopped::Failed(RefineError::Later { why, after: pause })) => {
                 tracing::info!(job = %job.id, why, seconds = pause.as_secs(), "a job waits");
                 let release = Release { why, not_before: Some(after(pause)), counts: false };
-                self.jobs.release(claim, release).await?;
+                self.release(claim, release).await?;
             }
             Err(Stopped::Failed(RefineError::Passing(why)))
                 if job.attempts < self.settings.attempts =>
@@ -104,7 +107,7 @@ impl Worker {
                 let doubled = 2_u32.saturating_pow(job.attempts.saturating_sub(1));
                 let pause = self.settings.retry_pause.saturating_mul(doubled);
                 let release = Release { why, not_before: Some(after(pause)), counts: true };
-                self.jobs.release(claim, release).await?;
+                self.release(claim, release).await?;
             }
             Err(Stopped::Failed(error)) => self.fail(claim, job, &error).await?,
         }
@@ -183,7 +186,29 @@ impl Worker {
 
     async fn end(&self, claim: Claim, job: Job) -> Result<(), StoreError> {
         self.metrics.job_ended(&job);
-        self.jobs.finish(claim, job).await
+        self.insist(|| self.jobs.finish(claim, job.clone())).await
+    }
+
+    async fn release(&self, claim: Claim, release: Release) -> Result<(), StoreError> {
+        self.insist(|| self.jobs.release(claim, release.clone())).await
+    }
+
+    /// Tells a store that is away for a while how a job has ended, as long as the job is this worker's:
+    /// what was worked out is not to be lost.
+    async fn insist<F>(&self, tell: impl Fn() -> F) -> Result<(), StoreError>
+    where
+        F: Future<Output = Result<(), StoreError>>,
+    {
+        let began = Instant::now();
+        loop {
+            match tell().await {
+                Err(StoreError::Unavailable(why)) if began.elapsed() < self.settings.lease => {
+                    tracing::warn!(why, "how a job has ended cannot be written down; trying again");
+                    tokio::time::sleep(TELL_AGAIN).await;
+                }
+                told => return told,
+            }
+        }
     }
 }
 

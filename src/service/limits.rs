@@ -44,9 +44,7 @@ impl Limits {
 
     /// Takes a request from what is left to a key.
     pub async fn take_request(&self, key: &ApiKey) -> (Allowances, Result<(), ServiceError>) {
-        // A body may be larger than what is left: then there is less than nothing for a while.
-        let bytes = Draw { needed: SOME, ..bytes(key, 0.0) };
-        let draws = [requests(key), bytes];
+        let draws = [requests(key), bytes(key, SOME, 0.0)];
         if draws.iter().all(|draw| draw.per_minute == 0.0) {
             return (Allowances::default(), Ok(()));
         }
@@ -97,7 +95,9 @@ impl Limits {
             return;
         }
         let requests = Draw { needed: f64::MIN, taken: 0.0, ..requests(key) };
-        if let Err(error) = self.0.draw(&key.id, [requests, bytes(key, count as f64)]).await {
+        if let Err(error) =
+            self.0.draw(&key.id, [requests, bytes(key, f64::MIN, count as f64)]).await
+        {
             tracing::warn!(%error, "the bytes of a body are not counted");
         }
     }
@@ -111,8 +111,9 @@ fn requests(key: &ApiKey) -> Draw {
     })
 }
 
-fn bytes(key: &ApiKey, taken: f64) -> Draw {
-    let bytes = |limit| Draw { per_minute: limit as f64, needed: f64::MIN, taken };
+/// A body may be larger than what is left: then there is less than nothing for a while.
+fn bytes(key: &ApiKey, needed: f64, taken: f64) -> Draw {
+    let bytes = |limit| Draw { per_minute: limit as f64, needed, taken };
     key.limits.bytes_per_minute.map_or(Draw::UNLIMITED, bytes)
 }
 

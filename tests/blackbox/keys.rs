@@ -189,6 +189,10 @@ async fn each_role_may_do_what_it_is_for() {
         assert!(!log.contains(&key[17..]), "a key is in the log");
     }
     server.kill();
+    if deployment::is_scale_out() {
+        // There is no folder to look into.
+        return;
+    }
     let kept = std::fs::read(dir.path().join("db/db")).unwrap();
     for key in [&admin, &operator, &robot] {
         let secret = &key.as_bytes()[17..];
@@ -393,6 +397,10 @@ async fn the_commands_take_the_key_from_the_environment() {
     let whole = get(&server, &admin, &format!("/keys/{}", other.trim())).await;
     assert!(whole.status.is_client_error());
     assert!(!server.log().contains(&other[20..70]), "a key is in the log");
+    if deployment::is_scale_out() {
+        // A database belongs to nobody.
+        return;
+    }
     let absent = dir.path().join("absent");
     let (ok, _, said) = run(None, &["keys", "list", "--data", absent.to_str().unwrap()]);
     assert!(!ok && said.contains("no data folder") && !absent.exists(), "{said}");

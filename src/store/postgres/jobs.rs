@@ -4,6 +4,10 @@
 //! (`SKIP LOCKED`), and holds it by a mark: its process, the number of the claim, and until when. A job
 //! whose holder is dead is free at once.
 
+use std::collections::HashMap;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
 use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
 use jiff_sqlx::ToSqlx;
@@ -37,6 +41,54 @@ enum Place {
     Ended,
 }
 
+/// The jobs that workers of this process hold. One that the database says the process holds, and that is not
+/// among these, was claimed in a transaction whose end was not heard.
+#[derive(Default)]
+pub(super) struct HeldJobs(Mutex<HashMap<Uuid, Instant>>);
+
+impl HeldJobs {
+    fn jobs(&self) -> MutexGuard<'_, HashMap<Uuid, Instant>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Those whose leases have not ended.
+    fn all(&self) -> Vec<Uuid> {
+        let (mut jobs, now) = (self.jobs(), Instant::now());
+        jobs.retain(|_, until| *until > now);
+        jobs.keys().copied().collect()
+    }
+
+    /// Holds a job as long as the returned value lives, or, if that is kept, until it is let go of or so many
+    /// seconds have passed.
+    fn hold(&self, job: Uuid, for_s: f64) -> Holding<'_> {
+        self.jobs().insert(job, Instant::now() + Duration::from_secs_f64(for_s));
+        Holding { held: self, job: Some(job) }
+    }
+
+    fn let_go(&self, job: Uuid) {
+        self.jobs().remove(&job);
+    }
+}
+
+struct Holding<'a> {
+    held: &'a HeldJobs,
+    job: Option<Uuid>,
+}
+
+impl Holding<'_> {
+    fn keep(mut self) {
+        self.job = None;
+    }
+}
+
+impl Drop for Holding<'_> {
+    fn drop(&mut self) {
+        if let Some(job) = self.job {
+            self.held.let_go(job);
+        }
+    }
+}
+
 impl PostgresStore {
     /// Applies a change to one job, unless the change says `None`.
     async fn change<F>(&self, id: Uuid, change: F) -> Result<Job, StoreError>
@@ -51,8 +103,12 @@ impl PostgresStore {
                 let found = found.bind(id).fetch_optional(&mut *tx).await?;
                 let Json(mut known): Json<JobRecord> = found.ok_or_else(|| no_job(id))?;
                 if let Some(place) = change(&mut known)? {
+                    let lets_go = !matches!(place, Place::Same);
                     inner.write_job(&mut tx, &known, place).await?;
                     tx.commit().await?;
+                    if lets_go {
+                        inner.held.let_go(id);
+                    }
                 }
                 Ok(known.job)
             })
@@ -268,17 +324,21 @@ impl JobStore for PostgresStore {
                 let found = sqlx::query_scalar(
                     "SELECT record FROM jobs
                      WHERE ended_at IS NULL AND (held_until IS NULL OR held_until <= now()
-                         OR (holder IS NOT NULL AND holder <> $1
-                             AND NOT is_alive(holder, make_interval(secs => $2))))
+                         OR CASE WHEN holder = $1 THEN id <> ALL ($3)
+                             ELSE NOT is_alive(holder, make_interval(secs => $2)) END)
                      ORDER BY place, id LIMIT 1 FOR UPDATE SKIP LOCKED",
                 )
                 .bind(inner.process)
-                .bind(inner.lifetime());
+                .bind(inner.lifetime())
+                .bind(inner.held.all());
                 let found: Option<Json<JobRecord>> = found.fetch_optional(&mut *tx).await?;
                 let Some(Json(mut known)) = found else { return Ok(None) };
                 known.take(now);
                 inner.write_job(&mut tx, &known, Place::Held { for_s }).await?;
+                // If the answer to the commit is lost, nobody knows of the claim, and the job is free.
+                let holding = inner.held.hold(known.job.id, for_s);
                 tx.commit().await?;
+                holding.keep();
                 Ok(Some(known))
             })
             .await

@@ -84,6 +84,7 @@ struct Inner {
     keys: watch::Sender<()>,
     levels: KnownLevels,
     graphs: descriptors::KnownGraphs,
+    held: jobs::HeldJobs,
     /// Ends what works in the background.
     _background: DropGuard,
 }
@@ -112,6 +113,7 @@ impl PostgresStore {
             keys: watch::Sender::new(()),
             levels: KnownLevels::default(),
             graphs: descriptors::KnownGraphs::default(),
+            held: jobs::HeldJobs::default(),
             _background: background.clone().drop_guard(),
             pool,
             settings,
