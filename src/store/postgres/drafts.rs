@@ -159,7 +159,7 @@ impl PostgresDraft {
     /// Builds the index, if the map is large enough for one.
     async fn build(&self, inner: &Inner) -> Result<bool, StoreError> {
         let table = table(self.next.uid, self.next.revision);
-        let large = format!("SELECT count(*) FROM (SELECT FROM {table} LIMIT $1) some");
+        let large = format!("SELECT count(*) FROM (SELECT FROM {table} LIMIT $1) counted");
         let exact = inner.settings.index.exact_up_to;
         let images: i64 = inner
             .call(async {
