@@ -10,7 +10,7 @@ use uuid::Uuid;
 use super::super::changes::{changed_map, removed};
 use super::super::{Added, IndexState, LookAlikes, MapStore, StoreError};
 use super::descriptors::{drop_table, make_table};
-use super::{Inner, PostgresStore, counted, record, unavailable};
+use super::{Inner, PostgresStore, counted, record};
 use crate::domain::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Image, ImageId, Map, MapName, Pose,
 };
@@ -170,6 +170,15 @@ impl MapStore for PostgresStore {
 
 impl Inner {
     async fn put_map(&self, wanted: Map) -> Result<(Map, bool), StoreError> {
+        loop {
+            if let Some(put) = self.try_to_put_map(wanted.clone()).await? {
+                return Ok(put);
+            }
+        }
+    }
+
+    /// `None` if somebody else has just made the map, so that it is there now.
+    async fn try_to_put_map(&self, wanted: Map) -> Result<Option<(Map, bool)>, StoreError> {
         let mut tx = self.begin().await?;
         let stored = sqlx::query_scalar("SELECT record FROM maps WHERE name = $1 FOR UPDATE");
         let stored = stored.bind(wanted.name.as_str()).fetch_optional(&mut *tx).await?;
@@ -186,7 +195,7 @@ impl Inner {
                 .execute(&mut *tx)
                 .await?;
                 if inserted.rows_affected() == 0 {
-                    return Err(unavailable("another process is making the same map"));
+                    return Ok(None);
                 }
                 make_table(&mut tx, &wanted).await?;
                 (wanted, true)
@@ -212,7 +221,7 @@ impl Inner {
             }
         };
         tx.commit().await?;
-        Ok((map, new))
+        Ok(Some((map, new)))
     }
 
     async fn delete_map(&self, name: &MapName) -> Result<Option<Uuid>, StoreError> {
