@@ -164,7 +164,7 @@ impl Inner {
             false => format!("SELECT slot, descriptor FROM {table}"),
         };
         let sql = format!(
-            "SELECT i.slot, i.id, i.record->'pose' AS pose, 1 - n.distance AS similarity
+            "SELECT i.slot, i.id, i.pose, 1 - n.distance AS similarity
              FROM (SELECT slot, descriptor <=> $1::real[]::vector AS distance
                    FROM ({nearest}) nearest ORDER BY distance, slot LIMIT $2) n
              JOIN images i ON i.map_uid = $4 AND i.slot = n.slot
@@ -193,11 +193,11 @@ impl Inner {
         };
         rows.into_iter()
             .map(|row| {
-                let Json(pose) = row.try_get("pose")?;
+                let pose: Option<Json<Pose>> = row.try_get("pose")?;
                 Ok(Found {
                     slot: row.try_get("slot")?,
                     id: image_id(row.try_get("id")?)?,
-                    pose,
+                    pose: pose.map(|Json(pose)| pose),
                     similarity: row.try_get("similarity")?,
                 })
             })
@@ -211,8 +211,8 @@ impl Inner {
         settings: CalibrationSettings,
         k: usize,
     ) -> Result<Vec<LookAlikes>, StoreError> {
-        let places: Vec<(i64, String, Json<Option<Pose>>)> = sqlx::query_as(
-            "SELECT slot, id, record->'pose' FROM images WHERE map_uid = $1 ORDER BY slot",
+        let places: Vec<(i64, String, Option<Json<Pose>>)> = sqlx::query_as(
+            "SELECT slot, id, pose FROM images WHERE map_uid = $1 ORDER BY slot",
         )
         .bind(map.uid)
         .fetch_all(&self.pool)
@@ -221,11 +221,12 @@ impl Inner {
         let step = places.len().div_ceil(settings.images.max(1)).max(1);
         let mut asked = Vec::new();
         for at in (0..places.len()).step_by(step) {
-            let (slot, id, Json(pose)) = &places[at];
+            let (slot, id, pose) = &places[at];
             let Some(descriptor) = self.descriptor(map, *slot).await? else { continue };
             let of_another_place = |found: &Found| {
                 let position = places.partition_point(|(slot, ..)| *slot < found.slot);
-                let distance = pose.zip(found.pose).and_then(|(a, b)| a.distance_m(&b));
+                let poses = pose.as_ref().zip(found.pose.as_ref());
+                let distance = poses.and_then(|(Json(a), b)| a.distance_m(b));
                 position.abs_diff(at) > near
                     && distance.is_none_or(|distance| distance > settings.place_m)
             };

@@ -32,8 +32,9 @@ impl Inner {
             "WITH map AS (
                  SELECT uid FROM maps WHERE uid = $1 AND revision = $2 FOR SHARE),
              added AS (
-                 INSERT INTO images (map_uid, id, digest, record)
-                 SELECT uid, $3, $4, $5::json FROM map ON CONFLICT DO NOTHING RETURNING slot),
+                 INSERT INTO images (map_uid, id, digest, record, pose)
+                 SELECT uid, $3, $4, $5::json, $8::json FROM map
+                 ON CONFLICT DO NOTHING RETURNING slot),
              described AS (
                  INSERT INTO {table} (slot, descriptor) SELECT slot, $6::real[]::vector FROM added),
              counted AS (
@@ -45,7 +46,7 @@ impl Inner {
                  WHERE digest = $4 AND EXISTS (SELECT FROM added) RETURNING digest)
              SELECT (SELECT count(*) FROM added) AS added, (SELECT count(*) FROM needed) AS needed"
         );
-        let text = record(&image)?;
+        let (text, pose) = (record(&image)?, image.pose.as_ref().map(record).transpose()?);
         for _ in 0..TRIES {
             // One transaction, so that nothing stays of an image without bytes.
             let mut tx = self.begin().await?;
@@ -57,6 +58,7 @@ impl Inner {
                 .bind(&text)
                 .bind(descriptor.as_slice())
                 .bind(part())
+                .bind(&pose)
                 .fetch_one(&mut *tx)
                 .await;
             let row = match added {
@@ -113,14 +115,13 @@ impl Inner {
     }
 
     pub(super) async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
-        let positions: Vec<(String, Json<Option<Pose>>)> = sqlx::query_as(
-            "SELECT id, record->'pose' FROM images WHERE map_uid = $1 ORDER BY slot",
+        let positions: Vec<(String, Json<Pose>)> = sqlx::query_as(
+            "SELECT id, pose FROM images WHERE map_uid = $1 AND pose IS NOT NULL ORDER BY slot",
         )
         .bind(map.uid)
         .fetch_all(&self.pool)
         .await?;
-        let known = positions.into_iter().filter_map(|(id, Json(pose))| Some((id, pose?)));
-        known.map(|(id, pose)| Ok((image_id(id)?, pose))).collect()
+        positions.into_iter().map(|(id, Json(pose))| Ok((image_id(id)?, pose))).collect()
     }
 
     pub(super) async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {
