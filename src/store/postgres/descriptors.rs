@@ -108,6 +108,14 @@ impl Inner {
         }
     }
 
+    /// Refuses a map that is gone.
+    pub(super) async fn check_there(&self, map: &Map) -> Result<(), StoreError> {
+        match self.check_revision(map).await {
+            Err(StoreError::Superseded(_)) => Ok(()),
+            checked => checked,
+        }
+    }
+
     /// What to say of a statement that failed because of the map's table.
     pub(super) async fn explain(&self, map: &Map, error: sqlx::Error) -> StoreError {
         if !is_missing_table(&error) {

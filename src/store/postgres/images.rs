@@ -116,11 +116,15 @@ impl Inner {
 
     pub(super) async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
         let positions: Vec<(String, Json<Pose>)> = sqlx::query_as(
-            "SELECT id, pose FROM images WHERE map_uid = $1 AND pose IS NOT NULL ORDER BY slot",
+            "SELECT i.id, i.pose FROM images i JOIN maps m ON m.uid = i.map_uid
+             WHERE i.map_uid = $1 AND i.pose IS NOT NULL ORDER BY i.slot",
         )
         .bind(map.uid)
         .fetch_all(&self.pool)
         .await?;
+        if positions.is_empty() {
+            self.check_there(map).await?;
+        }
         positions.into_iter().map(|(id, Json(pose))| Ok((image_id(id)?, pose))).collect()
     }
 
