@@ -51,6 +51,8 @@ CREATE TABLE images (
     -- Its place in the order of addition.
     slot bigint GENERATED ALWAYS AS IDENTITY,
     digest bytea NOT NULL,
+    -- Of the record, because PostgreSQL cannot look into one that has the character 0 in a text.
+    pose json,
     record json NOT NULL,
     PRIMARY KEY (map_uid, id),
     UNIQUE (map_uid, slot)

@@ -152,6 +152,8 @@ impl Objects {
 }
 
 fn s3(settings: &ObjectSettings, bucket: &str) -> Result<object_store::aws::AmazonS3, StoreError> {
+    // Whoever came first has chosen for all.
+    let _ = rustls::crypto::ring::default_provider().install_default();
     // Credentials come from the environment, as for every program that speaks S3.
     let mut builder = AmazonS3Builder::from_env()
         .with_bucket_name(bucket)

@@ -37,13 +37,14 @@ impl AnswerStore for PostgresStore {
                 }
                 let known = sqlx::query_as(
                     "SELECT record, CASE WHEN holder IS NULL THEN at >= $2
-                         ELSE is_alive(holder, make_interval(secs => $3)) END
+                         ELSE holder = $4 OR is_alive(holder, make_interval(secs => $3)) END
                      FROM answers WHERE id = $1 FOR UPDATE",
                 );
                 let known: Option<(Json<FirstAnswer>, bool)> = known
                     .bind(id)
                     .bind(since.to_sqlx())
                     .bind(inner.lifetime())
+                    .bind(inner.process)
                     .fetch_optional(&mut *tx)
                     .await?;
                 let Some((Json(known), counts)) = known else {

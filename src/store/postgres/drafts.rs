@@ -35,7 +35,8 @@ impl DraftStore for PostgresStore {
                     "INSERT INTO drafts (map_uid, revision, holder) VALUES ($1, $2, $3)
                      ON CONFLICT (map_uid) DO UPDATE
                      SET revision = EXCLUDED.revision, holder = EXCLUDED.holder
-                     WHERE NOT is_alive(drafts.holder, make_interval(secs => $4))",
+                     WHERE drafts.holder <> $3
+                         AND NOT is_alive(drafts.holder, make_interval(secs => $4))",
                 )
                 .bind(next.uid)
                 .bind(i64::from(next.revision))
@@ -66,6 +67,7 @@ impl Draft for PostgresDraft {
         inner
             .call(async {
                 inner.check_revision(&self.old).await?;
+                self.check_held(&inner.pool).await?;
                 loop {
                     let from = self.seen;
                     let some = self.missing_after(&inner, from, limit).await?;
@@ -90,13 +92,16 @@ impl Draft for PostgresDraft {
         let sql = format!(
             "INSERT INTO {table} (slot, descriptor)
              SELECT slot, $4::real[]::vector FROM images
-             WHERE map_uid = $1 AND id = $2 AND digest = $3 ON CONFLICT DO NOTHING"
+             WHERE map_uid = $1 AND id = $2 AND digest = $3
+                 AND EXISTS (SELECT FROM drafts WHERE map_uid = $1 AND holder = $5)
+             ON CONFLICT DO NOTHING"
         );
         let query = sqlx::query(AssertSqlSafe(sql))
             .bind(self.next.uid)
             .bind(image.id.as_str())
             .bind(image.digest.as_bytes().as_slice())
-            .bind(descriptor.as_slice());
+            .bind(descriptor.as_slice())
+            .bind(inner.process);
         inner
             .call(async {
                 query.execute(&inner.pool).await?;
@@ -107,34 +112,36 @@ impl Draft for PostgresDraft {
 
     async fn replace(&mut self) -> Result<bool, StoreError> {
         let inner = self.store.inner.clone();
+        inner
+            .call(async {
+                inner.check_revision(&self.old).await?;
+                self.check_held(&inner.pool).await
+            })
+            .await?;
         if !self.indexed {
             // Before it serves: a large map should not be searched exactly until its index is there.
             self.indexed = self.build(&inner).await?;
         }
         let replaced = inner.call(self.put_in_place(&inner)).await?;
-        if replaced && self.indexed {
-            inner.graphs.add(&self.next);
+        if replaced {
+            if self.indexed {
+                inner.graphs.add(&self.next);
+            }
+            inner.drop_left(self.next.uid).await;
         }
         Ok(replaced)
     }
 
     async fn discard(self: Box<Self>) {
         let inner = &self.store.inner;
-        let (uid, revision) = (self.next.uid, self.next.revision);
-        let discarded = inner
-            .call(async {
-                let mut tx = inner.begin().await?;
-                let own = sqlx::query("DELETE FROM drafts WHERE map_uid = $1 AND holder = $2");
-                let own = own.bind(uid).bind(inner.process).execute(&mut *tx).await?;
-                if own.rows_affected() > 0 {
-                    drop_table(&mut tx, uid, revision).await?;
-                }
-                Ok(tx.commit().await?)
-            })
-            .await;
-        if let Err(error) = discarded {
+        let uid = self.next.uid;
+        let own = sqlx::query("DELETE FROM drafts WHERE map_uid = $1 AND holder = $2")
+            .bind(uid)
+            .bind(inner.process);
+        if let Err(error) = inner.call(async { Ok(own.execute(&inner.pool).await?) }).await {
             tracing::warn!(%error, "a draft is left to the next one of the map");
         }
+        inner.drop_left(uid).await;
     }
 }
 
@@ -185,6 +192,7 @@ impl PostgresDraft {
         if stored.revision != self.old.revision {
             return Err(StoreError::Superseded(stored.name));
         }
+        self.check_held(&mut *tx).await?;
         if self.lacks_some(&mut tx).await? {
             return Ok(false);
         }
@@ -211,9 +219,23 @@ impl PostgresDraft {
         {
             sqlx::query(gone).bind(uid).execute(&mut *tx).await?;
         }
-        drop_table(&mut tx, uid, self.old.revision).await?;
         tx.commit().await?;
         Ok(true)
+    }
+
+    /// Refuses a draft that was taken from this process, because it had not been heard of.
+    async fn check_held(&self, executor: impl sqlx::PgExecutor<'_>) -> Result<(), StoreError> {
+        let held = sqlx::query("SELECT FROM drafts WHERE map_uid = $1 AND holder = $2 FOR SHARE")
+            .bind(self.next.uid)
+            .bind(self.store.inner.process);
+        match held.fetch_optional(executor).await? {
+            Some(_) => Ok(()),
+            None => Err(StoreError::Conflict(format!(
+                "the reindexing of the map {} was given up, because this process had not been heard of \
+                 for too long; begin it again",
+                self.next.name
+            ))),
+        }
     }
 
     async fn lacks_some(&self, connection: &mut PgConnection) -> Result<bool, StoreError> {

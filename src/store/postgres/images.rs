@@ -32,8 +32,9 @@ impl Inner {
             "WITH map AS (
                  SELECT uid FROM maps WHERE uid = $1 AND revision = $2 FOR SHARE),
              added AS (
-                 INSERT INTO images (map_uid, id, digest, record)
-                 SELECT uid, $3, $4, $5::json FROM map ON CONFLICT DO NOTHING RETURNING slot),
+                 INSERT INTO images (map_uid, id, digest, record, pose)
+                 SELECT uid, $3, $4, $5::json, $8::json FROM map
+                 ON CONFLICT DO NOTHING RETURNING slot),
              described AS (
                  INSERT INTO {table} (slot, descriptor) SELECT slot, $6::real[]::vector FROM added),
              counted AS (
@@ -45,7 +46,7 @@ impl Inner {
                  WHERE digest = $4 AND EXISTS (SELECT FROM added) RETURNING digest)
              SELECT (SELECT count(*) FROM added) AS added, (SELECT count(*) FROM needed) AS needed"
         );
-        let text = record(&image)?;
+        let (text, pose) = (record(&image)?, image.pose.as_ref().map(record).transpose()?);
         for _ in 0..TRIES {
             // One transaction, so that nothing stays of an image without bytes.
             let mut tx = self.begin().await?;
@@ -57,6 +58,7 @@ impl Inner {
                 .bind(&text)
                 .bind(descriptor.as_slice())
                 .bind(part())
+                .bind(&pose)
                 .fetch_one(&mut *tx)
                 .await;
             let row = match added {
@@ -75,10 +77,10 @@ impl Inner {
                 }
             }
             drop(tx);
+            self.check_revision(map).await?;
             if let Some(present) = self.image(map.uid, &image.id).await? {
                 return Ok(Added::Present(same_bytes(present, &image)?));
             }
-            self.check_revision(map).await?;
             // The image was there and has just been removed.
         }
         Err(super::unavailable("others change the same image"))
@@ -113,14 +115,17 @@ impl Inner {
     }
 
     pub(super) async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
-        let positions: Vec<(String, Json<Option<Pose>>)> = sqlx::query_as(
-            "SELECT id, record->'pose' FROM images WHERE map_uid = $1 ORDER BY slot",
+        let positions: Vec<(String, Json<Pose>)> = sqlx::query_as(
+            "SELECT i.id, i.pose FROM images i JOIN maps m ON m.uid = i.map_uid
+             WHERE i.map_uid = $1 AND i.pose IS NOT NULL ORDER BY i.slot",
         )
         .bind(map.uid)
         .fetch_all(&self.pool)
         .await?;
-        let known = positions.into_iter().filter_map(|(id, Json(pose))| Some((id, pose?)));
-        known.map(|(id, pose)| Ok((image_id(id)?, pose))).collect()
+        if positions.is_empty() {
+            self.check_there(map).await?;
+        }
+        positions.into_iter().map(|(id, Json(pose))| Ok((image_id(id)?, pose))).collect()
     }
 
     pub(super) async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {
@@ -177,13 +182,15 @@ impl ExportStore for PostgresStore {
         let table = table(map.uid, map.revision);
         let sql = format!(
             "SELECT i.record, d.descriptor::real[] FROM images i
+             JOIN maps m ON m.uid = i.map_uid AND m.revision = $4
              LEFT JOIN {table} d ON d.slot = i.slot
              WHERE i.map_uid = $1 AND i.id > $2 ORDER BY i.id LIMIT $3"
         );
         let query = sqlx::query_as(AssertSqlSafe(sql))
             .bind(map.uid)
             .bind(after.map_or("", ImageId::as_str))
-            .bind(count(limit));
+            .bind(count(limit))
+            .bind(i64::from(map.revision));
         inner
             .call(async {
                 let found: Vec<(Json<Image>, Option<Vec<f32>>)> =
@@ -191,6 +198,9 @@ impl ExportStore for PostgresStore {
                         Ok(found) => found,
                         Err(error) => return Err(inner.explain(map, error).await),
                     };
+                if found.is_empty() {
+                    inner.check_revision(map).await?;
+                }
                 let exported = |(Json(image), numbers): (Json<Image>, Option<Vec<f32>>)| {
                     ExportedImage { image, descriptor: numbers.and_then(descriptor_of) }
                 };

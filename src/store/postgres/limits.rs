@@ -57,7 +57,8 @@ impl SharedLimits for PostgresStore {
                      WHERE day = $1
                      UNION ALL
                      SELECT tokens, money FROM set_aside
-                     WHERE day = $1 AND is_alive(holder, make_interval(secs => $7))) used) used
+                     WHERE day = $1 AND (holder = $2
+                         OR is_alive(holder, make_interval(secs => $7)))) used) used
              WHERE ($5 = 0 OR tokens + $3 <= $5) AND ($6 = 0 OR money + $4 <= $6)
              ON CONFLICT (day, holder) DO UPDATE
              SET tokens = a.tokens + EXCLUDED.tokens, money = a.money + EXCLUDED.money",

@@ -29,13 +29,13 @@ mod webhooks;
 
 use std::future::Future;
 use std::str::FromStr;
-use std::sync::Arc;
-use std::time::Duration;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use jiff::SignedDuration;
 use serde::Serialize;
 use sqlx::postgres::{PgConnectOptions, PgPool, PgPoolOptions};
-use sqlx::{Postgres, Transaction};
+use sqlx::{Connection, Postgres, Transaction};
 use tokio::sync::{broadcast, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use uuid::Uuid;
@@ -75,6 +75,7 @@ pub struct PostgresStore {
 
 struct Inner {
     pool: PgPool,
+    doubts: Doubts,
     objects: Objects,
     settings: PostgresSettings,
     /// This process among all.
@@ -102,7 +103,8 @@ impl PostgresStore {
         objects: Objects,
         process: Uuid,
     ) -> Result<Self, StoreError> {
-        let pool = connect(&settings)?;
+        let doubts = Doubts::default();
+        let pool = connect(&settings, &doubts)?;
         check_schema(&pool, &settings).await?;
         let background = CancellationToken::new();
         let inner = Arc::new(Inner {
@@ -116,12 +118,15 @@ impl PostgresStore {
             held: jobs::HeldJobs::default(),
             _background: background.clone().drop_guard(),
             pool,
+            doubts,
             settings,
         });
         inner.call(inner.sign_of_life()).await?;
+        // Whoever has the store hears of every change.
+        let listener = inner.call(listener::connect(&inner.pool)).await?;
         let weak = Arc::downgrade(&inner);
         tokio::spawn(processes::keep_alive(weak.clone(), background.clone()));
-        tokio::spawn(listener::listen(inner.pool.clone(), weak.clone(), background.clone()));
+        tokio::spawn(listener::listen(listener, weak.clone(), background.clone()));
         tokio::spawn(indexer::keep_indexed(weak, background));
         Ok(Self { inner })
     }
@@ -134,7 +139,10 @@ impl Inner {
         work: impl Future<Output = Result<T, StoreError>>,
     ) -> Result<T, StoreError> {
         let limit = self.settings.timeout;
-        tokio::time::timeout(limit, work).await.unwrap_or_else(|_| {
+        let mut work = std::pin::pin!(work);
+        tokio::time::timeout(limit, work.as_mut()).await.unwrap_or_else(|_| {
+            // Before the work is dropped, and gives its connection back.
+            self.doubts.arise();
             let limit = limit.as_millis();
             Err(unavailable(format!("it did not answer within {limit} ms (database.timeout_ms)")))
         })
@@ -150,8 +158,25 @@ impl Inner {
     }
 }
 
+/// When a call last ran out of time. The pool asks every connection that it is given back whether it is alive,
+/// and would wait for the answer of a dead one for ever; after such a call it does not.
+#[derive(Clone, Default)]
+struct Doubts(Arc<Mutex<Option<Instant>>>);
+
+impl Doubts {
+    fn arise(&self) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
+    }
+
+    /// Whether a call ran out of time so short a while ago that its connection is still to come.
+    fn are_fresh(&self, within: Duration) -> bool {
+        let arose = *self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        arose.is_some_and(|arose| arose.elapsed() < within)
+    }
+}
+
 /// No connection yet: they are made when they are needed.
-fn connect(settings: &PostgresSettings) -> Result<PgPool, StoreError> {
+fn connect(settings: &PostgresSettings, doubts: &Doubts) -> Result<PgPool, StoreError> {
     let options = PgConnectOptions::from_str(&settings.url).map_err(|error| {
         // The error may show the address, and that may hold a password.
         let what = match error {
@@ -170,17 +195,29 @@ fn connect(settings: &PostgresSettings) -> Result<PgPool, StoreError> {
         .statement_cache_capacity(STATEMENTS_KEPT)
         .options([
             ("hnsw.ef_search", ef_search.as_str()),
-            // Dead images are in the index until the next vacuum: look on until there are enough.
-            ("hnsw.iterative_scan", "strict_order"),
+            // Dead images are in the index until the next vacuum: look on until there are enough. Their order
+            // is made anew, and the strict one leaves out what comes late.
+            ("hnsw.iterative_scan", "relaxed_order"),
             // Compiling a search takes longer than searching.
             ("jit", "off"),
             ("statement_timeout", patience.as_str()),
             ("idle_in_transaction_session_timeout", patience.as_str()),
         ]);
+    let (doubts, timeout) = (doubts.clone(), settings.timeout);
     Ok(PgPoolOptions::new()
         .max_connections(settings.max_connections)
         .acquire_timeout(settings.timeout)
         .acquire_slow_threshold(settings.timeout)
+        .after_release(move |connection, _| {
+            let doubtful = doubts.are_fresh(2 * timeout);
+            Box::pin(async move {
+                if doubtful {
+                    let answer = tokio::time::timeout(timeout, connection.ping()).await;
+                    answer.map_err(|_| sqlx::Error::PoolTimedOut)??;
+                }
+                Ok(true)
+            })
+        })
         .connect_lazy_with(options))
 }
 
@@ -237,6 +274,11 @@ impl From<sqlx::Error> for StoreError {
 /// Whether a table is missing: that of the descriptors of a map that was removed or reindexed.
 fn is_missing_table(error: &sqlx::Error) -> bool {
     error.as_database_error().and_then(|error| error.code()).as_deref() == Some("42P01")
+}
+
+/// Whether a lock was not to be had in time.
+fn is_locked(error: &sqlx::Error) -> bool {
+    error.as_database_error().and_then(|error| error.code()).as_deref() == Some("55P03")
 }
 
 /// A record as it is stored.
