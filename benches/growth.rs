@@ -166,6 +166,7 @@ async fn one_job(store: &EmbeddedStore) -> Vec<f64> {
         query,
         candidates: candidates.clone(),
         claims: 0,
+        traceparent: None,
     };
     let (mut laps, mut since) = (Vec::new(), Instant::now());
     let mut lap = |since: &mut Instant| {

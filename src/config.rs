@@ -21,6 +21,7 @@ use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
 use crate::retrieve::{AdmissionSettings, Layout, Provider, Wanted};
 use crate::service::{BulkSettings, TrackSettings, WebhookSettings};
+use crate::telemetry::TraceSettings;
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../deploy/whereabouts.toml");
@@ -67,6 +68,8 @@ pub struct Config {
     pub console: Console,
     /// Logs.
     pub log: Log,
+    /// Traces.
+    pub traces: TraceSettings,
 }
 
 /// `[data]`
@@ -540,7 +543,8 @@ impl Config {
         let console = || self.console.contradiction();
         let scale =
             || self.database.contradiction().or_else(|| self.objects.contradiction(timeout));
-        self.server.contradiction().or_else(track).or_else(console).or_else(scale)
+        let traces = || self.traces.contradiction();
+        self.server.contradiction().or_else(track).or_else(console).or_else(scale).or_else(traces)
     }
 
     fn contradiction(&self) -> Option<String> {

@@ -1,7 +1,8 @@
-//! Logs and metrics.
+//! Logs, metrics and traces.
 
 mod recent;
 mod refused;
+pub mod traces;
 mod webhooks;
 
 use std::io::IsTerminal;
@@ -16,7 +17,7 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::Registry;
-use tracing_subscriber::filter::LevelFilter;
+use tracing_subscriber::filter::{FilterExt, LevelFilter, filter_fn};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, fmt};
@@ -24,6 +25,7 @@ use tracing_subscriber::{EnvFilter, Layer, fmt};
 use self::recent::Listener;
 pub use self::recent::{LastHour, Minute, Trouble, Troubles};
 pub use self::refused::RefusedFor;
+pub use self::traces::{TraceSettings, Traces};
 pub use self::webhooks::AttemptOutcome;
 use self::webhooks::OutcomeLabels;
 use crate::config::{Log, LogFormat};
@@ -32,8 +34,9 @@ use crate::refine::mllm::MllmLevels;
 use crate::retrieve::{AdmissionLevels, StageTimes};
 use crate::store::RemovedJobs;
 
-/// Starts logging to standard error, and gives the last warnings and errors. A second call changes nothing.
-pub fn init_logs(log: &Log) -> Result<Arc<Troubles>, String> {
+/// Starts logging to standard error and tracing, and gives the last warnings and errors, and what sends the
+/// traces. A second call changes nothing.
+pub fn init(log: &Log, traces: &TraceSettings) -> Result<(Arc<Troubles>, Traces), String> {
     let filter = EnvFilter::try_new(&log.filter)
         .map_err(|error| format!("log.filter cannot be read: {error}"))?;
     let pretty = match log.format {
@@ -48,9 +51,14 @@ pub fn init_logs(log: &Log) -> Result<Arc<Troubles>, String> {
     };
     let troubles = Arc::new(Troubles::default());
     let listener = Listener(Arc::clone(&troubles)).with_filter(LevelFilter::WARN);
-    let _ =
-        tracing_subscriber::registry().with(lines.with_filter(filter)).with(listener).try_init();
-    Ok(troubles)
+    let traces = Traces::start(traces)?;
+    let no_span_of_a_trace = filter_fn(|about| !(about.is_span() && traces::is_ours(about)));
+    let _ = tracing_subscriber::registry()
+        .with(traces.layer())
+        .with(lines.with_filter(filter.and(no_span_of_a_trace)))
+        .with(listener)
+        .try_init();
+    Ok((troubles, traces))
 }
 
 /// The routes that localize a frame.

@@ -122,7 +122,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     }
 
     let config = args.config()?;
-    telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
+    let _logs = telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
     let service = open(config.clone()).await?;
     let model = service.models.default_model().to_owned();
     let execution = service.installed_model(&model).await?.execution().to_string();

@@ -58,7 +58,8 @@ pub async fn run(role: Role, args: Args) -> anyhow::Result<()> {
     if role == Role::Worker {
         check_worker(&config)?;
     }
-    let troubles = telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
+    let (troubles, _traces) =
+        telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
     let listener = TcpListener::bind(config.server.listen).await.with_context(|| {
         format!("cannot listen on {}; choose another with --listen", config.server.listen)
     })?;

@@ -197,6 +197,10 @@ pub struct Job {
     pub usage: Usage,
     /// What went wrong, or what a job that is queued again waits for.
     pub error: Option<String>,
+    /// The trace of its request and its refinement (W3C Trace Context), where the server sends traces.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub trace_id: Option<String>,
 }
 
 impl Job {
@@ -224,6 +228,7 @@ impl Job {
             estimate: None,
             usage: Usage::default(),
             error: None,
+            trace_id: None,
         }
     }
 }

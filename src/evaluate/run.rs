@@ -201,7 +201,15 @@ impl Evaluator<'_> {
             descriptor: Some(extraction.descriptor),
         };
         let job = Job::queued(map.name.clone(), query.id, RefinerKind::Local, now);
-        JobRecord { job, map_uid: map.uid, revision: map.revision, query, candidates, claims: 0 }
+        JobRecord {
+            job,
+            map_uid: map.uid,
+            revision: map.revision,
+            query,
+            candidates,
+            claims: 0,
+            traceparent: None,
+        }
     }
 
     async fn refine(

@@ -11,6 +11,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt;
 use http_body_util::BodyExt;
+use tracing::Instrument;
 
 use super::auth::without_secrets;
 use super::batch;
@@ -21,7 +22,7 @@ use super::problem::Problem;
 use super::state::AppState;
 use crate::grpc::{self, Call, HEALTH_CHECK, Held};
 use crate::service::{Deadline, ErrorKind};
-use crate::telemetry::RefusedFor;
+use crate::telemetry::{RefusedFor, traces};
 
 /// The id of a request: the caller's `x-request-id`, or a fresh one.
 #[derive(Debug, Clone, Default)]
@@ -43,8 +44,10 @@ pub(super) async fn observe(
     let route =
         request.extensions().get::<MatchedPath>().map_or("none", |path| path.as_str()).to_owned();
     let path = without_secrets(request.uri().path());
-    let mut response = next.run(request).await;
+    let span = traces::request(method.as_str(), &route, request.headers());
+    let mut response = next.run(request).instrument(span.clone()).await;
     let (took, status) = (start.elapsed(), answered(&response));
+    traces::answered(&span, status);
     state.metrics.request(method.as_str(), &route, status, took);
     tracing::debug!(request_id = %id.0, %method, path, status, ms = took.as_secs_f64() * 1e3);
     if let Ok(value) = HeaderValue::from_str(&id.0) {

@@ -10,6 +10,7 @@ use axum::http::header::{CONTENT_TYPE, RETRY_AFTER};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use tracing::Instrument;
 
 use super::batch;
 use super::body::whole;
@@ -83,7 +84,8 @@ async fn answer(state: AppState, request: Request, next: Next) -> Result<Respons
             let mut request = Request::from_parts(parts, Body::from(bytes));
             request.extensions_mut().insert(OnceId(id.clone()));
             // Goes on when the sender has gone: it will ask again.
-            let doing = tokio::spawn(do_and_keep(service, id, fingerprint, request, next));
+            let doing = do_and_keep(service, id, fingerprint, request, next);
+            let doing = tokio::spawn(doing.in_current_span());
             doing.await.map_err(|_| defect())
         }
     }

@@ -7,11 +7,12 @@ use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast::error::RecvError;
 use tokio_util::sync::CancellationToken;
+use tracing::Instrument;
 
 use super::{JobPace, Progress, RefineError, Refinement, Refiner};
 use crate::domain::{Estimate, Job, JobState};
 use crate::store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
-use crate::telemetry::Metrics;
+use crate::telemetry::{Metrics, traces};
 
 /// Bounds on a worker's patience.
 #[derive(Debug, Clone, Copy)]
@@ -83,7 +84,9 @@ impl Worker {
             return Ok(false);
         };
         let (job, claim, began) = (record.job.clone(), record.claim(), Instant::now());
-        match self.refine(&record, shutdown).await {
+        let traceparent = record.traceparent.as_deref();
+        let span = traces::job(job.id, job.refiner.as_str(), job.attempts, traceparent);
+        match self.refine(&record, shutdown).instrument(span).await {
             Ok(refinement) => {
                 self.record(began.elapsed());
                 let estimate = self.estimate(&record, &refinement).await;

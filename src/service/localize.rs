@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
+use tracing::Instrument;
 use utoipa::ToSchema;
 use uuid::Uuid;
 
@@ -15,6 +16,7 @@ use crate::domain::{Calibration, Candidate, Digest, Estimate, JobState, Map, Map
 use crate::retrieve::index::SearchMode;
 use crate::retrieve::{Class, Demand, Extraction};
 use crate::store::StoreError;
+use crate::telemetry::traces;
 
 /// What becomes of the candidates after the first answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
@@ -161,7 +163,8 @@ impl Service {
                 dense: extraction.dense,
             };
             let once = request.once.as_deref();
-            match self.submit(&map, frame, compared, request.priority, once).await? {
+            let submit = self.submit(&map, frame, compared, request.priority, once);
+            match submit.instrument(traces::stage("submit")).await? {
                 Ok(job) => (Some(job), None),
                 Err(why) if request.refine == RefineMode::Wait && why.is_shedding() => {
                     return Err(self.refuse_job(&why));
@@ -214,11 +217,12 @@ impl Service {
         let mut left = SUPERSEDED;
         loop {
             let (map, extractor) = self.usable_map(map).await?;
-            let extraction =
-                self.extract(&extractor, frame.clone(), map.descriptor, demand).await?;
+            let extracting = self.extract(&extractor, frame.clone(), map.descriptor, demand);
+            let extraction = extracting.instrument(traces::stage("extract")).await?;
             self.metrics.observe_stages(extraction.times);
             let searching = Instant::now();
-            match self.maps.search(&map, extraction.descriptor.clone(), k, mode).await {
+            let search = self.maps.search(&map, extraction.descriptor.clone(), k, mode);
+            match search.instrument(traces::stage("search")).await {
                 // The frame's descriptor is of the model that the map had a moment ago.
                 Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
                 found => {

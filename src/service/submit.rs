@@ -13,7 +13,7 @@ use super::{ErrorKind, Service, ServiceError};
 use crate::domain::{Candidate, DenseFeatures, Descriptor, Digest, Job, Map, MediaType, Priority};
 use crate::refine::DenseKey;
 use crate::store::{JobRecord, Query, StoreError};
-use crate::telemetry::RefusedFor;
+use crate::telemetry::{RefusedFor, traces};
 
 /// Why an answer has no job, although one was asked for.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -105,11 +105,14 @@ impl Service {
         };
         let key = DenseKey { model: frame.model, picture: query.digest };
         self.dense.insert(key, Arc::new(frame.dense));
+        let trace = traces::current();
         let job = Job {
             priority,
+            trace_id: trace.as_ref().map(|(_, id)| id.clone()),
             ..Job::queued(map.name.clone(), query.id, refiner.kind(), query.created_at)
         };
         let record = JobRecord {
+            traceparent: trace.map(|(traceparent, _)| traceparent),
             job: job.clone(),
             map_uid: map.uid,
             revision: map.revision,

@@ -301,6 +301,9 @@ pub struct JobRecord {
     /// How often a worker has claimed it, whatever became of that.
     #[serde(default)]
     pub claims: u32,
+    /// The trace of its request, for the span of its refinement (W3C Trace Context).
+    #[serde(default)]
+    pub traceparent: Option<String>,
 }
 
 /// The right of one worker to a job, which ends when the job is cancelled, or when its lease runs out

@@ -148,7 +148,8 @@ impl Server {
             .model(Some(model));
         let mut config = Config::load(None, &flags)?;
         "warn".clone_into(&mut config.log.filter);
-        let troubles = telemetry::init_logs(&config.log).map_err(anyhow::Error::msg)?;
+        let (troubles, _traces) =
+            telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
         let listener = TcpListener::bind(config.server.listen).await?;
         let (announce, ready) = oneshot::channel();
         let shutdown = CancellationToken::new();

@@ -10,6 +10,7 @@ use reqwest::header::{
 };
 use reqwest::{Response, StatusCode, Url, redirect};
 use tokio::sync::Semaphore;
+use tracing::Instrument;
 
 use super::breaker::Breaker;
 use super::rate::RateLimiter;
@@ -18,6 +19,7 @@ use super::secret::Secret;
 use super::settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError};
 use super::wire::{ChatAnswer, ChatRequest, ErrorAnswer, Message, Reply, Schema};
 use crate::store::Buckets;
+use crate::telemetry::traces;
 
 /// What is read of a refusal, in bytes, and what is told of it, in characters.
 const REFUSAL_BYTES: usize = 64 << 10;
@@ -134,7 +136,11 @@ impl MllmClient {
         let admission = self.breaker.admit().await.map_err(Failure::Open)?;
         let most = call.prompt_tokens + self.max_tokens();
         self.rate.take(most).await;
-        let outcome = self.exchange(call).await;
+        let what = if call.schema.is_some() { "reason" } else { "describe" };
+        let span = traces::model_call(call.model, what);
+        let outcome = self.exchange(call).instrument(span.clone()).await;
+        let tokens = outcome.as_ref().map(|a| (a.prompt_tokens, a.completion_tokens));
+        traces::model_answered(&span, tokens.map_err(|failure| format!("{failure:?}")));
         match &outcome {
             Err(failure) if failure.is_the_servers() => admission.failed(),
             _ => admission.succeeded(),

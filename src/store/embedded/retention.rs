@@ -120,7 +120,15 @@ mod tests {
             Query { id, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
         let job = Job::queued("m".parse().unwrap(), id, RefinerKind::Local, now);
         let (map_uid, candidates) = (Uuid::nil(), vec![]);
-        let record = JobRecord { job, map_uid, revision: 0, query, candidates, claims: 0 };
+        let record = JobRecord {
+            job,
+            map_uid,
+            revision: 0,
+            query,
+            candidates,
+            claims: 0,
+            traceparent: None,
+        };
         let id = record.job.id;
         let _pin = store.put_blob(digest, Bytes::from_static(frame.as_bytes())).await.unwrap();
         store.submit(record, 100).await.unwrap();

@@ -277,7 +277,7 @@ mod tests {
             let job = Job::queued("m".parse().unwrap(), id, RefinerKind::Local, now);
             let job = Job { state, finished_at: state.is_final().then_some(now), ..job };
             let (map_uid, candidates) = (Uuid::nil(), vec![]);
-            JobRecord { job, map_uid, revision: 0, query, candidates, claims: 0 }
+            JobRecord { job, map_uid, revision: 0, query, candidates, claims: 0, traceparent: None }
         };
         let (waiting, ended) = (record(JobState::Running), record(JobState::Failed));
         let trees = Trees::open(&dir.path().join("db"), 1 << 20).unwrap();

@@ -147,6 +147,7 @@ impl Shelf {
             query,
             candidates: (0..candidates).map(candidate).collect(),
             claims: 0,
+            traceparent: None,
         }
     }
 }

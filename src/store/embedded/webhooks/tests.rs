@@ -37,7 +37,8 @@ async fn ended(store: &EmbeddedStore, map: &str, state: JobState) -> Uuid {
         Query { id, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
     let job = Job::queued(map.parse().unwrap(), id, RefinerKind::Local, now);
     let (map_uid, candidates) = (Uuid::nil(), vec![]);
-    let record = JobRecord { job, map_uid, revision: 0, query, candidates, claims: 0 };
+    let record =
+        JobRecord { job, map_uid, revision: 0, query, candidates, claims: 0, traceparent: None };
     store.submit(record, 100).await.unwrap();
     end(store, state).await
 }
