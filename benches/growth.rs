@@ -187,6 +187,7 @@ async fn one_job(store: &EmbeddedStore) -> Vec<f64> {
             text: "The same sign over the same door, three windows to its left. ".repeat(6),
             cached: false,
             stands_in: None,
+            took_ms: None,
             usage: Usage::default(),
         };
         let step = Step { usage: Usage::default(), description: Some(description) };

@@ -137,6 +137,8 @@ class RealServer(unittest.TestCase):
         self.assertEqual(job.ranking[0].image_id, "place-0002.jpg")
         self.assertEqual(job.estimate.pose, first.pose)
         self.assertGreaterEqual(job.finished_at, job.created_at)
+        self.assertTrue(all(description.took_ms is not None for description in job.descriptions))
+        self.assertIsNone(job.reasoning_took_ms)
 
     def test_refined_frames_from_near_by_are_at_their_places(self) -> None:
         for number in range(PLACES):

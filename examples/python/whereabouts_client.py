@@ -283,6 +283,8 @@ class Description:
     cached: bool
     usage: Usage
     stands_in: StandIn | None = None
+    took_ms: int | None = None
+    """Milliseconds that the model took to write it; None for a text that was known."""
 
 
 @dataclass(frozen=True)
@@ -315,6 +317,8 @@ class Job:
     ranking: tuple[RankedCandidate, ...] | None = None
     """The refined order, once there is one. The server may compare more candidates than it answered."""
     reasoning: str | None = None
+    reasoning_took_ms: int | None = None
+    """Milliseconds that the call took which ordered the candidates, if there was one."""
     estimate: Estimate | None = None
     """Where the frame was probably taken, by the refined order."""
     error: str | None = None

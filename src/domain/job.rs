@@ -91,6 +91,11 @@ pub struct Description {
     #[serde(default)]
     #[schema(nullable)]
     pub stands_in: Option<StandIn>,
+    /// Milliseconds that the model took to write it: of `mllm`, from the request that was answered to
+    /// the end of its answer, without waiting for a turn and without earlier tries; of `local`, which
+    /// compares all pairs together, an equal share of that. Null for a text that was known.
+    #[serde(default)]
+    pub took_ms: Option<u64>,
     /// What it cost.
     pub usage: Usage,
 }
@@ -189,6 +194,10 @@ pub struct Job {
     pub ranking: Option<Ranking>,
     /// Why the ranking is as it is.
     pub reasoning: Option<String>,
+    /// Milliseconds that the call took which ordered the candidates, counted as those of a description.
+    /// Null if there was no such call; `local` makes none.
+    #[serde(default)]
+    pub reasoning_took_ms: Option<u64>,
     /// Where the frame was probably taken, by the refined order, once there is one.
     #[serde(default)]
     #[schema(nullable)]
@@ -225,6 +234,7 @@ impl Job {
             descriptions: Vec::new(),
             ranking: None,
             reasoning: None,
+            reasoning_took_ms: None,
             estimate: None,
             usage: Usage::default(),
             error: None,

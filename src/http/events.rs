@@ -5,7 +5,7 @@ use std::time::Duration;
 use axum::Extension;
 use axum::extract::State;
 use axum::response::sse::{Event, KeepAlive, Sse};
-use futures_util::{Stream, StreamExt};
+use futures_util::{Stream, StreamExt, stream};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -61,7 +61,8 @@ pub(super) struct FollowParams {
 ///
 /// Server-sent events, from now on and without an end: `job` with a `JobChange` whenever a job has come
 /// further or has ended, and `missed` with a `Missed` when changes came faster than they were taken. Ask
-/// for the list of jobs after the stream is open, and again after `missed`.
+/// for the list of jobs after the stream is open, and again after `missed`. A comment comes at once, by which
+/// clients that wait for the first bytes know that it is.
 #[utoipa::path(get, path = "/events", tag = "jobs", params(FollowParams), responses(
     (status = 200, body = String, content_type = "text/event-stream"),
     (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
@@ -82,7 +83,8 @@ pub(super) async fn follow_jobs(
             AnyJobEvent::Missed(missed) => Event::default().event("missed").json_data(missed),
         }
     });
-    Ok(streamed(events, service.over(&state.door, caller, Deadline::default())))
+    let opened = stream::once(async { Ok(Event::default().comment("open")) });
+    Ok(streamed(opened.chain(events), service.over(&state.door, caller, Deadline::default())))
 }
 
 /// Sends events until they end, the server drains, or the caller may ask no more. A drain does not wait for

@@ -1,12 +1,15 @@
 //! The refiner `local`: fetches what the matcher needs, and turns its findings into a ranking.
 
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
 use bytes::Bytes;
 
 use super::local::{LocalMatcher, Match, PairMatch, describe, rank};
-use super::{DenseCache, DenseKey, PairRegion, Progress, RefineError, Refinement, Refiner};
+use super::{
+    DenseCache, DenseKey, PairRegion, Progress, RefineError, Refinement, Refiner, milliseconds,
+};
 use crate::domain::{
     Candidate, DenseFeatures, Description, DescriptorKind, Digest, Evidence, ImageId, Map, Ranking,
     RefinerKind, Usage,
@@ -47,8 +50,8 @@ impl Refiner for LocalRefiner {
         record: &JobRecord,
         _: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        let Compared { present, pairs } = self.compared_of(record).await?;
-        conclude(&record.candidates, &present, &pairs)
+        let compared = self.compared_of(record).await?;
+        conclude(&record.candidates, &compared)
     }
 
     async fn regions(
@@ -57,7 +60,7 @@ impl Refiner for LocalRefiner {
         image: &ImageId,
     ) -> Result<Option<Vec<PairRegion>>, RefineError> {
         // Beside the others, as it was compared: what speaks for it depends on them.
-        let Compared { present, pairs } = self.compared_of(record).await?;
+        let Compared { present, pairs, .. } = self.compared_of(record).await?;
         let of = present.iter().position(|&index| record.candidates[index].image_id == *image);
         let matches = of.and_then(|of| pairs.into_iter().nth(of)).map(|pair| pair.matches);
         let region = |found: Match| PairRegion {
@@ -88,6 +91,8 @@ struct Compared {
     present: Vec<usize>,
     /// What they have in common with the query.
     pairs: Vec<PairMatch>,
+    /// How long comparing them took, without getting their features.
+    took: Duration,
 }
 
 impl LocalRefiner {
@@ -123,12 +128,12 @@ impl LocalRefiner {
             }
         }
         let (dense, matcher) = (Arc::clone(&self.dense), self.matcher.clone());
-        let pairs = self
+        let (pairs, took) = self
             .pool
             .run(move || compare(&extractor, &dense, &matcher, query, sources))
             .await
             .map_err(|error| RefineError::Passing(error.to_string()))??;
-        Ok(Compared { present, pairs })
+        Ok(Compared { present, pairs, took })
     }
 
     async fn candidate_source(
@@ -162,14 +167,14 @@ fn no_model(error: ModelError) -> RefineError {
     }
 }
 
-/// Extracts what is missing and compares; blocks.
+/// Extracts what is missing and compares, and says how long the comparison took; blocks.
 fn compare(
     extractor: &Extractor,
     dense: &DenseCache,
     matcher: &LocalMatcher,
     query: Source,
     candidates: Vec<Source>,
-) -> Result<Vec<PairMatch>, RefineError> {
+) -> Result<(Vec<PairMatch>, Duration), RefineError> {
     let features = |source: Source| match source {
         Source::Dense(features) => Ok(features),
         Source::Bytes(key, bytes) => {
@@ -185,21 +190,21 @@ fn compare(
     let candidates =
         candidates.into_iter().map(features).collect::<Result<Vec<_>, RefineError>>()?;
     let candidates: Vec<&DenseFeatures> = candidates.iter().map(AsRef::as_ref).collect();
-    matcher
+    let began = Instant::now();
+    let pairs = matcher
         .compare_all(&query, &candidates)
-        .map_err(|error| RefineError::Hopeless(error.to_string()))
+        .map_err(|error| RefineError::Hopeless(error.to_string()))?;
+    Ok((pairs, began.elapsed()))
 }
 
 /// Orders those that could be compared, and puts those that are gone behind them.
-fn conclude(
-    candidates: &[Candidate],
-    present: &[usize],
-    pairs: &[PairMatch],
-) -> Result<Refinement, RefineError> {
+fn conclude(candidates: &[Candidate], compared: &Compared) -> Result<Refinement, RefineError> {
+    let Compared { present, pairs, took } = compared;
+    let share = u32::try_from(pairs.len()).ok().and_then(|pairs| took.checked_div(pairs));
     let places = rank(pairs);
-    let compared: Vec<usize> = places.iter().map(|&place| present[place]).collect();
+    let ordered: Vec<usize> = places.iter().map(|&place| present[place]).collect();
     let gone = (0..candidates.len()).filter(|index| !present.contains(index));
-    let order: Vec<usize> = compared.iter().copied().chain(gone).collect();
+    let order: Vec<usize> = ordered.iter().copied().chain(gone).collect();
     let ranking = Ranking::new(candidates, &order)
         .map_err(|error| RefineError::Hopeless(error.to_string()))?;
     let missing = candidates.len() - present.len();
@@ -212,10 +217,12 @@ fn conclude(
                 text: describe(pair),
                 cached: false,
                 stands_in: None,
+                took_ms: share.map(milliseconds),
                 usage: Usage::default(),
             })
             .collect(),
-        reasoning: reasoning(candidates, present, pairs, &compared),
+        reasoning: reasoning(candidates, present, pairs, &ordered),
+        reasoning_took_ms: None,
         evidence: places.first().and_then(|&first| agreement(pairs, first)),
         ranking,
         usage: Usage::default(),

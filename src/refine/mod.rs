@@ -96,10 +96,17 @@ pub struct Refinement {
     pub evidence: Option<Evidence>,
     /// Why it is so.
     pub reasoning: Option<String>,
+    /// Milliseconds that the call took which gave the order, if there was one.
+    pub reasoning_took_ms: Option<u64>,
     /// What this attempt cost.
     pub usage: Usage,
     /// Why part of the order is the coarse one, if it is.
     pub degraded: Option<String>,
+}
+
+/// A time as jobs tell it.
+fn milliseconds(took: Duration) -> u64 {
+    u64::try_from(took.as_millis()).unwrap_or(u64::MAX)
 }
 
 /// Why there is no refinement.

@@ -239,6 +239,7 @@ fn after(pause: Duration) -> Timestamp {
 
 fn succeeded(job: Job, refinement: Refinement, estimate: Option<Estimate>) -> Job {
     let Refinement { descriptions, ranking, reasoning, usage, degraded, .. } = refinement;
+    let reasoning_took_ms = refinement.reasoning_took_ms;
     Job {
         state: if degraded.is_some() { JobState::Degraded } else { JobState::Succeeded },
         finished_at: Some(Timestamp::now()),
@@ -246,6 +247,7 @@ fn succeeded(job: Job, refinement: Refinement, estimate: Option<Estimate>) -> Jo
         ranking: Some(ranking),
         estimate,
         reasoning,
+        reasoning_took_ms,
         usage: job.usage + usage,
         error: degraded,
         ..job

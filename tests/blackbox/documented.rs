@@ -76,8 +76,9 @@ async fn beginning(mut response: Response, is_stream: bool) -> String {
     let wait = Duration::from_secs(30);
     while let Some(chunk) = tokio::time::timeout(wait, response.chunk()).await.unwrap().unwrap() {
         text += std::str::from_utf8(&chunk).unwrap();
-        if is_stream && let Some(end) = text.find("\n\n") {
-            return text[..end].to_owned();
+        let events = || text.split_inclusive("\n\n").filter(|event| event.ends_with("\n\n"));
+        if is_stream && let Some(event) = events().find(|event| !event.starts_with(':')) {
+            return event.trim_end().to_owned();
         }
     }
     let lines = text.split_inclusive('\n');

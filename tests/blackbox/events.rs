@@ -98,7 +98,10 @@ async fn all_jobs_are_followed_and_those_of_a_map() {
     server.town("m", 3).await;
     server.town("n", 3).await;
     let follow = async |path: &str| server.request(Method::GET, path).send().await.unwrap();
-    let (all, of_map) = (follow("/events").await, follow("/events?map=m").await);
+    let (mut all, of_map) = (follow("/events").await, follow("/events?map=m").await);
+    // Browsers hand a stream to the page with its first bytes.
+    let opened = tokio::time::timeout(Duration::from_secs(5), all.chunk()).await;
+    assert!(opened.unwrap().unwrap().unwrap().starts_with(b": open"));
     let mut expected = Vec::new();
     for map in ["m", "n", "m"] {
         let path = format!("/localize?map={map}");

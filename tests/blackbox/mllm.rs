@@ -53,6 +53,9 @@ async fn a_job_of_ten_candidates_makes_eleven_calls_and_a_repeat_makes_one() {
     assert_eq!((mock.describe_calls(), mock.reason_calls()), (10, 2));
     assert_eq!(again["usage"]["cached"], 10);
     assert!(again["descriptions"].as_array().unwrap().iter().all(|d| d["cached"] == true));
+    assert!(job["descriptions"].as_array().unwrap().iter().all(|d| d["took_ms"].is_u64()));
+    assert!(again["descriptions"].as_array().unwrap().iter().all(|d| d["took_ms"].is_null()));
+    assert!(job["reasoning_took_ms"].is_u64() && again["reasoning_took_ms"].is_u64());
     assert!(!server.log().contains("sk-secret-of-the-test"));
 }
 

@@ -147,14 +147,14 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
     const described = job.descriptions.reduce((sum, one) => sum + one.usage.calls, 0);
     const row = (name, what, usage, took) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, what),
       h("td", { class: "num" }, count(usage.prompt_tokens)), h("td", { class: "num" }, count(usage.completion_tokens)),
-      h("td", { class: "num" }, took === undefined || took === null ? "–" : duration(took)));
+      h("td", { class: "num" }, took === null ? "–" : duration(took)));
     const rest = (field) => Math.max(0, job.usage[field] - job.descriptions.reduce((sum, one) => sum + one.usage[field], 0));
     fill(calls, h("section", { class: "card" }, h("h2", {}, "Calls"),
       h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Calls" }, h("table", { class: "calls" },
         h("thead", {}, h("tr", {}, ["Call", "How", "Tokens sent", "received", "Took"].map((name) => h("th", { scope: "col" }, name)))),
         h("tbody", {}, job.descriptions.map((one) => row(one.image_id, bought(one), one.usage, one.took_ms)),
           job.usage.calls > described && row("Ranking and repeats", plural(job.usage.calls - described, "call"),
-            { prompt_tokens: rest("prompt_tokens"), completion_tokens: rest("completion_tokens") })))),
+            { prompt_tokens: rest("prompt_tokens"), completion_tokens: rest("completion_tokens") }, job.reasoning_took_ms)))),
       job.usage.estimated > 0 && h("p", { class: "muted small" }, `The tokens of ${plural(job.usage.estimated, "call")} are estimated: the model's server did not count them.`)));
   }
 

@@ -2,7 +2,7 @@
 
 import { address, call, contentOf, frameOf, isAbort, picture } from "./api.js";
 import { fill, h } from "./dom.js";
-import { cost, count, plural } from "./format.js";
+import { cost, count, duration, plural } from "./format.js";
 import { apart } from "./words.js";
 
 const EDGE = 1024;
@@ -123,7 +123,7 @@ export function words(description) {
     found && h("div", { class: "apart" }, list("agree", "Agrees", found.agree), list("differ", "Differs", found.differ)),
     found?.view && h("p", { class: "muted" }, found.view),
     found ? h("details", {}, h("summary", {}, "The whole text"), whole(description.text)) : whole(description.text),
-    h("p", { class: "muted small" }, bought(description)));
+    h("p", { class: "muted small" }, bought(description), description.took_ms !== null && ` · took ${duration(description.took_ms)}`));
 }
 
 /** Whether a description was bought, and for how much. */

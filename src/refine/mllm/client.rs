@@ -1,7 +1,7 @@
 //! The client of one MLLM server: what to send, how long to wait, how often to try.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::{Bytes, BytesMut};
 use jiff::Timestamp;
@@ -51,6 +51,8 @@ pub struct Answer {
     pub completion_tokens: u64,
     /// Whether the tokens are a guess, because the server does not count them.
     pub estimated: bool,
+    /// From sending the request to the end of the answer.
+    pub took: Duration,
 }
 
 /// Talks to one server, within its limits.
@@ -167,10 +169,11 @@ impl MllmClient {
     async fn send(&self, call: &Call<'_>, schema: Option<&Schema>) -> Result<Answer, Failure> {
         let body = self.body(call, schema)?;
         let request = self.http.post(self.url.clone()).headers(self.headers.clone()).body(body);
+        let began = Instant::now();
         let exchange = async {
             let response = request.send().await.map_err(|error| self.broken(error))?;
             if response.status().is_success() {
-                self.read_answer(call, response).await
+                self.read_answer(call, response, began).await
             } else {
                 Err(self.read_refusal(response, schema.is_some()).await)
             }
@@ -194,7 +197,12 @@ impl MllmClient {
         .map_err(|error| Failure::Refused(format!("the request cannot be written: {error}")))
     }
 
-    async fn read_answer(&self, call: &Call<'_>, response: Response) -> Result<Answer, Failure> {
+    async fn read_answer(
+        &self,
+        call: &Call<'_>,
+        response: Response,
+        began: Instant,
+    ) -> Result<Answer, Failure> {
         let broken = |why: String| Failure::Broken { why, retry_after: None };
         let body = match self.read(response, self.answer_max_bytes).await? {
             (body, false) => body,
@@ -208,7 +216,7 @@ impl MllmClient {
         };
         let answer: ChatAnswer = serde_json::from_slice(&body)
             .map_err(|error| broken(format!("the answer is not a chat completion: {error}")))?;
-        Ok(answered(answer.into(), call.prompt_tokens))
+        Ok(answered(answer.into(), call.prompt_tokens, began.elapsed()))
     }
 
     async fn read_refusal(&self, response: Response, structured: bool) -> Failure {
@@ -271,7 +279,7 @@ impl MllmClient {
 }
 
 /// The tokens are those that the server counted, or else a guess.
-fn answered(reply: Reply, prompt_tokens: u64) -> Answer {
+fn answered(reply: Reply, prompt_tokens: u64, took: Duration) -> Answer {
     let Reply { text, cut, usage } = reply;
     let guess = estimate_tokens(&text);
     Answer {
@@ -280,6 +288,7 @@ fn answered(reply: Reply, prompt_tokens: u64) -> Answer {
         estimated: usage.is_none(),
         text,
         cut,
+        took,
     }
 }
 
@@ -377,7 +386,8 @@ mod tests {
 
     #[test]
     fn tokens_are_guessed_where_the_server_does_not_count() {
-        let answer = answered(Reply { text: "abcdefgh".into(), ..Reply::default() }, 50);
+        let reply = Reply { text: "abcdefgh".into(), ..Reply::default() };
+        let answer = answered(reply, 50, Duration::ZERO);
         assert_eq!((answer.prompt_tokens, answer.completion_tokens), (50, 2));
         assert!(answer.estimated);
     }

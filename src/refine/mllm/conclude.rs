@@ -1,10 +1,12 @@
 //! From what was found to a refinement: whatever failed, every candidate has its place.
 
 use super::describe::{Findings, Work};
+use super::rank::Ranked;
 use super::reason::Verdict;
 use super::retry::CallError;
 use super::{RefineError, Refinement};
 use crate::domain::Ranking;
+use crate::refine::milliseconds;
 
 /// Orders the candidates: those that could be compared as the model says, the others behind them in
 /// coarse order. Without a verdict, all are in coarse order. `ranked` is `None` if there was nothing
@@ -12,12 +14,12 @@ use crate::domain::Ranking;
 pub(super) fn conclude(
     work: &Work<'_>,
     findings: Findings,
-    ranked: Option<Result<Verdict, CallError>>,
+    ranked: Option<Result<Ranked, CallError>>,
 ) -> Result<Refinement, RefineError> {
     let candidates = &work.record.candidates;
     let degraded = shortfalls(candidates.len(), &findings, ranked.as_ref());
-    let verdict = ranked.and_then(Result::ok);
-    let mut order = verdict.as_ref().map_or(Vec::new(), |verdict| verdict.order.clone());
+    let ranked = ranked.and_then(Result::ok);
+    let mut order = ranked.as_ref().map_or(Vec::new(), |ranked| ranked.verdict.order.clone());
     let behind: Vec<usize> = (0..candidates.len()).filter(|index| !order.contains(index)).collect();
     order.extend(behind);
     let ranking = Ranking::new(candidates, &order)
@@ -26,7 +28,8 @@ pub(super) fn conclude(
         descriptions: findings.described.iter().map(|pair| pair.of(candidates)).collect(),
         ranking,
         evidence: None,
-        reasoning: verdict.map(|verdict| verdict.reasoning),
+        reasoning_took_ms: ranked.as_ref().map(|ranked| milliseconds(ranked.took)),
+        reasoning: ranked.map(|ranked| ranked.verdict.reasoning),
         usage: work.usage(),
         degraded: (!degraded.is_empty()).then(|| degraded.join("; ")),
     })
@@ -36,7 +39,7 @@ pub(super) fn conclude(
 fn shortfalls(
     candidates: usize,
     findings: &Findings,
-    ranked: Option<&Result<Verdict, CallError>>,
+    ranked: Option<&Result<Ranked, CallError>>,
 ) -> Vec<String> {
     let Findings { described, failed } = findings;
     let mut found = Vec::new();
@@ -48,7 +51,7 @@ fn shortfalls(
         let count = failed.len();
         found.push(format!("{count} of {candidates} pairs could not be described: {error}"));
     }
-    match ranked {
+    match ranked.map(|ranked| ranked.as_ref().map(|ranked| &ranked.verdict)) {
         Some(Ok(Verdict { left_out: 0, .. })) | None => {}
         Some(Ok(Verdict { left_out, .. })) => {
             found.push(format!("the model's ranking left out {left_out} candidates"));

@@ -20,6 +20,7 @@ use super::{MllmRefiner, Progress, RefineError};
 use crate::domain::{
     Candidate, Description, Descriptor, Digest, Map, Scene, StandIn, Usage, utc_day,
 };
+use crate::refine::milliseconds;
 use crate::store::{JobRecord, Step, StoreError};
 use crate::telemetry::CacheLookup;
 
@@ -60,6 +61,8 @@ pub(super) struct Pair {
 pub(super) struct Found {
     description: CachedDescription,
     stands_in: Option<StandIn>,
+    /// How long the call took, if it was just made.
+    took: Option<Duration>,
 }
 
 /// A pair in words.
@@ -72,6 +75,8 @@ pub(super) struct Described {
     pub cached: bool,
     /// The frame it is of, if that is an earlier one.
     pub stands_in: Option<StandIn>,
+    /// How long the call took, if this job made it.
+    pub took: Option<Duration>,
     /// What it cost this job.
     pub usage: Usage,
 }
@@ -84,6 +89,7 @@ impl Described {
             text: self.text.clone(),
             cached: self.cached,
             stands_in: self.stands_in,
+            took_ms: self.took.map(milliseconds),
             usage: self.usage,
         }
     }
@@ -123,13 +129,14 @@ impl<'a> Work<'a> {
 
     /// Takes a description into the account; what was bought is charged when it is answered.
     fn take(&self, index: usize, found: Found, cached: bool) -> Described {
-        let Found { description: CachedDescription { text, usage, .. }, stands_in } = found;
+        let Found { description: CachedDescription { text, usage, .. }, stands_in, took } = found;
         let known = Usage { cached: 1, ..Usage::default() };
         if cached {
             self.charge(known);
         }
         let usage = if cached { known } else { usage };
-        Described { index, text, cached, stands_in, usage }
+        let took = took.filter(|_| !cached);
+        Described { index, text, cached, stands_in, took, usage }
     }
 
     fn charge(&self, cost: Usage) {
@@ -261,26 +268,27 @@ impl MllmRefiner {
     ) -> Result<Found, CallError> {
         if let Some(description) = self.cache.description(&pair.key).await.map_err(passing)? {
             self.metrics.description_lookup(CacheLookup::Hit);
-            return Ok(Found { description, stands_in: None });
+            return Ok(Found { description, stands_in: None, took: None });
         }
         for frame in &work.similar {
             let key = self.key(&frame.digest, &pair.digest, work.scene);
             if let Some(description) = self.cache.description(&key).await.map_err(passing)? {
                 self.metrics.description_lookup(CacheLookup::Similar);
-                return Ok(Found { description, stands_in: Some(frame.stand_in) });
+                let stands_in = Some(frame.stand_in);
+                return Ok(Found { description, stands_in, took: None });
             }
         }
         let _purchase = match self.purchase(&pair.key).await? {
             Ok(purchase) => purchase,
             Err(description) => {
                 self.metrics.description_lookup(CacheLookup::Hit);
-                return Ok(Found { description, stands_in: None });
+                return Ok(Found { description, stands_in: None, took: None });
             }
         };
         self.metrics.description_lookup(CacheLookup::Miss);
-        let description = self.buy(work, pair).await?;
+        let (description, took) = self.buy(work, pair).await?;
         bought.store(true, Ordering::Relaxed);
-        Ok(Found { description, stands_in: None })
+        Ok(Found { description, stands_in: None, took: Some(took) })
     }
 
     /// The right to buy a description; or the description, if another process was buying it.
@@ -303,7 +311,11 @@ impl MllmRefiner {
         }
     }
 
-    async fn buy(&self, work: &Work<'_>, pair: &Pair) -> Result<CachedDescription, CallError> {
+    async fn buy(
+        &self,
+        work: &Work<'_>,
+        pair: &Pair,
+    ) -> Result<(CachedDescription, Duration), CallError> {
         let frame = || self.pictures.picture(&work.record.query.digest);
         let frame = work.frame.get_or_try_init(frame).await?;
         let candidate = self.pictures.picture(&pair.digest).await?;
@@ -325,7 +337,7 @@ impl MllmRefiner {
         }
         let description = CachedDescription { text, usage, created_at: Timestamp::now() };
         self.keep(work, usage, Some((pair.key, description.clone()))).await;
-        Ok(description)
+        Ok((description, answer.took))
     }
 
     /// Writes down what was paid, and what for, on a task of its own: a job that is cancelled in this

@@ -1,5 +1,7 @@
 //! One call over all descriptions, and one more if its answer cannot be used.
 
+use std::time::Duration;
+
 use super::MllmRefiner;
 use super::client::{Answer, Call, estimate_tokens};
 use super::describe::{Described, Work, cost_of};
@@ -10,32 +12,40 @@ use super::wire::Message;
 use crate::domain::Digest;
 use crate::store::Step;
 
+/// An order of the candidates, and how long the call took which gave it.
+pub(super) struct Ranked {
+    pub verdict: Verdict,
+    pub took: Duration,
+}
+
 impl MllmRefiner {
     /// Orders the described candidates by what was written about them.
     pub(super) async fn rank(
         &self,
         work: &Work<'_>,
         described: &[Described],
-    ) -> Result<Verdict, CallError> {
+    ) -> Result<Ranked, CallError> {
         let candidates = described.iter().map(|described| described.index).collect();
         let job = work.record.job.id;
         let labels = Labels::new(candidates, self.settings.hide_coarse_rank.then_some(job));
         let mut talk = vec![Message::user(self.reasoning_prompt(work, described, &labels))];
         let first = self.ask(work, &labels, &talk).await?;
-        let verdict = match read(&labels, &first) {
-            Ok(verdict) => verdict,
+        let (verdict, took) = match read(&labels, &first) {
+            Ok(verdict) => (verdict, first.took),
             Err(why) => {
                 tracing::info!(%job, why, "the reasoning model is asked to repair its answer");
                 let names: Vec<&str> = labels.iter().map(|(label, _)| label).collect();
                 talk.push(Message::assistant(self.quoted(&first)));
                 talk.push(Message::user(prompts::repair(&why, &names)));
                 let second = self.ask(work, &labels, &talk).await?;
-                read(&labels, &second).map_err(|why| {
+                let verdict = read(&labels, &second).map_err(|why| {
                     CallError::Hopeless(format!("the reasoning model gave no ranking twice: {why}"))
-                })?
+                })?;
+                (verdict, second.took)
             }
         };
-        Ok(Verdict { reasoning: self.explained(work, &labels, &verdict.reasoning), ..verdict })
+        let reasoning = self.explained(work, &labels, &verdict.reasoning);
+        Ok(Ranked { verdict: Verdict { reasoning, ..verdict }, took })
     }
 
     fn reasoning_prompt(

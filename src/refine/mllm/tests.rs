@@ -55,6 +55,21 @@ async fn a_repeat_asks_for_no_description() {
 }
 
 #[tokio::test]
+async fn each_call_that_was_made_tells_how_long_it_took_and_what_was_known_does_not() {
+    let script = Script { latency: Duration::from_millis(40), ..Script::default() };
+    // Waiting for a turn does not count: all calls but the first wait for others here.
+    let bench = Bench::with(script, |settings| settings.concurrency = 1).await;
+    let bought = bench.refine(4).await.unwrap();
+    let took: Vec<u64> = bought.descriptions.iter().filter_map(|pair| pair.took_ms).collect();
+    assert_eq!(took.len(), 4);
+    assert!(took.iter().all(|&ms| ms >= 40) && took.iter().any(|&ms| ms < 120), "{took:?}");
+    assert!(bought.reasoning_took_ms.unwrap() >= 40);
+    let known = bench.refine(4).await.unwrap();
+    assert!(known.descriptions.iter().all(|pair| pair.took_ms.is_none()));
+    assert!(known.reasoning_took_ms.unwrap() >= 40);
+}
+
+#[tokio::test]
 async fn each_step_is_told_with_its_cost() {
     let bench = Bench::new(Script::default()).await;
     for known in [0, 4] {
@@ -107,10 +122,13 @@ async fn the_descriptions_of_a_similar_frame_stand_in() {
 async fn jobs_that_need_the_same_pairs_at_once_share_the_calls() {
     let bench = Bench::new(Script::default()).await;
     let (one, two) = tokio::join!(bench.refine(4), bench.refine(4));
+    let (one, two) = (one.unwrap(), two.unwrap());
     assert_eq!(bench.mock.describe_calls(), 4);
     assert_eq!(bench.mock.asked_again(), 0);
-    let calls = one.unwrap().usage.calls + two.unwrap().usage.calls;
-    assert_eq!(calls, 4 + 2);
+    assert_eq!(one.usage.calls + two.usage.calls, 4 + 2);
+    let timed = one.descriptions.iter().chain(&two.descriptions);
+    assert!(timed.clone().all(|pair| pair.took_ms.is_some() != pair.cached));
+    assert_eq!(timed.filter(|pair| pair.took_ms.is_some()).count(), 4);
 }
 
 #[tokio::test]

@@ -25,6 +25,7 @@ impl Refiner for Reverse {
             ranking: Ranking::new(&record.candidates, &order).unwrap(),
             evidence: None,
             reasoning: None,
+            reasoning_took_ms: None,
             usage: Usage::default(),
             degraded: None,
         })
