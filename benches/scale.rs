@@ -17,17 +17,22 @@ use sqlx::postgres::{PgConnection, PgPoolCopyExt};
 use sqlx::{AssertSqlSafe, Connection, PgPool};
 use uuid::Uuid;
 use whereabouts::domain::{
-    Descriptor, DescriptorKind, Digest, Frame, Image, Map, MediaType, Precision, Scene,
+    Description, Descriptor, DescriptorKind, Digest, Frame, Image, Job, JobState, Map, MediaType,
+    Precision, RefinerKind, Scene, Usage,
 };
 use whereabouts::retrieve::index::{IndexSettings, MapIndex, SearchMode};
 use whereabouts::store::postgres::{PostgresSettings, PostgresStore, migrate};
-use whereabouts::store::{DescriptionBounds, MapStore, Objects};
+use whereabouts::store::{
+    BlobStore, DescriptionBounds, JobRecord, JobStore, MapStore, Objects, Query, Step,
+};
 
 use self::vectors::{DIM, Rows, clustered, recall};
 
 const QUERIES: usize = 500;
 const K: usize = 10;
 const CALLERS: usize = 8;
+const JOBS: usize = 50;
+const STEPS: usize = 10;
 const INDEX: IndexSettings = IndexSettings {
     exact_up_to: 1000,
     m: 16,
@@ -145,6 +150,13 @@ async fn in_postgres(
         ms(percentile(took, 0.99)),
         ms(median(exact.into_iter().map(|(took, _)| took).collect()))
     );
+    let start = Instant::now();
+    let jobs = futures_util::future::try_join_all((0..CALLERS).map(|_| jobs(&store, &map))).await?;
+    let jobs: usize = jobs.into_iter().sum();
+    println!(
+        "{size} in PostgreSQL: {:.0} jobs/s through the queue by {CALLERS} workers, {STEPS} steps each",
+        jobs as f64 / start.elapsed().as_secs_f64()
+    );
     pool.close().await;
     drop(store);
     let drop = format!("DROP DATABASE {database} WITH (FORCE)");
@@ -197,6 +209,45 @@ async fn fill(pool: &PgPool, map: &Map, rows: &Rows, size: usize) -> anyhow::Res
         sqlx::raw_sql(AssertSqlSafe(tidy)).execute(pool).await?;
     }
     Ok(())
+}
+
+/// Queues jobs, takes as many, writes their steps down and ends them; returns how many.
+async fn jobs(store: &PostgresStore, map: &Map) -> anyhow::Result<usize> {
+    let now = Timestamp::now();
+    let digest = Digest::of(b"frame");
+    let _pin = store.put_blob(digest, "frame".into()).await?;
+    for _ in 0..JOBS {
+        let id = Uuid::now_v7();
+        let query =
+            Query { id, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
+        let record = JobRecord {
+            job: Job::queued(map.name.clone(), id, RefinerKind::Mllm, now),
+            map_uid: map.uid,
+            revision: map.revision,
+            query,
+            candidates: Vec::new(),
+            claims: 0,
+            traceparent: None,
+        };
+        store.submit(record, usize::MAX / 2).await?;
+        let until = now + jiff::SignedDuration::from_mins(5);
+        let taken = store.claim(now, until).await?.context("the queue is empty")?;
+        for step in 0..STEPS {
+            let description = Description {
+                image_id: format!("image-{step}").parse()?,
+                text: "What agrees and what differs, in so many words. ".repeat(20),
+                cached: false,
+                stands_in: None,
+                took_ms: None,
+                usage: Usage::default(),
+            };
+            let step = Step { usage: Usage::default(), description: Some(description) };
+            store.progress(taken.claim(), step).await?;
+        }
+        let job = Job { state: JobState::Succeeded, finished_at: Some(now), ..taken.job.clone() };
+        store.finish(taken.claim(), job).await?;
+    }
+    Ok(JOBS)
 }
 
 /// One search after another: how long each took, and what it found.

@@ -48,5 +48,6 @@ mod service;
 mod slow_clients;
 mod smuggling;
 mod tls;
+mod traces;
 mod track;
 mod webhooks;
