@@ -3,10 +3,10 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino chromium test conformance console examples crash fuzz lint format bench load soak openapi clean
+.PHONY: help demo build assets nasm openvino chromium test conformance console console-bench examples crash fuzz lint format bench load soak openapi clean
 
 help: ## Say what can be made
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
 
 demo: build ## Set up, build, index a town, localize in it, refine, print what happened
 	$(BINARY) demo --out demo-out
@@ -40,6 +40,9 @@ conformance: build ## Hold the server against its own description with thousands
 
 console: build chromium ## Open the operator's console in a browser and use it
 	tests/console/check.sh $(BINARY) target/console-venv
+
+console-bench: build chromium ## Measure the first view of the console on a server with much to show
+	tests/console/first_view.sh $(BINARY) target/console-venv
 
 examples: build ## Check the clients, the calls in curl and the load tests against the service
 	examples/check.sh $(BINARY) target/examples-venv

@@ -359,6 +359,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             bulk: config.bulk,
         },
         matching: Semaphore::new(1),
+        searching: Semaphore::new(1),
     };
     let model = service.models.default_model();
     tracing::info!(model, %why, "the model of maps that name none");

@@ -1,6 +1,6 @@
 //! `whereabouts jobs`.
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use uuid::Uuid;
 
@@ -21,6 +21,9 @@ pub struct Args {
     /// Only jobs in this state
     #[arg(long, conflicts_with = "id")]
     state: Option<JobState>,
+    /// Only jobs that contain this text, such as the id of an image, or words of an error or of a description
+    #[arg(long, value_name = "TEXT", conflicts_with = "id")]
+    search: Option<String>,
     /// How many to list
     #[arg(long, default_value_t = 20, conflicts_with = "id")]
     limit: usize,
@@ -33,41 +36,65 @@ pub struct Args {
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let client = Client::new(&args.server)?;
-    let request = match args.id {
+    match args.id {
         Some(id) => {
             let wait = args.wait.map(|wait| ("wait", wait));
-            client.get(&format!("/jobs/{id}")).query(&Vec::from_iter(wait))
+            let request = client.get(&format!("/jobs/{id}")).query(&Vec::from_iter(wait));
+            let job: Value = client.json(request).await?;
+            match args.json {
+                true => println!("{job}"),
+                false => print_one(&serde_json::from_value(job)?),
+            }
         }
         None => {
-            let filters = [
-                args.map.as_ref().map(|map| ("map", map.to_string())),
-                args.state.map(|state| ("state", state.to_string())),
-                Some(("limit", args.limit.to_string())),
-            ];
-            client.get("/jobs").query(&filters.into_iter().flatten().collect::<Vec<_>>())
+            let page = list(&client, &args).await?;
+            match args.json {
+                true => println!("{}", serde_json::to_value(page)?),
+                false => print_list(page, args.search.is_some())?,
+            }
         }
-    };
-    let answer: Value = client.json(request).await?;
-    match (args.json, args.id) {
-        (true, _) => println!("{answer}"),
-        (false, Some(_)) => print_one(&serde_json::from_value(answer)?),
-        (false, None) => print_list(serde_json::from_value(answer)?),
     }
     Ok(())
 }
 
-#[derive(Deserialize)]
+#[derive(Serialize, Deserialize)]
 struct Page {
-    jobs: Vec<Job>,
+    jobs: Vec<Value>,
+    next_cursor: Option<Uuid>,
 }
 
-fn print_list(page: Page) {
-    if page.jobs.is_empty() {
-        println!("no jobs; POST /localize makes one");
+/// As many jobs as are wanted. A search comes in pages that may be short, before the last one too.
+async fn list(client: &Client, args: &Args) -> anyhow::Result<Page> {
+    let mut page = Page { jobs: Vec::new(), next_cursor: None };
+    loop {
+        let filters = [
+            args.map.as_ref().map(|map| ("map", map.to_string())),
+            args.state.map(|state| ("state", state.to_string())),
+            args.search.as_ref().map(|text| ("q", text.clone())),
+            Some(("limit", (args.limit - page.jobs.len()).to_string())),
+            page.next_cursor.map(|cursor| ("cursor", cursor.to_string())),
+        ];
+        let request = client.get("/jobs").query(&filters.into_iter().flatten().collect::<Vec<_>>());
+        let next: Page = client.json(request).await?;
+        page.next_cursor = next.next_cursor;
+        page.jobs.extend(next.jobs);
+        if page.next_cursor.is_none() || page.jobs.len() >= args.limit {
+            return Ok(page);
+        }
+    }
+}
+
+fn print_list(page: Page, searched: bool) -> anyhow::Result<()> {
+    match (page.jobs.is_empty(), searched) {
+        (true, true) => println!("no job contains that"),
+        (true, false) => println!("no jobs; POST /localize makes one"),
+        (false, _) => {}
     }
     for job in page.jobs {
+        let job: Job = serde_json::from_value(job)?;
         println!("{}  {:9}  {:5}  {}  {}", job.id, job.state, job.refiner, job.created_at, job.map);
     }
+    Ok(())
 }
 
 fn print_one(job: &Job) {

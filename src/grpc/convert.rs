@@ -271,6 +271,7 @@ impl From<Description> for proto::Description {
                 similarity: earlier.similarity,
             }),
             usage: Some(description.usage.into()),
+            took_ms: description.took_ms,
         }
     }
 }
@@ -301,6 +302,7 @@ impl From<Job> for proto::Job {
             descriptions: job.descriptions.into_iter().map(Into::into).collect(),
             ranking: ranking.iter().map(Into::into).collect(),
             reasoning: job.reasoning.unwrap_or_default(),
+            reasoning_took_ms: job.reasoning_took_ms,
             estimate: job.estimate.map(Into::into),
             usage: Some(job.usage.into()),
             error: job.error.unwrap_or_default(),

@@ -15,7 +15,7 @@ use super::proto::{
 use super::streams::{Answers, until_over};
 use super::{Api, Asked, convert, status};
 use crate::domain::Job;
-use crate::service::{ErrorKind, JobEvent, ServiceError, uuid};
+use crate::service::{ErrorKind, JobEvent, ServiceError, search_text, uuid};
 use crate::store::JobFilter;
 
 /// Jobs in a page unless more are asked for: clients take no more than four megabytes at a time by themselves.
@@ -116,7 +116,7 @@ impl Asked {
     }
 
     async fn jobs(&self, request: ListJobsRequest) -> Result<ListJobsResponse, ServiceError> {
-        let ListJobsRequest { map, state, page_size, page_token } = request;
+        let ListJobsRequest { map, state, page_size, page_token, text } = request;
         let map = (!map.is_empty()).then(|| self.map(&map)).transpose()?;
         if map.is_none() && !self.caller.may_use_all() {
             return Err(ServiceError::new(
@@ -125,7 +125,8 @@ impl Asked {
                  admin for another key",
             ));
         }
-        let filter = JobFilter { map, state: convert::job_state(state)? };
+        let (state, text) = (convert::job_state(state)?, search_text(&text)?);
+        let filter = JobFilter { map, state, text };
         let cursor = (!page_token.is_empty()).then(|| uuid("job", &page_token)).transpose()?;
         let limit = match page_size {
             0 => PAGE_SIZE,

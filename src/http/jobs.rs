@@ -25,6 +25,11 @@ pub(super) struct ListParams {
     map: Option<String>,
     /// Only jobs in this state.
     state: Option<JobState>,
+    /// Only jobs that contain this text, in upper or lower case, at most 200 characters: in their id, query id,
+    /// map, state, refiner, error, reasoning or descriptions, or in the ids of their candidates. A request
+    /// looks at some thousand jobs at the most: go on with `next_cursor` until it is null.
+    #[param(max_length = 200)]
+    q: Option<String>,
     /// Jobs in a page, 1 to 1000; 100 by default.
     limit: Option<usize>,
     /// `next_cursor` of the page before.
@@ -38,15 +43,18 @@ pub(super) struct ListParams {
 /// List jobs, newest first
 #[utoipa::path(get, path = "/jobs", tag = "jobs", params(ListParams), responses(
     (status = 200, body = JobPage),
-    (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+    (status = 400, body = Problem, description = "Malformed, or q is too long", content_type = "application/problem+json"),
     (status = 422, body = Problem, description = "limit is out of range", content_type = "application/problem+json"),
 ))]
 pub(super) async fn list_jobs(
     Ready(service): Ready,
     Params(params): Params<ListParams>,
 ) -> Result<Json<JobPage>, Problem> {
-    let filter =
-        JobFilter { map: params.map.as_deref().map(map_name).transpose()?, state: params.state };
+    let filter = JobFilter {
+        map: params.map.as_deref().map(map_name).transpose()?,
+        state: params.state,
+        text: params.q.as_deref().map(service::search_text).transpose()?.flatten(),
+    };
     let cursor = params.cursor.as_deref().map(job_id).transpose()?;
     let mut page = service.list_jobs(filter, cursor, params.limit).await?;
     if params.brief {

@@ -13,14 +13,19 @@ use super::images::page_size;
 use super::{ErrorKind, Service, ServiceError};
 use crate::domain::{ImageId, Job, MediaType};
 use crate::refine::{PairRegion, RefineError};
-use crate::store::JobFilter;
+use crate::store::{JobFilter, JobList};
+
+/// The longest text that jobs are searched for, in characters.
+const LONGEST_SEARCH: usize = 200;
 
 /// Some jobs, newest first.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct JobPage {
     /// The jobs.
     pub jobs: Vec<Job>,
-    /// Where the next page starts: `cursor=` of the next request. Null on the last page.
+    /// Where the next page starts: `cursor=` of the next request. Null on the last page. A search (`q=`)
+    /// looks at some thousand jobs for one page, so that a page may be short, even empty, and yet not be
+    /// the last.
     pub next_cursor: Option<Uuid>,
 }
 
@@ -43,7 +48,8 @@ impl Service {
         }
     }
 
-    /// Jobs, newest first, a page at a time.
+    /// Jobs, newest first, a page at a time. A search for a text ends its page early once it has looked at
+    /// as many jobs as the store looks at in one go.
     pub async fn list_jobs(
         &self,
         filter: JobFilter,
@@ -51,10 +57,14 @@ impl Service {
         limit: Option<usize>,
     ) -> Result<JobPage, ServiceError> {
         let limit = page_size(limit)?;
-        let mut jobs = self.jobs.jobs(&filter, cursor, limit + 1).await?;
+        let _turn = match filter.text {
+            Some(_) => Some(self.searching.acquire().await),
+            None => None,
+        };
+        let JobList { mut jobs, searched_to } = self.jobs.jobs(&filter, cursor, limit + 1).await?;
         let more = jobs.len() > limit;
         jobs.truncate(limit);
-        let next_cursor = jobs.last().filter(|_| more).map(|job| job.id);
+        let next_cursor = jobs.last().filter(|_| more).map(|job| job.id).or(searched_to);
         Ok(JobPage { jobs, next_cursor })
     }
 
@@ -137,6 +147,17 @@ impl Service {
             None => Err(no_job(id)),
         }
     }
+}
+
+/// What jobs are searched for, if for anything.
+pub fn search_text(text: &str) -> Result<Option<String>, ServiceError> {
+    let length = text.chars().count();
+    if length > LONGEST_SEARCH {
+        return Err(ServiceError::malformed(format!(
+            "the text to search for has {length} characters; {LONGEST_SEARCH} are the most"
+        )));
+    }
+    Ok(Some(text.trim()).filter(|text| !text.is_empty()).map(str::to_owned))
 }
 
 /// The id of a job, or of another thing, that a text is.

@@ -35,7 +35,7 @@ pub use self::door::{Door, Phase};
 pub use self::error::{ErrorKind, ServiceError};
 pub use self::events::{AnyJobEvent, JobChange, JobEvent, JobStatus, Missed, PairDescribed};
 pub use self::images::{ImageMeta, ImagePage, NewImage};
-pub use self::jobs::{JobPage, PairRegions, uuid};
+pub use self::jobs::{JobPage, PairRegions, search_text, uuid};
 pub use self::keys::{Caller, Keys, MadeKey, NewKey};
 pub use self::limits::{Allowance, Allowances, Limits};
 pub use self::localize::{
@@ -131,6 +131,8 @@ pub struct Service {
     pub dense: Arc<DenseCache>,
     /// Matches are compared one pair after another: jobs go first.
     pub matching: tokio::sync::Semaphore,
+    /// Jobs are searched for one text after another: each looks at many of them.
+    pub searching: tokio::sync::Semaphore,
     /// Where they are all kept.
     pub retention: Arc<dyn Retention>,
     /// What is counted.

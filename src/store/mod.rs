@@ -7,6 +7,7 @@
 mod changes;
 pub mod embedded;
 mod limits;
+mod listing;
 mod objects;
 pub mod postgres;
 mod webhooks;
@@ -24,6 +25,7 @@ use utoipa::ToSchema;
 use uuid::Uuid;
 
 pub use self::limits::{Buckets, Draw, Drawn, Purse, SharedLimits};
+pub use self::listing::{JobFilter, JobList};
 pub use self::objects::{ObjectSettings, Objects};
 pub use self::webhooks::{ForgottenDeliveries, KeepDeliveries, StoredDelivery, WebhookStore};
 use crate::domain::{
@@ -328,15 +330,6 @@ impl JobRecord {
     }
 }
 
-/// Which jobs to list.
-#[derive(Debug, Clone, Default)]
-pub struct JobFilter {
-    /// Only those of this map.
-    pub map: Option<MapName>,
-    /// Only those in this state.
-    pub state: Option<JobState>,
-}
-
 /// A step of a job that runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Step {
@@ -375,13 +368,14 @@ pub trait JobStore: Send + Sync {
     async fn queued(&self) -> Result<usize, StoreError>;
     /// One job.
     async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError>;
-    /// Jobs, newest first, those older than `before`, at most `limit`.
+    /// Jobs, newest first, those older than `before`, at most `limit`. A search for a text may look at a
+    /// bounded number of jobs only, and says so.
     async fn jobs(
         &self,
         filter: &JobFilter,
         before: Option<Uuid>,
         limit: usize,
-    ) -> Result<Vec<Job>, StoreError>;
+    ) -> Result<JobList, StoreError>;
     /// Takes, until `lease_until`, a job that waits or whose lease ran out: one of the highest
     /// priority, and of those the oldest.
     async fn claim(

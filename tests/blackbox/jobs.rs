@@ -43,8 +43,9 @@ async fn a_job_describes_every_pair_and_ranks_every_candidate_once() {
     assert_eq!(ranked, all);
     for description in job["descriptions"].as_array().unwrap() {
         assert!(description["text"].as_str().unwrap().len() > 40, "{description}");
+        assert!(description["took_ms"].is_u64(), "{description}");
     }
-    assert!(job["reasoning"].is_string());
+    assert!(job["reasoning"].is_string() && job["reasoning_took_ms"].is_null());
     assert!(job["created_at"].as_str() <= job["finished_at"].as_str());
 }
 
@@ -73,6 +74,47 @@ async fn jobs_are_listed_newest_first_by_map_and_state() {
     let rest = server.get(&format!("/jobs?map=m&limit=2&cursor={cursor}")).await.expect(200);
     assert_eq!((ids(&rest), &rest["next_cursor"]), (made[2..].to_vec(), &json!(null)));
     assert_eq!(ids(&server.get("/jobs?state=failed").await.expect(200)), [] as [Value; 0]);
+}
+
+#[tokio::test]
+async fn jobs_are_searched_for_a_text_in_whatever_case() {
+    let (_dir, server) = server();
+    server.town("m", 3).await;
+    server.town("backyard", 1).await;
+    let mut made = Vec::new();
+    for map in ["m", "backyard", "m"] {
+        let path = format!("/localize?map={map}&refine=wait");
+        let answer = server.post_jpeg(&path, frame(made.len(), 0)).await.expect(200);
+        made.push(answer);
+    }
+    let id = |at: usize| made[at]["job"]["id"].as_str().unwrap().to_owned();
+    let search = async |query: String| -> Vec<String> {
+        let page = server.get(&format!("/jobs?{query}")).await.expect(200);
+        assert_eq!(page["next_cursor"], json!(null));
+        let jobs = page["jobs"].as_array().unwrap().iter();
+        jobs.map(|job| job["id"].as_str().unwrap().to_owned()).collect()
+    };
+    let query_id = made[1]["query_id"].as_str().unwrap().to_uppercase();
+    assert_eq!(search(format!("q={query_id}")).await, [id(1)]);
+    assert_eq!(search(format!("q={}", &id(0)[24..])).await, [id(0)]);
+    assert_eq!(search("q=BACKYARD".into()).await, [id(1)]);
+    let only_in_m = made[0]["candidates"].as_array().unwrap().iter();
+    let first = made[1]["candidates"][0]["image_id"].as_str().unwrap();
+    let another = only_in_m.map(|one| one["image_id"].as_str().unwrap()).find(|of| *of != first);
+    let another = another.unwrap().to_uppercase();
+    assert_eq!(search(format!("q={another}")).await, [id(2), id(0)]);
+    // Words of a description, beside the other filters.
+    assert_eq!(search("q=Regions+Of+The&brief=true".into()).await, [id(2), id(1), id(0)]);
+    assert_eq!(search("q=regions+of+the&map=backyard&state=succeeded".into()).await, [id(1)]);
+    assert_eq!(search("q=regions+of+the&state=failed".into()).await, [""; 0]);
+    assert_eq!(search("q=no+job+says+so".into()).await, [""; 0]);
+    assert_eq!(search("q=++".into()).await.len(), 3);
+    let page = server.get(&format!("/jobs?q={another}&limit=1")).await.expect(200);
+    let cursor = page["next_cursor"].as_str().unwrap();
+    assert_eq!(search(format!("q={another}&limit=1&cursor={cursor}")).await, [id(0)]);
+    server.get(&format!("/jobs?q={}", "%C3%A9".repeat(200))).await.expect(200);
+    let why = server.get(&format!("/jobs?q={}", "a".repeat(201))).await.problem(400);
+    assert!(why.contains("200"), "{why}");
 }
 
 #[tokio::test]

@@ -1,5 +1,5 @@
 // The list of jobs, live: one stream for all of them, the first page again when something has ended, and no
-// request per row.
+// request per row. The server searches them.
 
 import { address, call, follow, isAbort } from "./api.js";
 import { announce, badge, command, empty, failure, fill, h, loading } from "./dom.js";
@@ -9,35 +9,38 @@ const PAGE = 50;
 const STATES = ["queued", "running", "succeeded", "degraded", "failed", "cancelled"];
 const ENDED = new Set(["succeeded", "degraded", "failed", "cancelled"]);
 
-// Older servers know no `brief`: their lists come with all descriptions, which is slow but right.
-let brief = true;
+const LONGEST_SEARCH = 200; // characters; the server takes no more
+const UUID = /^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$/i;
 
-async function page(query, signal) {
-  try {
-    return await call(address(["jobs"], { ...query, brief: brief ? "true" : null }), { signal });
-  } catch (problem) {
-    if (!brief || problem.status !== 400) throw problem;
-    brief = false;
-    return page(query, signal);
-  }
-}
+/** A page of the jobs that fit a filter, without their descriptions. */
+const page = ({ map, state, q }, cursor, signal) => call(address(["jobs"], { map, state, q, cursor, limit: PAGE, brief: "true" }), { signal });
 
 export async function show({ root, query, signal, setQuery, title }) {
   title("Jobs");
   let filter = read(query);
   let jobs = new Map(); // by id; ids sort by time
-  let cursor = null;
+  let cursor = null; // where older ones begin; null if there are none
+  let loaded = false; // whether `cursor` says so
+  let want = PAGE; // as many are looked for
   let generation = 0; // a slow answer to an earlier filter is dropped
 
   const live = h("span", { class: "live waiting" }, "connecting");
   const maps = h("select", { id: "f-map", onchange: () => setQuery({ map: maps.value }, { step: true }) }, h("option", { value: "" }, "all maps"));
   const states = h("select", { id: "f-state", onchange: () => setQuery({ state: states.value }, { step: true }) },
     h("option", { value: "" }, "all states"), STATES.map((state) => h("option", { value: state }, state)));
-  const search = h("input", { id: "f-q", type: "search", placeholder: "id, image, error…", spellcheck: "false", oninput: () => {
-    filter.q = search.value.trim();
-    setQuery({ q: filter.q });
-    draw();
+  let typing = null;
+  const search = h("input", { id: "f-q", type: "search", placeholder: "id, image, error, words of a description…", maxlength: LONGEST_SEARCH, spellcheck: "false", oninput: () => {
+    clearTimeout(typing);
+    typing = setTimeout(typed, 300);
   } });
+  function typed() {
+    clearTimeout(typing);
+    typing = null;
+    const q = search.value.trim();
+    if (q === filter.q) return;
+    setQuery({ q });
+    ask({ ...filter, q });
+  }
   const body = h("tbody");
   const table = h("table", { class: "jobs stack" }, h("caption", { class: "unseen" }, "Jobs, newest first"),
     h("thead", {}, h("tr", {}, ["State", "Job", "Map", "Age", "Took", "Estimate", "Refiner", "Cost"].map((name) => h("th", { scope: "col" }, name)))), body);
@@ -45,7 +48,7 @@ export async function show({ root, query, signal, setQuery, title }) {
   const after = h("div", { class: "after" });
   fill(root,
     h("div", { class: "heading" }, h("h1", {}, "Jobs"), live),
-    h("form", { class: "filters", role: "search", "aria-label": "Filter jobs", onsubmit: (event) => event.preventDefault() },
+    h("form", { class: "filters", role: "search", "aria-label": "Filter jobs", onsubmit: (event) => { event.preventDefault(); typed(); } },
       h("label", { for: "f-map" }, "Map", maps), h("label", { for: "f-state" }, "State", states), h("label", { class: "grow", for: "f-q" }, "Search", search)),
     before, h("div", { class: "card flush" }, table), after);
   const rows = new Map();
@@ -54,12 +57,11 @@ export async function show({ root, query, signal, setQuery, title }) {
     if (filter.map && ![...maps.options].some((option) => option.value === filter.map)) maps.append(h("option", { value: filter.map }, filter.map));
     maps.value = filter.map;
     states.value = filter.state;
-    if (search.value.trim() !== filter.q) search.value = filter.q;
+    if (typing === null && search.value.trim() !== filter.q) search.value = filter.q;
   }
 
   function draw() {
-    const all = [...jobs.values()].sort((a, b) => (a.id < b.id ? 1 : -1));
-    const shown = all.filter((job) => matches(job, filter.q));
+    const shown = [...jobs.values()].sort((a, b) => (a.id < b.id ? 1 : -1));
     const wanted = new Set(shown.map((job) => job.id));
     for (const [id, { row }] of rows) if (!wanted.has(id)) { row.remove(); rows.delete(id); }
     let place = body.firstChild;
@@ -73,17 +75,19 @@ export async function show({ root, query, signal, setQuery, title }) {
       else body.insertBefore(known.row, place);
     }
     table.parentElement.hidden = shown.length === 0;
-    fill(before, shown.length === 0 && nothing(all.length));
-    const what = filter.q ? `${plural(shown.length, "match", "matches")} among the ${plural(all.length, "job")} loaded` : `${plural(all.length, "job")} loaded`;
-    fill(after, all.length > 0 && h("span", { class: "muted" }, cursor ? what : `${what}; no older ones`),
-      cursor && h("button", { type: "button", onclick: (event) => more(event.target) }, filter.q ? "Look through older jobs" : "Load older jobs"));
+    const searching = Boolean(filter.q && cursor && shown.length < want);
+    const direct = shown.length === 0 && UUID.test(filter.q) && h("p", {}, h("a", { href: `#/jobs/${filter.q.toLowerCase()}` }, "Open the job of this id"));
+    fill(before, direct, shown.length === 0 && (searching ? loading("older jobs") : nothing()));
+    body.removeAttribute("aria-busy");
+    const what = filter.q ? plural(shown.length, "job found", "jobs found") : `${plural(shown.length, "job")} loaded`;
+    fill(after, shown.length > 0 && h("span", { class: "muted" }, searching ? `${what}, looking through older ones…` : cursor ? what : `${what}; no older ones`),
+      cursor && !searching && h("button", { type: "button", onclick: (event) => more(event.target) }, filter.q ? "Look through older jobs" : "Load older jobs"));
   }
 
-  function nothing(loaded) {
-    if (/^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$/i.test(filter.q)) {
-      return empty("Not among the jobs loaded", h("p", {}, h("a", { href: `#/jobs/${filter.q.toLowerCase()}` }, "Open the job of this id")));
+  function nothing() {
+    if (filter.q) {
+      return empty("No match", h("p", {}, "No job that fits the filters contains this text. Search looks at the ids of jobs, queries and candidates, at maps, states, refiners, errors, reasons and descriptions."));
     }
-    if (loaded) return empty("No match", h("p", {}, "Nothing that is loaded matches. Search looks at ids, maps, states, refiners and errors."));
     if (filter.map || filter.state) {
       return empty("No such jobs", h("p", {}, "No job fits these filters. ", h("a", { href: "#/jobs" }, "Show all jobs")));
     }
@@ -94,39 +98,71 @@ export async function show({ root, query, signal, setQuery, title }) {
   async function load() {
     const mine = ++generation;
     try {
-      const answer = await page({ map: filter.map, state: filter.state, limit: PAGE }, signal);
+      const answer = await page(filter, null, signal);
       if (mine !== generation) return;
-      const last = answer.jobs.at(-1)?.id ?? "";
+      const end = answer.next_cursor;
       // What was loaded below this page stays; what belongs into it and is not there is gone.
-      const older = cursor && answer.next_cursor ? [...jobs.values()].filter((job) => job.id < last) : [];
-      if (!older.length) cursor = answer.next_cursor;
-      jobs = new Map([...answer.jobs, ...older].map((job) => [job.id, { ...progress.get(job.id), ...job }]));
+      const older = end && loaded && (cursor === null || cursor < end) ? [...jobs.values()].filter((job) => job.id < end) : null;
+      if (!older) cursor = end;
+      loaded = true;
+      jobs = new Map([...answer.jobs, ...older ?? []].map((job) => [job.id, { ...progress.get(job.id), ...job }]));
       draw();
+      fillUp(mine);
     } catch (problem) {
       if (isAbort(problem) || mine !== generation || problem.status === 401) return;
       if (jobs.size === 0) { table.parentElement.hidden = true; fill(before, failure(problem, load)); }
     }
   }
 
+  async function further(mine) {
+    const answer = await page(filter, cursor, signal);
+    if (mine !== generation) return;
+    for (const job of answer.jobs) jobs.set(job.id, job);
+    cursor = answer.next_cursor;
+    draw();
+  }
+
+  /** Goes on with a search until there are enough: the server looks at some thousand jobs for one page of it. */
+  async function fillUp(mine) {
+    try {
+      while (mine === generation && filter.q && cursor && jobs.size < want) await further(mine);
+    } catch (problem) {
+      if (isAbort(problem) || mine !== generation) return;
+      if (jobs.size === 0) fill(before);
+      fill(after, failure(problem, () => fillUp(mine)));
+    }
+  }
+
   async function more(button) {
     button.disabled = true;
     const mine = generation;
+    want = jobs.size + PAGE;
     try {
-      const answer = await page({ map: filter.map, state: filter.state, cursor, limit: brief && filter.q ? 1000 : PAGE }, signal);
-      if (mine !== generation) return draw();
-      for (const job of answer.jobs) jobs.set(job.id, job);
-      cursor = answer.next_cursor;
-      draw();
+      await further(mine);
+      if (mine !== generation) draw();
+      fillUp(mine);
     } catch (problem) {
       if (!isAbort(problem)) fill(after, failure(problem, () => more(button)));
     }
+  }
+
+  /** Shows the jobs of another filter. */
+  function ask(next) {
+    filter = next;
+    jobs = new Map();
+    cursor = null;
+    loaded = false;
+    want = PAGE;
+    body.setAttribute("aria-busy", "true"); // what is shown fits the filter before
+    load();
   }
 
   // How many pairs are described is told by events alone; it outlives the row that a reload replaces.
   const progress = new Map();
   let reload = null;
   let frame = 0;
-  const soon = () => { reload ??= setTimeout(() => { reload = null; load(); }, brief ? 1500 : 5000); };
+  // A search costs the server more than a list does.
+  const soon = () => { reload ??= setTimeout(() => { reload = null; load(); }, filter.q ? 5000 : 1500); };
   let ended = 0;
   let said = 0; // a busy server is not read out job by job
   function changed(change) {
@@ -145,6 +181,8 @@ export async function show({ root, query, signal, setQuery, title }) {
     }
     const job = jobs.get(change.id);
     if (!job) return soon();
+    // It may be none of those any more.
+    if ((filter.q || filter.state) && (job.state !== state || job.error !== error)) soon();
     Object.assign(job, { state, attempts, error, described, of });
     frame ||= requestAnimationFrame(() => { frame = 0; draw(); }); // many changes, one drawing
   }
@@ -154,14 +192,14 @@ export async function show({ root, query, signal, setQuery, title }) {
   fill(before, loading("the jobs"));
   const first = load(); // before all else that asks: it is what the page is for
 
-  signal.addEventListener("abort", () => { clearTimeout(reload); cancelAnimationFrame(frame); });
+  signal.addEventListener("abort", () => { clearTimeout(reload); clearTimeout(typing); cancelAnimationFrame(frame); });
   follow("events", {
     signal,
     on(name, data) { if (name === "job") changed(data); else if (name === "missed") load(); },
     status(state) {
       live.className = `live ${state}`;
       live.textContent = state === "live" ? "live" : "reconnecting";
-      if (state === "live" && jobs.size) load(); // what happened while nobody listened
+      if (state === "live" && loaded) load(); // what happened while nobody listened
     },
     failed(problem) { live.className = "live off"; live.textContent = "not live"; live.title = problem.detail; },
   });
@@ -176,19 +214,15 @@ export async function show({ root, query, signal, setQuery, title }) {
 
   return (changedQuery) => {
     const next = read(changedQuery);
-    const other = next.map !== filter.map || next.state !== filter.state;
-    filter = next;
+    const same = next.map === filter.map && next.state === filter.state && next.q === filter.q;
+    if (!same) ask(next);
     controls();
-    if (other) { jobs = new Map(); cursor = null; load(); } else draw();
   };
 }
 
-const read = (query) => ({ map: query.get("map") ?? "", state: query.get("state") ?? "", q: query.get("q") ?? "" });
-
-function matches(job, text) {
-  if (!text) return true;
-  const all = [job.id, job.query_id, job.map, job.state, job.refiner, job.error, job.estimate?.image_id].join("\n").toLowerCase();
-  return text.toLowerCase().split(/\s+/).every((word) => all.includes(word));
+function read(query) {
+  const q = (query.get("q") ?? "").trim().slice(0, LONGEST_SEARCH);
+  return { map: query.get("map") ?? "", state: query.get("state") ?? "", q };
 }
 
 function cells(job) {

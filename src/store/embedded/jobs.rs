@@ -13,7 +13,10 @@ use tokio::sync::broadcast;
 use uuid::Uuid;
 
 use super::super::changes::{ended_at, no_job};
-use super::super::{Claim, FirstAnswer, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
+use super::super::listing::SEARCHED;
+use super::super::{
+    Claim, FirstAnswer, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
+};
 use super::trees::{
     BlobOwner, Lease, Trees, blob_ref_key, decode, encode, ended_key, failed, get, put, queue_key,
     queued_job, transaction_failed,
@@ -143,23 +146,11 @@ impl JobStore for EmbeddedStore {
         filter: &JobFilter,
         before: Option<Uuid>,
         limit: usize,
-    ) -> Result<Vec<Job>, StoreError> {
+    ) -> Result<JobList, StoreError> {
         let (inner, filter) = (Arc::clone(&self.inner), filter.clone());
         blocking(move || {
-            let end = before.unwrap_or(Uuid::max());
-            let matches = |job: &Job| {
-                filter.map.as_ref().is_none_or(|map| *map == job.map)
-                    && filter.state.is_none_or(|state| state == job.state)
-            };
-            inner
-                .trees
-                .jobs
-                .range(..end.as_bytes().to_vec())
-                .rev()
-                .map(|entry| Ok(decode::<JobRecord>(&entry.map_err(failed)?.1)?.job))
-                .filter(|job: &Result<Job, StoreError>| job.as_ref().map_or(true, matches))
-                .take(limit)
-                .collect()
+            let most = filter.text.as_ref().map_or(usize::MAX, |_| SEARCHED);
+            list(&inner.trees, &filter, before.unwrap_or(Uuid::max()), limit, most)
         })
         .await
     }
@@ -254,6 +245,32 @@ impl JobStore for EmbeddedStore {
     }
 }
 
+/// Jobs older than `before`, at most `limit` of them, among the `most` youngest of those.
+fn list(
+    trees: &Trees,
+    filter: &JobFilter,
+    before: Uuid,
+    limit: usize,
+    most: usize,
+) -> Result<JobList, StoreError> {
+    let (mut found, mut last) = (JobList::default(), None);
+    for (looked, entry) in trees.jobs.range(..before.as_bytes().to_vec()).rev().enumerate() {
+        if found.jobs.len() == limit {
+            break;
+        }
+        if looked == most {
+            found.searched_to = last;
+            break;
+        }
+        let record: JobRecord = decode(&entry.map_err(failed)?.1)?;
+        last = Some(record.job.id);
+        if filter.matches(&record) {
+            found.jobs.push(record.job);
+        }
+    }
+    Ok(found)
+}
+
 /// No job is held or kept waiting longer than this, budgets of a day included. An entry that says so
 /// was written before the clock was set back.
 const LONGEST_LEASE: SignedDuration = SignedDuration::from_hours(25);
@@ -337,7 +354,55 @@ fn write_job(trees: &Trees, record: &JobRecord, place: Place) -> Result<(), Stor
 
 #[cfg(test)]
 mod tests {
+    use super::super::drafts::tests::settings;
     use super::*;
+    use crate::domain::{Digest, MapName, MediaType, RefinerKind};
+    use crate::store::Query;
+
+    /// A job that waits in a map.
+    async fn submitted(store: &EmbeddedStore, map: &str) -> Uuid {
+        let (now, id) = (Timestamp::now(), Uuid::now_v7());
+        let digest = Digest::of(id.as_bytes());
+        let query =
+            Query { id, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
+        let map: MapName = map.parse().unwrap();
+        let job = Job::queued(map, id, RefinerKind::Local, now);
+        let id = job.id;
+        let (map_uid, candidates) = (Uuid::nil(), vec![]);
+        let record = JobRecord {
+            job,
+            map_uid,
+            revision: 0,
+            query,
+            candidates,
+            claims: 0,
+            traceparent: None,
+        };
+        store.submit(record, 100).await.unwrap();
+        id
+    }
+
+    #[tokio::test]
+    async fn a_search_ends_after_so_many_jobs_and_goes_on_where_it_ended() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = EmbeddedStore::open(&settings(dir.path())).unwrap();
+        let mut jobs = Vec::new();
+        for map in ["town", "yard", "town", "yard", "yard"] {
+            jobs.push(submitted(&store, map).await);
+        }
+        let filter = JobFilter { text: Some("TOW".into()), ..JobFilter::default() };
+        let search = |before: Uuid, limit: usize| {
+            let found = list(&store.inner.trees, &filter, before, limit, 2).unwrap();
+            (found.jobs.iter().map(|job| job.id).collect::<Vec<_>>(), found.searched_to)
+        };
+        assert_eq!(search(Uuid::max(), 10), (vec![], Some(jobs[3])));
+        assert_eq!(search(jobs[3], 10), (vec![jobs[2]], Some(jobs[1])));
+        assert_eq!(search(jobs[1], 10), (vec![jobs[0]], None));
+        // A list that is full says nothing of where the search ended.
+        assert_eq!(search(jobs[3], 1), (vec![jobs[2]], None));
+        let whole = store.jobs(&filter, None, 10).await.unwrap();
+        assert_eq!((whole.jobs.len(), whole.searched_to), (2, None));
+    }
 
     #[test]
     fn a_lease_from_before_the_clock_was_set_back_holds_nothing() {

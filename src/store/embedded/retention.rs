@@ -153,8 +153,8 @@ mod tests {
     }
 
     async fn listed(store: &EmbeddedStore, before: Option<Uuid>) -> Vec<Uuid> {
-        let jobs = store.jobs(&JobFilter::default(), before, 10).await.unwrap();
-        jobs.iter().map(|job| job.id).collect()
+        let list = store.jobs(&JobFilter::default(), before, 10).await.unwrap();
+        list.jobs.iter().map(|job| job.id).collect()
     }
 
     #[tokio::test]

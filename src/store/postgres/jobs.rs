@@ -17,7 +17,10 @@ use tokio::sync::broadcast;
 use uuid::Uuid;
 
 use super::super::changes::{ended_at, news_of, no_job};
-use super::super::{Claim, FirstAnswer, JobFilter, JobRecord, JobStore, Release, Step, StoreError};
+use super::super::listing::SEARCHED;
+use super::super::{
+    Claim, FirstAnswer, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
+};
 use super::listener::{DELIVERIES, JOBS};
 use super::{Inner, PostgresStore, count, counted, record, seconds};
 use crate::domain::{Job, JobState, Priority, StoredWebhook};
@@ -28,6 +31,9 @@ const SUBMITTED_AT_ONCE: usize = 256;
 
 /// The advisory lock of those who count.
 const QUEUE_LOCK: i64 = 0x7768_6572_6561_0001;
+
+/// Jobs read at a time while a text is looked for.
+const PAGE: usize = 250;
 
 /// What a change does to a job's row, beside its record.
 enum Place {
@@ -214,6 +220,27 @@ impl Inner {
         }
     }
 
+    /// Jobs of a map and state that are older than another, newest first.
+    async fn older(
+        &self,
+        filter: &JobFilter,
+        before: Option<Uuid>,
+        limit: usize,
+    ) -> Result<Vec<JobRecord>, StoreError> {
+        let found: Vec<Json<JobRecord>> = sqlx::query_scalar(
+            "SELECT record FROM jobs
+             WHERE id < $1 AND ($2::text IS NULL OR map = $2) AND ($3::text IS NULL OR state = $3)
+             ORDER BY id DESC LIMIT $4",
+        )
+        .bind(before.unwrap_or(Uuid::max()))
+        .bind(filter.map.as_ref().map(|map| map.as_str()))
+        .bind(filter.state.map(JobState::as_str))
+        .bind(count(limit))
+        .fetch_all(&self.pool)
+        .await?;
+        Ok(found.into_iter().map(|Json(known)| known).collect())
+    }
+
     /// Jobs that wait or run.
     async fn waiting<'a>(
         &self,
@@ -292,23 +319,36 @@ impl JobStore for PostgresStore {
         filter: &JobFilter,
         before: Option<Uuid>,
         limit: usize,
-    ) -> Result<Vec<Job>, StoreError> {
+    ) -> Result<JobList, StoreError> {
         let inner = &self.inner;
-        let query = sqlx::query_scalar(
-            "SELECT record FROM jobs
-             WHERE id < $1 AND ($2::text IS NULL OR map = $2) AND ($3::text IS NULL OR state = $3)
-             ORDER BY id DESC LIMIT $4",
-        )
-        .bind(before.unwrap_or(Uuid::max()))
-        .bind(filter.map.as_ref().map(|map| map.as_str()))
-        .bind(filter.state.map(JobState::as_str))
-        .bind(count(limit));
-        inner
-            .call(async {
-                let found: Vec<Json<JobRecord>> = query.fetch_all(&inner.pool).await?;
-                Ok(found.into_iter().map(|Json(known)| known.job).collect())
-            })
-            .await
+        if filter.text.is_none() {
+            let page = inner.call(inner.older(filter, before, limit)).await?;
+            let jobs = page.into_iter().map(|known| known.job).collect();
+            return Ok(JobList { jobs, searched_to: None });
+        }
+        // The text is looked for here, so that both stores find the same.
+        let (mut found, mut before, mut looked) = (JobList::default(), before, 0);
+        while found.jobs.len() < limit {
+            if looked >= SEARCHED {
+                found.searched_to = before;
+                break;
+            }
+            let page = inner.call(inner.older(filter, before, PAGE)).await?;
+            let whole = page.len() == PAGE;
+            for known in page {
+                if found.jobs.len() == limit {
+                    break;
+                }
+                (before, looked) = (Some(known.job.id), looked + 1);
+                if filter.matches(&known) {
+                    found.jobs.push(known.job);
+                }
+            }
+            if !whole {
+                break;
+            }
+        }
+        Ok(found)
     }
 
     async fn claim(

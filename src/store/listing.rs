@@ -1,0 +1,153 @@
+//! Lists of jobs: which ones, and how far a search for them went.
+
+use uuid::Uuid;
+
+use super::JobRecord;
+use crate::domain::{Job, JobState, MapName};
+
+/// Jobs that one search for a text looks at, at the most: records are read and decoded for it.
+pub(super) const SEARCHED: usize = 5_000;
+
+/// Which jobs to list.
+#[derive(Debug, Clone, Default)]
+pub struct JobFilter {
+    /// Only those of this map.
+    pub map: Option<MapName>,
+    /// Only those in this state.
+    pub state: Option<JobState>,
+    /// Only those that contain this text, in upper or lower case: in their id, query id, map, state,
+    /// refiner, error, reasoning or descriptions, or in the ids of their candidates.
+    pub text: Option<String>,
+}
+
+/// Some jobs, newest first.
+#[derive(Debug, Clone, Default)]
+pub struct JobList {
+    /// The jobs.
+    pub jobs: Vec<Job>,
+    /// The last job that was looked at, if the search for a text ended there although older jobs may
+    /// contain it too.
+    pub searched_to: Option<Uuid>,
+}
+
+impl JobFilter {
+    /// Whether a job is one of those.
+    pub fn matches(&self, record: &JobRecord) -> bool {
+        let job = &record.job;
+        self.map.as_ref().is_none_or(|map| *map == job.map)
+            && self.state.is_none_or(|state| state == job.state)
+            && self.text.as_deref().is_none_or(|text| contains(record, &folded(text)))
+    }
+}
+
+fn contains(record: &JobRecord, text: &str) -> bool {
+    let job = &record.job;
+    let has = |of: &str| folded(of).contains(text);
+    // Those that are short and asked for most come first.
+    has(&job.id.to_string())
+        || has(&job.query_id.to_string())
+        || has(job.map.as_str())
+        || has(&job.state.to_string())
+        || has(&job.refiner.to_string())
+        || record.candidates.iter().any(|candidate| has(candidate.image_id.as_str()))
+        || job.error.as_deref().is_some_and(has)
+        || job.reasoning.as_deref().is_some_and(has)
+        || job.descriptions.iter().any(|description| has(&description.text))
+}
+
+/// The same whatever its case. Letter by letter, so that a part of a text stays a part of it.
+fn folded(text: &str) -> String {
+    match text.is_ascii() {
+        true => text.to_ascii_lowercase(),
+        false => text.chars().flat_map(char::to_lowercase).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+
+    use super::*;
+    use crate::domain::{Candidate, Description, Digest, MediaType, Priority, RefinerKind, Usage};
+    use crate::store::Query;
+
+    fn record() -> JobRecord {
+        let now = Timestamp::now();
+        let query = Query {
+            id: Uuid::from_u128(0xABC),
+            digest: Digest::of(b"frame"),
+            media_type: MediaType::Jpeg,
+            created_at: now,
+            descriptor: None,
+        };
+        let image_id: crate::domain::ImageId = "Gate.jpg".parse().unwrap();
+        let description = Description {
+            image_id: image_id.clone(),
+            text: "A red door, ΟΔΟΣ on its sign".into(),
+            cached: false,
+            stands_in: None,
+            took_ms: None,
+            usage: Usage::default(),
+        };
+        let job = Job {
+            id: Uuid::from_u128(0xDEF),
+            priority: Priority::High,
+            state: JobState::Degraded,
+            descriptions: vec![description],
+            reasoning: Some("The awning decides.".into()),
+            error: Some("1 of 2 pairs failed".into()),
+            ..Job::queued("yard".parse().unwrap(), query.id, RefinerKind::Mllm, now)
+        };
+        let candidates = vec![Candidate { rank: 1, image_id, similarity: 0.5, pose: None }];
+        JobRecord {
+            job,
+            map_uid: Uuid::nil(),
+            revision: 0,
+            query,
+            candidates,
+            claims: 0,
+            traceparent: None,
+        }
+    }
+
+    #[test]
+    fn a_text_is_found_in_all_that_a_job_tells_and_in_nothing_else() {
+        let record = record();
+        let found = |text: &str| {
+            JobFilter { text: Some(text.into()), ..JobFilter::default() }.matches(&record)
+        };
+        for text in [
+            "000000000def",
+            "0ABC",
+            "YARD",
+            "degraded",
+            "mllm",
+            "gate.j",
+            "1 of 2 PAIRS",
+            "awning",
+            "red door",
+            "οδοσ on",
+            "ΟΔΟΣ",
+        ] {
+            assert!(found(text), "{text}");
+        }
+        for text in ["local", "high", "door red", "awning red", "frame", "0.5"] {
+            assert!(!found(text), "{text}");
+        }
+    }
+
+    #[test]
+    fn all_that_is_asked_for_must_be_true() {
+        let record = record();
+        let filter = |map: &str, state, text: &str| JobFilter {
+            map: Some(map.parse().unwrap()),
+            state: Some(state),
+            text: Some(text.into()),
+        };
+        assert!(filter("yard", JobState::Degraded, "door").matches(&record));
+        assert!(!filter("town", JobState::Degraded, "door").matches(&record));
+        assert!(!filter("yard", JobState::Failed, "door").matches(&record));
+        assert!(!filter("yard", JobState::Degraded, "window").matches(&record));
+        assert!(JobFilter::default().matches(&record));
+    }
+}

@@ -1,0 +1,33 @@
+#!/usr/bin/env bash
+# Says how large and how quick the operator's console is when it is opened: fills a server of its own with 10,000
+# jobs and 5,000 images and opens views in a browser that has nothing of them yet.
+#
+#     first_view.sh BINARY VENV
+#
+# VENV and the browser are those of check.sh. Takes several minutes, most of them to fill the server. Ends with 1
+# if the first view is above 200 kB or 300 ms.
+set -euo pipefail
+
+if [ $# -ne 2 ]; then
+    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/console-venv" >&2
+    exit 2
+fi
+if ! CHROMIUM=$(command -v "${CHROMIUM:-chromium}"); then
+    echo "there is no chromium to open the console in; install it: apt-get install chromium" >&2
+    exit 1
+fi
+binary=$(realpath "$1")
+venv=$(realpath -m "$2")
+cd "$(dirname "$0")"
+
+# shellcheck source-path=SCRIPTDIR source=../server.sh
+. ../server.sh
+environment "$venv" requirements.txt
+
+if ! "$binary" demo --offline --json --places 12 --out "$scratch/town" > "$scratch/demo" 2>&1; then
+    cat "$scratch/demo" >&2
+    exit 1
+fi
+export WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_JOBS__QUEUE=20000
+serve "$binary"
+TOWN=$scratch/town URL=$url CHROMIUM=$CHROMIUM PYTHONDONTWRITEBYTECODE=1 "$venv/bin/python" first_view.py
