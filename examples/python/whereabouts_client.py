@@ -322,6 +322,8 @@ class Job:
     estimate: Estimate | None = None
     """Where the frame was probably taken, by the refined order."""
     error: str | None = None
+    trace_id: str | None = None
+    """The trace of its request and its refinement, where the server sends traces."""
 
     @property
     def ended(self) -> bool:

@@ -306,6 +306,7 @@ impl From<Job> for proto::Job {
             estimate: job.estimate.map(Into::into),
             usage: Some(job.usage.into()),
             error: job.error.unwrap_or_default(),
+            trace_id: job.trace_id.unwrap_or_default(),
         }
     }
 }

@@ -1,11 +1,16 @@
 //! What calls in progress may cost, among all processes that share a store.
 
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use jiff::civil::Date;
 
 use super::budget::Spent;
 use crate::store::{Purse, SharedLimits, StoreError};
+
+/// The pause before a store that is away is told again, and for how long it is.
+const PAUSE: Duration = Duration::from_millis(500);
+const LONGEST: Duration = Duration::from_secs(24 * 3600);
 
 /// What is set aside for one call. Dropped unsettled, it goes back: the call was not answered.
 pub(super) struct Aside {
@@ -42,10 +47,28 @@ impl Drop for Aside {
     fn drop(&mut self) {
         let (shared, day, unneeded) = (Arc::clone(&self.shared), self.day, self.unneeded);
         tokio::spawn(async move {
-            if let Err(error) = shared.give_back(day, unneeded).await {
-                tracing::warn!(%error, "what a call did not need stays set aside until the process ends");
-            }
+            insist("what a call did not need", || shared.give_back(day, unneeded)).await;
         });
+    }
+}
+
+/// Tells a store that is away for a while; gives up after a day.
+pub(super) async fn insist<F>(what: &str, tell: impl Fn() -> F)
+where
+    F: Future<Output = Result<(), StoreError>>,
+{
+    let began = Instant::now();
+    loop {
+        match tell().await {
+            Ok(()) => return,
+            Err(StoreError::Unavailable(_)) if began.elapsed() < LONGEST => {
+                tokio::time::sleep(PAUSE).await;
+            }
+            Err(error) => {
+                tracing::warn!(%error, "the store cannot be told {what}");
+                return;
+            }
+        }
     }
 }
 

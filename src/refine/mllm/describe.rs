@@ -8,7 +8,7 @@ use futures_util::{StreamExt, stream};
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::OnceCell;
 
-use super::aside::Aside;
+use super::aside::{Aside, insist};
 use super::budget::{Exceeded, JobBudget, Spent};
 use super::cache::{CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame};
 use super::client::{Answer, Call, estimate_tokens};
@@ -157,16 +157,24 @@ pub(super) fn cost_of(answer: &Answer) -> Usage {
 /// The right of this process to buy a description. It ends when this is dropped.
 struct Purchase {
     cache: Arc<dyn DescriptionCache>,
-    key: Digest,
+    key: Option<Digest>,
+}
+
+impl Purchase {
+    fn not_granted(mut self) -> Option<Self> {
+        self.key = None;
+        None
+    }
 }
 
 impl Drop for Purchase {
     fn drop(&mut self) {
-        let (cache, key) = (Arc::clone(&self.cache), self.key);
+        let Some(key) = self.key else { return };
+        let cache = Arc::clone(&self.cache);
         tokio::spawn(async move {
-            if let Err(error) = cache.end_purchase(&key).await {
-                tracing::warn!(%error, "other processes wait for a description that was not bought");
-            }
+            // Other processes wait for it, as long as this one is alive.
+            let ended = || cache.end_purchase(&key);
+            insist("that a description is not being bought any more", ended).await;
         });
     }
 }
@@ -298,8 +306,10 @@ impl MllmRefiner {
     ) -> Result<Result<Purchase, CachedDescription>, CallError> {
         loop {
             let until = Timestamp::now().saturating_add(LONGEST_PURCHASE).unwrap_or(Timestamp::MAX);
+            // Made before it is known to be granted: the answer may be lost on its way.
+            let purchase = Purchase { cache: Arc::clone(&self.cache), key: Some(*key) };
             let begun = self.cache.begin_purchase(key, until).await.map_err(passing)?;
-            let purchase = begun.then(|| Purchase { cache: Arc::clone(&self.cache), key: *key });
+            let purchase = if begun { Some(purchase) } else { purchase.not_granted() };
             // Whoever was at it a moment ago may have ended just now.
             if let Some(known) = self.cache.description(key).await.map_err(passing)? {
                 return Ok(Err(known));
