@@ -201,7 +201,8 @@ class Contract(unittest.TestCase):
         self.assertEqual(ended.state, 3)
         self.assertEqual([c.image_id for c in ended.ranking], [c["image_id"] for c in same["ranking"]])
         self.assertEqual([d.text for d in ended.descriptions], [d["text"] for d in same["descriptions"]])
-        self.assertEqual([d.took_ms for d in ended.descriptions], [d["took_ms"] for d in same["descriptions"]])
+        took = [description["took_ms"] for description in same["descriptions"]]
+        self.assertEqual([description.took_ms for description in ended.descriptions], took)
         self.assertTrue(all(d.HasField("took_ms") for d in ended.descriptions))
         self.assertFalse(ended.HasField("reasoning_took_ms"))
         self.assertEqual(ended.finished_at.ToJsonString()[:19], same["finished_at"][:19])
