@@ -1,16 +1,12 @@
 //! What calls in progress may cost, among all processes that share a store.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use jiff::civil::Date;
 
 use super::budget::Spent;
+use super::patience::insist;
 use crate::store::{Purse, SharedLimits, StoreError};
-
-/// The pause before a store that is away is told again, and for how long it is.
-const PAUSE: Duration = Duration::from_millis(500);
-const LONGEST: Duration = Duration::from_secs(24 * 3600);
 
 /// What is set aside for one call. Dropped unsettled, it goes back: the call was not answered.
 pub(super) struct Aside {
@@ -49,26 +45,6 @@ impl Drop for Aside {
         tokio::spawn(async move {
             insist("what a call did not need", || shared.give_back(day, unneeded)).await;
         });
-    }
-}
-
-/// Tells a store that is away for a while; gives up after a day.
-pub(super) async fn insist<F>(what: &str, tell: impl Fn() -> F)
-where
-    F: Future<Output = Result<(), StoreError>>,
-{
-    let began = Instant::now();
-    loop {
-        match tell().await {
-            Ok(()) => return,
-            Err(StoreError::Unavailable(_)) if began.elapsed() < LONGEST => {
-                tokio::time::sleep(PAUSE).await;
-            }
-            Err(error) => {
-                tracing::warn!(%error, "the store cannot be told {what}");
-                return;
-            }
-        }
     }
 }
 

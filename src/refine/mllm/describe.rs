@@ -5,15 +5,17 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use futures_util::{StreamExt, stream};
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use tokio::sync::OnceCell;
 
-use super::aside::{Aside, insist};
+use super::aside::Aside;
 use super::budget::{Exceeded, JobBudget, Spent};
-use super::cache::{CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame};
+use super::cache::{CachedDescription, DescribedFrame, SimilarFrame};
 use super::client::{Answer, Call, estimate_tokens};
+use super::patience::{insist, patiently};
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Switches, clean};
+use super::purchase::Purchase;
 use super::retry::CallError;
 use super::wire::{Content, ImageUrl, Message, Part, Role};
 use super::{MllmRefiner, Progress, RefineError};
@@ -23,12 +25,6 @@ use crate::domain::{
 use crate::refine::milliseconds;
 use crate::store::{JobRecord, Step, StoreError};
 use crate::telemetry::CacheLookup;
-
-/// The pause between two looks for a description that another process is buying.
-const PURCHASE_LOOK: Duration = Duration::from_millis(250);
-
-/// After so long another process may buy what this one has not bought.
-const LONGEST_PURCHASE: SignedDuration = SignedDuration::from_mins(10);
 
 /// What one refinement goes along with.
 pub(super) struct Work<'a> {
@@ -154,31 +150,6 @@ pub(super) fn cost_of(answer: &Answer) -> Usage {
     }
 }
 
-/// The right of this process to buy a description. It ends when this is dropped.
-struct Purchase {
-    cache: Arc<dyn DescriptionCache>,
-    key: Option<Digest>,
-}
-
-impl Purchase {
-    fn not_granted(mut self) -> Option<Self> {
-        self.key = None;
-        None
-    }
-}
-
-impl Drop for Purchase {
-    fn drop(&mut self) {
-        let Some(key) = self.key else { return };
-        let cache = Arc::clone(&self.cache);
-        tokio::spawn(async move {
-            // Other processes wait for it, as long as this one is alive.
-            let ended = || cache.end_purchase(&key);
-            insist("that a description is not being bought any more", ended).await;
-        });
-    }
-}
-
 impl MllmRefiner {
     /// The candidates that are still in the map, in coarse order.
     pub(super) async fn pairs(
@@ -274,19 +245,23 @@ impl MllmRefiner {
         pair: &Pair,
         bought: &AtomicBool,
     ) -> Result<Found, CallError> {
-        if let Some(description) = self.cache.description(&pair.key).await.map_err(passing)? {
+        if let Some(description) =
+            patiently(|| self.cache.description(&pair.key)).await.map_err(passing)?
+        {
             self.metrics.description_lookup(CacheLookup::Hit);
             return Ok(Found { description, stands_in: None, took: None });
         }
         for frame in &work.similar {
             let key = self.key(&frame.digest, &pair.digest, work.scene);
-            if let Some(description) = self.cache.description(&key).await.map_err(passing)? {
+            if let Some(description) =
+                patiently(|| self.cache.description(&key)).await.map_err(passing)?
+            {
                 self.metrics.description_lookup(CacheLookup::Similar);
                 let stands_in = Some(frame.stand_in);
                 return Ok(Found { description, stands_in, took: None });
             }
         }
-        let _purchase = match self.purchase(&pair.key).await? {
+        let _purchase = match Purchase::begin(&self.cache, &pair.key).await.map_err(passing)? {
             Ok(purchase) => purchase,
             Err(description) => {
                 self.metrics.description_lookup(CacheLookup::Hit);
@@ -297,28 +272,6 @@ impl MllmRefiner {
         let (description, took) = self.buy(work, pair).await?;
         bought.store(true, Ordering::Relaxed);
         Ok(Found { description, stands_in: None, took: Some(took) })
-    }
-
-    /// The right to buy a description; or the description, if another process was buying it.
-    async fn purchase(
-        &self,
-        key: &Digest,
-    ) -> Result<Result<Purchase, CachedDescription>, CallError> {
-        loop {
-            let until = Timestamp::now().saturating_add(LONGEST_PURCHASE).unwrap_or(Timestamp::MAX);
-            // Made before it is known to be granted: the answer may be lost on its way.
-            let purchase = Purchase { cache: Arc::clone(&self.cache), key: Some(*key) };
-            let begun = self.cache.begin_purchase(key, until).await.map_err(passing)?;
-            let purchase = if begun { Some(purchase) } else { purchase.not_granted() };
-            // Whoever was at it a moment ago may have ended just now.
-            if let Some(known) = self.cache.description(key).await.map_err(passing)? {
-                return Ok(Err(known));
-            }
-            if let Some(purchase) = purchase {
-                return Ok(Ok(purchase));
-            }
-            tokio::time::sleep(PURCHASE_LOOK).await;
-        }
     }
 
     async fn buy(
@@ -362,23 +315,16 @@ impl MllmRefiner {
         let spent = self.spent_now(work.record, usage);
         let keeping = tokio::spawn(async move {
             let describing = async {
-                match bought {
-                    Some((key, description)) => cache.keep_description(key, description).await,
-                    None => Ok(()),
+                if let Some((key, description)) = bought {
+                    let keep = || cache.keep_description(key, description.clone());
+                    insist("a description, so that the next job has to pay again", keep).await;
                 }
             };
-            tokio::join!(describing, accounts.add_usage(spent))
+            let accounting = insist("what was spent", || accounts.add_usage(spent.clone()));
+            tokio::join!(describing, accounting)
         });
-        let (described, accounted) = keeping.await.unwrap_or_else(|error| {
-            let broken = || Err(StoreError::Failed(error.to_string()));
-            (broken(), broken())
-        });
-        if let Err(error) = described {
-            // The job has its text; only the next one will have to pay again.
-            tracing::error!(%error, "a description could not be stored");
-        }
-        if let Err(error) = accounted {
-            tracing::error!(%error, "what was spent could not be written down");
+        if let Err(error) = keeping.await {
+            tracing::error!(%error, "what was bought could not be written down");
         }
     }
 
