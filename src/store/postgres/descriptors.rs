@@ -14,7 +14,7 @@ use uuid::Uuid;
 
 use super::super::changes::removed;
 use super::super::{LookAlikes, StoreError};
-use super::{Inner, count, is_missing_table};
+use super::{Inner, count, is_locked, is_missing_table};
 use crate::domain::{CalibrationSettings, Candidate, Descriptor, ImageId, Map, Pose};
 use crate::retrieve::index::SearchMode;
 
@@ -26,6 +26,18 @@ const SPARE: usize = 8;
 
 /// Longer descriptors do not fit into a page of a table, and are kept beside it.
 const MOST_IN_PAGE: usize = 1900;
+
+/// Tables of descriptors that no map and no draft has, by how their names begin.
+const UNNEEDED: &str = "
+    SELECT relname::text FROM pg_class
+    WHERE relkind = 'r' AND pg_table_is_visible(oid) AND starts_with(relname::text, $1)
+        AND relname::text NOT IN (
+            SELECT 'descriptors_' || replace(uid::text, '-', '') || '_' || revision FROM maps
+            UNION ALL
+            SELECT 'descriptors_' || replace(map_uid::text, '-', '') || '_' || revision FROM drafts)";
+
+/// So long a table is waited for that is to be dropped, in milliseconds. Nobody can search it meanwhile.
+const DROP_PATIENCE_MS: u32 = 200;
 
 /// Maps whose index is known to be there, by uid and revision. None ever loses it.
 #[derive(Default)]
@@ -51,7 +63,11 @@ impl KnownGraphs {
 
 /// The table of a map's descriptors.
 pub(super) fn table(uid: Uuid, revision: u32) -> String {
-    format!("descriptors_{}_{revision}", uid.simple())
+    format!("{}{revision}", table_prefix(uid))
+}
+
+fn table_prefix(uid: Uuid) -> String {
+    format!("descriptors_{}_", uid.simple())
 }
 
 /// The name of its index.
@@ -72,7 +88,7 @@ pub(super) async fn make_table(connection: &mut PgConnection, map: &Map) -> Resu
     Ok(())
 }
 
-/// Removes it, once nobody reads it.
+/// Drops it, once nobody reads it.
 pub(super) async fn drop_table(
     connection: &mut PgConnection,
     uid: Uuid,
@@ -130,6 +146,50 @@ impl Inner {
         }
     }
 
+    /// Drops the tables of descriptors that no map and no draft has any more, of one uid or of all. One that is
+    /// in use, or whose index is being built, is left to a later look.
+    ///
+    /// Never in the transaction that made them so: whoever adds an image locks the table and then the map's
+    /// row, and a transaction that locked the two in the other order would wait for it, and it for that.
+    pub(super) async fn drop_unneeded(&self, uid: Option<Uuid>) -> Result<(), StoreError> {
+        let prefix = uid.map_or_else(|| "descriptors_".to_owned(), table_prefix);
+        let unneeded = sqlx::query_scalar(UNNEEDED).bind(prefix);
+        let unneeded: Vec<String> =
+            self.call(async { Ok(unneeded.fetch_all(&self.pool).await?) }).await?;
+        for table in unneeded {
+            self.call(self.drop_if_unneeded(&table)).await?;
+        }
+        Ok(())
+    }
+
+    /// The same after a change that is done: what cannot be dropped is left to the janitor.
+    pub(super) async fn drop_left(&self, uid: Uuid) {
+        if let Err(error) = self.drop_unneeded(Some(uid)).await {
+            tracing::warn!(%error, "old descriptors are left to a later look");
+        }
+    }
+
+    async fn drop_if_unneeded(&self, table: &str) -> Result<(), StoreError> {
+        let mut tx = self.begin().await?;
+        for statement in [
+            format!("SET LOCAL lock_timeout = {DROP_PATIENCE_MS}"),
+            format!("LOCK TABLE {table} IN ACCESS EXCLUSIVE MODE"),
+        ] {
+            match sqlx::raw_sql(AssertSqlSafe(statement)).execute(&mut *tx).await {
+                Err(error) if is_missing_table(&error) || is_locked(&error) => return Ok(()),
+                done => done?,
+            };
+        }
+        // Another draft of the same revision may have begun meanwhile.
+        let still = sqlx::query_scalar(UNNEEDED).bind(table);
+        let still: Vec<String> = still.fetch_all(&mut *tx).await?;
+        if still.iter().any(|still| still == table) {
+            let drop = format!("DROP TABLE {table}");
+            sqlx::raw_sql(AssertSqlSafe(drop)).execute(&mut *tx).await?;
+        }
+        Ok(tx.commit().await?)
+    }
+
     /// Whether the map's index is there.
     async fn has_graph(&self, map: &Map) -> Result<bool, StoreError> {
         if self.graphs.has(map) {
@@ -176,6 +236,7 @@ impl Inner {
              FROM (SELECT slot, descriptor <=> $1::real[]::vector AS distance
                    FROM ({nearest}) nearest ORDER BY distance, slot LIMIT $2) n
              JOIN images i ON i.map_uid = $4 AND i.slot = n.slot
+             JOIN maps m ON m.uid = i.map_uid AND m.revision = $5
              ORDER BY n.distance, i.slot"
         );
         let wanted = k + SPARE;
@@ -183,7 +244,8 @@ impl Inner {
             .bind(query.as_slice())
             .bind(count(k))
             .bind(count(wanted))
-            .bind(map.uid);
+            .bind(map.uid)
+            .bind(i64::from(map.revision));
         let rows = if by_graph && wanted > self.settings.index.ef_search {
             let mut tx = self.begin().await?;
             // For this search alone: as many points are looked at as it takes to find so many.
@@ -199,6 +261,9 @@ impl Inner {
             Ok(rows) => rows,
             Err(error) => return Err(self.explain(map, error).await),
         };
+        if rows.is_empty() {
+            self.check_revision(map).await?;
+        }
         rows.into_iter()
             .map(|row| {
                 let pose: Option<Json<Pose>> = row.try_get("pose")?;
@@ -219,12 +284,11 @@ impl Inner {
         settings: CalibrationSettings,
         k: usize,
     ) -> Result<Vec<LookAlikes>, StoreError> {
-        let places: Vec<(i64, String, Option<Json<Pose>>)> = sqlx::query_as(
-            "SELECT slot, id, pose FROM images WHERE map_uid = $1 ORDER BY slot",
-        )
-        .bind(map.uid)
-        .fetch_all(&self.pool)
-        .await?;
+        let places: Vec<(i64, String, Option<Json<Pose>>)> =
+            sqlx::query_as("SELECT slot, id, pose FROM images WHERE map_uid = $1 ORDER BY slot")
+                .bind(map.uid)
+                .fetch_all(&self.pool)
+                .await?;
         let near = settings.place_images_of(places.len());
         let step = places.len().div_ceil(settings.images.max(1)).max(1);
         let mut asked = Vec::new();

@@ -35,7 +35,8 @@ impl DraftStore for PostgresStore {
                     "INSERT INTO drafts (map_uid, revision, holder) VALUES ($1, $2, $3)
                      ON CONFLICT (map_uid) DO UPDATE
                      SET revision = EXCLUDED.revision, holder = EXCLUDED.holder
-                     WHERE NOT is_alive(drafts.holder, make_interval(secs => $4))",
+                     WHERE drafts.holder <> $3
+                         AND NOT is_alive(drafts.holder, make_interval(secs => $4))",
                 )
                 .bind(next.uid)
                 .bind(i64::from(next.revision))
@@ -112,29 +113,25 @@ impl Draft for PostgresDraft {
             self.indexed = self.build(&inner).await?;
         }
         let replaced = inner.call(self.put_in_place(&inner)).await?;
-        if replaced && self.indexed {
-            inner.graphs.add(&self.next);
+        if replaced {
+            if self.indexed {
+                inner.graphs.add(&self.next);
+            }
+            inner.drop_left(self.next.uid).await;
         }
         Ok(replaced)
     }
 
     async fn discard(self: Box<Self>) {
         let inner = &self.store.inner;
-        let (uid, revision) = (self.next.uid, self.next.revision);
-        let discarded = inner
-            .call(async {
-                let mut tx = inner.begin().await?;
-                let own = sqlx::query("DELETE FROM drafts WHERE map_uid = $1 AND holder = $2");
-                let own = own.bind(uid).bind(inner.process).execute(&mut *tx).await?;
-                if own.rows_affected() > 0 {
-                    drop_table(&mut tx, uid, revision).await?;
-                }
-                Ok(tx.commit().await?)
-            })
-            .await;
-        if let Err(error) = discarded {
+        let uid = self.next.uid;
+        let own = sqlx::query("DELETE FROM drafts WHERE map_uid = $1 AND holder = $2")
+            .bind(uid)
+            .bind(inner.process);
+        if let Err(error) = inner.call(async { Ok(own.execute(&inner.pool).await?) }).await {
             tracing::warn!(%error, "a draft is left to the next one of the map");
         }
+        inner.drop_left(uid).await;
     }
 }
 
@@ -211,7 +208,6 @@ impl PostgresDraft {
         {
             sqlx::query(gone).bind(uid).execute(&mut *tx).await?;
         }
-        drop_table(&mut tx, uid, self.old.revision).await?;
         tx.commit().await?;
         Ok(true)
     }

@@ -77,10 +77,10 @@ impl Inner {
                 }
             }
             drop(tx);
+            self.check_revision(map).await?;
             if let Some(present) = self.image(map.uid, &image.id).await? {
                 return Ok(Added::Present(same_bytes(present, &image)?));
             }
-            self.check_revision(map).await?;
             // The image was there and has just been removed.
         }
         Err(super::unavailable("others change the same image"))
@@ -182,13 +182,15 @@ impl ExportStore for PostgresStore {
         let table = table(map.uid, map.revision);
         let sql = format!(
             "SELECT i.record, d.descriptor::real[] FROM images i
+             JOIN maps m ON m.uid = i.map_uid AND m.revision = $4
              LEFT JOIN {table} d ON d.slot = i.slot
              WHERE i.map_uid = $1 AND i.id > $2 ORDER BY i.id LIMIT $3"
         );
         let query = sqlx::query_as(AssertSqlSafe(sql))
             .bind(map.uid)
             .bind(after.map_or("", ImageId::as_str))
-            .bind(count(limit));
+            .bind(count(limit))
+            .bind(i64::from(map.revision));
         inner
             .call(async {
                 let found: Vec<(Json<Image>, Option<Vec<f32>>)> =
@@ -196,6 +198,9 @@ impl ExportStore for PostgresStore {
                         Ok(found) => found,
                         Err(error) => return Err(inner.explain(map, error).await),
                     };
+                if found.is_empty() {
+                    inner.check_revision(map).await?;
+                }
                 let exported = |(Json(image), numbers): (Json<Image>, Option<Vec<f32>>)| {
                     ExportedImage { image, descriptor: numbers.and_then(descriptor_of) }
                 };

@@ -9,7 +9,7 @@ use uuid::Uuid;
 
 use super::super::changes::{changed_map, removed};
 use super::super::{Added, IndexState, LookAlikes, MapStore, StoreError};
-use super::descriptors::{drop_table, make_table};
+use super::descriptors::make_table;
 use super::{Inner, PostgresStore, counted, record};
 use crate::domain::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Image, ImageId, Map, MapName, Pose,
@@ -49,6 +49,7 @@ impl MapStore for PostgresStore {
         let inner = &self.inner;
         let Some(uid) = inner.call(inner.delete_map(name)).await? else { return Ok(false) };
         inner.graphs.forget(uid);
+        inner.drop_left(uid).await;
         // The map is gone for every caller; what it leaves behind is cleared away in small steps, and by
         // whoever removes what has had its time, if this process ends before.
         while inner.call(inner.sweep(uid)).await? {}
@@ -202,12 +203,11 @@ impl Inner {
             }
             Some(Json(stored)) => {
                 let stored: Map = stored;
-                let before = (stored.uid, stored.revision);
-                let has_images = has_images(&mut tx, stored.uid).await?;
+                let before = stored.uid;
+                let has_images = has_images(&mut tx, before).await?;
                 let map = changed_map(stored, wanted, || has_images)?;
-                if map.uid != before.0 {
-                    leave(&mut tx, before.0).await?;
-                    drop_table(&mut tx, before.0, before.1).await?;
+                if map.uid != before {
+                    leave(&mut tx, before).await?;
                     make_table(&mut tx, &map).await?;
                 }
                 let changed = sqlx::query(
@@ -216,7 +216,7 @@ impl Inner {
                          calibration = CASE WHEN uid = $2 THEN calibration END
                      WHERE uid = $1",
                 );
-                changed.bind(before.0).bind(map.uid).bind(record(&map)?).execute(&mut *tx).await?;
+                changed.bind(before).bind(map.uid).bind(record(&map)?).execute(&mut *tx).await?;
                 (map, false)
             }
         };
@@ -226,11 +226,10 @@ impl Inner {
 
     async fn delete_map(&self, name: &MapName) -> Result<Option<Uuid>, StoreError> {
         let mut tx = self.begin().await?;
-        let gone = sqlx::query_as("DELETE FROM maps WHERE name = $1 RETURNING uid, revision");
-        let gone: Option<(Uuid, i64)> = gone.bind(name.as_str()).fetch_optional(&mut *tx).await?;
-        let Some((uid, revision)) = gone else { return Ok(None) };
+        let gone = sqlx::query_scalar("DELETE FROM maps WHERE name = $1 RETURNING uid");
+        let gone: Option<Uuid> = gone.bind(name.as_str()).fetch_optional(&mut *tx).await?;
+        let Some(uid) = gone else { return Ok(None) };
         leave(&mut tx, uid).await?;
-        drop_table(&mut tx, uid, u32::try_from(revision).unwrap_or_default()).await?;
         tx.commit().await?;
         Ok(Some(uid))
     }
@@ -287,8 +286,16 @@ impl Inner {
         Ok(gone > 0)
     }
 
-    /// Clears away what processes that ended too soon have left of deleted maps.
+    /// Clears away what processes that ended too soon have left of deleted maps, and of drafts.
     pub(super) async fn sweep_deleted(&self) -> Result<(), StoreError> {
+        let broken_off = sqlx::query(
+            "DELETE FROM drafts
+             WHERE holder <> $1 AND NOT is_alive(holder, make_interval(secs => $2))",
+        )
+        .bind(self.process)
+        .bind(self.lifetime());
+        self.call(async { Ok(broken_off.execute(&self.pool).await?) }).await?;
+        self.drop_unneeded(None).await?;
         let left = sqlx::query_scalar("SELECT uid FROM deleted_maps");
         let left: Vec<Uuid> = self.call(async { Ok(left.fetch_all(&self.pool).await?) }).await?;
         for uid in left {
