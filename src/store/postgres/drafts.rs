@@ -67,6 +67,7 @@ impl Draft for PostgresDraft {
         inner
             .call(async {
                 inner.check_revision(&self.old).await?;
+                self.check_held(&inner.pool).await?;
                 loop {
                     let from = self.seen;
                     let some = self.missing_after(&inner, from, limit).await?;
@@ -91,13 +92,16 @@ impl Draft for PostgresDraft {
         let sql = format!(
             "INSERT INTO {table} (slot, descriptor)
              SELECT slot, $4::real[]::vector FROM images
-             WHERE map_uid = $1 AND id = $2 AND digest = $3 ON CONFLICT DO NOTHING"
+             WHERE map_uid = $1 AND id = $2 AND digest = $3
+                 AND EXISTS (SELECT FROM drafts WHERE map_uid = $1 AND holder = $5)
+             ON CONFLICT DO NOTHING"
         );
         let query = sqlx::query(AssertSqlSafe(sql))
             .bind(self.next.uid)
             .bind(image.id.as_str())
             .bind(image.digest.as_bytes().as_slice())
-            .bind(descriptor.as_slice());
+            .bind(descriptor.as_slice())
+            .bind(inner.process);
         inner
             .call(async {
                 query.execute(&inner.pool).await?;
@@ -108,6 +112,12 @@ impl Draft for PostgresDraft {
 
     async fn replace(&mut self) -> Result<bool, StoreError> {
         let inner = self.store.inner.clone();
+        inner
+            .call(async {
+                inner.check_revision(&self.old).await?;
+                self.check_held(&inner.pool).await
+            })
+            .await?;
         if !self.indexed {
             // Before it serves: a large map should not be searched exactly until its index is there.
             self.indexed = self.build(&inner).await?;
@@ -182,6 +192,7 @@ impl PostgresDraft {
         if stored.revision != self.old.revision {
             return Err(StoreError::Superseded(stored.name));
         }
+        self.check_held(&mut *tx).await?;
         if self.lacks_some(&mut tx).await? {
             return Ok(false);
         }
@@ -210,6 +221,21 @@ impl PostgresDraft {
         }
         tx.commit().await?;
         Ok(true)
+    }
+
+    /// Refuses a draft that was taken from this process, because it had not been heard of.
+    async fn check_held(&self, executor: impl sqlx::PgExecutor<'_>) -> Result<(), StoreError> {
+        let held = sqlx::query("SELECT FROM drafts WHERE map_uid = $1 AND holder = $2 FOR SHARE")
+            .bind(self.next.uid)
+            .bind(self.store.inner.process);
+        match held.fetch_optional(executor).await? {
+            Some(_) => Ok(()),
+            None => Err(StoreError::Conflict(format!(
+                "the reindexing of the map {} was given up, because this process had not been heard of \
+                 for too long; begin it again",
+                self.next.name
+            ))),
+        }
     }
 
     async fn lacks_some(&self, connection: &mut PgConnection) -> Result<bool, StoreError> {
