@@ -116,9 +116,11 @@ impl PostgresStore {
             settings,
         });
         inner.call(inner.sign_of_life()).await?;
+        // Whoever has the store hears of every change.
+        let listener = inner.call(listener::connect(&inner.pool)).await?;
         let weak = Arc::downgrade(&inner);
         tokio::spawn(processes::keep_alive(weak.clone(), background.clone()));
-        tokio::spawn(listener::listen(inner.pool.clone(), weak.clone(), background.clone()));
+        tokio::spawn(listener::listen(listener, weak.clone(), background.clone()));
         tokio::spawn(indexer::keep_indexed(weak, background));
         Ok(Self { inner })
     }
