@@ -28,13 +28,13 @@ mod webhooks;
 
 use std::future::Future;
 use std::str::FromStr;
-use std::sync::Arc;
-use std::time::Duration;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use jiff::SignedDuration;
 use serde::Serialize;
 use sqlx::postgres::{PgConnectOptions, PgPool, PgPoolOptions};
-use sqlx::{Postgres, Transaction};
+use sqlx::{Connection, Postgres, Transaction};
 use tokio::sync::{broadcast, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use uuid::Uuid;
@@ -74,6 +74,7 @@ pub struct PostgresStore {
 
 struct Inner {
     pool: PgPool,
+    doubts: Doubts,
     objects: Objects,
     settings: PostgresSettings,
     /// This process among all.
@@ -100,7 +101,8 @@ impl PostgresStore {
         objects: Objects,
         process: Uuid,
     ) -> Result<Self, StoreError> {
-        let pool = connect(&settings)?;
+        let doubts = Doubts::default();
+        let pool = connect(&settings, &doubts)?;
         check_schema(&pool, &settings).await?;
         let background = CancellationToken::new();
         let inner = Arc::new(Inner {
@@ -113,6 +115,7 @@ impl PostgresStore {
             graphs: descriptors::KnownGraphs::default(),
             _background: background.clone().drop_guard(),
             pool,
+            doubts,
             settings,
         });
         inner.call(inner.sign_of_life()).await?;
@@ -133,7 +136,10 @@ impl Inner {
         work: impl Future<Output = Result<T, StoreError>>,
     ) -> Result<T, StoreError> {
         let limit = self.settings.timeout;
-        tokio::time::timeout(limit, work).await.unwrap_or_else(|_| {
+        let mut work = std::pin::pin!(work);
+        tokio::time::timeout(limit, work.as_mut()).await.unwrap_or_else(|_| {
+            // Before the work is dropped, and gives its connection back.
+            self.doubts.arise();
             let limit = limit.as_millis();
             Err(unavailable(format!("it did not answer within {limit} ms (database.timeout_ms)")))
         })
@@ -149,8 +155,25 @@ impl Inner {
     }
 }
 
+/// When a call last ran out of time. The pool asks every connection that it is given back whether it is alive,
+/// and would wait for the answer of a dead one for ever; after such a call it does not.
+#[derive(Clone, Default)]
+struct Doubts(Arc<Mutex<Option<Instant>>>);
+
+impl Doubts {
+    fn arise(&self) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
+    }
+
+    /// Whether a call ran out of time so short a while ago that its connection is still to come.
+    fn are_fresh(&self, within: Duration) -> bool {
+        let arose = *self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        arose.is_some_and(|arose| arose.elapsed() < within)
+    }
+}
+
 /// No connection yet: they are made when they are needed.
-fn connect(settings: &PostgresSettings) -> Result<PgPool, StoreError> {
+fn connect(settings: &PostgresSettings, doubts: &Doubts) -> Result<PgPool, StoreError> {
     let options = PgConnectOptions::from_str(&settings.url).map_err(|error| {
         // The error may show the address, and that may hold a password.
         let what = match error {
@@ -176,9 +199,20 @@ fn connect(settings: &PostgresSettings) -> Result<PgPool, StoreError> {
             ("statement_timeout", patience.as_str()),
             ("idle_in_transaction_session_timeout", patience.as_str()),
         ]);
+    let (doubts, timeout) = (doubts.clone(), settings.timeout);
     Ok(PgPoolOptions::new()
         .max_connections(settings.max_connections)
         .acquire_timeout(settings.timeout)
+        .after_release(move |connection, _| {
+            let doubtful = doubts.are_fresh(2 * timeout);
+            Box::pin(async move {
+                if doubtful {
+                    let answer = tokio::time::timeout(timeout, connection.ping()).await;
+                    answer.map_err(|_| sqlx::Error::PoolTimedOut)??;
+                }
+                Ok(true)
+            })
+        })
         .connect_lazy_with(options))
 }
 
