@@ -222,7 +222,24 @@ impl Inner {
         k: usize,
         mode: SearchMode,
     ) -> Result<Vec<Found>, StoreError> {
-        let by_graph = mode == SearchMode::Fast && self.has_graph(map).await?;
+        if mode == SearchMode::Fast && self.has_graph(map).await? {
+            let found = self.nearest(map, query, k, true).await?;
+            // Among many removed images an index can lose its way to the rest, and it is not looked through
+            // to its end.
+            if found.len() == k {
+                return Ok(found);
+            }
+        }
+        self.nearest(map, query, k, false).await
+    }
+
+    async fn nearest(
+        &self,
+        map: &Map,
+        query: &Descriptor,
+        k: usize,
+        by_graph: bool,
+    ) -> Result<Vec<Found>, StoreError> {
         let (table, dim) = (table(map.uid, map.revision), map.dim);
         let nearest = match by_graph {
             true => format!(

@@ -192,8 +192,9 @@ fn connect(settings: &PostgresSettings, doubts: &Doubts) -> Result<PgPool, Store
         .statement_cache_capacity(STATEMENTS_KEPT)
         .options([
             ("hnsw.ef_search", ef_search.as_str()),
-            // Dead images are in the index until the next vacuum: look on until there are enough.
-            ("hnsw.iterative_scan", "strict_order"),
+            // Dead images are in the index until the next vacuum: look on until there are enough. Their order
+            // is made anew, and the strict one leaves out what comes late.
+            ("hnsw.iterative_scan", "relaxed_order"),
             // Compiling a search takes longer than searching.
             ("jit", "off"),
             ("statement_timeout", patience.as_str()),
