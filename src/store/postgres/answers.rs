@@ -26,7 +26,8 @@ impl AnswerStore for PostgresStore {
                          ON CONFLICT (id) DO UPDATE
                          SET at = EXCLUDED.at, holder = EXCLUDED.holder, record = EXCLUDED.record
                          WHERE CASE WHEN answers.holder IS NULL THEN answers.at < $5
-                             ELSE NOT is_alive(answers.holder, make_interval(secs => $6)) END",
+                             ELSE answers.holder <> $3
+                                 AND NOT is_alive(answers.holder, make_interval(secs => $6)) END",
                     )
                     .bind(id)
                     .bind(reserved.at.to_sqlx())
