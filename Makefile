@@ -28,7 +28,7 @@ chromium:
 	@deploy/setup/chromium.sh
 
 test: assets nasm chromium ## Set up, build and run every test
-	$(CARGO) test --release --locked
+	tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked
 	tests/api/conformance.sh $(BINARY) target/api-venv
 	tests/grpc/check.sh $(BINARY) target/grpc-venv
 	tests/console/check.sh $(BINARY) target/console-venv

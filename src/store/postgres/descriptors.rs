@@ -152,7 +152,7 @@ impl Inner {
     /// Never in the transaction that made them so: whoever adds an image locks the table and then the map's
     /// row, and a transaction that locked the two in the other order would wait for it, and it for that.
     pub(super) async fn drop_unneeded(&self, uid: Option<Uuid>) -> Result<(), StoreError> {
-        let prefix = uid.map_or_else(|| "descriptors_".to_owned(), |uid| table_prefix(uid));
+        let prefix = uid.map_or_else(|| "descriptors_".to_owned(), table_prefix);
         let unneeded = sqlx::query_scalar(UNNEEDED).bind(prefix);
         let unneeded: Vec<String> =
             self.call(async { Ok(unneeded.fetch_all(&self.pool).await?) }).await?;

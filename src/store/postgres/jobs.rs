@@ -108,15 +108,24 @@ impl PostgresStore {
                 let found = sqlx::query_scalar("SELECT record FROM jobs WHERE id = $1 FOR UPDATE");
                 let found = found.bind(id).fetch_optional(&mut *tx).await?;
                 let Json(mut known): Json<JobRecord> = found.ok_or_else(|| no_job(id))?;
-                if let Some(place) = change(&mut known)? {
-                    let lets_go = !matches!(place, Place::Same);
-                    inner.write_job(&mut tx, &known, place).await?;
-                    tx.commit().await?;
-                    if lets_go {
-                        inner.held.let_go(id);
+                let mut lets_go = false;
+                let changed = match change(&mut known) {
+                    Ok(Some(place)) => {
+                        lets_go = !matches!(place, Place::Same);
+                        inner.write_job(&mut tx, &known, place).await
                     }
+                    Ok(None) => Ok(()),
+                    Err(refused) => Err(refused),
+                };
+                // Also where nothing has changed: whoever claims passes over a job that is locked.
+                match changed {
+                    Ok(()) => tx.commit().await?,
+                    Err(_) => tx.rollback().await?,
                 }
-                Ok(known.job)
+                if lets_go && changed.is_ok() {
+                    inner.held.let_go(id);
+                }
+                changed.map(|()| known.job)
             })
             .await
     }
