@@ -7,8 +7,12 @@ use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast;
 use uuid::Uuid;
-use whereabouts::domain::{Candidate, Description, Job, JobState, Priority, StandIn, Usage};
-use whereabouts::store::{Claim, JobFilter, JobRecord, Release, Step, Store, StoreError};
+use whereabouts::domain::{
+    Candidate, Description, Digest, Job, JobState, Priority, StandIn, Usage,
+};
+use whereabouts::store::{
+    Claim, FirstAnswer, JobFilter, JobRecord, Progress, Release, Step, Store, StoreError,
+};
 
 use crate::support::{
     Fixture, claim, descriptor, eventually, image, odd_texts, record, submit, submit_record,
@@ -27,6 +31,8 @@ contract!(
     the_queue_holds_exactly_so_many,
     every_change_is_told,
     jobs_are_listed_newest_first_by_map_and_state_a_page_at_a_time,
+    jobs_are_searched_for_a_text,
+    a_request_that_is_done_again_finds_its_job,
     a_job_that_is_not_there_is_not_found,
     a_job_outlives_a_restart_and_is_free_of_the_worker_that_did_not,
     odd_texts_in_a_job_survive,
@@ -216,7 +222,8 @@ async fn steps_add_up_and_a_description_replaces_that_of_the_same_image(fixture:
     let stands_in = Some(StandIn { query_id: Uuid::now_v7(), similarity: 0.99 });
     for (image_id, text) in [("a", "first"), ("b", "second"), ("a", "third")] {
         let (image_id, text) = (image_id.parse().unwrap(), text.to_owned());
-        let description = Some(Description { image_id, text, cached: true, stands_in, took_ms: None, usage });
+        let description =
+            Some(Description { image_id, text, cached: true, stands_in, took_ms: None, usage });
         store.progress(taken.claim(), Step { usage, description }).await.unwrap();
     }
     store.progress(taken.claim(), Step { usage, description: None }).await.unwrap();
@@ -341,7 +348,8 @@ async fn jobs_are_listed_newest_first_by_map_and_state_a_page_at_a_time(fixture:
         store.cancel(*id).await.unwrap();
     }
     let listed = async |map: Option<&str>, state, before, limit| -> Vec<usize> {
-        let filter = JobFilter { map: map.map(|map| map.parse().unwrap()), state };
+        let map = map.map(|map| map.parse().unwrap());
+        let filter = JobFilter { map, state, text: None };
         let jobs = store.jobs(&filter, before, limit).await.unwrap().jobs;
         jobs.iter().map(|job| ids.iter().position(|id| *id == job.id).unwrap()).collect()
     };
@@ -402,6 +410,7 @@ async fn odd_texts_in_a_job_survive(fixture: &Fixture) {
             text: text.clone(),
             cached: false,
             stands_in: None,
+            took_ms: None,
             usage: Usage::default(),
         };
         let step = Step { usage: Usage::default(), description: Some(description) };
@@ -419,4 +428,51 @@ async fn odd_texts_in_a_job_survive(fixture: &Fixture) {
         assert_eq!(store.job(id).await.unwrap().unwrap().job, job);
         assert_eq!(store.jobs(&JobFilter::default(), None, 1).await.unwrap().jobs, [job]);
     }
+}
+
+async fn jobs_are_searched_for_a_text(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let mut ids = Vec::new();
+    for map in ["town", "yard", "town"] {
+        ids.push(submit(&*store, map, b"frame").await);
+    }
+    let search = async |text: &str, limit| -> Vec<Uuid> {
+        let filter = JobFilter { text: Some(text.into()), ..JobFilter::default() };
+        let list = store.jobs(&filter, None, limit).await.unwrap();
+        assert_eq!(list.searched_to, None);
+        list.jobs.iter().map(|job| job.id).collect()
+    };
+    assert_eq!(search("TOW", 10).await, [ids[2], ids[0]]);
+    assert_eq!(search("TOW", 1).await, [ids[2]]);
+    assert_eq!(search(&ids[1].to_string(), 10).await, [ids[1]]);
+    for text in ["nowhere", "%", "\0", "'"] {
+        assert!(search(text, 10).await.is_empty(), "{text:?}");
+    }
+}
+
+async fn a_request_that_is_done_again_finds_its_job(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let running = || {
+        let progress = Progress::Running { process: Uuid::now_v7(), job: None };
+        FirstAnswer { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
+    };
+    let reserve = async || {
+        store.reserve_answer("r", running(), Timestamp::UNIX_EPOCH).await.unwrap();
+    };
+    let _pin = store.put_blob(Digest::of(b"frame"), "frame".into()).await.unwrap();
+    reserve().await;
+    let first = record("m", b"frame");
+    let id = first.job.id;
+    assert_eq!(store.submit_once(first, 10, "r").await.unwrap(), None);
+    let again = store.submit_once(record("m", b"frame"), 10, "r").await.unwrap();
+    assert_eq!(again.unwrap().id, id);
+    assert_eq!(store.queued().await.unwrap(), 1);
+    // Another request has a job of its own; so has one that nobody remembers.
+    assert_eq!(store.submit_once(record("m", b"frame"), 10, "other").await.unwrap(), None);
+    store.forget_answer("r").await.unwrap();
+    reserve().await;
+    assert_eq!(store.submit_once(record("m", b"frame"), 10, "r").await.unwrap(), None);
+    assert_eq!(store.queued().await.unwrap(), 3);
+    let full = store.submit_once(record("m", b"frame"), 3, "third").await;
+    assert!(matches!(full, Err(StoreError::QueueFull { limit: 3 })));
 }

@@ -10,15 +10,15 @@ use sqlx::ConnectOptions;
 use tokio::sync::broadcast;
 use uuid::Uuid;
 use whereabouts::domain::{
-    ApiKey, Delivery, Digest, Job, JobState, KeyLimits, Role, StoredKey, StoredWebhook, Webhook,
-    WebhookEvent, WebhookSecret,
+    ApiKey, DayUsage, Delivery, Digest, Job, JobState, KeyLimits, Role, StoredKey, StoredWebhook,
+    Usage, Webhook, WebhookEvent, WebhookSecret,
 };
 use whereabouts::refine::mllm::{CachedDescription, DescriptionCache};
 use whereabouts::retrieve::index::SearchMode;
 use whereabouts::store::postgres::{PostgresStore, SchemaState, migrate, schema_of};
 use whereabouts::store::{
-    AnswerStore, DraftStore, FirstAnswer, JobStore, KeyStore, MapStore, Progress, Retention,
-    StoreError, StoredDelivery, WebhookStore,
+    AnswerStore, DraftStore, Draw, FirstAnswer, JobStore, KeyStore, MapStore, Progress, Purse,
+    Retention, SharedLimits, StoreError, StoredDelivery, UsageStore, WebhookStore,
 };
 
 use crate::support::{
@@ -399,19 +399,26 @@ async fn the_schema_is_migrated_once_however_many_do_it() {
 }
 
 #[tokio::test]
-async fn a_schema_of_a_later_program_is_refused() {
+async fn a_schema_that_is_later_by_one_step_is_borne_and_by_more_refused() {
     let database = database().await;
-    database
-        .run(
+    let step = async |version: u32| {
+        let step = format!(
             "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
-             VALUES (9000, 'later', true, '', 0)",
-        )
-        .await;
+             VALUES ({version}, 'later', true, '', 0)"
+        );
+        database.run(&step).await;
+    };
     let settings = database.settings(Tuning::default());
-    let opened = PostgresStore::open(settings.clone(), database.objects(), Uuid::now_v7()).await;
-    for refused in [opened.err().unwrap(), migrate(&settings).await.unwrap_err()] {
+    let open =
+        async || PostgresStore::open(settings.clone(), database.objects(), Uuid::now_v7()).await;
+    // While servers are replaced one after another, the old ones may have to start again.
+    step(9000).await;
+    open().await.unwrap();
+    assert_eq!(migrate(&settings).await.unwrap(), 0);
+    step(9001).await;
+    for refused in [open().await.err().unwrap(), migrate(&settings).await.unwrap_err()] {
         assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
-        assert!(refused.to_string().contains("version 9000"), "{refused}");
+        assert!(refused.to_string().contains("version 9001"), "{refused}");
     }
 }
 
@@ -427,4 +434,45 @@ async fn right_after_the_database_was_started_everybody_counts_as_alive() {
     let other = database.open(Tuning { lifetime: age, ..Tuning::default() }).await;
     tokio::time::sleep(3 * SHORT_LIFE).await;
     assert!(claim(&other).await.is_none());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_limit_by_the_minute_is_that_of_all_processes() {
+    let database = database().await;
+    let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
+    // As good as nothing comes back while this runs.
+    let draw = Draw { per_minute: 0.01, needed: 0.001, taken: 0.001 };
+    let mut taken = 0;
+    for number in 0..30 {
+        let drawn = processes[number % 2].draw("key", [draw, Draw::UNLIMITED]).await.unwrap();
+        taken += usize::from(drawn.taken);
+        assert!(drawn.taken || drawn.left[0] < 0.002);
+    }
+    assert!((9..=12).contains(&taken), "{taken}");
+    // What is given back is there for others, and no more than a minute's worth.
+    let back = Draw { needed: f64::MIN, taken: -1.0, ..draw };
+    processes[0].draw("key", [back, Draw::UNLIMITED]).await.unwrap();
+    let drawn = processes[1].draw("key", [draw, Draw::UNLIMITED]).await.unwrap();
+    assert!(drawn.taken && drawn.left[0] < 0.01, "{drawn:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_budget_of_a_day_is_that_of_all_processes() {
+    let database = database().await;
+    let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
+    let (day, limit) = (date(2026, 5, 1), Purse { tokens: 1000, money: 0.0 });
+    let tokens = |tokens| Purse { tokens, money: 0.0 };
+    assert!(processes[0].set_aside(day, tokens(600), limit).await.unwrap());
+    assert!(!processes[1].set_aside(day, tokens(600), limit).await.unwrap());
+    // The call took 100 tokens: 500 go back, and the rest is spent when it is written down.
+    processes[0].give_back(day, tokens(500)).await.unwrap();
+    let usage = Usage { calls: 1, prompt_tokens: 80, completion_tokens: 20, ..Usage::default() };
+    let spent = DayUsage { date: day, map: "m".parse().unwrap(), usage, money: 0.0 };
+    processes[0].add_usage(spent).await.unwrap();
+    assert!(!processes[1].set_aside(day, tokens(901), limit).await.unwrap());
+    assert!(processes[1].set_aside(day, tokens(900), limit).await.unwrap());
+    assert!(!processes[0].set_aside(day, tokens(1), limit).await.unwrap());
+    // Another day, and no limit at all.
+    assert!(processes[0].set_aside(date(2026, 5, 2), tokens(1000), limit).await.unwrap());
+    assert!(processes[0].set_aside(day, tokens(5000), tokens(0)).await.unwrap());
 }

@@ -363,7 +363,15 @@ pub fn record(map: &str, frame: &[u8]) -> JobRecord {
     let query =
         Query { id, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
     let job = Job::queued(map.parse().unwrap(), id, RefinerKind::Local, now);
-    JobRecord { job, map_uid: Uuid::nil(), revision: 0, query, candidates: vec![], claims: 0, traceparent: None }
+    JobRecord {
+        job,
+        map_uid: Uuid::nil(),
+        revision: 0,
+        query,
+        candidates: vec![],
+        claims: 0,
+        traceparent: None,
+    }
 }
 
 /// Takes a job for a minute.
