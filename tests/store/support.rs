@@ -93,7 +93,7 @@ pub struct Fixture(Kind);
 
 enum Kind {
     Embedded(TempDir),
-    Postgres(Database),
+    Postgres(Box<Database>),
 }
 
 impl Fixture {
@@ -102,11 +102,11 @@ impl Fixture {
     }
 
     pub async fn postgres() -> Self {
-        Self(Kind::Postgres(Database::migrated(Pictures::Folder).await))
+        Self(Kind::Postgres(Box::new(Database::migrated(Pictures::Folder).await)))
     }
 
     pub async fn postgres_and_s3() -> Self {
-        Self(Kind::Postgres(Database::migrated(Pictures::S3).await))
+        Self(Kind::Postgres(Box::new(Database::migrated(Pictures::S3).await)))
     }
 
     /// Opens the store. To open it again, as after a restart, drop it first.
