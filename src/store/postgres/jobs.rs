@@ -50,47 +50,56 @@ enum Place {
 /// The jobs that workers of this process hold. One that the database says the process holds, and that is not
 /// among these, was claimed in a transaction whose end was not heard.
 #[derive(Default)]
-pub(super) struct HeldJobs(Mutex<HashMap<Uuid, Instant>>);
+pub(super) struct HeldJobs(Mutex<HashMap<Uuid, (Claim, Instant)>>);
 
 impl HeldJobs {
-    fn jobs(&self) -> MutexGuard<'_, HashMap<Uuid, Instant>> {
+    fn jobs(&self) -> MutexGuard<'_, HashMap<Uuid, (Claim, Instant)>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Those whose leases have not ended.
     fn all(&self) -> Vec<Uuid> {
         let (mut jobs, now) = (self.jobs(), Instant::now());
-        jobs.retain(|_, until| *until > now);
+        jobs.retain(|_, (_, until)| *until > now);
         jobs.keys().copied().collect()
+    }
+
+    fn has(&self, job: Uuid) -> bool {
+        self.jobs().get(&job).is_some_and(|(_, until)| *until > Instant::now())
     }
 
     /// Holds a job as long as the returned value lives, or, if that is kept, until it is let go of or so many
     /// seconds have passed.
-    fn hold(&self, job: Uuid, for_s: f64) -> Holding<'_> {
-        self.jobs().insert(job, Instant::now() + Duration::from_secs_f64(for_s));
-        Holding { held: self, job: Some(job) }
+    fn hold(&self, claim: Claim, for_s: f64) -> Holding<'_> {
+        let until = Instant::now() + Duration::from_secs_f64(for_s);
+        self.jobs().insert(claim.job, (claim, until));
+        Holding { held: self, claim: Some(claim) }
     }
 
-    fn let_go(&self, job: Uuid) {
-        self.jobs().remove(&job);
+    /// Not of a later claim: the job may have been taken again already.
+    fn let_go(&self, claim: Claim) {
+        let mut jobs = self.jobs();
+        if jobs.get(&claim.job).is_some_and(|(known, _)| *known == claim) {
+            jobs.remove(&claim.job);
+        }
     }
 }
 
 struct Holding<'a> {
     held: &'a HeldJobs,
-    job: Option<Uuid>,
+    claim: Option<Claim>,
 }
 
 impl Holding<'_> {
     fn keep(mut self) {
-        self.job = None;
+        self.claim = None;
     }
 }
 
 impl Drop for Holding<'_> {
     fn drop(&mut self) {
-        if let Some(job) = self.job {
-            self.held.let_go(job);
+        if let Some(claim) = self.claim {
+            self.held.let_go(claim);
         }
     }
 }
@@ -123,7 +132,7 @@ impl PostgresStore {
                     Err(_) => tx.rollback().await?,
                 }
                 if lets_go && changed.is_ok() {
-                    inner.held.let_go(id);
+                    inner.held.let_go(known.claim());
                 }
                 changed.map(|()| known.job)
             })
@@ -369,23 +378,32 @@ impl JobStore for PostgresStore {
         let for_s = seconds(lease_until.duration_since(now).max(SignedDuration::ZERO));
         inner
             .call(async {
-                let mut tx = inner.begin().await?;
-                let found = sqlx::query_scalar(
-                    "SELECT record FROM jobs
-                     WHERE ended_at IS NULL AND (held_until IS NULL OR held_until <= now()
-                         OR CASE WHEN holder = $1 THEN id <> ALL ($3)
-                             ELSE NOT is_alive(holder, make_interval(secs => $2)) END)
-                     ORDER BY place, id LIMIT 1 FOR UPDATE SKIP LOCKED",
-                )
-                .bind(inner.process)
-                .bind(inner.lifetime())
-                .bind(inner.held.all());
-                let found: Option<Json<JobRecord>> = found.fetch_optional(&mut *tx).await?;
-                let Some(Json(mut known)) = found else { return Ok(None) };
+                let (mut tx, mut known) = loop {
+                    let mut tx = inner.begin().await?;
+                    let found = sqlx::query_as(
+                        "SELECT record, coalesce(holder = $1 AND held_until > now(), false) FROM jobs
+                         WHERE ended_at IS NULL AND (held_until IS NULL OR held_until <= now()
+                             OR CASE WHEN holder IS NULL THEN false
+                                 WHEN holder = $1 THEN id <> ALL ($3)
+                                 ELSE NOT is_alive(holder, make_interval(secs => $2)) END)
+                         ORDER BY place, id LIMIT 1 FOR UPDATE SKIP LOCKED",
+                    )
+                    .bind(inner.process)
+                    .bind(inner.lifetime())
+                    .bind(inner.held.all());
+                    let found: Option<(Json<JobRecord>, bool)> =
+                        found.fetch_optional(&mut *tx).await?;
+                    let Some((Json(known), ours)) = found else { return Ok(None) };
+                    // Another worker of this process may have taken it since the list was made.
+                    if !(ours && inner.held.has(known.job.id)) {
+                        break (tx, known);
+                    }
+                    tx.rollback().await?;
+                };
                 known.take(now);
                 inner.write_job(&mut tx, &known, Place::Held { for_s }).await?;
                 // If the answer to the commit is lost, nobody knows of the claim, and the job is free.
-                let holding = inner.held.hold(known.job.id, for_s);
+                let holding = inner.held.hold(known.claim(), for_s);
                 tx.commit().await?;
                 holding.keep();
                 Ok(Some(known))
