@@ -166,7 +166,8 @@ fn s3(settings: &ObjectSettings, bucket: &str) -> Result<object_store::aws::Amaz
         )
         .with_retry(RetryConfig {
             backoff: BackoffConfig { init_backoff: FIRST_PAUSE, ..BackoffConfig::default() },
-            max_retries: 3,
+            // As many as there is time for.
+            max_retries: 10,
             retry_timeout: settings.timeout,
         });
     if !settings.endpoint.is_empty() {

@@ -8,6 +8,7 @@ use reqwest::Method;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
+use super::deployment;
 use super::receiver::{Receiver, Reply};
 use super::support::{Answer, BINARY, Server, frame};
 
@@ -358,6 +359,7 @@ async fn one_that_is_slow_holds_up_no_other_and_no_end() {
 fn key(data: &Path, role: &str) -> String {
     let mut command = Command::new(BINARY);
     command.args(["keys", "create", "--name", "test", "--role", role, "--data"]).arg(data);
+    command.envs(deployment::settings(data));
     let output = command.output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap().trim().to_owned()
