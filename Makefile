@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino chromium test conformance console console-bench examples crash fuzz lint format bench load soak openapi clean
+.PHONY: help demo build assets nasm openvino chromium test scale-out conformance console console-bench examples crash fuzz lint format bench load soak openapi clean
 
 help: ## Say what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
@@ -29,12 +29,14 @@ chromium:
 
 test: assets nasm chromium ## Set up, build and run every test
 	tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked
-	tests/scale_out.sh $(CARGO) target/postgres-venv
 	tests/api/conformance.sh $(BINARY) target/api-venv
 	tests/grpc/check.sh $(BINARY) target/grpc-venv
 	tests/console/check.sh $(BINARY) target/console-venv
 	tests/deploy/check.sh $(BINARY) target/deploy-venv
 	examples/check.sh $(BINARY) target/examples-venv
+
+scale-out: assets nasm ## Run the black-box tests against servers and workers that share a database
+	tests/scale_out.sh $(CARGO) target/postgres-venv
 
 conformance: build ## Hold the server against its own description with thousands of made-up requests
 	tests/api/conformance.sh $(BINARY) target/api-venv 150

@@ -541,8 +541,11 @@ impl Config {
         }
         let timeout = self.server.request_timeout().as_secs();
         let console = || self.console.contradiction();
-        let scale =
-            || self.database.contradiction().or_else(|| self.objects.contradiction(timeout));
+        let objects = || self.objects.contradiction(timeout);
+        let scale = || match self.database.is_set() {
+            true => self.database.contradiction().or_else(objects),
+            false => None,
+        };
         let traces = || self.traces.contradiction();
         self.server.contradiction().or_else(track).or_else(console).or_else(scale).or_else(traces)
     }

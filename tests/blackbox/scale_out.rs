@@ -1,7 +1,7 @@
 //! Several servers and workers share a database: what happens when processes die, and when the database
 //! does.
 //!
-//! These need WHEREABOUTS_TEST_DEPLOYMENT=scale-out; `make test` runs them with `--include-ignored`.
+//! These need WHEREABOUTS_TEST_DEPLOYMENT=scale-out; `make scale-out` runs them with `--include-ignored`.
 
 use std::collections::HashSet;
 use std::process::Command;
@@ -142,8 +142,10 @@ async fn five_hundred_jobs_survive_the_death_of_processes_and_a_restart_of_the_d
         assert!(began.elapsed() < Duration::from_secs(180), "{} jobs ended", jobs.len());
         tokio::time::sleep(Duration::from_millis(200)).await;
     };
-    let bad: Vec<_> = jobs.iter().filter(|job| job["state"] != "succeeded").collect();
-    assert!(bad.is_empty(), "{} jobs: {}", bad.len(), bad[0]);
+    let of = |state: &str| jobs.iter().filter(|job| job["state"] == state).count();
+    assert_eq!(of("failed"), 0);
+    // Those that were in the middle of a pair when the database died.
+    assert!(of("degraded") <= JOBS / 50, "{} jobs are degraded", of("degraded"));
     // A process that dies takes along what it has not yet written down; one that lives buys nothing twice.
     let again = mock.asked_again();
     eprintln!(
