@@ -1,9 +1,8 @@
 //! The descriptors of maps, each map's in a table of its own, and the search in them.
 //!
 //! A table holds the descriptors as they were given, in 32-bit floats. Its HNSW index is over the same
-//! numbers in 16 bits (`halfvec`), which takes half the memory and costs no recall that could be measured
-//! (docs/scale.md): the index proposes a few more images than are wanted, and those are compared again with
-//! all their bits.
+//! numbers in 16 bits (`halfvec`), which takes half the memory: the index proposes a few more images than are
+//! wanted, and those are compared again with all their bits. `tests/store/search.rs` holds its recall.
 
 use std::collections::HashSet;
 use std::sync::{PoisonError, RwLock};
