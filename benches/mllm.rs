@@ -11,6 +11,9 @@
     reason = "it uses what the black-box tests use"
 )]
 
+#[allow(dead_code)]
+#[path = "../tests/blackbox/deployment.rs"]
+mod deployment;
 #[path = "../tests/blackbox/mock_mllm.rs"]
 mod mock_mllm;
 #[path = "../tests/blackbox/support.rs"]
