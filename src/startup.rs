@@ -23,8 +23,8 @@ use crate::retrieve::index::IndexSettings;
 use crate::retrieve::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use crate::retrieve::{LoadedModels, LoadedSettings, WhyModel};
 use crate::service::{
-    Dispatcher, Janitor, Keys, Limits, OnceSettings, Reindexes, RetentionSettings, Service,
-    ServiceSettings, Tracks, Webhooks,
+    Dispatcher, Janitor, Keys, Limits, OnceSettings, RecallCheck, Reindexes, RetentionSettings,
+    Service, ServiceSettings, Tracks, Webhooks,
 };
 use crate::store::embedded::{EmbeddedSettings, EmbeddedStore};
 use crate::store::postgres::{PostgresSettings, PostgresStore};
@@ -333,6 +333,9 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         accounts: store.clone(),
         retention: store.clone(),
         models,
+        recall: RecallCheck::new(
+            Some(Duration::from_secs(config.index.check_s)).filter(|pause| !pause.is_zero()),
+        ),
         admission: Admission::new(admission),
         pool,
         job_pace,

@@ -31,7 +31,7 @@ use self::webhooks::OutcomeLabels;
 use crate::config::{Log, LogFormat};
 use crate::domain::{Job, JobState};
 use crate::refine::mllm::MllmLevels;
-use crate::retrieve::{AdmissionLevels, StageTimes};
+use crate::retrieve::{AdmissionLevels, Extraction};
 use crate::store::RemovedJobs;
 
 /// Starts logging to standard error and tracing, and gives the last warnings and errors, and what sends the
@@ -73,9 +73,12 @@ pub struct Metrics {
     requests: Family<RequestLabels, Counter>,
     request_seconds: Family<RouteLabels, Histogram, fn() -> Histogram>,
     stage_seconds: Family<StageLabels, Histogram, fn() -> Histogram>,
+    batch_pictures: Histogram,
+    neighbours_checked: Family<CheckLabels, Counter>,
     jobs: Family<JobLabels, Counter>,
     job_seconds: Family<RefinerLabels, Histogram, fn() -> Histogram>,
     queued_jobs: Gauge,
+    oldest_job_seconds: Gauge<f64, AtomicU64>,
     submitted_jobs: Counter,
     removed_jobs: Family<RemovedLabels, Counter>,
     removed_frame_bytes: Counter,
@@ -90,6 +93,7 @@ pub struct Metrics {
     mllm_tokens_today: Gauge,
     mllm_money_today: Gauge<f64, AtomicU64>,
     map_images: Family<MapLabels, Gauge>,
+    index_bytes: Family<MapLabels, Gauge>,
     dense_cache_bytes: Gauge<f64, AtomicU64>,
     refused: Family<RefusedLabels, Counter>,
     permits: Gauge,
@@ -116,8 +120,12 @@ pub enum CacheLookup {
 pub struct Levels {
     /// Images of each map.
     pub maps: Vec<(String, usize)>,
+    /// Bytes of each map's descriptors and their index.
+    pub index_bytes: Vec<(String, u64)>,
     /// Jobs that wait or run.
     pub queued: usize,
+    /// How long ago the oldest of them was submitted; zero, if there is none.
+    pub oldest_job: Duration,
     /// Deliveries to webhooks that wait.
     pub waiting_deliveries: usize,
     /// Bytes of the database's files.
@@ -180,6 +188,12 @@ struct MapLabels {
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct CheckLabels {
+    map: String,
+    found: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct RefusedLabels {
     reason: &'static str,
 }
@@ -187,6 +201,17 @@ struct RefusedLabels {
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct ClassLabels {
     class: &'static str,
+}
+
+/// Sets a level of each map; one that is gone has none any more.
+fn set_of_maps<'a>(
+    family: &Family<MapLabels, Gauge>,
+    levels: impl Iterator<Item = (&'a String, i64)>,
+) {
+    family.clear();
+    for (map, level) in levels {
+        family.get_or_create(&MapLabels { map: map.clone() }).set(level);
+    }
 }
 
 /// From half a millisecond to about 16 seconds.
@@ -209,9 +234,12 @@ impl Metrics {
             requests: Family::default(),
             request_seconds: Family::new_with_constructor(latency),
             stage_seconds: Family::new_with_constructor(latency),
+            batch_pictures: Histogram::new(exponential_buckets(1.0, 2.0, 7)),
+            neighbours_checked: Family::default(),
             jobs: Family::default(),
             job_seconds: Family::new_with_constructor(latency),
             queued_jobs: Gauge::default(),
+            oldest_job_seconds: Gauge::default(),
             submitted_jobs: Counter::default(),
             removed_jobs: Family::default(),
             removed_frame_bytes: Counter::default(),
@@ -226,6 +254,7 @@ impl Metrics {
             mllm_tokens_today: Gauge::default(),
             mllm_money_today: Gauge::default(),
             map_images: Family::default(),
+            index_bytes: Family::default(),
             dense_cache_bytes: Gauge::default(),
             refused: Family::default(),
             permits: Gauge::default(),
@@ -252,6 +281,17 @@ impl Metrics {
             "Time in one stage of localizing or indexing a picture",
             self.stage_seconds.clone(),
         );
+        registry.register(
+            "batch_pictures",
+            "Pictures that the model was run on together, counted for each picture",
+            self.batch_pictures.clone(),
+        );
+        registry.register(
+            "neighbours_checked",
+            "Nearest images, by exact search, of frames whose search was checked: whether the index had \
+             found them (index.check_s)",
+            self.neighbours_checked.clone(),
+        );
         registry.register("jobs_ended", "Jobs that ended", self.jobs.clone());
         registry.register("jobs_submitted", "Jobs queued", self.submitted_jobs.clone());
         registry.register(
@@ -260,6 +300,11 @@ impl Metrics {
             self.job_seconds.clone(),
         );
         registry.register("jobs_queued", "Jobs that wait or run", self.queued_jobs.clone());
+        registry.register(
+            "oldest_job_seconds",
+            "Time since the oldest job that waits or runs was submitted; 0 if there is none",
+            self.oldest_job_seconds.clone(),
+        );
         registry.register(
             "jobs_removed",
             "Ended jobs that were removed, because of their age or of their number (count)",
@@ -318,6 +363,11 @@ impl Metrics {
             self.mllm_money_today.clone(),
         );
         registry.register("map_images", "Images in a map", self.map_images.clone());
+        registry.register(
+            "index_bytes",
+            "Bytes of a map's descriptors and of their index",
+            self.index_bytes.clone(),
+        );
         registry.register(
             "dense_cache_bytes",
             "Memory held by cached dense features",
@@ -388,8 +438,10 @@ impl Metrics {
         self.connections.dec();
     }
 
-    /// Counts the stages of one extraction.
-    pub fn observe_stages(&self, times: StageTimes) {
+    /// Counts one extraction.
+    pub fn observe_extraction(&self, extraction: &Extraction) {
+        self.batch_pictures.observe(extraction.batch as f64);
+        let times = extraction.times;
         for (stage, time) in [("decode", times.decode), ("extract", times.extract)] {
             self.stage_seconds.get_or_create(&StageLabels { stage }).observe(time.as_secs_f64());
         }
@@ -399,6 +451,14 @@ impl Metrics {
     pub fn observe_search(&self, took: Duration) {
         let stage = StageLabels { stage: "search" };
         self.stage_seconds.get_or_create(&stage).observe(took.as_secs_f64());
+    }
+
+    /// Counts the nearest images of a frame whose search was checked, and those of them that it had found.
+    pub fn search_checked(&self, map: &str, nearest: usize, found: usize) {
+        for (word, count) in [("yes", found), ("no", nearest.saturating_sub(found))] {
+            let labels = CheckLabels { map: map.to_owned(), found: word };
+            self.neighbours_checked.get_or_create(&labels).inc_by(count as u64);
+        }
     }
 
     /// Counts a queued job.
@@ -445,12 +505,14 @@ impl Metrics {
 
     /// Sets what is measured when it is asked for.
     pub fn set_levels(&self, levels: &Levels) {
-        self.map_images.clear();
-        for (map, images) in &levels.maps {
-            let labels = MapLabels { map: map.clone() };
-            self.map_images.get_or_create(&labels).set(*images as i64);
-        }
+        set_of_maps(
+            &self.map_images,
+            levels.maps.iter().map(|(map, images)| (map, *images as i64)),
+        );
+        let sizes = levels.index_bytes.iter();
+        set_of_maps(&self.index_bytes, sizes.map(|(map, bytes)| (map, *bytes as i64)));
         self.queued_jobs.set(levels.queued as i64);
+        self.oldest_job_seconds.set(levels.oldest_job.as_secs_f64());
         self.waiting_deliveries.set(levels.waiting_deliveries as i64);
         self.db_bytes.set(levels.db_bytes as i64);
         self.dense_cache_bytes.set(levels.dense_cache_bytes as f64);

@@ -141,6 +141,24 @@ impl CalibrationSettings {
     pub fn place_images_of(&self, images: usize) -> usize {
         self.place_images.min(images / 10)
     }
+
+    /// One of so many images is asked, in a map of so many.
+    pub fn step(&self, images: usize) -> usize {
+        images.div_ceil(self.images.max(1)).max(1)
+    }
+
+    /// Whether two images show different places, in a map of so many. Of each, where it stands in the order
+    /// of addition, and its pose.
+    pub fn are_apart(
+        &self,
+        images: usize,
+        one: (usize, Option<Pose>),
+        other: (usize, Option<Pose>),
+    ) -> bool {
+        let distance = one.1.zip(other.1).and_then(|(a, b)| a.distance_m(&b));
+        one.0.abs_diff(other.0) > self.place_images_of(images)
+            && distance.is_none_or(|distance| distance > self.place_m)
+    }
 }
 
 impl Calibration {

@@ -59,9 +59,12 @@ impl crate::service::Service {
             .into_iter()
             .map(|map| (map.name.to_string(), map.images))
             .collect();
+        let index_bytes = self.retention.index_bytes().await?.into_iter();
         self.metrics.set_levels(&Levels {
             maps,
+            index_bytes: index_bytes.map(|(map, bytes)| (map.to_string(), bytes)).collect(),
             queued: self.jobs.queued().await?,
+            oldest_job: self.age_of_oldest_job().await?,
             waiting_deliveries: self.webhooks.store.waiting_deliveries().await?,
             db_bytes: self.retention.db_bytes().await?,
             dense_cache_bytes: self.dense.bytes(),

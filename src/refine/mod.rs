@@ -9,6 +9,7 @@ mod dense_cache;
 pub mod local;
 mod local_refiner;
 pub mod mllm;
+mod patience;
 mod worker;
 
 use std::sync::{Arc, Mutex};

@@ -9,6 +9,7 @@ use tokio::sync::broadcast::error::RecvError;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
+use super::patience::until;
 use super::{JobPace, Progress, RefineError, Refinement, Refiner};
 use crate::domain::{Estimate, Job, JobState};
 use crate::store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
@@ -46,9 +47,6 @@ pub struct Worker {
     /// Its patience.
     pub settings: WorkerSettings,
 }
-
-/// The pause before a store that is away is told again.
-const TELL_AGAIN: Duration = Duration::from_millis(500);
 
 /// Why a refinement was given up.
 enum Stopped {
@@ -202,16 +200,7 @@ impl Worker {
     where
         F: Future<Output = Result<(), StoreError>>,
     {
-        let began = Instant::now();
-        loop {
-            match tell().await {
-                Err(StoreError::Unavailable(why)) if began.elapsed() < self.settings.lease => {
-                    tracing::warn!(why, "how a job has ended cannot be written down; trying again");
-                    tokio::time::sleep(TELL_AGAIN).await;
-                }
-                told => return told,
-            }
-        }
+        until(self.settings.lease, tell).await
     }
 }
 

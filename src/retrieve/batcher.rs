@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread;
+use std::thread::{self, JoinHandle};
 
 use serde::{Deserialize, Serialize};
 use tokio::sync::oneshot;
@@ -30,9 +30,13 @@ pub struct Layout {
 /// threads that work on pictures of their own need not wait for each other after every layer, so that
 /// more pictures are done in the same time. No timer holds a picture back: a free session takes what
 /// waits as one batch.
+///
+/// Dropping it waits until its threads have ended: ONNX Runtime goes when the process ends, and a session
+/// that is loaded or runs meanwhile would crash.
 #[derive(Debug)]
 pub(super) struct Batcher {
     queue: Arc<Queue>,
+    threads: Vec<JoinHandle<()>>,
 }
 
 /// An answer that is to come. Dropping it takes the picture out of the queue.
@@ -69,29 +73,35 @@ impl Batcher {
         });
         let wide = model.load(execution, threads, layout.max_batch)?;
         let serving = Arc::clone(&queue);
-        spawn("inference", move || serving.serve(wide, Kind::Wide))?;
-        Ok(Self { queue })
+        let threads = vec![spawn("inference", move || serving.serve(wide, Kind::Wide))?];
+        Ok(Self { queue, threads })
     }
 
     /// Loads the narrow sessions in the background, one after another, so that a core is left for
     /// those who come meanwhile.
-    pub fn add_narrow(&self, model: Model, execution: Execution) -> Result<(), InferenceError> {
+    pub fn add_narrow(&mut self, model: Model, execution: Execution) -> Result<(), InferenceError> {
         let Layout { threads, sessions, .. } = self.queue.layout;
         if sessions == 1 {
             return Ok(());
         }
         self.queue.lock().loading = sessions;
         let queue = Arc::clone(&self.queue);
-        spawn("inference-load", move || {
+        self.threads.push(spawn("inference-load", move || {
+            let mut serving = Vec::new();
             for index in 0..sessions {
-                if let Err(error) = add_narrow(&queue, &model, execution, threads / sessions, index)
-                {
-                    tracing::error!(%error, "there is one session less");
+                if queue.lock().closed {
+                    break;
+                }
+                match add_narrow(&queue, &model, execution, threads / sessions, index) {
+                    Ok(thread) => serving.push(thread),
+                    Err(error) => tracing::error!(%error, "there is one session less"),
                 }
                 queue.lock().loading -= 1;
                 queue.room.notify_all();
             }
-        })
+            join(serving);
+        })?);
+        Ok(())
     }
 
     /// Blocks until every session is loaded, or cannot be.
@@ -123,6 +133,7 @@ impl Batcher {
 impl Drop for Batcher {
     fn drop(&mut self) {
         self.queue.close();
+        join(std::mem::take(&mut self.threads));
     }
 }
 
@@ -288,18 +299,28 @@ fn add_narrow(
     execution: Execution,
     threads: usize,
     index: usize,
-) -> Result<(), InferenceError> {
+) -> Result<JoinHandle<()>, InferenceError> {
     let mut runner = model.load(execution, threads, queue.layout.max_batch)?;
     runner.warm_up()?;
     let serving = Arc::clone(queue);
-    spawn(&format!("inference-{index}"), move || serving.serve(runner, Kind::Narrow))?;
+    let thread = spawn(&format!("inference-{index}"), move || serving.serve(runner, Kind::Narrow))?;
     queue.lock().narrow_sessions += 1;
-    Ok(())
+    Ok(thread)
 }
 
-fn spawn(name: &str, body: impl FnOnce() + Send + 'static) -> Result<(), InferenceError> {
+fn spawn(
+    name: &str,
+    body: impl FnOnce() + Send + 'static,
+) -> Result<JoinHandle<()>, InferenceError> {
     let spawned = thread::Builder::new().name(name.to_owned()).spawn(body);
-    spawned.map(drop).map_err(|error| InferenceError::Load(error.to_string()))
+    spawned.map_err(|error| InferenceError::Load(error.to_string()))
+}
+
+/// Waits until these threads have ended; what one panicked about has been told where it did.
+fn join(threads: Vec<JoinHandle<()>>) {
+    for thread in threads {
+        let _ = thread.join();
+    }
 }
 
 /// Groups a batch by the shape of its tensors: only like shapes run together.
@@ -408,7 +429,7 @@ mod tests {
     fn the_room_of_those_who_have_gone_is_given_away() {
         let queue = Arc::new(queue(0, 1));
         let gone: Vec<_> = (0..queue.layout.capacity()).map(|_| submit(&queue)).collect();
-        let batcher = Batcher { queue: Arc::clone(&queue) };
+        let batcher = Batcher { queue: Arc::clone(&queue), threads: Vec::new() };
         let waits = thread::spawn(move || {
             let inferring = batcher.submit(Tensor::grey(2, 2));
             (batcher, inferring)
@@ -422,7 +443,7 @@ mod tests {
     #[test]
     fn who_waits_hears_of_the_end() {
         let queue = Arc::new(queue(0, 1));
-        let batcher = Batcher { queue: Arc::clone(&queue) };
+        let batcher = Batcher { queue: Arc::clone(&queue), threads: Vec::new() };
         let waits = batcher.submit(Tensor::grey(1, 1)).unwrap();
         drop(batcher);
         assert!(queue.take(Kind::Wide).is_none());

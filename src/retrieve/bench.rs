@@ -135,7 +135,7 @@ impl Bench {
         layout: Layout,
         duration: Duration,
     ) -> Result<(Duration, f64), InferenceError> {
-        let batcher = Batcher::start(&self.opened.model, execution, layout)?;
+        let mut batcher = Batcher::start(&self.opened.model, execution, layout)?;
         batcher.add_narrow(self.opened.model.clone(), execution)?;
         batcher.wait_until_complete();
         let mut pictures = self.sample.iter().cycle();

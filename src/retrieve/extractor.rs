@@ -107,6 +107,8 @@ pub struct Extraction {
     pub height: u32,
     /// How long the stages took.
     pub times: StageTimes,
+    /// Pictures that the model was run on together, this one included.
+    pub batch: usize,
 }
 
 /// How long the stages of one extraction took.
@@ -154,7 +156,7 @@ impl Extractor {
             Opened::open(assets, &settings.model, settings.wanted.provider)?;
         let execution = chosen(&model, digest, settings)?;
         let batcher = Batcher::start(&model, execution, settings.layout)?;
-        let extractor = Self {
+        let mut extractor = Self {
             manifest: Arc::clone(&model.manifest),
             digest,
             batcher,
@@ -231,7 +233,7 @@ impl Extractor {
         let dense = local.into_dense()?;
         let Shown { width, height, media_type, decode, decoded, .. } = shown;
         let times = StageTimes { decode, extract: decoded.elapsed() };
-        Ok(Extraction { descriptor, dense, media_type, width, height, times })
+        Ok(Extraction { descriptor, dense, media_type, width, height, times, batch: raw.batch })
     }
 
     /// A manifest that does not fit its model should stop the start, not the first request; and that

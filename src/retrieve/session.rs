@@ -20,6 +20,8 @@ pub(super) struct RawOutput {
     pub features: Vec<f32>,
     /// The reliability map, if the manifest names one.
     pub reliability: Option<Vec<f32>>,
+    /// Pictures that were run together, this one included.
+    pub batch: usize,
 }
 
 impl RawOutput {
@@ -173,7 +175,7 @@ impl Runner {
         Ok(features
             .into_iter()
             .zip(reliability)
-            .map(|(features, reliability)| RawOutput { features, reliability })
+            .map(|(features, reliability)| RawOutput { features, reliability, batch: count })
             .collect())
     }
 }

@@ -68,7 +68,7 @@ impl Service {
             let meta = CheckedMeta::new(new.meta.clone(), &map)?;
             let bytes = new.bytes.clone();
             let extraction = self.extract(&extractor, bytes, map.descriptor, new.demand).await?;
-            self.metrics.observe_stages(extraction.times);
+            self.metrics.observe_extraction(&extraction);
             let image = Image {
                 id: meta.id.unwrap_or_else(|| ImageId::from_digest(&digest)),
                 digest,

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use bytes::Bytes;
+use jiff::Timestamp;
 use serde::Serialize;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::RecvError;
@@ -81,6 +82,14 @@ impl Service {
     /// Jobs that wait or run.
     pub async fn open_jobs(&self) -> Result<usize, ServiceError> {
         Ok(self.jobs.queued().await?)
+    }
+
+    /// How long ago the oldest of them was submitted; zero, if there is none.
+    pub async fn age_of_oldest_job(&self) -> Result<Duration, ServiceError> {
+        let submitted = self.jobs.oldest_open().await?;
+        let age = submitted.map(|submitted| Timestamp::now().duration_since(submitted));
+        // The clock of whoever submitted it may be ahead.
+        Ok(age.and_then(|age| age.try_into().ok()).unwrap_or_default())
     }
 
     /// The frame of a job: as it was sent, or as a JPEG no larger than `max_edge` pixels.

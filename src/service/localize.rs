@@ -219,7 +219,7 @@ impl Service {
             let (map, extractor) = self.usable_map(map).await?;
             let extracting = self.extract(&extractor, frame.clone(), map.descriptor, demand);
             let extraction = extracting.instrument(traces::stage("extract")).await?;
-            self.metrics.observe_stages(extraction.times);
+            self.metrics.observe_extraction(&extraction);
             let searching = Instant::now();
             let search = self.maps.search(&map, extraction.descriptor.clone(), k, mode);
             match search.instrument(traces::stage("search")).await {
@@ -228,6 +228,9 @@ impl Service {
                 found => {
                     let (candidates, searched) = (found?, searching.elapsed());
                     self.metrics.observe_search(searched);
+                    if mode == SearchMode::Fast {
+                        self.check_search(&map, &extraction.descriptor, &candidates);
+                    }
                     let model = extractor.identity();
                     return Ok(Retrieved { map, model, extraction, candidates, searched });
                 }

@@ -17,6 +17,7 @@ mod localize;
 mod maps;
 mod models;
 mod once;
+mod recall;
 mod reindex;
 mod retention;
 mod submit;
@@ -43,6 +44,7 @@ pub use self::localize::{
 };
 pub use self::maps::{IndexKind, MapChange, MapState};
 pub use self::once::{Once, OnceSettings};
+pub use self::recall::RecallCheck;
 pub use self::reindex::{Reindex, ReindexRequest, ReindexState, Reindexes};
 pub use self::retention::{Janitor, RetentionSettings};
 pub use self::submit::{NoJob, NoJobReason};
@@ -119,6 +121,8 @@ pub struct Service {
     pub webhooks: Webhooks,
     /// The models in memory.
     pub models: LoadedModels,
+    /// When a search was last held against exact search.
+    pub recall: RecallCheck,
     /// Who may have a picture decoded and inferred.
     pub admission: Admission,
     /// Where pictures are decoded.

@@ -60,6 +60,7 @@ impl Janitor {
         let now = Timestamp::now();
         let days = SignedDuration::from_hours(24 * i64::from(self.settings.usage_days));
         self.store.forget_usage(utc_day(now).saturating_sub(days)).await?;
+        self.store.clear_left().await?;
         let once = self.settings.once;
         self.answers.forget_answers(once.since(now), once.most).await?;
         let keep = KeepJobs {

@@ -5,7 +5,8 @@ use uuid::Uuid;
 
 use super::{FirstAnswer, JobRecord, Progress, Release, Step, StoreError, StoredDelivery};
 use crate::domain::{
-    Delivery, Image, Job, JobState, Map, Message, StoredWebhook, Usage, WebhookEvent,
+    Attempt, Delivery, DeliveryState, Descriptor, Image, Job, JobState, Map, Message, Priority,
+    StoredWebhook, Then, Usage, WebhookEvent,
 };
 
 impl JobRecord {
@@ -158,6 +159,37 @@ pub(super) fn removed(map: &Map) -> StoreError {
     StoreError::NotFound(format!("the map {} was removed", map.name))
 }
 
+/// Refuses a descriptor that a map cannot be searched for.
+pub(super) fn check_dim(map: &Map, query: &Descriptor) -> Result<(), StoreError> {
+    if query.dim() == map.dim {
+        return Ok(());
+    }
+    Err(StoreError::Conflict(format!(
+        "a descriptor of {} numbers cannot be searched in a map of {}",
+        query.dim(),
+        map.dim
+    )))
+}
+
+pub(super) fn being_reindexed(map: &Map) -> StoreError {
+    StoreError::Conflict(format!("the map {} is being reindexed already", map.name))
+}
+
+/// A priority's place in the queue; those of a lower number go first.
+pub(super) fn place(priority: Priority) -> u8 {
+    match priority {
+        Priority::High => 0,
+        Priority::Normal => 1,
+        Priority::Low => 2,
+    }
+}
+
+/// When a job was submitted, which its id says.
+pub(super) fn submitted_at(id: Uuid) -> Option<Timestamp> {
+    let (seconds, nanoseconds) = id.get_timestamp()?.to_unix();
+    Timestamp::new(seconds.cast_signed(), nanoseconds.cast_signed()).ok()
+}
+
 pub(super) fn no_job(id: Uuid) -> StoreError {
     StoreError::NotFound(format!("there is no job {id}"))
 }
@@ -180,6 +212,24 @@ pub(super) fn check_enabled(stored: &StoredWebhook) -> Result<(), StoreError> {
     }
     let why = stored.webhook.disabled_reason.as_deref().unwrap_or_default();
     Err(StoreError::Conflict(format!("the webhook is disabled ({why}); make another one")))
+}
+
+/// From now on a webhook is to be told nothing; `false` if that was so before.
+pub(super) fn disable(stored: &mut StoredWebhook, at: Timestamp, why: &str) -> bool {
+    let webhook = &mut stored.webhook;
+    if webhook.disabled_at.is_some() {
+        return false;
+    }
+    webhook.disabled_at = Some(at);
+    webhook.disabled_reason = Some(why.to_owned());
+    true
+}
+
+/// A delivery after an attempt; `None` if it waits no more.
+pub(super) fn attempted(known: Delivery, attempt: Attempt) -> Option<Delivery> {
+    // What was given up meanwhile has been delivered all the same.
+    let counts = known.state == DeliveryState::Waiting || attempt.then == Then::Delivered;
+    counts.then(|| known.after(attempt))
 }
 
 pub(super) fn too_many_webhooks(most: usize) -> StoreError {

@@ -9,6 +9,7 @@ use jiff::civil::Date;
 use tokio::time::Instant;
 
 use super::StoreError;
+use crate::refine::mllm::Spent;
 
 /// What is wanted of a bucket, which fills steadily up to a minute's worth. What it holds may go below zero.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -43,18 +44,9 @@ pub trait SharedLimits: Send + Sync {
     /// Sets aside what a call may cost at the most on that day; `false` if what was spent and set aside would
     /// then pass the limit, of which 0 is none. What is spent is taken from it by
     /// [`UsageStore::add_usage`](super::UsageStore::add_usage).
-    async fn set_aside(&self, day: Date, most: Purse, limit: Purse) -> Result<bool, StoreError>;
+    async fn set_aside(&self, day: Date, most: Spent, limit: Spent) -> Result<bool, StoreError>;
     /// Gives back what was set aside and not needed.
-    async fn give_back(&self, day: Date, unneeded: Purse) -> Result<(), StoreError>;
-}
-
-/// Tokens and money.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Purse {
-    /// Tokens, sent and received.
-    pub tokens: u64,
-    /// Money, in the currency of the configured prices.
-    pub money: f64,
+    async fn give_back(&self, day: Date, unneeded: Spent) -> Result<(), StoreError>;
 }
 
 /// Buckets of this process, or of all.
@@ -102,8 +94,7 @@ impl Buckets {
                 let now = Instant::now();
                 let full = Levels { left: draws.map(|draw| draw.per_minute), at: now };
                 let known = levels.entry(name.to_owned()).or_insert(full);
-                let drawn = known.draw(draws, now);
-                Ok(drawn)
+                Ok(known.draw(draws, now))
             }
         }
     }

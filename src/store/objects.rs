@@ -8,10 +8,7 @@ use bytes::Bytes;
 use object_store::aws::AmazonS3Builder;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
-use object_store::{
-    BackoffConfig, ClientOptions, Error, ObjectStore, ObjectStoreExt, PutMode, PutOptions,
-    RetryConfig,
-};
+use object_store::{BackoffConfig, ClientOptions, Error, ObjectStore, ObjectStoreExt, RetryConfig};
 
 use super::StoreError;
 use crate::domain::Digest;
@@ -90,8 +87,7 @@ impl Objects {
                 Ok(_) | Err(Error::NotFound { .. }) => {}
                 Err(error) => return Err(error),
             }
-            let put = PutOptions { mode: PutMode::Overwrite, ..PutOptions::default() };
-            self.store.put_opts(&path, bytes.into(), put).await.map(drop)
+            self.store.put(&path, bytes.into()).await.map(drop)
         })
         .await
     }

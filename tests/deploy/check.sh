@@ -33,10 +33,7 @@ export PYTHONDONTWRITEBYTECODE=1
 outside=$!
 trap 'kill "$outside" 2> /dev/null || true; finish' EXIT
 
-if ! "$binary" demo --offline --json --places 6 --out "$scratch/town" > "$scratch/demo" 2>&1; then
-    cat "$scratch/demo" >&2
-    exit 1
-fi
+town "$binary" 6
 cp -r "$scratch/town/data" "$scratch/data"
 "$binary" config --defaults > "$scratch/defaults.toml"
 for role in admin operator robot; do
@@ -44,6 +41,7 @@ for role in admin operator robot; do
 done
 # All that makes metrics appear within seconds which otherwise take days.
 export WHEREABOUTS_AUTH__KEYS=required WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_JOBS__SWEEP_S=1
+export WHEREABOUTS_INDEX__EXACT_UP_TO=1 WHEREABOUTS_INDEX__CHECK_S=1
 export WHEREABOUTS_REFINE__REFINER=mllm WHEREABOUTS_REFINE__CANDIDATES=2
 WHEREABOUTS_MLLM__BASE_URL=$(cat "$scratch/outside")/v1
 export WHEREABOUTS_MLLM__BASE_URL

@@ -61,10 +61,12 @@ SHARED = {
     "whereabouts_db_bytes",
     "whereabouts_description_cache_bytes",
     "whereabouts_description_cache_entries",
+    "whereabouts_index_bytes",
     "whereabouts_jobs_queued",
     "whereabouts_map_images",
     "whereabouts_mllm_money_today",
     "whereabouts_mllm_tokens_today",
+    "whereabouts_oldest_job_seconds",
     "whereabouts_webhook_deliveries_waiting",
 }
 
@@ -192,6 +194,14 @@ class Dashboard(unittest.TestCase):
         told(f"whereabouts.json: {len(self.panels)} panels, {queries} queries, {len(asked)} metrics, all there")
         missing = families() - {re.sub(r"_(bucket|sum|count)$", "", name) for name in asked}
         self.assertEqual(missing, set(), "metrics that no panel shows")
+
+    def test_every_metric_is_in_the_reference(self):
+        rows = re.findall(r"^\| `(whereabouts_\w+)(?:\{([\w, ]+)\})?` \|", read("docs/operations.md"), re.M)
+        listed = {name: set(labels.replace(",", " ").split()) for name, labels in rows}
+        there = {name: set() for name in families()}
+        for name, metric in METRICS.items():
+            there[re.sub(r"_(bucket|sum|count)$", "", name)] |= set(metric.labels) - {"le"}
+        self.assertEqual(listed, there, "docs/operations.md, Metrics")
 
     def test_what_it_says_names_settings_that_exist(self):
         check_settings(self, "deploy/grafana/whereabouts.json")

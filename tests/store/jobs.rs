@@ -93,10 +93,18 @@ async fn jobs_are_taken_by_priority_and_then_by_age(fixture: &Fixture) {
         submit_record(&*store, record, b"frame").await;
     }
     assert_eq!(store.queued().await.unwrap(), 6);
-    for expected in [2, 4, 1, 5, 0, 3] {
+    let made_at = |id: Uuid| {
+        let (seconds, nanoseconds) = id.get_timestamp().unwrap().to_unix();
+        Timestamp::new(seconds as i64, nanoseconds as i32).unwrap()
+    };
+    // What is left then, the oldest first.
+    let left = [&[0, 1, 3, 4, 5][..], &[0, 1, 3, 5], &[0, 3, 5], &[0, 3], &[3], &[]];
+    for (expected, left) in [2, 4, 1, 5, 0, 3].into_iter().zip(left) {
         let taken = claim(&*store).await.unwrap();
         assert_eq!(taken.job.id, jobs[expected]);
         store.finish(taken.claim(), ended(&taken, JobState::Succeeded)).await.unwrap();
+        let oldest = left.first().map(|oldest| made_at(jobs[*oldest]));
+        assert_eq!(store.oldest_open().await.unwrap(), oldest);
     }
     assert!(claim(&*store).await.is_none());
     assert_eq!(store.queued().await.unwrap(), 0);

@@ -13,12 +13,12 @@ use whereabouts::domain::{
     ApiKey, DayUsage, Delivery, Digest, Job, JobState, KeyLimits, Role, StoredKey, StoredWebhook,
     Usage, Webhook, WebhookEvent, WebhookSecret,
 };
-use whereabouts::refine::mllm::{CachedDescription, DescriptionCache};
+use whereabouts::refine::mllm::{CachedDescription, DescriptionCache, Spent};
 use whereabouts::retrieve::index::SearchMode;
 use whereabouts::store::postgres::{PostgresStore, SchemaState, migrate, schema_of};
 use whereabouts::store::{
-    AnswerStore, DraftStore, Draw, FirstAnswer, JobStore, KeyStore, MapStore, Progress, Purse,
-    Retention, SharedLimits, StoreError, StoredDelivery, UsageStore, WebhookStore,
+    AnswerStore, DraftStore, Draw, FirstAnswer, JobStore, KeyStore, MapStore, Progress, Retention,
+    SharedLimits, StoreError, StoredDelivery, UsageStore, WebhookStore,
 };
 
 use crate::support::{
@@ -164,7 +164,7 @@ async fn the_draft_of_a_deleted_map_goes_with_it_though_its_process_is_dead() {
     drop(dying);
     assert_eq!(tables(&database).await, 1);
     eventually(async || {
-        other.forget_usage(date(2000, 1, 1)).await.unwrap();
+        other.clear_left().await.unwrap();
         (tables(&database).await == 0).then_some(())
     })
     .await;
@@ -460,8 +460,8 @@ async fn a_limit_by_the_minute_is_that_of_all_processes() {
 async fn the_budget_of_a_day_is_that_of_all_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
-    let (day, limit) = (date(2026, 5, 1), Purse { tokens: 1000, money: 0.0 });
-    let tokens = |tokens| Purse { tokens, money: 0.0 };
+    let (day, limit) = (date(2026, 5, 1), Spent { tokens: 1000, money: 0.0 });
+    let tokens = |tokens| Spent { tokens, money: 0.0 };
     assert!(processes[0].set_aside(day, tokens(600), limit).await.unwrap());
     assert!(!processes[1].set_aside(day, tokens(600), limit).await.unwrap());
     // The call took 100 tokens: 500 go back, and the rest is spent when it is written down.

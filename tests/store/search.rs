@@ -96,6 +96,9 @@ async fn a_graph_finds_nearly_all_of_that_and_nothing_that_was_removed(fixture: 
     let descriptors = clustered(2000, 48);
     add_all(&store, &map, &descriptors).await;
     graph_is_ready(&*store, &map).await;
+    let bytes = store.index_bytes().await.unwrap();
+    assert!(bytes.len() == 1 && bytes[0].0 == map.name, "{bytes:?}");
+    assert!((2000 * 48 * 4..2_000_000).contains(&bytes[0].1), "{bytes:?}");
     let recall = async |store: &dyn Store, removed: &HashSet<usize>| {
         let (mut hits, mut all) = (0, 0);
         for query in descriptors.iter().step_by(20) {

@@ -80,7 +80,8 @@ impl Spent {
         Self { tokens: self.tokens + other.tokens, money: self.money + other.money }
     }
 
-    fn minus(self, other: Self) -> Self {
+    /// The difference; nothing where more is taken than there is.
+    pub fn minus(self, other: Self) -> Self {
         Self {
             tokens: self.tokens.saturating_sub(other.tokens),
             money: (self.money - other.money).max(0.0),

@@ -12,7 +12,6 @@ use super::aside::Aside;
 use super::budget::{Exceeded, JobBudget, Spent};
 use super::cache::{CachedDescription, DescribedFrame, SimilarFrame};
 use super::client::{Answer, Call, estimate_tokens};
-use super::patience::{insist, patiently};
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Switches, clean};
 use super::purchase::Purchase;
@@ -23,6 +22,7 @@ use crate::domain::{
     Candidate, Description, Descriptor, Digest, Map, Scene, StandIn, Usage, utc_day,
 };
 use crate::refine::milliseconds;
+use crate::refine::patience::{insist, patiently};
 use crate::store::{JobRecord, Step, StoreError};
 use crate::telemetry::CacheLookup;
 

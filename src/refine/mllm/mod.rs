@@ -20,7 +20,6 @@ mod client;
 mod conclude;
 mod describe;
 mod flight;
-mod patience;
 mod pictures;
 mod prompts;
 mod purchase;

@@ -6,8 +6,8 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 
 use super::cache::{CachedDescription, DescriptionCache};
-use super::patience::{insist, patiently};
 use crate::domain::Digest;
+use crate::refine::patience::{insist, patiently};
 use crate::store::StoreError;
 
 /// The pause between two looks for a description that another process is buying.

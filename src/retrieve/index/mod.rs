@@ -172,6 +172,11 @@ impl MapIndex {
         self.graphs().graphed
     }
 
+    /// Bytes of the sealed graph, in memory as on disk. The growing one is not counted.
+    pub fn sealed_bytes(&self) -> usize {
+        self.graphs().sealed.as_ref().map_or(0, |sealed| sealed.bytes())
+    }
+
     /// The `k` most similar images, best first; equal similarities keep the order of the slots.
     pub fn search(
         &self,

@@ -178,6 +178,20 @@ impl SealedGraph {
         self.dim
     }
 
+    /// Bytes of its arrays.
+    pub fn bytes(&self) -> usize {
+        let of_layer = |layer: &Layer| {
+            size_of_val(&layer.points[..])
+                + size_of_val(&layer.starts[..])
+                + size_of_val(&layer.neighbours[..])
+        };
+        size_of_val(&self.slots[..])
+            + size_of_val(&self.lowest[..])
+            + self.upper.iter().map(of_layer).sum::<usize>()
+            + size_of_val(&self.codes[..])
+            + size_of_val(&self.scales[..])
+    }
+
     /// Points in the graph.
     pub fn len(&self) -> usize {
         self.slots.len()

@@ -13,6 +13,7 @@ use std::sync::{Arc, PoisonError};
 
 use async_trait::async_trait;
 
+use super::super::changes::being_reindexed;
 use super::super::{Draft, DraftStore, StoreError};
 use super::live_map::{LiveMap, folder_of};
 use super::maps::{remove_folder, still_there};
@@ -44,10 +45,7 @@ impl DraftStore for EmbeddedStore {
             let current = inner.live_revision(&old)?;
             let mut drafts = inner.drafts.write().unwrap_or_else(PoisonError::into_inner);
             if drafts.contains_key(&next.uid) {
-                return Err(StoreError::Conflict(format!(
-                    "the map {} is being reindexed already",
-                    next.name
-                )));
+                return Err(being_reindexed(&next));
             }
             // What a draft that failed may have left.
             remove_folder(&folder_of(&next, &inner.descriptors));

@@ -12,7 +12,7 @@ use sled::Transactional;
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
-use super::super::changes::{ended_at, no_job};
+use super::super::changes::{ended_at, no_job, place, submitted_at};
 use super::super::listing::SEARCHED;
 use super::super::{
     Claim, FirstAnswer, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
@@ -23,7 +23,7 @@ use super::trees::{
 };
 use super::webhooks::WebhookTrees;
 use super::{EmbeddedStore, answers, blocking};
-use crate::domain::Job;
+use crate::domain::{Job, Priority};
 
 impl EmbeddedStore {
     /// Applies a change to one job and tells the listeners.
@@ -134,6 +134,11 @@ impl JobStore for EmbeddedStore {
 
     async fn queued(&self) -> Result<usize, StoreError> {
         Ok(self.inner.queued.load(Ordering::Relaxed))
+    }
+
+    async fn oldest_open(&self) -> Result<Option<Timestamp>, StoreError> {
+        let inner = Arc::clone(&self.inner);
+        blocking(move || oldest_open(&inner.trees)).await
     }
 
     async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {
@@ -305,6 +310,18 @@ fn next_waiting(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, Stor
         }
     }
     Ok(None)
+}
+
+/// When the oldest job in the queue was submitted: the first of one of the priorities.
+fn oldest_open(trees: &Trees) -> Result<Option<Timestamp>, StoreError> {
+    let mut oldest: Option<Uuid> = None;
+    for priority in [Priority::High, Priority::Normal, Priority::Low] {
+        if let Some(key) = trees.queue.scan_prefix([place(priority)]).keys().next() {
+            let id = queued_job(&key.map_err(failed)?);
+            oldest = oldest.into_iter().chain(id).min();
+        }
+    }
+    Ok(oldest.and_then(submitted_at))
 }
 
 fn insert_job(trees: &Trees, record: &JobRecord) -> Result<(), StoreError> {

@@ -156,6 +156,11 @@ impl LiveMap {
         self.changes.fetch_add(1, Ordering::Relaxed);
     }
 
+    /// Bytes of the descriptors, and of the sealed graph.
+    pub fn index_bytes(&self) -> u64 {
+        self.vectors.bytes_of(self.next_slot()) + self.index.sealed_bytes() as u64
+    }
+
     /// How often images were added and removed since the map was loaded.
     pub fn changes(&self) -> u64 {
         self.changes.load(Ordering::Relaxed)
@@ -196,10 +201,8 @@ impl LiveMap {
             let known = known.filter_map(|(slot, entry)| Some((slot, entry.as_ref()?)));
             known.map(|(slot, entry)| Place { slot, pose: entry.pose }).collect()
         };
-        let near = settings.place_images_of(places.len());
-        let step = places.len().div_ceil(settings.images.max(1)).max(1);
-        let asked = (0..places.len()).step_by(step);
-        asked.filter_map(|at| self.look_alikes_of(&places, at, near, settings.place_m, k)).collect()
+        let asked = (0..places.len()).step_by(settings.step(places.len()));
+        asked.filter_map(|at| self.look_alikes_of(&places, at, settings, k)).collect()
     }
 
     /// `None` for an image that is no longer there.
@@ -207,8 +210,7 @@ impl LiveMap {
         &self,
         places: &[Place],
         at: usize,
-        near: usize,
-        metres: f64,
+        settings: CalibrationSettings,
         k: usize,
     ) -> Option<LookAlikes> {
         let asked = &places[at];
@@ -216,14 +218,13 @@ impl LiveMap {
             // Where it stands in the order of addition.
             let position = places.partition_point(|place| place.slot < found.slot);
             let pose = places.get(position).and_then(|place| place.pose);
-            let distance = asked.pose.zip(pose).and_then(|(a, b)| a.distance_m(&b));
-            position.abs_diff(at) > near && distance.is_none_or(|distance| distance > metres)
+            settings.are_apart(places.len(), (at, asked.pose), (position, pose))
         };
         let mut descriptor = Vec::new();
         self.vectors
             .scan(asked.slot..asked.slot + 1, &mut |_, numbers| descriptor = numbers.to_vec());
         // Twice as many, until enough of them are of other places.
-        let mut wanted = k + 2 * near + 1;
+        let mut wanted = k + 2 * settings.place_images_of(places.len()) + 1;
         let others: Vec<Found> = loop {
             let found =
                 self.index.search(self.vectors.as_ref(), &descriptor, wanted, SearchMode::Fast);

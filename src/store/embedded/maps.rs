@@ -8,7 +8,7 @@ use bytes::Bytes;
 use sled::Transactional;
 use uuid::Uuid;
 
-use super::super::changes::{changed_map, removed, same_bytes};
+use super::super::changes::{changed_map, check_dim, removed, same_bytes};
 use super::super::{Added, BlobPin, BlobStore, IndexState, LookAlikes, MapStore, StoreError};
 use super::blobs::Blobs;
 use super::live_map::{LiveMap, folder_of};
@@ -244,13 +244,7 @@ impl MapStore for EmbeddedStore {
         mode: SearchMode,
     ) -> Result<Vec<Candidate>, StoreError> {
         let live = self.inner.live_revision(map)?;
-        if query.dim() != map.dim {
-            return Err(StoreError::Conflict(format!(
-                "a descriptor of {} numbers cannot be searched in a map of {}",
-                query.dim(),
-                map.dim
-            )));
-        }
+        check_dim(map, &query)?;
         blocking(move || Ok(live.search(query.as_slice(), k, mode))).await
     }
 

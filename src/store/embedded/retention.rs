@@ -1,8 +1,8 @@
 //! Ended jobs go, with their queries and frames: the first to end first, a few in each change, so that
 //! no other change waits long.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, PoisonError};
 
 use async_trait::async_trait;
 use jiff::civil::Date;
@@ -11,7 +11,7 @@ use sled::Transactional;
 use super::super::{KeepJobs, RemovedJobs, Retention, StoreError};
 use super::trees::{BlobOwner, Trees, blob_ref_key, ended_job, failed, transaction_failed};
 use super::{EmbeddedStore, blocking};
-use crate::domain::Digest;
+use crate::domain::{Digest, MapName};
 
 /// What one change took away.
 #[derive(Default)]
@@ -48,9 +48,19 @@ impl Retention for EmbeddedStore {
         self.inner.writer.commit(forget, |()| {}).await
     }
 
+    async fn clear_left(&self) -> Result<(), StoreError> {
+        // Opening the folder does it, and every description that comes.
+        Ok(())
+    }
+
     async fn db_bytes(&self) -> Result<u64, StoreError> {
         let inner = Arc::clone(&self.inner);
         blocking(move || inner.trees.bytes()).await
+    }
+
+    async fn index_bytes(&self) -> Result<Vec<(MapName, u64)>, StoreError> {
+        let maps = self.inner.maps.read().unwrap_or_else(PoisonError::into_inner);
+        Ok(maps.iter().map(|(name, live)| (name.clone(), live.index_bytes())).collect())
     }
 
     async fn free_bytes(&self) -> Option<u64> {

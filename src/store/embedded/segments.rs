@@ -173,6 +173,11 @@ impl VectorFiles {
         HEADER_BYTES + (slot % ROWS) * self.stride()
     }
 
+    /// Bytes of so many rows.
+    pub fn bytes_of(&self, rows: usize) -> u64 {
+        (rows * self.stride()) as u64
+    }
+
     fn stride(&self) -> usize {
         ROW_HEADER_BYTES + self.dim * size_of::<f32>()
     }

@@ -9,9 +9,10 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use uuid::Uuid;
 
+use super::super::changes::place;
 use super::super::{JobRecord, StoreError};
 use super::webhooks::WebhookTrees;
-use crate::domain::{Digest, Image, ImageId, Job, JobState, Map, Priority};
+use crate::domain::{Digest, Image, ImageId, Job, JobState, Map};
 
 /// The sled trees. Clones share them.
 #[derive(Clone)]
@@ -222,11 +223,7 @@ impl Trees {
 /// A job's place in the queue: sorted by priority, then by age.
 pub(super) fn queue_key(job: &Job) -> [u8; 17] {
     let mut key = [0; 17];
-    key[0] = match job.priority {
-        Priority::High => 0,
-        Priority::Normal => 1,
-        Priority::Low => 2,
-    };
+    key[0] = place(job.priority);
     key[1..].copy_from_slice(job.id.as_bytes());
     key
 }

@@ -12,11 +12,13 @@ use jiff::Timestamp;
 use tokio::sync::watch;
 use uuid::Uuid;
 
-use super::super::changes::{check_ended, no_delivery, no_webhook, too_many_webhooks};
+use super::super::changes::{
+    attempted, check_ended, disable, no_delivery, no_webhook, too_many_webhooks,
+};
 use super::super::{ForgottenDeliveries, KeepDeliveries, StoreError, StoredDelivery, WebhookStore};
 use super::trees::{Trees, decode, failed, put};
 use super::{EmbeddedStore, blocking};
-use crate::domain::{Attempt, Delivery, DeliveryState, StoredWebhook, Then};
+use crate::domain::{Attempt, Delivery, DeliveryState, StoredWebhook};
 
 pub(super) use self::trees::WebhookTrees;
 use self::trees::{News, key};
@@ -74,9 +76,7 @@ impl WebhookStore for EmbeddedStore {
         let why = why.to_owned();
         self.change_webhooks(move |trees| {
             let Some(mut stored) = trees.webhook(id)? else { return Ok(()) };
-            if stored.webhook.disabled_at.is_none() {
-                stored.webhook.disabled_at = Some(at);
-                stored.webhook.disabled_reason = Some(why);
+            if disable(&mut stored, at, &why) {
                 put(&trees.webhooks, id.as_bytes(), &stored)?;
             }
             Ok(())
@@ -185,11 +185,7 @@ impl WebhookStore for EmbeddedStore {
     ) -> Result<Option<Delivery>, StoreError> {
         self.change_webhooks(move |trees| {
             let Some(known) = trees.delivery(&key(webhook, id))? else { return Ok(None) };
-            // What was given up meanwhile has been delivered all the same.
-            if known.state != DeliveryState::Waiting && attempt.then != Then::Delivered {
-                return Ok(None);
-            }
-            let after = known.clone().after(attempt);
+            let Some(after) = attempted(known.clone(), attempt) else { return Ok(None) };
             trees.replace(&known, &after)?;
             Ok(Some(after))
         })

@@ -82,23 +82,13 @@ impl AnswerStore for PostgresStore {
         .bind(answer.at.to_sqlx())
         .bind(holder)
         .bind(record(&answer)?);
-        inner
-            .call(async {
-                query.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await
+        inner.run(query).await.map(drop)
     }
 
     async fn forget_answer(&self, id: &str) -> Result<(), StoreError> {
         let inner = &self.inner;
         let query = sqlx::query("DELETE FROM answers WHERE id = $1").bind(id);
-        inner
-            .call(async {
-                query.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await
+        inner.run(query).await.map(drop)
     }
 
     async fn forget_answers(&self, before: Timestamp, most: usize) -> Result<usize, StoreError> {
@@ -109,11 +99,6 @@ impl AnswerStore for PostgresStore {
         )
         .bind(before.to_sqlx())
         .bind(count(most));
-        inner
-            .call(async {
-                let gone = query.execute(&inner.pool).await?.rows_affected();
-                Ok(usize::try_from(gone).unwrap_or(usize::MAX))
-            })
-            .await
+        Ok(usize::try_from(inner.run(query).await?).unwrap_or(usize::MAX))
     }
 }

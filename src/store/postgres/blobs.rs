@@ -27,12 +27,7 @@ impl BlobStore for PostgresStore {
         .bind(digest.as_bytes().as_slice())
         .bind(count(bytes.len()))
         .bind(inner.settings.pin.as_secs_f64());
-        inner
-            .call(async {
-                pinned.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await?;
+        inner.run(pinned).await?;
         inner.objects.put(&digest, bytes).await?;
         // The row says how long they are kept: longer than anybody takes to refer to them.
         Ok(Box::new(()))

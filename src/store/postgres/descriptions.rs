@@ -7,8 +7,6 @@ use std::sync::{Mutex, PoisonError};
 
 use async_trait::async_trait;
 use jiff::Timestamp;
-use sqlx::types::Json;
-use tokio::time::Instant;
 use uuid::Uuid;
 
 use super::super::StoreError;
@@ -30,15 +28,15 @@ const REMOVED_AT_ONCE: i64 = 1000;
 
 /// How full the cache was when it was last looked at.
 #[derive(Default)]
-pub(super) struct KnownLevels(Mutex<(CacheLevels, Option<Instant>)>);
+pub(super) struct KnownLevels(Mutex<CacheLevels>);
 
 impl KnownLevels {
     fn get(&self) -> CacheLevels {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).0
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn set(&self, levels: CacheLevels) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (levels, Some(Instant::now()));
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = levels;
     }
 }
 
@@ -56,13 +54,7 @@ impl DescriptionCache for PostgresStore {
         .bind(key.as_bytes().as_slice())
         .bind(inner.settings.descriptions.max_age.as_secs_f64())
         .bind(USES_NOTED_S);
-        inner
-            .call(async {
-                let found: Option<Json<CachedDescription>> =
-                    query.fetch_optional(&inner.pool).await?;
-                Ok(found.map(|Json(description)| description))
-            })
-            .await
+        inner.one(query).await
     }
 
     async fn keep_description(
@@ -82,12 +74,7 @@ impl DescriptionCache for PostgresStore {
         .bind(key.as_bytes().as_slice())
         .bind(count(text.len() + key.as_bytes().len()))
         .bind(text);
-        inner
-            .call(async {
-                query.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await
+        inner.run(query).await.map(drop)
     }
 
     async fn begin_purchase(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
@@ -104,7 +91,7 @@ impl DescriptionCache for PostgresStore {
         .bind(inner.process)
         .bind(for_s)
         .bind(inner.lifetime());
-        inner.call(async { Ok(query.execute(&inner.pool).await?.rows_affected() > 0) }).await
+        Ok(inner.run(query).await? > 0)
     }
 
     async fn end_purchase(&self, key: &Digest) -> Result<(), StoreError> {
@@ -112,12 +99,7 @@ impl DescriptionCache for PostgresStore {
         let query = sqlx::query("DELETE FROM purchases WHERE key = $1 AND holder = $2")
             .bind(key.as_bytes().as_slice())
             .bind(inner.process);
-        inner
-            .call(async {
-                query.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await
+        inner.run(query).await.map(drop)
     }
 
     async fn similar_frames(
@@ -195,7 +177,7 @@ impl Inner {
     pub(super) async fn tidy_descriptions(&self) -> Result<(), StoreError> {
         let bounds = self.settings.descriptions;
         let broken_off = sqlx::query("DELETE FROM purchases WHERE until <= now()");
-        self.call(async { Ok(broken_off.execute(&self.pool).await?) }).await?;
+        self.run(broken_off).await?;
         loop {
             let gone = sqlx::query(
                 "DELETE FROM descriptions WHERE key IN (
@@ -204,8 +186,8 @@ impl Inner {
             )
             .bind(bounds.max_age.as_secs_f64())
             .bind(REMOVED_AT_ONCE);
-            let gone = self.call(async { Ok(gone.execute(&self.pool).await?) }).await?;
-            if gone.rows_affected() < REMOVED_AT_ONCE.unsigned_abs() {
+            let gone = self.run(gone).await?;
+            if gone < REMOVED_AT_ONCE.unsigned_abs() {
                 break;
             }
         }
@@ -227,8 +209,8 @@ impl Inner {
             )
             .bind(i64::try_from(over).unwrap_or(i64::MAX))
             .bind(REMOVED_AT_ONCE);
-            let gone = self.call(async { Ok(gone.execute(&self.pool).await?) }).await?;
-            if gone.rows_affected() == 0 {
+            let gone = self.run(gone).await?;
+            if gone == 0 {
                 return Ok(());
             }
         }

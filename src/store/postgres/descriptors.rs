@@ -35,6 +35,12 @@ const UNNEEDED: &str = "
             UNION ALL
             SELECT 'descriptors_' || replace(map_uid::text, '-', '') || '_' || revision FROM drafts)";
 
+/// The bytes of each map's descriptors and their index. A table that is replaced at this moment counts nothing.
+pub(super) const SIZES: &str = "
+    SELECT name, coalesce(pg_total_relation_size(to_regclass(
+        'descriptors_' || replace(uid::text, '-', '') || '_' || revision)), 0)
+    FROM maps ORDER BY name";
+
 /// So long a table is waited for that is to be dropped, in milliseconds. Nobody can search it meanwhile.
 const DROP_PATIENCE_MS: u32 = 200;
 
@@ -305,21 +311,17 @@ impl Inner {
                 .bind(map.uid)
                 .fetch_all(&self.pool)
                 .await?;
-        let near = settings.place_images_of(places.len());
-        let step = places.len().div_ceil(settings.images.max(1)).max(1);
         let mut asked = Vec::new();
-        for at in (0..places.len()).step_by(step) {
+        for at in (0..places.len()).step_by(settings.step(places.len())) {
             let (slot, id, pose) = &places[at];
             let Some(descriptor) = self.descriptor(map, *slot).await? else { continue };
+            let pose = pose.as_ref().map(|Json(pose)| *pose);
             let of_another_place = |found: &Found| {
                 let position = places.partition_point(|(slot, ..)| *slot < found.slot);
-                let poses = pose.as_ref().zip(found.pose.as_ref());
-                let distance = poses.and_then(|(Json(a), b)| a.distance_m(b));
-                position.abs_diff(at) > near
-                    && distance.is_none_or(|distance| distance > settings.place_m)
+                settings.are_apart(places.len(), (at, pose), (position, found.pose))
             };
             // Twice as many, until enough of them are of other places.
-            let mut wanted = k + 2 * near + 1;
+            let mut wanted = k + 2 * settings.place_images_of(places.len()) + 1;
             let others = loop {
                 let found = self.find(map, &descriptor, wanted, SearchMode::Fast).await?;
                 let all = found.len() < wanted;

@@ -4,7 +4,7 @@ use async_trait::async_trait;
 use sqlx::types::Json;
 use sqlx::{AssertSqlSafe, PgConnection};
 
-use super::super::changes::removed;
+use super::super::changes::{being_reindexed, removed};
 use super::super::{Draft, DraftStore, StoreError};
 use super::descriptors::{MOST_INDEXED, drop_table, make_table, table};
 use super::{Inner, PostgresStore, count, record};
@@ -45,10 +45,7 @@ impl DraftStore for PostgresStore {
                 .execute(&mut *tx)
                 .await?;
                 if taken.rows_affected() == 0 {
-                    return Err(StoreError::Conflict(format!(
-                        "the map {} is being reindexed already",
-                        next.name
-                    )));
+                    return Err(being_reindexed(&next));
                 }
                 // What a process that is dead may have left.
                 drop_table(&mut tx, next.uid, next.revision).await?;
@@ -102,12 +99,7 @@ impl Draft for PostgresDraft {
             .bind(image.digest.as_bytes().as_slice())
             .bind(descriptor.as_slice())
             .bind(inner.process);
-        inner
-            .call(async {
-                query.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await
+        inner.run(query).await.map(drop)
     }
 
     async fn replace(&mut self) -> Result<bool, StoreError> {
@@ -138,7 +130,7 @@ impl Draft for PostgresDraft {
         let own = sqlx::query("DELETE FROM drafts WHERE map_uid = $1 AND holder = $2")
             .bind(uid)
             .bind(inner.process);
-        if let Err(error) = inner.call(async { Ok(own.execute(&inner.pool).await?) }).await {
+        if let Err(error) = inner.run(own).await {
             tracing::warn!(%error, "a draft is left to the next one of the map");
         }
         inner.drop_left(uid).await;

@@ -4,10 +4,6 @@
 //! (`SKIP LOCKED`), and holds it by a mark: its process, the number of the claim, and until when. A job
 //! whose holder is dead is free at once.
 
-use std::collections::HashMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
-
 use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
 use jiff_sqlx::ToSqlx;
@@ -16,14 +12,15 @@ use sqlx::{Postgres, Transaction};
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
-use super::super::changes::{ended_at, news_of, no_job};
+use super::super::changes::{ended_at, news_of, no_job, place, submitted_at};
 use super::super::listing::SEARCHED;
 use super::super::{
     Claim, FirstAnswer, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
 };
 use super::listener::{DELIVERIES, JOBS};
+use super::statements::alone;
 use super::{Inner, PostgresStore, count, counted, record, seconds};
-use crate::domain::{Job, JobState, Priority, StoredWebhook};
+use crate::domain::{Job, JobState, StoredWebhook};
 
 /// So close to its bound the length of the queue is counted by one submission after another; before that,
 /// as many submissions at once may do no harm.
@@ -45,63 +42,6 @@ enum Place {
     Held { for_s: f64 },
     /// It has ended.
     Ended,
-}
-
-/// The jobs that workers of this process hold. One that the database says the process holds, and that is not
-/// among these, was claimed in a transaction whose end was not heard.
-#[derive(Default)]
-pub(super) struct HeldJobs(Mutex<HashMap<Uuid, (Claim, Instant)>>);
-
-impl HeldJobs {
-    fn jobs(&self) -> MutexGuard<'_, HashMap<Uuid, (Claim, Instant)>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Those whose leases have not ended.
-    fn all(&self) -> Vec<Uuid> {
-        let (mut jobs, now) = (self.jobs(), Instant::now());
-        jobs.retain(|_, (_, until)| *until > now);
-        jobs.keys().copied().collect()
-    }
-
-    fn has(&self, job: Uuid) -> bool {
-        self.jobs().get(&job).is_some_and(|(_, until)| *until > Instant::now())
-    }
-
-    /// Holds a job as long as the returned value lives, or, if that is kept, until it is let go of or so many
-    /// seconds have passed.
-    fn hold(&self, claim: Claim, for_s: f64) -> Holding<'_> {
-        let until = Instant::now() + Duration::from_secs_f64(for_s);
-        self.jobs().insert(claim.job, (claim, until));
-        Holding { held: self, claim: Some(claim) }
-    }
-
-    /// Not of a later claim: the job may have been taken again already.
-    fn let_go(&self, claim: Claim) {
-        let mut jobs = self.jobs();
-        if jobs.get(&claim.job).is_some_and(|(known, _)| *known == claim) {
-            jobs.remove(&claim.job);
-        }
-    }
-}
-
-struct Holding<'a> {
-    held: &'a HeldJobs,
-    claim: Option<Claim>,
-}
-
-impl Holding<'_> {
-    fn keep(mut self) {
-        self.claim = None;
-    }
-}
-
-impl Drop for Holding<'_> {
-    fn drop(&mut self) {
-        if let Some(claim) = self.claim {
-            self.held.let_go(claim);
-        }
-    }
 }
 
 impl PostgresStore {
@@ -209,8 +149,7 @@ impl Inner {
         limit: usize,
     ) -> Result<(), StoreError> {
         if self.waiting(&mut **tx, limit).await? + SUBMITTED_AT_ONCE > limit {
-            let lock = sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(QUEUE_LOCK);
-            lock.execute(&mut **tx).await?;
+            alone(tx, QUEUE_LOCK).await?;
             if self.waiting(&mut **tx, limit).await? >= limit {
                 return Err(StoreError::QueueFull { limit });
             }
@@ -226,7 +165,7 @@ impl Inner {
         .bind(job.id)
         .bind(job.map.as_str())
         .bind(job.state.as_str())
-        .bind(place(job.priority))
+        .bind(i16::from(place(job.priority)))
         .bind(new.query.digest.as_bytes().as_slice())
         .bind(record(new)?)
         .bind(JOBS)
@@ -245,7 +184,7 @@ impl Inner {
         before: Option<Uuid>,
         limit: usize,
     ) -> Result<Vec<JobRecord>, StoreError> {
-        let found: Vec<Json<JobRecord>> = sqlx::query_scalar(
+        let query = sqlx::query_scalar(
             "SELECT record FROM jobs
              WHERE id < $1 AND ($2::text IS NULL OR map = $2) AND ($3::text IS NULL OR state = $3)
              ORDER BY id DESC LIMIT $4",
@@ -253,10 +192,8 @@ impl Inner {
         .bind(before.unwrap_or(Uuid::max()))
         .bind(filter.map.as_ref().map(|map| map.as_str()))
         .bind(filter.state.map(JobState::as_str))
-        .bind(count(limit))
-        .fetch_all(&self.pool)
-        .await?;
-        Ok(found.into_iter().map(|Json(known)| known).collect())
+        .bind(count(limit));
+        self.all(query).await
     }
 
     /// Jobs that wait or run.
@@ -321,15 +258,20 @@ impl JobStore for PostgresStore {
         inner.call(inner.waiting(&inner.pool, usize::MAX)).await
     }
 
-    async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {
+    async fn oldest_open(&self) -> Result<Option<Timestamp>, StoreError> {
         let inner = &self.inner;
-        inner
-            .call(async {
-                let found = sqlx::query_scalar("SELECT record FROM jobs WHERE id = $1").bind(id);
-                let found: Option<Json<JobRecord>> = found.fetch_optional(&inner.pool).await?;
-                Ok(found.map(|Json(known)| known))
-            })
-            .await
+        // Those that are open first, which are few: by the order of ids alone one would pass all that have ended.
+        let oldest = sqlx::query_scalar(
+            "WITH open AS MATERIALIZED (SELECT id FROM jobs WHERE ended_at IS NULL)
+             SELECT id FROM open ORDER BY id LIMIT 1",
+        );
+        let oldest: Option<Uuid> =
+            inner.call(async { Ok(oldest.fetch_optional(&inner.pool).await?) }).await?;
+        Ok(oldest.and_then(submitted_at))
+    }
+
+    async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {
+        self.inner.one(sqlx::query_scalar("SELECT record FROM jobs WHERE id = $1").bind(id)).await
     }
 
     async fn jobs(
@@ -340,7 +282,7 @@ impl JobStore for PostgresStore {
     ) -> Result<JobList, StoreError> {
         let inner = &self.inner;
         if filter.text.is_none() {
-            let page = inner.call(inner.older(filter, before, limit)).await?;
+            let page = inner.older(filter, before, limit).await?;
             let jobs = page.into_iter().map(|known| known.job).collect();
             return Ok(JobList { jobs, searched_to: None });
         }
@@ -351,7 +293,7 @@ impl JobStore for PostgresStore {
                 found.searched_to = before;
                 break;
             }
-            let page = inner.call(inner.older(filter, before, PAGE)).await?;
+            let page = inner.older(filter, before, PAGE).await?;
             let whole = page.len() == PAGE;
             for known in page {
                 if found.jobs.len() == limit {
@@ -460,14 +402,5 @@ impl JobStore for PostgresStore {
 
     fn changes(&self) -> broadcast::Receiver<Uuid> {
         self.inner.changes.subscribe()
-    }
-}
-
-/// A job's place in the queue; those of a lower number go first.
-fn place(priority: Priority) -> i16 {
-    match priority {
-        Priority::High => 0,
-        Priority::Normal => 1,
-        Priority::Low => 2,
     }
 }

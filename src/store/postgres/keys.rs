@@ -1,7 +1,6 @@
 //! API keys.
 
 use async_trait::async_trait;
-use sqlx::types::Json;
 use tokio::sync::watch;
 
 use super::super::{KeyStore, StoreError};
@@ -21,23 +20,11 @@ impl KeyStore for PostgresStore {
         .bind(key.key.id.clone())
         .bind(record(&key)?)
         .bind(KEYS);
-        inner
-            .call(async {
-                query.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await
+        inner.run(query).await.map(drop)
     }
 
     async fn keys(&self) -> Result<Vec<StoredKey>, StoreError> {
-        let inner = &self.inner;
-        inner
-            .call(async {
-                let keys = sqlx::query_scalar("SELECT record FROM keys");
-                let keys: Vec<Json<StoredKey>> = keys.fetch_all(&inner.pool).await?;
-                Ok(keys.into_iter().map(|Json(key)| key).collect())
-            })
-            .await
+        self.inner.all(sqlx::query_scalar("SELECT record FROM keys")).await
     }
 
     fn changed_keys(&self) -> Option<watch::Receiver<()>> {

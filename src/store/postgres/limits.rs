@@ -7,8 +7,10 @@ use async_trait::async_trait;
 use jiff::civil::Date;
 use jiff_sqlx::ToSqlx;
 
-use super::super::{Draw, Drawn, Purse, SharedLimits, StoreError};
+use super::super::{Draw, Drawn, SharedLimits, StoreError};
 use super::PostgresStore;
+use super::statements::alone;
+use crate::refine::mllm::Spent;
 
 /// The advisory lock of those who set something aside.
 const BUDGET_LOCK: i64 = 0x7768_6572_6561_0003;
@@ -47,7 +49,7 @@ impl SharedLimits for PostgresStore {
             .await
     }
 
-    async fn set_aside(&self, day: Date, most: Purse, limit: Purse) -> Result<bool, StoreError> {
+    async fn set_aside(&self, day: Date, most: Spent, limit: Spent) -> Result<bool, StoreError> {
         let inner = &self.inner;
         let set = sqlx::query(
             "INSERT INTO set_aside AS a (day, holder, tokens, money)
@@ -74,8 +76,7 @@ impl SharedLimits for PostgresStore {
             .call(async {
                 let mut tx = inner.begin().await?;
                 // One after another, so that no two take the same rest.
-                let lock = sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(BUDGET_LOCK);
-                lock.execute(&mut *tx).await?;
+                alone(&mut tx, BUDGET_LOCK).await?;
                 let set = set.execute(&mut *tx).await?.rows_affected() > 0;
                 tx.commit().await?;
                 Ok(set)
@@ -83,7 +84,7 @@ impl SharedLimits for PostgresStore {
             .await
     }
 
-    async fn give_back(&self, day: Date, unneeded: Purse) -> Result<(), StoreError> {
+    async fn give_back(&self, day: Date, unneeded: Spent) -> Result<(), StoreError> {
         let inner = &self.inner;
         let query = sqlx::query(
             "UPDATE set_aside SET tokens = greatest(tokens - $3, 0), money = greatest(money - $4, 0)
@@ -93,11 +94,6 @@ impl SharedLimits for PostgresStore {
         .bind(inner.process)
         .bind(unneeded.tokens.cast_signed())
         .bind(unneeded.money);
-        inner
-            .call(async {
-                query.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await
+        inner.run(query).await.map(drop)
     }
 }

@@ -7,7 +7,7 @@ use sqlx::types::Json;
 use sqlx::{PgConnection, Row};
 use uuid::Uuid;
 
-use super::super::changes::{changed_map, removed};
+use super::super::changes::{changed_map, check_dim, removed};
 use super::super::{Added, IndexState, LookAlikes, MapStore, StoreError};
 use super::descriptors::make_table;
 use super::{Inner, PostgresStore, counted, record};
@@ -23,26 +23,12 @@ impl MapStore for PostgresStore {
     }
 
     async fn map(&self, name: &MapName) -> Result<Option<Map>, StoreError> {
-        let inner = &self.inner;
         let query = sqlx::query_scalar("SELECT record FROM maps WHERE name = $1");
-        let query = query.bind(name.as_str());
-        inner
-            .call(async {
-                let found: Option<Json<Map>> = query.fetch_optional(&inner.pool).await?;
-                Ok(found.map(|Json(map)| map))
-            })
-            .await
+        self.inner.one(query.bind(name.as_str())).await
     }
 
     async fn maps(&self) -> Result<Vec<Map>, StoreError> {
-        let inner = &self.inner;
-        inner
-            .call(async {
-                let maps = sqlx::query_scalar("SELECT record FROM maps ORDER BY name");
-                let maps: Vec<Json<Map>> = maps.fetch_all(&inner.pool).await?;
-                Ok(maps.into_iter().map(|Json(map)| map).collect())
-            })
-            .await
+        self.inner.all(sqlx::query_scalar("SELECT record FROM maps ORDER BY name")).await
     }
 
     async fn delete_map(&self, name: &MapName) -> Result<bool, StoreError> {
@@ -116,13 +102,7 @@ impl MapStore for PostgresStore {
         k: usize,
         mode: SearchMode,
     ) -> Result<Vec<Candidate>, StoreError> {
-        if query.dim() != map.dim {
-            return Err(StoreError::Conflict(format!(
-                "a descriptor of {} numbers cannot be searched in a map of {}",
-                query.dim(),
-                map.dim
-            )));
-        }
+        check_dim(map, &query)?;
         self.inner.call(self.inner.candidates(map, &query, k, mode)).await
     }
 
@@ -287,14 +267,14 @@ impl Inner {
     }
 
     /// Clears away what processes that ended too soon have left of deleted maps, and of drafts.
-    pub(super) async fn sweep_deleted(&self) -> Result<(), StoreError> {
+    pub(super) async fn sweep_left(&self) -> Result<(), StoreError> {
         let broken_off = sqlx::query(
             "DELETE FROM drafts
              WHERE holder <> $1 AND NOT is_alive(holder, make_interval(secs => $2))",
         )
         .bind(self.process)
         .bind(self.lifetime());
-        self.call(async { Ok(broken_off.execute(&self.pool).await?) }).await?;
+        self.run(broken_off).await?;
         self.drop_unneeded(None).await?;
         let left = sqlx::query_scalar("SELECT uid FROM deleted_maps");
         let left: Vec<Uuid> = self.call(async { Ok(left.fetch_all(&self.pool).await?) }).await?;

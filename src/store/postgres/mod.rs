@@ -14,6 +14,7 @@ mod blobs;
 mod descriptions;
 mod descriptors;
 mod drafts;
+mod held;
 mod images;
 mod indexer;
 mod jobs;
@@ -24,6 +25,7 @@ mod maps;
 mod processes;
 mod retention;
 mod schema;
+mod statements;
 mod usage;
 mod webhooks;
 
@@ -41,8 +43,8 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use uuid::Uuid;
 
 use self::descriptions::KnownLevels;
-use self::schema::schema_state;
 pub use self::schema::{SchemaState, migrate, schema_of};
+use self::schema::{schema_state, too_new};
 use super::{DescriptionBounds, Objects, StoreError};
 use crate::retrieve::index::IndexSettings;
 
@@ -85,7 +87,7 @@ struct Inner {
     keys: watch::Sender<()>,
     levels: KnownLevels,
     graphs: descriptors::KnownGraphs,
-    held: jobs::HeldJobs,
+    held: held::HeldJobs,
     /// Ends what works in the background.
     _background: DropGuard,
 }
@@ -115,13 +117,13 @@ impl PostgresStore {
             keys: watch::Sender::new(()),
             levels: KnownLevels::default(),
             graphs: descriptors::KnownGraphs::default(),
-            held: jobs::HeldJobs::default(),
+            held: held::HeldJobs::default(),
             _background: background.clone().drop_guard(),
             pool,
             doubts,
             settings,
         });
-        inner.call(inner.sign_of_life()).await?;
+        inner.sign_of_life().await?;
         // Whoever has the store hears of every change.
         let listener = inner.call(listener::connect(&inner.pool)).await?;
         let weak = Arc::downgrade(&inner);
@@ -229,10 +231,7 @@ async fn check_schema(pool: &PgPool, settings: &PostgresSettings) -> Result<(), 
             "the tables of the database are not up to date (steps missing: {steps}); run `whereabouts \
              migrate` with the same settings first"
         ))),
-        SchemaState::Ahead { version } => Err(StoreError::Conflict(format!(
-            "the database has version {version} of the schema, and this program does not know it: a later \
-             whereabouts has migrated it. Run that one"
-        ))),
+        SchemaState::Ahead { version } => Err(too_new(version)),
     }
 }
 

@@ -16,25 +16,21 @@ const FORGOTTEN_S: i64 = 24 * 3600;
 impl Inner {
     /// Says that this process is alive.
     pub(super) async fn sign_of_life(&self) -> Result<(), StoreError> {
-        sqlx::query(
+        let alive = sqlx::query(
             "INSERT INTO processes (id, alive_until) VALUES ($1, now() + make_interval(secs => $2))
              ON CONFLICT (id) DO UPDATE SET alive_until = EXCLUDED.alive_until",
         )
         .bind(self.process)
-        .bind(self.lifetime())
-        .execute(&self.pool)
-        .await?;
-        Ok(())
+        .bind(self.lifetime());
+        self.run(alive).await.map(drop)
     }
 
     async fn forget_the_dead(&self) -> Result<(), StoreError> {
-        sqlx::query(
+        let dead = sqlx::query(
             "DELETE FROM processes WHERE alive_until < now() - make_interval(secs => $1::bigint)",
         )
-        .bind(FORGOTTEN_S)
-        .execute(&self.pool)
-        .await?;
-        Ok(())
+        .bind(FORGOTTEN_S);
+        self.run(dead).await.map(drop)
     }
 }
 
@@ -44,10 +40,10 @@ pub(super) async fn keep_alive(store: Weak<Inner>, closed: CancellationToken) {
     while let Some(inner) = store.upgrade() {
         let pause = inner.settings.lifetime / SIGNS;
         let told = match signs % 1000 {
-            0 => inner.call(inner.forget_the_dead()).await,
+            0 => inner.forget_the_dead().await,
             _ => Ok(()),
         };
-        let told = told.and(inner.call(inner.sign_of_life()).await);
+        let told = told.and(inner.sign_of_life().await);
         if let Err(error) = told {
             tracing::warn!(%error, "the other processes cannot be told that this one is alive");
         }

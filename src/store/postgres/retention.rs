@@ -5,7 +5,9 @@ use jiff::civil::Date;
 use jiff_sqlx::ToSqlx;
 
 use super::super::{KeepJobs, RemovedJobs, Retention, StoreError};
+use super::descriptors::SIZES;
 use super::{Inner, PostgresStore, count, counted};
+use crate::domain::MapName;
 
 #[async_trait]
 impl Retention for PostgresStore {
@@ -20,15 +22,13 @@ impl Retention for PostgresStore {
         let inner = &self.inner;
         let usage = sqlx::query("DELETE FROM usage WHERE day < $1").bind(before.to_sqlx());
         let set_aside = sqlx::query("DELETE FROM set_aside WHERE day < current_date - 2");
-        inner
-            .call(async {
-                usage.execute(&inner.pool).await?;
-                set_aside.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await?;
-        inner.sweep_deleted().await?;
-        inner.tidy_descriptions().await
+        inner.run(usage).await?;
+        inner.run(set_aside).await.map(drop)
+    }
+
+    async fn clear_left(&self) -> Result<(), StoreError> {
+        self.inner.sweep_left().await?;
+        self.inner.tidy_descriptions().await
     }
 
     async fn db_bytes(&self) -> Result<u64, StoreError> {
@@ -40,6 +40,18 @@ impl Retention for PostgresStore {
                 Ok(size.unsigned_abs())
             })
             .await
+    }
+
+    async fn index_bytes(&self) -> Result<Vec<(MapName, u64)>, StoreError> {
+        let inner = &self.inner;
+        let sizes = sqlx::query_as(SIZES);
+        let sizes: Vec<(String, i64)> =
+            inner.call(async { Ok(sizes.fetch_all(&inner.pool).await?) }).await?;
+        let sizes = sizes.into_iter();
+        // Each name was one when it was stored.
+        Ok(sizes
+            .filter_map(|(map, bytes)| Some((map.parse().ok()?, bytes.unsigned_abs())))
+            .collect())
     }
 
     async fn free_bytes(&self) -> Option<u64> {

@@ -40,12 +40,7 @@ pub async fn migrate(settings: &PostgresSettings) -> Result<usize, StoreError> {
     let missing = match schema_state(&pool).await? {
         SchemaState::UpToDate => 0,
         SchemaState::Behind { steps } => steps,
-        SchemaState::Ahead { version } => {
-            return Err(StoreError::Conflict(format!(
-                "the database has version {version} of the schema, and this program does not know it; run \
-                 the whereabouts that migrated it"
-            )));
-        }
+        SchemaState::Ahead { version } => return Err(too_new(version)),
     };
     if missing > 0 {
         let mut connection = pool.acquire().await?;
@@ -84,6 +79,14 @@ pub(super) async fn schema_state(pool: &PgPool) -> Result<SchemaState, StoreErro
         (_, [.., last]) => Ok(SchemaState::Ahead { version: last.version }),
         (steps, []) => Ok(SchemaState::Behind { steps }),
     }
+}
+
+/// Why a database is left alone that a later program has migrated, and what to do.
+pub(super) fn too_new(version: i64) -> StoreError {
+    StoreError::Conflict(format!(
+        "the database has version {version} of the schema, and this program does not know it: a later \
+         whereabouts has migrated it. Run that one"
+    ))
 }
 
 fn failed(error: MigrateError) -> StoreError {

@@ -41,12 +41,7 @@ impl UsageStore for PostgresStore {
         .bind(i64::from(usage.estimated))
         .bind(money)
         .bind(inner.process);
-        inner
-            .call(async {
-                query.execute(&inner.pool).await?;
-                Ok(())
-            })
-            .await
+        inner.run(query).await.map(drop)
     }
 
     async fn usage(&self, from: Date) -> Result<Vec<DayUsage>, StoreError> {

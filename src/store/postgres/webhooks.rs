@@ -10,12 +10,13 @@ use tokio::sync::watch;
 use uuid::Uuid;
 
 use super::super::changes::{
-    check_enabled, check_ended, no_delivery, no_webhook, too_many_webhooks,
+    attempted, check_enabled, check_ended, disable, no_delivery, no_webhook, too_many_webhooks,
 };
 use super::super::{ForgottenDeliveries, KeepDeliveries, StoreError, StoredDelivery, WebhookStore};
 use super::listener::DELIVERIES;
+use super::statements::alone;
 use super::{Inner, PostgresStore, count, counted, record};
-use crate::domain::{Attempt, Delivery, DeliveryState, StoredWebhook, Then};
+use crate::domain::{Attempt, Delivery, DeliveryState, StoredWebhook};
 
 /// The advisory lock of those who add webhooks.
 const WEBHOOKS_LOCK: i64 = 0x7768_6572_6561_0002;
@@ -101,8 +102,7 @@ impl WebhookStore for PostgresStore {
         inner
             .call(async {
                 let mut tx = inner.begin().await?;
-                let lock = sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(WEBHOOKS_LOCK);
-                lock.execute(&mut *tx).await?;
+                alone(&mut tx, WEBHOOKS_LOCK).await?;
                 let there: i64 =
                     sqlx::query_scalar("SELECT count(*) FROM webhooks").fetch_one(&mut *tx).await?;
                 if counted(there) >= most {
@@ -116,26 +116,12 @@ impl WebhookStore for PostgresStore {
     }
 
     async fn webhooks(&self) -> Result<Vec<StoredWebhook>, StoreError> {
-        let inner = &self.inner;
-        inner
-            .call(async {
-                let all = sqlx::query_scalar("SELECT record FROM webhooks ORDER BY id");
-                let all: Vec<Json<StoredWebhook>> = all.fetch_all(&inner.pool).await?;
-                Ok(all.into_iter().map(|Json(stored)| stored).collect())
-            })
-            .await
+        self.inner.all(sqlx::query_scalar("SELECT record FROM webhooks ORDER BY id")).await
     }
 
     async fn webhook(&self, id: Uuid) -> Result<Option<StoredWebhook>, StoreError> {
-        let inner = &self.inner;
-        inner
-            .call(async {
-                let found = sqlx::query_scalar("SELECT record FROM webhooks WHERE id = $1");
-                let found: Option<Json<StoredWebhook>> =
-                    found.bind(id).fetch_optional(&inner.pool).await?;
-                Ok(found.map(|Json(stored)| stored))
-            })
-            .await
+        let query = sqlx::query_scalar("SELECT record FROM webhooks WHERE id = $1");
+        self.inner.one(query.bind(id)).await
     }
 
     async fn disable_webhook(&self, id: Uuid, at: Timestamp, why: &str) -> Result<(), StoreError> {
@@ -147,9 +133,7 @@ impl WebhookStore for PostgresStore {
                 let found: Option<Json<StoredWebhook>> =
                     sqlx::query_scalar(sql).bind(id).fetch_optional(&mut *tx).await?;
                 let Some(Json(mut stored)) = found else { return Ok(()) };
-                if stored.webhook.disabled_at.is_none() {
-                    stored.webhook.disabled_at = Some(at);
-                    stored.webhook.disabled_reason = Some(why.to_owned());
+                if disable(&mut stored, at, why) {
                     let change = sqlx::query("UPDATE webhooks SET record = $2::json WHERE id = $1");
                     change.bind(id).bind(record(&stored)?).execute(&mut *tx).await?;
                     tx.commit().await?;
@@ -163,7 +147,7 @@ impl WebhookStore for PostgresStore {
         let inner = &self.inner;
         // Its deliveries go with it.
         let query = sqlx::query("DELETE FROM webhooks WHERE id = $1").bind(id);
-        inner.call(async { Ok(query.execute(&inner.pool).await?.rows_affected() > 0) }).await
+        Ok(inner.run(query).await? > 0)
     }
 
     async fn queue_delivery(&self, new: StoredDelivery) -> Result<(), StoreError> {
@@ -214,7 +198,6 @@ impl WebhookStore for PostgresStore {
         before: Option<Uuid>,
         limit: usize,
     ) -> Result<Vec<Delivery>, StoreError> {
-        let inner = &self.inner;
         let query = sqlx::query_scalar(
             "SELECT record FROM deliveries
              WHERE webhook = $1 AND id < $2 AND ($3::text IS NULL OR state = $3)
@@ -224,12 +207,7 @@ impl WebhookStore for PostgresStore {
         .bind(before.unwrap_or(Uuid::max()))
         .bind(state.map(DeliveryState::as_str))
         .bind(count(limit));
-        inner
-            .call(async {
-                let found: Vec<Json<Delivery>> = query.fetch_all(&inner.pool).await?;
-                Ok(found.into_iter().map(|Json(delivery)| delivery).collect())
-            })
-            .await
+        self.inner.all(query).await
     }
 
     async fn due_deliveries(
@@ -279,11 +257,7 @@ impl WebhookStore for PostgresStore {
                 let Some(known) = inner.lock_delivery(&mut tx, webhook, id).await? else {
                     return Ok(None);
                 };
-                // What was given up meanwhile has been delivered all the same.
-                if known.state != DeliveryState::Waiting && attempt.then != Then::Delivered {
-                    return Ok(None);
-                }
-                let after = known.after(attempt);
+                let Some(after) = attempted(known, attempt) else { return Ok(None) };
                 inner.update_delivery(&mut tx, &after).await?;
                 tx.commit().await?;
                 Ok(Some(after))

@@ -31,14 +31,16 @@ where
     }
 }
 
-async fn until<T, F>(limit: Duration, call: impl Fn() -> F) -> Result<T, StoreError>
+/// Asks or tells until there is an answer, for so long.
+pub(super) async fn until<T, F>(limit: Duration, call: impl Fn() -> F) -> Result<T, StoreError>
 where
     F: Future<Output = Result<T, StoreError>>,
 {
     let began = Instant::now();
     loop {
         match call().await {
-            Err(StoreError::Unavailable(_)) if began.elapsed() < limit => {
+            Err(StoreError::Unavailable(why)) if began.elapsed() < limit => {
+                tracing::warn!(why, "the store is away; trying again");
                 tokio::time::sleep(PAUSE).await;
             }
             answer => return answer,
