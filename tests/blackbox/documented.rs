@@ -21,6 +21,10 @@ const MOST: usize = 3;
 /// Words for people, and what may be another on another machine.
 const DIFFERS: [&str; 6] = ["text", "reasoning", "detail", "request_id", "provider", "precision"];
 
+/// What the server does by itself just then, and may have done or not: measure a map that images
+/// were added to, try a delivery that nobody takes.
+const UNDER_WAY: [&str; 3] = [".calibration", ".last_attempt_at", ".last_error"];
+
 /// Lists of what has happened on this server.
 const HAPPENED: [&str; 2] = [".minutes", ".errors"];
 
@@ -165,8 +169,7 @@ fn compare(at: &str, shown: &Value, real: &Value) {
         }
         (Value::Number(_), Value::Number(_)) => {}
         (Value::Bool(shown), Value::Bool(real)) => assert_eq!(shown, real, "{at}"),
-        // Measured a moment after images were added, which may be over or not.
-        (_, Value::Null) | (Value::Null, _) if at.ends_with(".calibration") => {}
+        (_, Value::Null) | (Value::Null, _) if UNDER_WAY.iter().any(|one| at.ends_with(one)) => {}
         _ => assert_eq!(shown, real, "{at}"),
     }
 }
