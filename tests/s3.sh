@@ -1,11 +1,11 @@
-#!/bin/sh
+#!/usr/bin/env bash
 # Runs a command with a server of its own that speaks S3, which is gone afterwards:
 #
 #     tests/s3.sh VENV COMMAND [ARGUMENT...]
 #
 # VENV is made if it is not there, and the server put into it. The command finds the address in
 # WHEREABOUTS_TEST_S3, and there the bucket whereabouts-test; if that is set already, that server is used.
-set -eu
+set -euo pipefail
 
 [ $# -ge 2 ] || { sed -n '4,7s/^# \{0,1\}//p' "$0" >&2; exit 2; }
 venv=$1
@@ -15,22 +15,12 @@ if [ -n "${WHEREABOUTS_TEST_S3:-}" ]; then
 fi
 
 here=$(cd "$(dirname "$0")" && pwd)
-if ! cmp -s "$here/store/requirements.txt" "$venv/installed.txt"; then
-    python3 -m venv "$venv"
-    "$venv/bin/pip" install --quiet --disable-pip-version-check -r "$here/store/requirements.txt"
-    cp "$here/store/requirements.txt" "$venv/installed.txt"
-fi
-port=$("$venv/bin/python" -c 'import socket
-with socket.socket() as s: s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')
-
-log=$(mktemp)
-server=
-end() {
-    [ -z "$server" ] || kill "$server" 2>/dev/null || true
-    rm -f "$log"
-}
-trap end EXIT
+# shellcheck source-path=SCRIPTDIR source=server.sh
+. "$here/server.sh"
 trap 'exit 130' INT TERM
+environment "$venv" "$here/store/requirements.txt"
+port=$(free_port "$venv")
+log=$scratch/log
 
 export AWS_ACCESS_KEY_ID=test AWS_SECRET_ACCESS_KEY=test
 "$venv/bin/moto_server" -H 127.0.0.1 -p "$port" >"$log" 2>&1 &

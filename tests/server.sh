@@ -1,15 +1,39 @@
 # Shared by the scripts that start a server; not run by itself.
 # shellcheck shell=bash
 
-# environment FOLDER REQUIREMENTS...: a Python environment with what these files name, made if it is not there.
+# environment FOLDER REQUIREMENTS...: a Python environment with what these files name, made if it is not there or
+# they name something else by now.
 environment() {
     local folder=$1 files=() file
     shift
-    if [ -e "$folder/complete" ]; then return; fi
+    if cat "$@" | cmp -s - "$folder/complete"; then return; fi
     for file in "$@"; do files+=(-r "$file"); done
     python3 -m venv "$folder"
     "$folder/bin/pip" install --quiet --disable-pip-version-check "${files[@]}"
-    touch "$folder/complete"
+    cat "$@" > "$folder/complete"
+}
+
+# free_port VENV: a port of this machine that nobody listens on, on standard output.
+free_port() {
+    "$1/bin/python" -c 'import socket
+with socket.socket() as s: s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])'
+}
+
+# browser: a browser to open pages in, as $CHROMIUM.
+browser() {
+    if ! CHROMIUM=$(command -v "${CHROMIUM:-chromium}"); then
+        echo "there is no chromium to open the console in; install it: apt-get install chromium" >&2
+        exit 1
+    fi
+}
+
+# town BINARY PLACES: a town of so many places with frames in it, and the data folder of a server that has
+# localized them, as $scratch/town.
+town() {
+    if ! "$1" demo --offline --json --places "$2" --out "$scratch/town" > "$scratch/demo" 2>&1; then
+        cat "$scratch/demo" >&2
+        exit 1
+    fi
 }
 
 # A folder for this run, as $scratch. It goes when the script ends, and the server with it.

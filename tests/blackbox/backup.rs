@@ -95,7 +95,7 @@ async fn another_server_answers_as_the_first_without_running_the_model() {
     let (there, here) = (to.get("/maps/indoors").await, from.get("/maps/indoors").await);
     assert_eq!(state(there.expect(200)), state(here.expect(200)));
     // What the model did is counted: nothing, before the frames above.
-    let metrics = String::from_utf8(to.get("/metrics").await.bytes).unwrap();
+    let metrics = to.metrics().await;
     let runs = metrics
         .lines()
         .find(|l| l.starts_with("whereabouts_stage_seconds_count{stage=\"extract\""))

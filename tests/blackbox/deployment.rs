@@ -50,6 +50,16 @@ pub fn settings(data: &Path) -> Vec<(String, String)> {
     settings
 }
 
+/// How many tables of descriptors a server has whose data folder this is.
+pub fn descriptor_tables(data: &Path) -> usize {
+    on_server(&database_of(data), async |connection| {
+        let count =
+            "SELECT count(*) FROM pg_class WHERE relkind = 'r' AND relname LIKE 'descriptors\\_%'";
+        let count: i64 = sqlx::query_scalar(count).fetch_one(connection).await.unwrap();
+        count as usize
+    })
+}
+
 /// A database for the data folder, made when it is first asked for.
 fn database_of(data: &Path) -> String {
     static TEMPLATE: OnceLock<String> = OnceLock::new();
@@ -82,22 +92,30 @@ fn address(database: &str) -> String {
     server().database(database).to_url_lossy().to_string()
 }
 
-/// Makes a database, unless it is there. Tests run on runtimes of their own, which must not be blocked.
+/// Makes a database, unless it is there.
 fn make(name: &str, template: Option<&str>) {
     let from = template.map(|name| format!(" TEMPLATE {name}")).unwrap_or_default();
-    let (name, sql) = (name.to_owned(), format!("CREATE DATABASE {name}{from}"));
-    let making = std::thread::spawn(move || {
+    let sql = format!("CREATE DATABASE {name}{from}");
+    on_server("postgres", async |connection| {
+        let there = sqlx::query("SELECT FROM pg_database WHERE datname = $1").bind(name);
+        if there.fetch_optional(&mut *connection).await.unwrap().is_some() {
+            return;
+        }
+        // Two tests cannot copy the template at once.
+        sqlx::query("SELECT pg_advisory_lock(1)").execute(&mut *connection).await.unwrap();
+        sqlx::query(AssertSqlSafe(sql)).execute(connection).await.unwrap();
+    });
+}
+
+/// Asks one database of the server. Tests run on runtimes of their own, which must not be blocked.
+fn on_server<T: Send>(database: &str, ask: impl AsyncFnOnce(&mut PgConnection) -> T + Send) -> T {
+    let asking = || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
-            let mut connection = PgConnection::connect_with(&server()).await.unwrap();
-            let there = sqlx::query("SELECT FROM pg_database WHERE datname = $1").bind(&name);
-            if there.fetch_optional(&mut connection).await.unwrap().is_some() {
-                return;
-            }
-            // Two tests cannot copy the template at once.
-            sqlx::query("SELECT pg_advisory_lock(1)").execute(&mut connection).await.unwrap();
-            sqlx::query(AssertSqlSafe(sql)).execute(&mut connection).await.unwrap();
-        });
-    });
-    making.join().unwrap();
+            let options = server().database(database);
+            let mut connection = PgConnection::connect_with(&options).await.unwrap();
+            ask(&mut connection).await
+        })
+    };
+    std::thread::scope(|scope| scope.spawn(asking).join().unwrap())
 }

@@ -122,7 +122,7 @@ impl Client {
 }
 
 async fn refused(server: &Server, reason: &str) -> u64 {
-    let metrics = String::from_utf8(server.get("/metrics").await.bytes).unwrap();
+    let metrics = server.metrics().await;
     let wanted = format!("reason=\"{reason}\"");
     let line = metrics.lines().find(|line| line.contains("refused") && line.contains(&wanted));
     line.and_then(|line| line.rsplit(' ').next()?.parse().ok()).unwrap_or(0)

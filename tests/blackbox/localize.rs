@@ -1,10 +1,13 @@
 //! `/localize`.
 
+use std::time::{Duration, Instant};
+
 use reqwest::Method;
 use reqwest::multipart::{Form, Part};
 use serde_json::json;
+use tempfile::TempDir;
 
-use super::support::{Answer, frame, reference, server};
+use super::support::{Answer, Server, frame, reference, server};
 
 #[tokio::test]
 async fn a_map_image_finds_itself_and_all_fields_are_there() {
@@ -31,6 +34,36 @@ async fn a_map_image_finds_itself_and_all_fields_are_there() {
     for stage in ["decode", "extract", "search", "total"] {
         assert!(answer["timing_ms"][stage].as_f64().unwrap() >= 0.0, "{stage}");
     }
+}
+
+#[tokio::test]
+async fn searches_by_a_graph_are_checked_and_counted() {
+    let dir = TempDir::new().unwrap();
+    let settings = [("WHEREABOUTS_INDEX__EXACT_UP_TO", "0"), ("WHEREABOUTS_INDEX__CHECK_S", "1")];
+    let server = Server::start(dir.path(), &settings);
+    server.town("m", 12).await;
+    let checked =
+        |found| format!("whereabouts_neighbours_checked_total{{map=\"m\",found=\"{found}\"}}");
+    let deadline = Instant::now() + Duration::from_secs(60);
+    // The first ones may come before the graph.
+    let metrics = loop {
+        server.post_jpeg("/localize?map=m&refine=off", reference(4)).await.expect(200);
+        let metrics = server.metrics().await;
+        if metrics.contains(&checked("yes")) {
+            break metrics;
+        }
+        assert!(Instant::now() < deadline, "{metrics}");
+    };
+    let value = |name: &str| -> f64 {
+        let line = metrics.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
+        line.unwrap_or_else(|| panic!("no {name}: {metrics}")).parse().unwrap()
+    };
+    assert!(value(&checked("yes")) >= 10.0, "{metrics}");
+    // In a map as small as this a graph misses nothing.
+    assert_eq!(value(&checked("no")), 0.0);
+    assert!(value("whereabouts_index_bytes{map=\"m\"}") > 12.0 * 576.0 * 4.0);
+    assert!(value("whereabouts_batch_pictures_count") >= 13.0);
+    assert_eq!(value("whereabouts_oldest_job_seconds"), 0.0);
 }
 
 #[tokio::test]

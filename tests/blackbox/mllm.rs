@@ -203,7 +203,7 @@ async fn what_is_spent_is_known_by_day_and_map_and_outlives_kill_9() {
     refine(&server, 0).await;
     let usage = server.get("/usage").await.expect(200)["total"]["usage"].clone();
     assert_eq!((&usage["calls"], &usage["cached"]), (&json!(6), &json!(4)));
-    let metrics = String::from_utf8(server.get("/metrics").await.bytes).unwrap();
+    let metrics = server.metrics().await;
     for line in [
         "whereabouts_description_lookups_total{result=\"hit\"} 4",
         "whereabouts_description_cache_entries 4",

@@ -33,7 +33,7 @@ fn post_all(server: &Server, path: &str, frames: usize) -> JoinSet<Answer> {
 }
 
 async fn metric(server: &Server, name: &str) -> f64 {
-    let metrics = String::from_utf8(server.get("/metrics").await.bytes).unwrap();
+    let metrics = server.metrics().await;
     let line = metrics.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
     line.map_or(0.0, |value| value.parse().unwrap())
 }

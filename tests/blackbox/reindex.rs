@@ -64,12 +64,22 @@ impl Bench {
         Server::start(&self.data(), &[&ours, settings].concat())
     }
 
-    /// With a database, descriptors are in tables, which the tests of the stores look at.
-    fn descriptor_folders(&self) -> usize {
-        if deployment::is_scale_out() {
-            return 1;
+    /// Waits until there are the descriptors of one model only. A folder is removed at once; a table when nobody
+    /// is left who could be at it.
+    async fn has_descriptors_of_one_model(&self) {
+        let start = Instant::now();
+        loop {
+            let found = match deployment::is_scale_out() {
+                true => deployment::descriptor_tables(&self.data()),
+                false => std::fs::read_dir(self.data().join("descriptors")).unwrap().count(),
+            };
+            if found == 1 {
+                return;
+            }
+            let patient = deployment::is_scale_out() && start.elapsed() < Duration::from_secs(20);
+            assert!(patient, "there are the descriptors of {found} models");
+            tokio::time::sleep(Duration::from_millis(50)).await;
         }
-        std::fs::read_dir(self.data().join("descriptors")).unwrap().count()
     }
 }
 
@@ -212,7 +222,7 @@ async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed()
         }
     }
     check(&server).await;
-    assert_eq!(bench.descriptor_folders(), 1, "the old descriptors are removed");
+    bench.has_descriptors_of_one_model().await;
     add(&server, "m", 32).await;
     server.kill();
     let server = bench.server(&graph);
@@ -245,18 +255,23 @@ async fn images_that_are_sent_all_the_time_are_neither_lost_nor_refused() {
 async fn kill_9_in_the_middle_loses_nothing_and_it_can_be_run_again() {
     let bench = Bench::new();
     bench.install_slow();
-    let server = bench.server(&[]);
+    let soon = [
+        ("WHEREABOUTS_DATABASE__TIMEOUT_MS", "1000"),
+        ("WHEREABOUTS_DATABASE__LIFETIME_S", "2"),
+        ("WHEREABOUTS_JOBS__SWEEP_S", "1"),
+    ];
+    let server = bench.server(&soon);
     town(&server, "m", "xfeat", 16).await;
     begin(&server, "m", json!({"model": "slow"})).await;
     in_the_middle(&server, "m").await;
     add(&server, "m", 16).await;
     server.kill();
 
-    let server = bench.server(&[]);
+    let server = bench.server(&soon);
     let state = server.get("/maps/m").await.expect(200);
     assert_eq!((&state["model"], &state["images"]), (&json!("xfeat"), &json!(17)));
     assert!(state["reindex"].is_null());
-    assert_eq!(bench.descriptor_folders(), 1, "the unfinished ones are removed");
+    bench.has_descriptors_of_one_model().await;
     for place in [0, 15, 16] {
         first(&look(&server, "m", place).await, place, "xfeat");
     }
@@ -342,7 +357,7 @@ async fn an_image_that_cannot_be_taken_over_stops_the_reindex_and_nothing_else()
     assert_eq!((&state["reindex"]["state"], &state["model"]), (&json!("failed"), &json!("xfeat")));
     let why = state["reindex"]["error"].as_str().unwrap();
     assert!(why.contains("place-2") && why.contains("delete it"), "{why}");
-    assert_eq!(bench.descriptor_folders(), 1);
+    bench.has_descriptors_of_one_model().await;
     first(&look(&server, "m", 2).await, 2, "xfeat");
     // As it says.
     server.delete("/maps/m/images/place-2").await.expect(204);

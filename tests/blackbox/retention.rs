@@ -67,7 +67,7 @@ async fn only_so_many_ended_jobs_are_kept_with_their_frames() {
     server.get(&format!("/jobs/{}/events", made[5])).await.problem(404);
     let page = server.get(&format!("/jobs?cursor={}", made[4])).await.expect(200);
     assert_eq!(page["jobs"], Value::Array(vec![]));
-    let metrics = String::from_utf8(server.get("/metrics").await.bytes).unwrap();
+    let metrics = server.metrics().await;
     let removed = "whereabouts_jobs_removed_total{why=\"count\"} 5";
     assert!(metrics.contains(removed), "{metrics}");
     assert!(server.log().contains("ended jobs were removed"));

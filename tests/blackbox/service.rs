@@ -34,7 +34,7 @@ async fn metrics_count_requests_jobs_and_images() {
     server.town("m", 3).await;
     server.post_jpeg("/localize?map=m&refine=wait", frame(0, 0)).await.expect(200);
     server.get("/maps/none").await.problem(404);
-    let metrics = String::from_utf8(server.get("/metrics").await.bytes).unwrap();
+    let metrics = server.metrics().await;
     for line in [
         r#"whereabouts_http_requests_total{method="POST",route="/localize",status="200"} 1"#,
         r#"whereabouts_http_requests_total{method="GET",route="/maps/{map}",status="404"} 1"#,

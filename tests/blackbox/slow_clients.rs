@@ -132,7 +132,7 @@ async fn a_body_that_pauses_or_trickles_gets_408() {
     assert!(problem(&paused, 408).contains("server.body_pause_s"));
     assert!(problem(&trickle, 408).contains("server.body_timeout_s"));
     assert!(problem(&endless, 408).contains("server.body_timeout_s"));
-    let metrics = String::from_utf8(server.get("/metrics").await.bytes).unwrap();
+    let metrics = server.metrics().await;
     assert!(metrics.contains(r#"whereabouts_refused_total{reason="slow"} 3"#), "{metrics}");
 }
 

@@ -103,6 +103,11 @@ impl Server {
         Answer::of(self.request(Method::GET, path)).await
     }
 
+    /// All metrics as text.
+    pub async fn metrics(&self) -> String {
+        String::from_utf8(self.get("/metrics").await.bytes).unwrap()
+    }
+
     pub async fn delete(&self, path: &str) -> Answer {
         Answer::of(self.request(Method::DELETE, path)).await
     }

@@ -88,7 +88,7 @@ async fn the_end_of_a_job_is_told_to_whom_it_concerns_signed_and_whole() {
     assert_eq!((&page["deliveries"][0], &page["next_cursor"]), (&delivery, &Value::Null));
 
     newest(&server, &id, "delivered", 1).await;
-    let metrics = String::from_utf8(server.get("/metrics").await.bytes).unwrap();
+    let metrics = server.metrics().await;
     for line in [
         "whereabouts_webhook_attempts_total{outcome=\"delivered\"} 2",
         "whereabouts_webhook_deliveries_waiting 0",

@@ -13,10 +13,6 @@ if [ $# -ne 2 ]; then
     echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/console-venv" >&2
     exit 2
 fi
-if ! CHROMIUM=$(command -v "${CHROMIUM:-chromium}"); then
-    echo "there is no chromium to open the console in; install it: apt-get install chromium" >&2
-    exit 1
-fi
 binary=$(realpath "$1")
 venv=$(realpath -m "$2")
 screenshots=
@@ -28,13 +24,11 @@ cd "$(dirname "$0")"
 
 # shellcheck source-path=SCRIPTDIR source=../server.sh
 . ../server.sh
+browser
 environment "$venv" requirements.txt
 
 # The town's own data folder: a map with images, and the jobs of its frames.
-if ! "$binary" demo --offline --json --places 12 --out "$scratch/town" > "$scratch/demo" 2>&1; then
-    cat "$scratch/demo" >&2
-    exit 1
-fi
+town "$binary" 12
 mv "$scratch/town/data" "$scratch/data"
 export WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_AUTH__KEYS=required
 for role in admin robot; do

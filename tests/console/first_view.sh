@@ -12,22 +12,16 @@ if [ $# -ne 2 ]; then
     echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/console-venv" >&2
     exit 2
 fi
-if ! CHROMIUM=$(command -v "${CHROMIUM:-chromium}"); then
-    echo "there is no chromium to open the console in; install it: apt-get install chromium" >&2
-    exit 1
-fi
 binary=$(realpath "$1")
 venv=$(realpath -m "$2")
 cd "$(dirname "$0")"
 
 # shellcheck source-path=SCRIPTDIR source=../server.sh
 . ../server.sh
+browser
 environment "$venv" requirements.txt
 
-if ! "$binary" demo --offline --json --places 12 --out "$scratch/town" > "$scratch/demo" 2>&1; then
-    cat "$scratch/demo" >&2
-    exit 1
-fi
+town "$binary" 12
 export WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_JOBS__QUEUE=20000
 serve "$binary"
 TOWN=$scratch/town URL=$url CHROMIUM=$CHROMIUM PYTHONDONTWRITEBYTECODE=1 "$venv/bin/python" first_view.py

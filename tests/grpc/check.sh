@@ -21,10 +21,7 @@ cd "$(dirname "$0")"
 environment "$venv" requirements.txt
 (cd ../../proto && "$venv/bin/buf" lint)
 
-if ! "$binary" demo --offline --json --places 12 --out "$scratch/town" > "$scratch/demo" 2>&1; then
-    cat "$scratch/demo" >&2
-    exit 1
-fi
+town "$binary" 12
 export WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_SERVER__BODY_LIMIT_BYTES=2000000
 export WHEREABOUTS_SERVER__BODIES_LIMIT_BYTES=80000000
 export WHEREABOUTS_SERVER__BODY_PAUSE_S=2 WHEREABOUTS_SERVER__STREAM_IDLE_S=4
