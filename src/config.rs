@@ -2,25 +2,25 @@
 //!
 //! Defaults (`deploy/whereabouts.toml`) < the file of `--config` < environment < flags.
 
+mod answers;
 mod database;
+mod model;
 mod overrides;
 mod server;
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
+pub use self::answers::{Confidence, Idempotency, Jobs, Localize, Refine, Refiner};
 pub use self::database::{Database, ObjectStore};
+pub use self::model::{Image, Model, PrecisionWish, ProviderWish, cores_unless};
 pub use self::overrides::Overrides;
 pub use self::server::Server;
-use crate::domain::{Precision, RefinerKind};
 use crate::http::Tiles;
-use crate::models::DownloadSettings;
 use crate::refine::mllm::MllmSettings;
-use crate::retrieve::{AdmissionSettings, Layout, Provider, Wanted};
 use crate::service::{BulkSettings, TrackSettings, WebhookSettings};
 use crate::telemetry::TraceSettings;
 
@@ -93,126 +93,6 @@ pub struct Data {
     pub usage_days: u32,
 }
 
-/// `[model]`
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Model {
-    /// The model's name, or "auto".
-    pub name: String,
-    /// Who runs it.
-    pub provider: ProviderWish,
-    /// At which precision.
-    pub precision: PrecisionWish,
-    /// The most models in memory.
-    pub loaded: usize,
-    /// An assets folder to look in before the usual places; empty for none.
-    pub assets: PathBuf,
-    /// Threads of all inference; 0 for one a core.
-    pub threads: usize,
-    /// Pictures run side by side while several wait; 0 for one a thread.
-    pub sessions: usize,
-    /// The most pictures in one run.
-    pub max_batch: usize,
-    /// Where `whereabouts model pull` downloads from.
-    pub hub: String,
-    /// How long the demo waits for it to answer, in seconds; 0: it does not ask.
-    pub hub_patience_s: u64,
-    /// The largest file it downloads, in bytes.
-    pub max_download_bytes: u64,
-    /// The longest time without a byte, in seconds.
-    pub download_stall_s: u64,
-    /// How often it asks while nothing comes of it.
-    pub download_attempts: u32,
-    /// The pause before the second attempt, in milliseconds; it doubles each time.
-    pub download_backoff_ms: u64,
-}
-
-/// Who is to run the model.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ProviderWish {
-    /// The fastest that there is.
-    Auto,
-    /// ONNX Runtime itself.
-    Cpu,
-    /// Intel's OpenVINO.
-    OpenVino,
-    /// NVIDIA's CUDA.
-    Cuda,
-    /// NVIDIA's TensorRT.
-    TensorRt,
-    /// Apple's Core ML.
-    CoreMl,
-}
-
-/// At which precision the model is to run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum PrecisionWish {
-    /// That of the maps there are, else the fastest that gives the same descriptors.
-    Auto,
-    /// 32-bit floats.
-    Full,
-    /// 16-bit floats with 8 bits of exponent.
-    Bf16,
-}
-
-impl Model {
-    /// How inference shares its threads among pictures.
-    pub fn layout(&self) -> Layout {
-        let threads = cores_unless(self.threads);
-        let sessions = if self.sessions == 0 { threads } else { self.sessions };
-        Layout { threads, sessions, max_batch: self.max_batch }
-    }
-
-    /// What may be chosen from.
-    pub fn wanted(&self) -> Wanted {
-        Wanted {
-            provider: match self.provider {
-                ProviderWish::Auto => None,
-                ProviderWish::Cpu => Some(Provider::Cpu),
-                ProviderWish::OpenVino => Some(Provider::OpenVino),
-                ProviderWish::Cuda => Some(Provider::Cuda),
-                ProviderWish::TensorRt => Some(Provider::TensorRt),
-                ProviderWish::CoreMl => Some(Provider::CoreMl),
-            },
-            precision: match self.precision {
-                PrecisionWish::Auto => None,
-                PrecisionWish::Full => Some(Precision::Full),
-                PrecisionWish::Bf16 => Some(Precision::Bf16),
-            },
-        }
-    }
-}
-
-/// A number of threads, or where it is 0, one for each core.
-pub fn cores_unless(threads: usize) -> usize {
-    match threads {
-        0 => std::thread::available_parallelism().map_or(1, usize::from),
-        threads => threads,
-    }
-}
-
-/// `[image]`
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Image {
-    /// The most pixels that are decoded.
-    pub max_pixels: u64,
-    /// Decoding threads; 0 for one a core.
-    pub threads: usize,
-    /// Pictures in work at a time; 0 for as many as keep decoding and inference busy.
-    pub permits: usize,
-    /// Pictures that may wait.
-    pub queue: usize,
-    /// For how long, in milliseconds.
-    pub max_wait_ms: u64,
-    /// The longest Retry-After, in seconds.
-    pub max_retry_after_s: u64,
-    /// Whether every pixel of a large JPEG is decoded before it is scaled down.
-    pub exact: bool,
-}
-
 /// `[index]`
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -282,119 +162,6 @@ impl Console {
         (!(whole && plain && known)).then(|| {
             "console.tiles_url must be an address like https://HOST/{z}/{x}/{y}.png".to_owned()
         })
-    }
-}
-
-/// `[idempotency]`
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Idempotency {
-    /// For how many hours an answer is given again.
-    pub keep_hours: u32,
-    /// How many answers are kept.
-    pub max: usize,
-}
-
-/// `[localize]`
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Localize {
-    /// Candidates in an answer by default.
-    pub k: usize,
-    /// Candidates in an answer at the most.
-    pub max_k: usize,
-    /// The least confidence of a known place.
-    pub known_confidence: f64,
-}
-
-/// `[confidence]`
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Confidence {
-    /// Images that are asked as if they were frames, at most.
-    pub images: usize,
-    /// Of these, how many are also refined.
-    pub refined: usize,
-    /// Images before and after one that show the same place.
-    pub place_images: usize,
-    /// The size of a place, in metres.
-    pub place_m: f64,
-}
-
-/// `[jobs]`
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Jobs {
-    /// Jobs that may wait or run.
-    pub queue: usize,
-    /// The share of `image.queue` from which frames get no job.
-    pub shed_at: f64,
-    /// Jobs refined side by side in this process; 0: others refine.
-    pub workers: usize,
-    /// The lease of a job, in seconds.
-    pub lease_s: u64,
-    /// The longest a job may take, in seconds.
-    pub timeout_s: u64,
-    /// How often a job is tried.
-    pub attempts: u32,
-    /// The pause before the second try, in seconds; it doubles each time.
-    pub retry_pause_s: u64,
-    /// The longest wait of a caller, in seconds.
-    pub max_wait_s: u64,
-    /// How long a job is kept after it has ended, in days; 0: for ever.
-    pub keep_days: u32,
-    /// The most jobs that have ended; 0: any number.
-    pub keep_count: usize,
-    /// The pause between two looks for jobs to remove, in seconds.
-    pub sweep_s: u64,
-    /// The most jobs removed in one change.
-    pub sweep_batch: usize,
-}
-
-/// `[refine]`
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Refine {
-    /// Who refines.
-    pub refiner: Refiner,
-    /// Candidates that `mllm` compares.
-    pub candidates: usize,
-    /// Candidates that `local` compares.
-    pub local_candidates: usize,
-    /// Memory for dense features, in bytes.
-    pub dense_cache_bytes: usize,
-}
-
-impl Refine {
-    /// Candidates that the configured refiner compares.
-    pub fn compared(&self) -> usize {
-        match self.refiner {
-            Refiner::Mllm => self.candidates,
-            Refiner::Local | Refiner::Off => self.local_candidates,
-        }
-    }
-}
-
-/// Who refines, if anybody.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Refiner {
-    /// Geometric matching of dense features.
-    Local,
-    /// A multimodal LLM ([mllm] says which).
-    Mllm,
-    /// Nobody.
-    Off,
-}
-
-impl Refiner {
-    /// The refiner of a new job, if there is one.
-    pub fn kind(self) -> Option<RefinerKind> {
-        match self {
-            Self::Local => Some(RefinerKind::Local),
-            Self::Mllm => Some(RefinerKind::Mllm),
-            Self::Off => None,
-        }
     }
 }
 
@@ -573,43 +340,10 @@ impl Config {
     }
 }
 
-impl Model {
-    /// The folder to look in before the usual places, if there is one.
-    pub fn assets(&self) -> Option<&Path> {
-        Some(self.assets.as_path()).filter(|path| *path != Path::new(""))
-    }
-
-    /// Bounds on a download.
-    pub fn download(&self) -> DownloadSettings {
-        DownloadSettings {
-            max_bytes: self.max_download_bytes,
-            stall: Duration::from_secs(self.download_stall_s),
-            attempts: self.download_attempts,
-            backoff: Duration::from_millis(self.download_backoff_ms),
-        }
-    }
-}
-
-impl Image {
-    /// Bounds on the pictures in work and waiting, where inference has this layout.
-    pub fn admission(&self, layout: Layout) -> AdmissionSettings {
-        let permits = match self.permits {
-            // Each thread decodes one, and twice as many as are inferred have been decoded.
-            0 => cores_unless(self.threads) + 2 * layout.sessions * layout.max_batch,
-            permits => permits,
-        };
-        AdmissionSettings {
-            permits,
-            queue: self.queue,
-            max_wait: Duration::from_millis(self.max_wait_ms),
-            max_retry_after: Duration::from_secs(self.max_retry_after_s),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::RefinerKind;
 
     fn with_file(text: &str) -> Result<Config, ConfigError> {
         let file = tempfile::NamedTempFile::new().unwrap();
