@@ -80,8 +80,14 @@ fn in_process(
     let exact = median((0..30).map(|query| timed(|| find(query, SearchMode::Exact))).collect());
     let threads = rayon::ThreadPoolBuilder::default().build()?;
     let start = Instant::now();
+    let mut said = 0;
     while index.has_work() {
         index.catch_up(rows, 1000, &threads);
+        let tenths = 10 * index.graphed() / size;
+        if tenths > said {
+            said = tenths;
+            eprintln!("{said}0 % in the graph after {:.0} s", start.elapsed().as_secs_f64());
+        }
     }
     let built = start.elapsed();
     let mut found = Vec::new();
@@ -244,7 +250,14 @@ async fn jobs(store: &PostgresStore, map: &Map) -> anyhow::Result<usize> {
         };
         store.submit(record, usize::MAX / 2).await?;
         let until = now + jiff::SignedDuration::from_mins(5);
-        let taken = store.claim(now, until).await?.context("the queue is empty")?;
+        // The only job that was there when this one looked may just have been taken by another, whose own
+        // came a moment later.
+        let taken = loop {
+            match store.claim(now, until).await? {
+                Some(taken) => break taken,
+                None => tokio::task::yield_now().await,
+            }
+        };
         for step in 0..STEPS {
             let description = Description {
                 image_id: format!("image-{step}").parse()?,

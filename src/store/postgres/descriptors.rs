@@ -253,13 +253,15 @@ impl Inner {
             ),
             false => format!("SELECT slot, descriptor FROM {table}"),
         };
+        // OFFSET 0 has images looked up one by one. A plan made for any LIMIT would read the whole map's.
         let sql = format!(
-            "SELECT i.slot, i.id, i.pose, 1 - n.distance AS similarity
+            "SELECT n.slot, i.id, i.pose, 1 - n.distance AS similarity
              FROM (SELECT slot, descriptor <=> $1::real[]::vector AS distance
                    FROM ({nearest}) nearest ORDER BY distance, slot LIMIT $2) n
-             JOIN images i ON i.map_uid = $4 AND i.slot = n.slot
-             JOIN maps m ON m.uid = i.map_uid AND m.revision = $5
-             ORDER BY n.distance, i.slot"
+             JOIN LATERAL (SELECT id, pose FROM images
+                           WHERE map_uid = $4 AND slot = n.slot OFFSET 0) i ON true
+             JOIN maps m ON m.uid = $4 AND m.revision = $5
+             ORDER BY n.distance, n.slot"
         );
         let wanted = k + SPARE;
         let search = sqlx::query(AssertSqlSafe(sql))
