@@ -1,5 +1,4 @@
-//! The graph that takes what arrives: HNSW (Malkov and Yashunin, 2018) of `hnsw_rs`, which is searched
-//! while it grows.
+//! Approximate search: an HNSW graph (Malkov and Yashunin, 2018) built by `hnsw_rs`.
 
 use hnsw_rs::prelude::{Distance, FilterT, Hnsw};
 
@@ -18,6 +17,14 @@ impl Distance<f32> for CosineDistance {
     }
 }
 
+/// A point of a graph.
+pub(super) struct Linked {
+    /// Its slot.
+    pub slot: usize,
+    /// The slots of its neighbours in each of its layers, the lowest layer first.
+    pub layers: Vec<Vec<usize>>,
+}
+
 pub(super) struct Graph {
     hnsw: Hnsw<'static, f32, CosineDistance>,
 }
@@ -34,6 +41,25 @@ impl Graph {
 
     pub fn insert(&self, slot: usize, vector: &[f32]) {
         self.hnsw.insert((vector, slot));
+    }
+
+    /// Its points, each with its neighbours.
+    pub fn linked(&self) -> Vec<Linked> {
+        let points = self.hnsw.get_point_indexation();
+        let layers = 0..=usize::from(points.get_max_level_observed());
+        layers
+            .flat_map(|layer| points.get_layer_iterator(layer))
+            .map(|point| Linked {
+                slot: point.get_origin_id(),
+                layers: point
+                    .get_neighborhood_id()
+                    .iter()
+                    // A point has room for all layers, but is part of those up to its own.
+                    .take(usize::from(point.get_point_id().0) + 1)
+                    .map(|layer| layer.iter().map(|neighbour| neighbour.d_id).collect())
+                    .collect(),
+            })
+            .collect()
     }
 
     /// The `k` nearest among the slots that `keep` lets through.

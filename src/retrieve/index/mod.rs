@@ -3,19 +3,14 @@
 //! The index is derived. It reads descriptors from wherever they are stored ([`Vectors`]) by
 //! *slot*, the position in which they were stored, and can be thrown away and made again.
 //!
-//! Small maps are searched exactly. For larger ones HNSW graphs cover the slots below
+//! Small maps are searched exactly. For larger ones an HNSW graph covers the slots below
 //! [`MapIndex::graphed`], and the rest, which arrived since, is searched exactly: adding an image
-//! never waits for a graph, and a map answers while its graph is still being built.
-//!
-//! There are two: one over the whole map as it once was ([`SealedGraph`]), small, fast and kept in a
-//! file, and one of `hnsw_rs` that takes what arrives. When as much has arrived as the first one
-//! covers, a new one is built over all ([`Builder`]).
+//! never waits for the graph, and a map answers while its graph is still being built. A graph that
+//! has caught up is sealed ([`SealedGraph`]), which makes it smaller and its search faster, and lets
+//! it be written to a file.
 
-mod builder;
-mod codes;
 mod exact;
 mod graph;
-mod layer;
 mod sealed;
 
 use std::ops::Range;
@@ -24,7 +19,6 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, Rw
 use rayon::ThreadPool;
 use rayon::prelude::*;
 
-use self::builder::Builder;
 use self::exact::Best;
 use self::graph::Graph;
 pub use self::sealed::{DamagedGraph, SealedGraph};
@@ -81,7 +75,7 @@ pub struct MapIndex {
     live: RwLock<Live>,
     graphs: RwLock<Graphs>,
     /// A graph over everything, on its way to replace those there are. Only the indexer touches it.
-    building: Mutex<Option<Builder>>,
+    merging: Mutex<Option<Merging>>,
 }
 
 #[derive(Default)]
@@ -122,6 +116,14 @@ struct Graphs {
     graphed: usize,
 }
 
+struct Merging {
+    graph: Graph,
+    /// Slots below this one are in it.
+    done: usize,
+    /// Slots below this one will be.
+    end: usize,
+}
+
 impl Graphs {
     /// Where the growing graph begins.
     fn sealed_end(&self) -> usize {
@@ -136,7 +138,7 @@ impl MapIndex {
             settings,
             live: RwLock::default(),
             graphs: RwLock::default(),
-            building: Mutex::default(),
+            merging: Mutex::default(),
         }
     }
 
@@ -223,46 +225,42 @@ impl MapIndex {
 
     /// Whether [`MapIndex::catch_up`] has anything to do.
     pub fn has_work(&self) -> bool {
-        self.is_behind() || self.building().is_some() || self.wants_sealing()
+        self.is_behind() || self.merging().is_some() || self.wants_sealing()
     }
 
-    /// Whether as many slots lie behind the sealed graph as in it, or too many of its points are
-    /// dead: a search walks over them in vain.
+    /// Whether the growing graph has become as large as the sealed one, or too many points of the
+    /// sealed one are dead: a search walks over them in vain.
     fn wants_sealing(&self) -> bool {
-        let sealed = self.graphs().sealed.clone();
-        let (end, points) = sealed.map_or((0, 0), |sealed| (sealed.end(), sealed.len()));
-        let live = self.live();
-        let has_grown = live.count > self.settings.exact_up_to
-            && live.slots.len().saturating_sub(end) >= end.max(1);
-        let dead = points.saturating_sub(live.sealed_count);
+        let graphs = self.graphs();
+        let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
+        let has_grown = graphs.growing.is_some() && graphed - sealed_end >= sealed_end.max(1);
+        let points = graphs.sealed.as_ref().map_or(0, |sealed| sealed.len());
+        let dead = points.saturating_sub(self.live().sealed_count);
         has_grown || dead as f32 > self.settings.max_dead_share * points as f32
     }
 
     /// Does a piece of the work that waits, over at most `most` slots; returns the graph that was
     /// sealed by it, if one was. Call from one thread at a time; searches go on meanwhile.
     ///
-    /// New slots go into the growing graph. When as many have come as the sealed one covers, a graph
-    /// over all is built, which replaces both: each slot is put into such a graph twice on average,
-    /// whatever the size of the map. `threads` share the work.
+    /// New slots go into the growing graph. When none waits and that graph has become as large as
+    /// the sealed one, the two are made one, which is then sealed: each slot is put into a graph
+    /// twice on average, whatever the size of the map. `threads` share the work on the graph.
     pub fn catch_up(
         &self,
         vectors: &dyn Vectors,
         most: usize,
         threads: &ThreadPool,
     ) -> Option<Arc<SealedGraph>> {
-        let mut building = self.building();
-        if let Some(builder) = building.as_mut() {
-            if !builder.link(most, threads) {
+        let mut merging = self.merging();
+        if let Some(merge) = merging.as_mut() {
+            let end = merge.end.min(merge.done + most);
+            self.insert(&merge.graph, vectors, merge.done..end, threads);
+            merge.done = end;
+            if merge.done < merge.end {
                 return None;
             }
-            let sealed = Arc::new(building.take()?.finish());
-            self.replace_graphs(Arc::clone(&sealed));
-            return Some(sealed);
-        }
-        if self.wants_sealing() {
-            let live = self.live().slots.clone();
-            *building = Some(Builder::new(&live, vectors, self.settings));
-            return None;
+            let Merging { graph, end, .. } = merging.take()?;
+            return Some(self.seal(&graph, end, vectors));
         }
         if self.is_behind() {
             let graphs = self.graphs().clone();
@@ -272,8 +270,20 @@ impl MapIndex {
             let mut graphs = self.graphs_mut();
             graphs.growing = Some(growing);
             graphs.graphed = end;
+            return None;
         }
-        None
+        if !self.wants_sealing() {
+            return None;
+        }
+        let Graphs { sealed, growing, graphed } = self.graphs().clone();
+        match (sealed, growing) {
+            (None, Some(growing)) => Some(self.seal(&growing, graphed, vectors)),
+            _ => {
+                let graph = Graph::new(&self.settings);
+                *merging = Some(Merging { graph, done: 0, end: graphed });
+                None
+            }
+        }
     }
 
     fn insert(
@@ -297,6 +307,12 @@ impl MapIndex {
     }
 
     /// Replaces the graphs there are by a finished one.
+    fn seal(&self, graph: &Graph, end: usize, vectors: &dyn Vectors) -> Arc<SealedGraph> {
+        let sealed = Arc::new(SealedGraph::new(&graph.linked(), end, vectors, &self.settings));
+        self.replace_graphs(Arc::clone(&sealed));
+        sealed
+    }
+
     fn replace_graphs(&self, sealed: Arc<SealedGraph>) {
         let graphed = sealed.end();
         *self.graphs_mut() = Graphs { sealed: Some(sealed), growing: None, graphed };
@@ -319,8 +335,8 @@ impl MapIndex {
         self.graphs.write().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn building(&self) -> MutexGuard<'_, Option<Builder>> {
-        self.building.lock().unwrap_or_else(PoisonError::into_inner)
+    fn merging(&self) -> MutexGuard<'_, Option<Merging>> {
+        self.merging.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
