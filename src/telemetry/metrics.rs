@@ -158,7 +158,6 @@ impl Metrics {
         let registry = &mut all;
         Self {
             last_hour: LastHour::default(),
-            levels: Gauges::new(registry),
             requests: add(registry, "http_requests", "Requests answered", Family::default()),
             request_seconds: add(
                 registry,
@@ -249,6 +248,7 @@ impl Metrics {
                  (it is given up)",
                 Family::default(),
             ),
+            levels: Gauges::new(registry),
             registry: all,
         }
     }
