@@ -51,7 +51,15 @@ async fn main() -> anyhow::Result<()> {
         .context("run it through tests/postgres.sh")?;
     for size in sizes {
         let (rows, queries) = (clustered(size, 7), clustered(QUERIES, 11));
-        let truth = in_process(&rows, &queries, size, !only("postgres"))?;
+        let index = MapIndex::new(INDEX);
+        (0..size).for_each(|slot| index.add(slot));
+        let truth: Vec<_> = (0..QUERIES)
+            .into_par_iter()
+            .map(|query| find(&index, &rows, queries.row(query), SearchMode::Exact))
+            .collect();
+        if !only("postgres") {
+            in_process(&index, &rows, &queries, &truth)?;
+        }
         if !only("embedded") {
             in_postgres(&url, &rows, &queries, size, &truth).await?;
         }
@@ -59,24 +67,19 @@ async fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Prints what the graph of the embedded store does, if that is wanted; returns the true neighbours.
+fn find(index: &MapIndex, rows: &Rows, query: &[f32], mode: SearchMode) -> Vec<usize> {
+    index.search(rows, query, K, mode).iter().map(|found| found.slot).collect()
+}
+
+/// Builds the graph of the embedded store and prints what it does.
 fn in_process(
+    index: &MapIndex,
     rows: &Rows,
     queries: &Rows,
-    size: usize,
-    wanted: bool,
-) -> anyhow::Result<Vec<Vec<usize>>> {
-    let index = MapIndex::new(INDEX);
-    (0..size).for_each(|slot| index.add(slot));
-    let find = |query: usize, mode| -> Vec<usize> {
-        let found = index.search(rows, queries.row(query), K, mode);
-        found.iter().map(|found| found.slot).collect()
-    };
-    let truth: Vec<_> =
-        (0..QUERIES).into_par_iter().map(|query| find(query, SearchMode::Exact)).collect();
-    if !wanted {
-        return Ok(truth);
-    }
+    truth: &[Vec<usize>],
+) -> anyhow::Result<()> {
+    let size = index.len();
+    let find = |query: usize, mode| find(index, rows, queries.row(query), mode);
     let exact = median((0..30).map(|query| timed(|| find(query, SearchMode::Exact))).collect());
     let threads = rayon::ThreadPoolBuilder::default().build()?;
     let start = Instant::now();
@@ -98,13 +101,13 @@ fn in_process(
         "{size} in this process: built in {:.1} s, recall@10 {:.4}, p50 {:.2} ms, p99 {:.2} ms; exact \
          p50 {:.2} ms; sealed graph {:.0} MB",
         built.as_secs_f64(),
-        recall(&found, &truth),
+        recall(&found, truth),
         ms(p50),
         ms(p99),
         ms(exact),
         index.sealed_bytes() as f64 / 1e6
     );
-    Ok(truth)
+    Ok(())
 }
 
 async fn in_postgres(

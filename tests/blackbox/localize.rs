@@ -7,7 +7,7 @@ use reqwest::multipart::{Form, Part};
 use serde_json::json;
 use tempfile::TempDir;
 
-use super::support::{Answer, Server, frame, reference, server};
+use super::support::{Answer, Server, frame, reference, server, value_of};
 
 #[tokio::test]
 async fn a_map_image_finds_itself_and_all_fields_are_there() {
@@ -54,10 +54,8 @@ async fn searches_by_a_graph_are_checked_and_counted() {
         }
         assert!(Instant::now() < deadline, "{metrics}");
     };
-    let value = |name: &str| -> f64 {
-        let line = metrics.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
-        line.unwrap_or_else(|| panic!("no {name}: {metrics}")).parse().unwrap()
-    };
+    let value =
+        |name: &str| value_of(&metrics, name).unwrap_or_else(|| panic!("{name}: {metrics}"));
     assert!(value(&checked("yes")) >= 10.0, "{metrics}");
     // In a map as small as this a graph misses nothing.
     assert_eq!(value(&checked("no")), 0.0);

@@ -7,7 +7,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 use tokio::task::JoinSet;
 
-use super::support::{Answer, Server, frame, reference};
+use super::support::{Answer, Server, frame, reference, value_of};
 
 /// One picture in work, so that others wait, and time for all of them on any machine.
 const NARROW: &[(&str, &str)] = &[
@@ -33,9 +33,7 @@ fn post_all(server: &Server, path: &str, frames: usize) -> JoinSet<Answer> {
 }
 
 async fn metric(server: &Server, name: &str) -> f64 {
-    let metrics = server.metrics().await;
-    let line = metrics.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
-    line.map_or(0.0, |value| value.parse().unwrap())
+    value_of(&server.metrics().await, name).unwrap_or(0.0)
 }
 
 /// Waits until so many frames wait.

@@ -218,6 +218,12 @@ fn town() -> Town {
     Town::new(TownSpec { seed: 11, places: 1000, width: 320, height: 240 })
 }
 
+/// The value of a metric, named with its labels, in what [`Server::metrics`] gives.
+pub fn value_of(metrics: &str, name: &str) -> Option<f64> {
+    let value = metrics.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
+    value.map(|value| value.parse().unwrap())
+}
+
 /// The map image of a place, as a JPEG.
 pub fn reference(place: usize) -> Vec<u8> {
     jpeg(&town().reference(place).image)
