@@ -18,15 +18,13 @@ use bytes::Bytes;
 use futures_util::{StreamExt, stream};
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
-use whereabouts::domain::{
+use whereabouts_core::{
     Candidate, Description, Descriptor, DescriptorKind, Digest, Frame, Image, Job, JobState, Map,
     MediaType, Precision, RefinerKind, Scene, Usage,
 };
-use whereabouts::retrieve::index::IndexSettings;
-use whereabouts::store::embedded::{
-    EmbeddedSettings, EmbeddedStore, Examination, compact, examine,
-};
-use whereabouts::store::{
+use whereabouts_index::IndexSettings;
+use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore, Examination, compact, examine};
+use whereabouts_store::{
     BlobStore, DescriptionBounds, JobRecord, JobStore, KeepJobs, MapStore, Query, Retention, Step,
 };
 

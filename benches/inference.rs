@@ -10,7 +10,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use anyhow::Context;
-use whereabouts::retrieve::{Assets, Bench, BenchRow, BenchSettings, Layout, Wanted};
+use whereabouts_vision::{Assets, Bench, BenchRow, BenchSettings, Layout, Wanted};
 
 const MODEL: &str = "dinov2-small";
 const SIZE: usize = 224;

@@ -16,11 +16,11 @@ use std::time::{Duration, Instant};
 use futures_util::{TryStreamExt, stream};
 use serde_json::Value;
 use server::Server;
-use whereabouts::config::{Config, Overrides};
-use whereabouts::demo::{Town, TownSpec};
-use whereabouts::domain::DescriptorKind;
-use whereabouts::retrieve::decode::encode_jpeg;
-use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits, Wanted};
+use whereabouts_core::DescriptorKind;
+use whereabouts_server::config::{Config, Overrides};
+use whereabouts_town::{Town, TownSpec};
+use whereabouts_vision::decode::encode_jpeg;
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Wanted};
 
 const PLACES: usize = 200;
 const FRAMES: usize = 50;

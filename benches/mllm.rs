@@ -11,22 +11,13 @@
     reason = "it uses what the black-box tests use"
 )]
 
-#[allow(dead_code)]
-#[path = "../tests/blackbox/deployment.rs"]
-mod deployment;
-#[path = "../tests/blackbox/mock_mllm.rs"]
-mod mock_mllm;
-#[path = "../tests/blackbox/support.rs"]
-#[expect(dead_code, reason = "the black-box tests use the rest")]
-mod support;
-
 use std::time::{Duration, Instant};
 
-use mock_mllm::{MockMllm, Reply, Script};
 use serde_json::{Value, json};
-use support::{Server, jpeg};
 use tempfile::TempDir;
-use whereabouts::demo::{Town, TownSpec};
+use whereabouts_testkit::mock_mllm::{MockMllm, Reply, Script};
+use whereabouts_testkit::server::{Server, jpeg};
+use whereabouts_town::{Town, TownSpec};
 
 const CANDIDATES: usize = 10;
 /// About what a model writes of one pair.

@@ -16,9 +16,9 @@ use anyhow::{Context, ensure};
 use bytes::Bytes;
 use server::Server;
 use tokio::task::JoinSet;
-use whereabouts::config::{Config, Overrides};
-use whereabouts::demo::{Town, TownSpec};
-use whereabouts::retrieve::decode::encode_jpeg;
+use whereabouts_server::config::{Config, Overrides};
+use whereabouts_town::{Town, TownSpec};
+use whereabouts_vision::decode::encode_jpeg;
 
 const PLACES: usize = 20;
 const ALONE: usize = 300;

@@ -7,12 +7,12 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use whereabouts::demo::{Town, TownSpec};
-use whereabouts::domain::DescriptorKind;
-use whereabouts::retrieve::decode::{decode, encode_jpeg};
-use whereabouts::retrieve::manifest::{Input, Interpolation, Resize};
-use whereabouts::retrieve::preprocess::{needed, preprocess};
-use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits, Needed};
+use whereabouts_core::DescriptorKind;
+use whereabouts_town::{Town, TownSpec};
+use whereabouts_vision::decode::{decode, encode_jpeg};
+use whereabouts_vision::manifest::{Input, Interpolation, Resize};
+use whereabouts_vision::preprocess::{needed, preprocess};
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Needed};
 
 const PICTURES: usize = 12;
 const ROUNDS: usize = 15;

@@ -8,11 +8,11 @@ use std::path::Path;
 use std::time::Instant;
 
 use ndarray::ArrayView2;
-use whereabouts::demo::{Town, TownSpec};
-use whereabouts::domain::{DenseFeatures, DescriptorKind};
-use whereabouts::refine::local::LocalMatcher;
-use whereabouts::retrieve::decode::encode_jpeg;
-use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits};
+use whereabouts_core::{DenseFeatures, DescriptorKind};
+use whereabouts_refine::local::LocalMatcher;
+use whereabouts_town::{Town, TownSpec};
+use whereabouts_vision::decode::encode_jpeg;
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits};
 
 const CANDIDATES: usize = 20;
 const ROUNDS: usize = 30;

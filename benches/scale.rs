@@ -16,13 +16,13 @@ use rayon::prelude::*;
 use sqlx::postgres::{PgConnection, PgPoolCopyExt};
 use sqlx::{AssertSqlSafe, Connection, PgPool};
 use uuid::Uuid;
-use whereabouts::domain::{
+use whereabouts_core::{
     Description, Descriptor, DescriptorKind, Digest, Frame, Image, Job, JobState, Map, MediaType,
     Precision, RefinerKind, Scene, Usage,
 };
-use whereabouts::retrieve::index::{IndexSettings, MapIndex, SearchMode};
-use whereabouts::store::postgres::{PostgresSettings, PostgresStore, migrate};
-use whereabouts::store::{
+use whereabouts_index::{IndexSettings, MapIndex, SearchMode};
+use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
+use whereabouts_store::{
     BlobStore, DescriptionBounds, JobRecord, JobStore, MapStore, Objects, Query, Step,
 };
 

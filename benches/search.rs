@@ -16,7 +16,7 @@ use std::time::Instant;
 
 use anyhow::Context;
 use rayon::prelude::*;
-use whereabouts::retrieve::index::{IndexSettings, MapIndex, SealedGraph, SearchMode};
+use whereabouts_index::{IndexSettings, MapIndex, SealedGraph, SearchMode};
 
 use self::vectors::{DIM, Rows, clustered, recall};
 

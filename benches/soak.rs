@@ -18,8 +18,8 @@ use bytes::Bytes;
 use server::Server;
 use tokio::sync::Mutex;
 use tokio::task::JoinSet;
-use whereabouts::demo::{Town, TownSpec};
-use whereabouts::retrieve::decode::encode_jpeg;
+use whereabouts_town::{Town, TownSpec};
+use whereabouts_vision::decode::encode_jpeg;
 
 const MINUTES: f64 = 10.0;
 const PLACES: usize = 60;

@@ -13,12 +13,12 @@ use futures_util::{StreamExt, TryStreamExt, stream};
 use jiff::Timestamp;
 use tempfile::TempDir;
 use uuid::Uuid;
-use whereabouts::domain::{
+use whereabouts_core::{
     Descriptor, DescriptorKind, Digest, Frame, Image, Map, MediaType, Precision, Scene,
 };
-use whereabouts::retrieve::index::IndexSettings;
-use whereabouts::store::embedded::{EmbeddedSettings, EmbeddedStore};
-use whereabouts::store::{DescriptionBounds, MapStore};
+use whereabouts_index::IndexSettings;
+use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
+use whereabouts_store::{DescriptionBounds, MapStore};
 
 const IMAGES: usize = 76_000;
 const DIM: usize = 384;

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use rayon::prelude::*;
-use whereabouts::demo::{Town, TownSpec};
+use whereabouts_town::{Town, TownSpec};
 
 const PICTURES: usize = 160;
 

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
-use whereabouts::cli::Cli;
+use whereabouts_cli::Cli;
 
 fn main() -> ExitCode {
     Cli::parse().run()

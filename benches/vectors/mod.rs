@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use whereabouts::retrieve::index::Vectors;
+use whereabouts_index::Vectors;
 
 /// Numbers in a vector.
 pub const DIM: usize = 384;

@@ -14,8 +14,8 @@ use super::{
     ArchiveError, ArchivedMap, BLOCK, END, End, FORMAT, LeftOut, MANIFEST, Manifest, VERSION,
     bytes_name, left_out_name, map_name, record_name,
 };
-use crate::domain::{Digest, ImageId, Map, MapName};
-use crate::store::ExportedImage;
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{Digest, ImageId, Map, MapName};
 
 /// The largest JSON entry, in bytes: `end.json` names images that were left out.
 const MAX_JSON_BYTES: u64 = 64 << 20;

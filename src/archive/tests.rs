@@ -8,8 +8,8 @@ use tempfile::TempDir;
 use uuid::Uuid;
 
 use super::*;
-use crate::domain::{Descriptor, DescriptorKind, Frame, Image, Map, Precision, Scene};
-use crate::store::ExportedImage;
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{Descriptor, DescriptorKind, Frame, Image, Map, Precision, Scene};
 
 fn map(name: &str) -> Map {
     Map {

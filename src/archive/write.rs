@@ -14,8 +14,8 @@ use super::{
     ArchiveError, ArchivedMap, BLOCK, END, End, LeftOut, MANIFEST, Manifest, bytes_name,
     left_out_name, map_name, record_name,
 };
-use crate::domain::{Digest, ImageId, Map, MapName};
-use crate::store::ExportedImage;
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{Digest, ImageId, Map, MapName};
 
 /// Writes an archive beside its place; it is there when it is whole.
 pub struct Writer {

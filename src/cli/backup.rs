@@ -11,10 +11,10 @@ use serde::{Deserialize, Serialize};
 
 use super::client::{Client, ServerArg, explained, segment};
 use super::progress::Progress;
-use crate::archive::{ArchivedMap, LeftOut, Manifest, Mark, Resumed, Writer, growing};
-use crate::domain::{Digest, Image, ImageId, Map, MapName};
-use crate::service::{ExportPage, MapState};
-use crate::store::ExportedImage;
+use whereabouts_api::{ExportPage, MapState};
+use whereabouts_archive::{ArchivedMap, LeftOut, Manifest, Mark, Resumed, Writer, growing};
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{Digest, Image, ImageId, Map, MapName};
 
 /// Images whose records are fetched at a time.
 const PAGE: usize = 256;
@@ -68,7 +68,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     if args.file.exists() {
         bail!("{} is there already; choose another name or remove it", args.file.display());
     }
-    let client = Client::new(&args.server)?;
+    let client = args.server.client()?;
     let states = states(&client, &args.maps).await?;
     let names: Vec<MapName> = states.iter().map(|map| map.name.clone()).collect();
     let (writer, resumed) = writer(&args, &names)?;

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::config::{Config, DEFAULTS, Overrides};
+use whereabouts_server::config::{Config, DEFAULTS, Overrides};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use anyhow::bail;
 use serde::Serialize;
 
-use crate::config::{Config, Overrides};
-use crate::store::embedded::{Compacted, Examination, MapReport, Report, compact, examine};
+use whereabouts_server::config::{Config, Overrides};
+use whereabouts_store::embedded::{Compacted, Examination, MapReport, Report, compact, examine};
 
 /// Stop the server first. Exit code 0: nothing is wrong; 1: something is, and each line says what to do.
 #[derive(Debug, clap::Args)]

@@ -7,20 +7,20 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 
 use super::progress::Progress;
-use crate::config::{Config, Overrides, Refiner as ConfiguredRefiner};
-use crate::domain::{DescriptorKind, Digest, RefinerKind, Scene};
-use crate::evaluate::{
+use whereabouts_core::{DescriptorKind, Digest, RefinerKind, Scene};
+use whereabouts_eval::{
     Dataset, Evaluator, Folders, RunSettings, Sampling, Summary, Told, TruthSource, Watch,
     predictions, report, table,
 };
-use crate::refine::local::{LocalMatcher, LocalSettings};
-use crate::refine::mllm::PROMPT_VERSION;
-use crate::refine::{LocalRefiner, Refiner};
-use crate::retrieve::CpuPool;
-use crate::retrieve::index::SearchMode;
-use crate::service::Service;
-use crate::startup;
-use crate::telemetry::{self, Metrics};
+use whereabouts_index::SearchMode;
+use whereabouts_refine::local::{LocalMatcher, LocalSettings};
+use whereabouts_refine::mllm::PROMPT_VERSION;
+use whereabouts_refine::{LocalRefiner, Refiner};
+use whereabouts_server::Metrics;
+use whereabouts_server::config::{Config, Overrides, Refiner as ConfiguredRefiner};
+use whereabouts_server::startup;
+use whereabouts_service::Service;
+use whereabouts_vision::CpuPool;
 
 /// Indexes a folder of references, asks every picture of a folder of queries, and prints Recall@1,
 /// 5 and 10 before and after refinement. Which references are true for which query is taken from, in
@@ -122,7 +122,8 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     }
 
     let config = args.config()?;
-    let _logs = telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
+    let _logs =
+        whereabouts_telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
     let service = open(config.clone()).await?;
     let model = service.models.default_model().to_owned();
     let execution = service.installed_model(&model).await?.execution().to_string();

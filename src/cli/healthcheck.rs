@@ -1,6 +1,6 @@
 //! `whereabouts healthcheck`.
 
-use super::client::{Client, ServerArg};
+use super::client::ServerArg;
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -9,7 +9,7 @@ pub struct Args {
 }
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
-    let client = Client::new(&args.server)?;
+    let client = args.server.client()?;
     client.text(client.get("/readyz")).await?;
     println!("ready");
     Ok(())

@@ -6,7 +6,7 @@ use uuid::Uuid;
 
 use super::client::{Client, ServerArg};
 use super::localize::print_job;
-use crate::domain::{Job, JobState, MapName};
+use whereabouts_core::{Job, JobState, MapName};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -35,7 +35,7 @@ pub struct Args {
 }
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
-    let client = Client::new(&args.server)?;
+    let client = args.server.client()?;
     match args.id {
         Some(id) => {
             let wait = args.wait.map(|wait| ("wait", wait));

@@ -8,10 +8,11 @@ use serde::Deserialize;
 use uuid::Uuid;
 
 use super::client::{Client, ServerArg};
-use crate::config::{Config, Overrides};
-use crate::domain::{ApiKey, KeyLimits, MapName, Role, Token};
-use crate::service::{Keys, MadeKey, NewKey};
-use crate::startup;
+use whereabouts_api::{MadeKey, NewKey};
+use whereabouts_core::{ApiKey, KeyLimits, MapName, Role, Token};
+use whereabouts_server::config::{Config, Overrides};
+use whereabouts_server::startup;
+use whereabouts_service::Keys;
 
 /// Make, list and revoke the keys that a server asks for.
 #[derive(Debug, clap::Args)]
@@ -77,7 +78,7 @@ enum Place {
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let place = match args.data {
-        None => Place::Server(Client::new(&args.server)?),
+        None => Place::Server(args.server.client()?),
         Some(data) => {
             let flags = Overrides::default().data(Some(data));
             let config = Config::load(args.config.as_deref(), &flags)?;

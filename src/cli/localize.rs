@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use anyhow::Context;
 use serde_json::Value;
 
-use super::client::{Client, ServerArg, segment};
-use crate::domain::{Job, MapName, MediaType, Pose};
-use crate::service::Answer;
+use super::client::{ServerArg, segment};
+use whereabouts_api::Answer;
+use whereabouts_core::{Job, MapName, MediaType, Pose};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -30,7 +30,7 @@ pub struct Args {
 }
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
-    let client = Client::new(&args.server)?;
+    let client = args.server.client()?;
     let frame = std::fs::read(&args.file)
         .with_context(|| format!("cannot read {}", args.file.display()))?;
     let media_type = MediaType::sniff(&frame)

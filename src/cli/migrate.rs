@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use anyhow::bail;
 
-use crate::config::{Config, Overrides};
-use crate::startup;
-use crate::store::postgres::{SchemaState, migrate, schema_of};
+use whereabouts_server::config::{Config, Overrides};
+use whereabouts_server::startup;
+use whereabouts_store::postgres::{SchemaState, migrate, schema_of};
 
 /// Makes the tables of the database (database.url, WHEREABOUTS_DATABASE__URL), or brings them up to date. Run it
 /// before a new version is started; it may run several times, and several times at once.

@@ -1,6 +1,6 @@
 //! `whereabouts openapi`.
 
 pub fn run() -> anyhow::Result<()> {
-    println!("{}", crate::http::openapi().to_pretty_json()?);
+    println!("{}", whereabouts_server::http::openapi().to_pretty_json()?);
     Ok(())
 }

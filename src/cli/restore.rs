@@ -15,10 +15,10 @@ use serde::{Deserialize, Serialize};
 
 use super::client::{Client, ServerArg, explained, segment};
 use super::progress::Progress;
-use crate::archive::{ArchivedMap, End, Item, LeftOut, Reader};
-use crate::domain::{Digest, Image, ImageId, Map, MapName};
-use crate::service::ImportedImage;
-use crate::store::ExportedImage;
+use whereabouts_api::ImportedImage;
+use whereabouts_archive::{ArchivedMap, End, Item, LeftOut, Reader};
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{Digest, Image, ImageId, Map, MapName};
 
 /// Images that are listed at a time.
 const PAGE: usize = 1000;
@@ -76,7 +76,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         return said_checked(&args, &end);
     }
     let mut restore = Restore {
-        client: Client::new(&args.server)?,
+        client: args.server.client()?,
         progress: Progress::new("images", maps.iter().map(|map| map.images).sum()),
         concurrency: usize::from(args.concurrency),
         done: Vec::new(),

@@ -8,9 +8,9 @@ use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-use crate::config::{Config, Overrides, Refiner};
-use crate::startup::Role;
-use crate::{startup, telemetry};
+use whereabouts_server::config::{Config, Overrides, Refiner};
+use whereabouts_server::startup;
+use whereabouts_server::startup::Role;
 
 /// The settings that a flag can set; all others are in the file and the environment.
 #[derive(Debug, clap::Args)]
@@ -59,7 +59,7 @@ pub async fn run(role: Role, args: Args) -> anyhow::Result<()> {
         check_worker(&config)?;
     }
     let (troubles, _traces) =
-        telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
+        whereabouts_telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
     let listener = TcpListener::bind(config.server.listen).await.with_context(|| {
         format!("cannot listen on {}; choose another with --listen", config.server.listen)
     })?;

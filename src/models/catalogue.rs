@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::retrieve::{Manifest, ManifestError};
+use whereabouts_vision::{Manifest, ManifestError};
 
 const BUILT_IN: &str = include_str!("../../deploy/models/catalogue.toml");
 
@@ -120,8 +120,8 @@ impl Entry {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::DescriptorKind;
-    use crate::retrieve::PREFERRED_MODELS;
+    use whereabouts_core::DescriptorKind;
+    use whereabouts_vision::PREFERRED_MODELS;
 
     #[test]
     fn every_entry_is_consistent_and_says_its_licence() {

@@ -8,7 +8,7 @@ use reqwest::header::{CONTENT_RANGE, ETAG, HeaderMap, IF_RANGE, RANGE, RETRY_AFT
 use reqwest::{Client, Response, StatusCode};
 
 use super::partial::{Origin, Partial, remove_if_there};
-use crate::domain::Digest;
+use whereabouts_core::Digest;
 
 /// Bounds on a download.
 #[derive(Debug, Clone, Copy)]

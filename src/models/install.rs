@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use super::catalogue::Entry;
 use super::download::{Download, DownloadError, DownloadSettings, Progress};
 use super::partial::remove_if_there;
-use crate::domain::Digest;
-use crate::retrieve::{AUTO, CHOSEN, MANIFEST, Manifest, ManifestError, file_digest};
+use whereabouts_core::Digest;
+use whereabouts_vision::{AUTO, CHOSEN, MANIFEST, Manifest, ManifestError, file_digest};
 
 /// `ASSETS/models` of an assets folder that can be written.
 #[derive(Debug, Clone)]
@@ -344,10 +344,12 @@ fn disk(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> InstallEr
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::retrieve::Assets;
+    use whereabouts_vision::Assets;
 
     fn fixture(file: &str) -> PathBuf {
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/models/tiny-tokens").join(file)
+        Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("../../tests/fixtures/models/tiny-tokens")
+            .join(file)
     }
 
     #[test]

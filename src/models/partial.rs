@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
-use crate::domain::Digest;
+use whereabouts_core::Digest;
 
 /// The bytes so far, on disk, with their running digest.
 #[derive(Debug)]

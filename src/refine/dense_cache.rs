@@ -5,7 +5,7 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::domain::{DenseFeatures, Digest};
+use whereabouts_core::{DenseFeatures, Digest};
 
 /// Whose features they are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -7,15 +7,14 @@ use async_trait::async_trait;
 use bytes::Bytes;
 
 use super::local::{LocalMatcher, Match, PairMatch, describe, rank};
-use super::{
-    DenseCache, DenseKey, PairRegion, Progress, RefineError, Refinement, Refiner, milliseconds,
-};
-use crate::domain::{
+use super::{DenseCache, DenseKey, Progress, RefineError, Refinement, Refiner, milliseconds};
+use whereabouts_core::PairRegion;
+use whereabouts_core::{
     Candidate, DenseFeatures, Description, DescriptorKind, Digest, Evidence, ImageId, Map, Ranking,
     RefinerKind, Usage,
 };
-use crate::retrieve::{CpuPool, ExtractError, Extractor, LoadedModels, ModelError};
-use crate::store::{BlobStore, JobRecord, LookAlikes, MapStore};
+use whereabouts_store::{BlobStore, JobRecord, LookAlikes, MapStore};
+use whereabouts_vision::{CpuPool, ExtractError, Extractor, LoadedModels, ModelError};
 
 /// Geometric matching of dense features, on this machine.
 pub struct LocalRefiner {

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::store::StoreError;
+use whereabouts_store::StoreError;
 
 /// The pause before it is asked or told again.
 const PAUSE: Duration = Duration::from_millis(500);

@@ -10,10 +10,10 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::patience::until;
-use super::{JobPace, Progress, RefineError, Refinement, Refiner};
-use crate::domain::{Estimate, Job, JobState};
-use crate::store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
-use crate::telemetry::{Metrics, traces};
+use super::{JobPace, Progress, RefineError, RefineMetrics, Refinement, Refiner};
+use whereabouts_core::{Estimate, Job, JobState};
+use whereabouts_store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
+use whereabouts_telemetry::traces;
 
 /// Bounds on a worker's patience.
 #[derive(Debug, Clone, Copy)]
@@ -41,7 +41,7 @@ pub struct Worker {
     /// Who refines.
     pub refiner: Arc<dyn Refiner>,
     /// What is counted.
-    pub metrics: Arc<Metrics>,
+    pub metrics: Arc<RefineMetrics>,
     /// Learns how long jobs take.
     pub pace: JobPace,
     /// Its patience.

@@ -1,7 +1,7 @@
 //! What is asked of whoever brings a picture, before anything is done for it.
 
 use super::{Service, ServiceError};
-use crate::retrieve::{Demand, Permit, Refused};
+use whereabouts_vision::{Demand, Permit, Refused};
 
 impl Service {
     /// Whether there is room for a picture; whoever is refused need not send it.
@@ -15,7 +15,7 @@ impl Service {
     }
 
     fn counted(&self, refused: Refused) -> ServiceError {
-        self.metrics.refused(refused.reason.into());
+        self.metrics.refusals.count(refused.reason.into());
         refused.into()
     }
 }

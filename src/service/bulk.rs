@@ -9,10 +9,11 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
 
-use super::{Caller, ErrorKind, ImageMeta, NewImage, Service, ServiceError};
-use crate::domain::{ImageId, MapName};
-use crate::retrieve::{Class, Demand};
-use crate::store::Added;
+use super::{Caller, NewImage, Service, ServiceError};
+use whereabouts_api::{ErrorKind, ImageMeta};
+use whereabouts_core::{ImageId, MapName};
+use whereabouts_store::Added;
+use whereabouts_vision::{Class, Demand};
 
 /// Bounds of bulk uploads.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]

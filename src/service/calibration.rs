@@ -1,18 +1,16 @@
-//! Measures in each map how far chance resemblance goes; see [`crate::domain::confidence`].
+//! Measures in each map how far chance resemblance goes; see [`whereabouts_core::confidence`].
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use serde::{Deserialize, Serialize};
 use tokio_util::sync::CancellationToken;
-use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::{Service, ServiceError};
-use crate::domain::confidence::{COMPARED, Chance};
-use crate::domain::{Calibration, Evidence, Map};
-use crate::refine::{RefineError, Refiner};
-use crate::store::{IndexState, LookAlikes};
+use whereabouts_core::confidence::{COMPARED, Chance};
+use whereabouts_core::{Calibration, Evidence, Map};
+use whereabouts_refine::{RefineError, Refiner};
+use whereabouts_store::{IndexState, LookAlikes};
 
 /// How often it is looked for maps that have changed.
 const LOOK: Duration = Duration::from_millis(500);
@@ -29,25 +27,6 @@ const PAUSES: usize = 300;
 
 /// A map is measured again when its number of images has changed by one in so many.
 const CHANGED: usize = 5;
-
-/// What confidence in a map rests on.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize, ToSchema)]
-pub struct CalibrationState {
-    /// Images that the map had when it was measured.
-    pub images: usize,
-    /// Images that were asked as if they were frames: the confidence of an answer at once is at most
-    /// n / (n + 1).
-    pub asked: usize,
-    /// Of these, how many were refined too: the same for a refined answer. Where it is 0, the
-    /// confidence of a refined answer rests on similarity.
-    pub refined: usize,
-}
-
-impl From<&Calibration> for CalibrationState {
-    fn from(known: &Calibration) -> Self {
-        Self { images: known.images, asked: known.similarity.len(), refined: known.agreement.len() }
-    }
-}
 
 impl Service {
     /// Measures maps when their images have changed, until `shutdown`.

@@ -1,11 +1,12 @@
 //! The way in: a service once there is one, and until it drains.
 
 use std::sync::{Arc, OnceLock};
+use whereabouts_api::ErrorKind;
 
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use super::{Caller, Deadline, ErrorKind, Service, ServiceError};
+use super::{Caller, Deadline, Service, ServiceError};
 
 /// Whether requests are answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -5,16 +5,15 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
 use futures_util::{Stream, stream};
-use serde::Serialize;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::RecvError;
-use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::jobs::no_job;
 use super::{Service, ServiceError};
-use crate::domain::{Description, ImageId, Job, JobState, MapName};
-use crate::store::{JobRecord, JobStore};
+use whereabouts_api::{JobChange, JobStatus, Missed, PairDescribed};
+use whereabouts_core::{ImageId, Job, JobState, MapName};
+use whereabouts_store::{JobRecord, JobStore};
 
 /// Something that happened to a job.
 #[derive(Debug, Clone, PartialEq)]
@@ -25,54 +24,6 @@ pub enum JobEvent {
     Described(PairDescribed),
     /// It has ended; no event follows.
     Ended(Box<Job>),
-}
-
-/// How far a job has come.
-#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
-pub struct JobStatus {
-    /// Its state.
-    pub state: JobState,
-    /// How often a worker has taken it.
-    pub attempts: u32,
-    /// What went wrong, or what it waits for.
-    pub error: Option<String>,
-}
-
-/// One more pair of a job is described.
-#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
-pub struct PairDescribed {
-    /// Pairs described so far.
-    pub described: usize,
-    /// Pairs of the job.
-    pub of: usize,
-    /// The pair.
-    pub description: Description,
-}
-
-/// A job has come further, or has ended.
-#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
-pub struct JobChange {
-    /// The job.
-    pub id: Uuid,
-    /// Its map.
-    pub map: MapName,
-    /// Its state.
-    pub state: JobState,
-    /// How often a worker has taken it.
-    pub attempts: u32,
-    /// Pairs described so far.
-    pub described: usize,
-    /// Pairs of the job.
-    pub of: usize,
-    /// What went wrong, or what it waits for.
-    pub error: Option<String>,
-}
-
-/// Changes that were not told, because they came faster than they were taken.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ToSchema)]
-pub struct Missed {
-    /// How many. `GET /jobs` says how the jobs are now.
-    pub changes: u64,
 }
 
 /// Something that happened to any job.

@@ -4,36 +4,15 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use tokio_util::sync::CancellationToken;
-use utoipa::ToSchema;
 
 use super::{SUPERSEDED, Service, ServiceError};
-use crate::domain::{DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose};
-use crate::retrieve::{
+use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
+use whereabouts_core::{DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose};
+use whereabouts_store::{Added, StoreError};
+use whereabouts_vision::{
     Class, Demand, ExtractError, Extraction, Extractor, PoolError, decode, preprocess,
 };
-use crate::store::{Added, StoreError};
-
-/// What a caller says about an image.
-#[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ImageMeta {
-    /// Its id; without one, the head of the digest of its bytes.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub id: Option<String>,
-    /// Where it was taken from, in the frame of the map.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schema(value_type = Option<Pose>)]
-    pub pose: Option<Value>,
-    /// When it was taken.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub captured_at: Option<Timestamp>,
-    /// Up to 32 words, each up to 64 characters.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub tags: Vec<String>,
-}
 
 /// An image to add.
 #[derive(Debug)]
@@ -44,15 +23,6 @@ pub struct NewImage {
     pub meta: ImageMeta,
     /// How urgent it is.
     pub demand: Demand,
-}
-
-/// Some images, by id.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct ImagePage {
-    /// The images.
-    pub images: Vec<Image>,
-    /// Where the next page starts: `cursor=` of the next request. Null on the last page.
-    pub next_cursor: Option<String>,
 }
 
 impl Service {
@@ -124,7 +94,7 @@ impl Service {
         let image = self.get_image(map, id).await?;
         let bytes = self.blobs.blob(&image.digest).await?.ok_or_else(|| {
             ServiceError::new(
-                super::ErrorKind::Internal,
+                ErrorKind::Internal,
                 format!("the bytes of {id} ({}) are missing from the store", image.digest),
             )
         })?;
@@ -189,7 +159,7 @@ impl Service {
         let extractor = Arc::clone(extractor);
         let finishing = tokio::task::spawn_blocking(move || extractor.finish(inferred, kind)).await;
         let extraction = finishing
-            .map_err(|error| ServiceError::new(super::ErrorKind::Internal, error.to_string()))??;
+            .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))??;
         permit.served();
         Ok(extraction)
     }
@@ -203,7 +173,7 @@ impl Service {
             Ok(result) => Ok(result?),
             Err(PoolError::Overloaded(overloaded)) => Err(overloaded.into()),
             Err(error @ PoolError::BrokeOff) => {
-                Err(ServiceError::new(super::ErrorKind::Internal, error.to_string()))
+                Err(ServiceError::new(ErrorKind::Internal, error.to_string()))
             }
         }
     }

@@ -4,38 +4,19 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use jiff::Timestamp;
-use serde::Serialize;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::RecvError;
-use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::images::page_size;
-use super::{ErrorKind, Service, ServiceError};
-use crate::domain::{ImageId, Job, MediaType};
-use crate::refine::{PairRegion, RefineError};
-use crate::store::{JobFilter, JobList};
+use super::{Service, ServiceError};
+use whereabouts_api::{ErrorKind, JobPage, PairRegions};
+use whereabouts_core::{ImageId, Job, MediaType};
+use whereabouts_refine::RefineError;
+use whereabouts_store::{JobFilter, JobList};
 
 /// The longest text that jobs are searched for, in characters.
 const LONGEST_SEARCH: usize = 200;
-
-/// Some jobs, newest first.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct JobPage {
-    /// The jobs.
-    pub jobs: Vec<Job>,
-    /// Where the next page starts: `cursor=` of the next request. Null on the last page. A search (`q=`)
-    /// looks at some thousand jobs for one page, so that a page may be short, even empty, and yet not be
-    /// the last.
-    pub next_cursor: Option<Uuid>,
-}
-
-/// The regions that two pictures have in common, the most telling first.
-#[derive(Debug, Serialize, ToSchema)]
-pub struct PairRegions {
-    /// The pairs of regions.
-    pub regions: Vec<PairRegion>,
-}
 
 impl Service {
     /// One job, at once or when it has ended, but after `wait` at the latest.

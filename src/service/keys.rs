@@ -6,14 +6,13 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use ring::rand::{SecureRandom, SystemRandom};
-use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
-use utoipa::ToSchema;
 
+use super::ServiceError;
 use super::limits::Limits;
-use super::{ErrorKind, ServiceError};
-use crate::domain::{ApiKey, Digest, KeyLimits, MapName, Role, StoredKey, Token};
-use crate::store::{KeyStore, StoreError};
+use whereabouts_api::{ErrorKind, MadeKey, NewKey};
+use whereabouts_core::{ApiKey, Digest, MapName, StoredKey, Token};
+use whereabouts_store::{KeyStore, StoreError};
 
 /// The most keys, revoked ones included: they are all held in memory.
 const MOST_KEYS: usize = 10_000;
@@ -29,35 +28,6 @@ const READ_AGAIN: Duration = Duration::from_secs(1);
 
 /// The longest name of a key, in bytes.
 const MOST_NAME_BYTES: usize = 100;
-
-/// A key that is wanted.
-#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct NewKey {
-    /// What people call it, 1 to 100 bytes.
-    pub name: String,
-    /// What its holder may do.
-    pub role: Role,
-    /// In which maps, which need not be there yet; in all, if there is none.
-    #[serde(default)]
-    pub maps: Vec<MapName>,
-    /// How often.
-    #[serde(default)]
-    pub limits: KeyLimits,
-    /// For how many days, 1 to 36500; null for ever.
-    #[serde(default)]
-    #[schema(nullable, minimum = 1, maximum = 36500)]
-    pub expires_days: Option<u32>,
-}
-
-/// A key that was made.
-#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
-pub struct MadeKey {
-    /// The key, to be sent as `Authorization: Bearer …`. It is shown this once.
-    pub token: String,
-    /// What is known of it.
-    pub key: ApiKey,
-}
 
 /// Who asks.
 #[derive(Debug, Clone)]
@@ -312,6 +282,7 @@ mod tests {
     use super::*;
     use async_trait::async_trait;
     use std::sync::Mutex;
+    use whereabouts_core::{KeyLimits, Role};
 
     #[derive(Default)]
     struct Drawer(Mutex<Vec<StoredKey>>);

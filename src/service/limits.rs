@@ -2,9 +2,10 @@
 
 use std::time::Duration;
 
-use super::{Caller, ErrorKind, ServiceError};
-use crate::domain::ApiKey;
-use crate::store::{Buckets, Draw, Drawn};
+use super::{Caller, ServiceError};
+use whereabouts_api::ErrorKind;
+use whereabouts_core::ApiKey;
+use whereabouts_store::{Buckets, Draw, Drawn};
 
 /// A bucket of a key fills up in this time.
 const WINDOW: Duration = Duration::from_secs(60);

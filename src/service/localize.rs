@@ -3,33 +3,19 @@
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use serde::{Deserialize, Serialize};
 use tracing::Instrument;
-use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::images::empty_body;
 use super::submit::Frame;
-use super::{NoJob, SUPERSEDED, Service, ServiceError, TrackEstimate, TrackStep};
-use crate::domain::confidence::COMPARED;
-use crate::domain::{Calibration, Candidate, Digest, Estimate, JobState, Map, MapName, Priority};
-use crate::retrieve::index::SearchMode;
-use crate::retrieve::{Class, Demand, Extraction};
-use crate::store::StoreError;
-use crate::telemetry::traces;
-
-/// What becomes of the candidates after the first answer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum RefineMode {
-    /// A job refines them; the answer does not wait.
-    #[default]
-    Async,
-    /// A job refines them; the answer waits for it, and its estimate follows the refined order.
-    Wait,
-    /// Nothing.
-    Off,
-}
+use super::{SUPERSEDED, Service, ServiceError, TrackStep};
+use whereabouts_api::{Answer, JobLink, RefineMode, TimingMs};
+use whereabouts_core::confidence::COMPARED;
+use whereabouts_core::{Calibration, Candidate, Digest, Estimate, Map, MapName, Priority};
+use whereabouts_index::SearchMode;
+use whereabouts_store::StoreError;
+use whereabouts_telemetry::traces;
+use whereabouts_vision::{Class, Demand, Extraction};
 
 /// When a caller no longer wants the answer, if it said so.
 #[derive(Debug, Clone, Copy, Default)]
@@ -54,59 +40,6 @@ pub struct LocalizeRequest {
     pub track: Option<TrackStep>,
     /// The id of the request, if it is done once however often it comes ([`Service::begin_once`]).
     pub once: Option<String>,
-}
-
-/// Where the frame was probably taken.
-#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
-pub struct Answer {
-    /// The id of this query.
-    pub query_id: Uuid,
-    /// The map.
-    pub map: MapName,
-    /// The model that made the descriptor.
-    pub model: String,
-    /// The most similar images, best first.
-    pub candidates: Vec<Candidate>,
-    /// The best guess; null in an empty map.
-    #[schema(nullable)]
-    pub estimate: Option<Estimate>,
-    /// Where the robot is, given all frames of its track; null for a frame of none.
-    #[serde(default)]
-    #[schema(nullable)]
-    pub track: Option<TrackEstimate>,
-    /// The refinement; null if there is none.
-    #[schema(nullable)]
-    pub job: Option<JobLink>,
-    /// Why there is no refinement, if one was asked for; else null.
-    #[serde(default)]
-    #[schema(nullable)]
-    pub no_job: Option<NoJob>,
-    /// How long the stages took.
-    pub timing_ms: TimingMs,
-}
-
-/// Where to find a job.
-#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
-pub struct JobLink {
-    /// Its id.
-    pub id: Uuid,
-    /// Its address.
-    pub href: String,
-    /// How far it has come.
-    pub state: JobState,
-}
-
-/// How long the stages of an answer took, in milliseconds.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize, ToSchema)]
-pub struct TimingMs {
-    /// Decoding and resizing.
-    pub decode: f64,
-    /// Inference and pooling, including the wait for a free session.
-    pub extract: f64,
-    /// Search.
-    pub search: f64,
-    /// Everything until the answer, including the wait for a free thread and for the disk.
-    pub total: f64,
 }
 
 /// What the coarse retriever found for a frame.

@@ -1,87 +1,13 @@
 //! Maps: create, change, list, remove.
 
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::models::dimension;
-use super::{CalibrationState, ErrorKind, Reindex, SUPERSEDED, Service, ServiceError};
-use crate::domain::{DescriptorKind, Digest, Frame, Map, MapName, Precision, Scene};
-use crate::store::{IndexState, StoreError};
-
-/// What to set on a map. What is left out keeps its value, or its default in a new map.
-#[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct MapChange {
-    /// Indoor or outdoor (default).
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub scene: Option<Scene>,
-    /// `gem` (default) or `cls`; once the map has images, only a reindex changes it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub descriptor: Option<DescriptorKind>,
-    /// `wgs84` (default) or `metric`; fixed once the map has images.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub frame: Option<Frame>,
-    /// The model, one that is installed; in a new map by default the one that the server was
-    /// started with. Once the map has images, only a reindex changes it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub model: Option<String>,
-    /// For people, up to 2,000 characters.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub description: Option<String>,
-}
-
-/// A map as callers see it.
-#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
-pub struct MapState {
-    /// Its name.
-    pub name: MapName,
-    /// Indoor or outdoor.
-    pub scene: Scene,
-    /// Which descriptor it compares.
-    pub descriptor: DescriptorKind,
-    /// The frame of its poses.
-    pub frame: Frame,
-    /// The model that makes its descriptors.
-    pub model: String,
-    /// The digest of that model's weights and of how they are fed and pooled.
-    #[schema(value_type = String)]
-    pub model_digest: Digest,
-    /// The arithmetic that the model runs in; descriptors of another do not mix with them.
-    pub precision: Precision,
-    /// Numbers in a descriptor.
-    pub dim: usize,
-    /// Images in the map.
-    pub images: usize,
-    /// How it is searched: `exact`, `building` (a graph for part of it, the rest exactly), or
-    /// `hnsw`.
-    pub index: IndexKind,
-    /// The reindex that goes on, or the last one since the server was started.
-    #[serde(default)]
-    #[schema(nullable)]
-    pub reindex: Option<Reindex>,
-    /// What confidence rests on; null until it is measured, a moment after images were added.
-    #[serde(default)]
-    #[schema(nullable)]
-    pub calibration: Option<CalibrationState>,
-    /// What a person wrote about it.
-    pub description: Option<String>,
-    /// When it was created.
-    pub created_at: Timestamp,
-}
-
-/// How a map is searched.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum IndexKind {
-    /// Every descriptor is compared.
-    Exact,
-    /// A graph covers part of the map; the rest is compared.
-    Building,
-    /// A graph covers the whole map.
-    Hnsw,
-}
+use super::{SUPERSEDED, Service, ServiceError};
+use whereabouts_api::{CalibrationState, ErrorKind, IndexKind, MapChange, MapState};
+use whereabouts_core::{Map, MapName};
+use whereabouts_store::{IndexState, StoreError};
 
 impl Service {
     /// Creates a map or changes it; also says whether it is new.

@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 
-use super::{ErrorKind, Service, ServiceError};
-use crate::domain::{DescriptorKind, Map, MapName};
-use crate::retrieve::{Extractor, Manifest, ModelError};
+use super::{Service, ServiceError};
+use whereabouts_api::ErrorKind;
+use whereabouts_core::{DescriptorKind, Map, MapName};
+use whereabouts_vision::{Extractor, Manifest, ModelError};
 
 impl Service {
     /// The map, and the very model that made its descriptors.

@@ -6,8 +6,8 @@ use jiff::Timestamp;
 
 use super::retention::before;
 use super::{Service, ServiceError};
-use crate::domain::Digest;
-use crate::store::{FirstAnswer, KeptAnswer, Progress};
+use whereabouts_core::Digest;
+use whereabouts_store::{FirstAnswer, KeptAnswer, Progress};
 
 /// What answers to requests with a key are kept for.
 #[derive(Debug, Clone, Copy)]

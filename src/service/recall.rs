@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 use tokio::sync::{Mutex, OwnedMutexGuard};
 
 use super::Service;
-use crate::domain::{Candidate, Descriptor, Map};
-use crate::retrieve::index::SearchMode;
-use crate::store::{MapStore, StoreError};
-use crate::telemetry::Metrics;
+use crate::ServiceMetrics;
+use whereabouts_core::{Candidate, Descriptor, Map};
+use whereabouts_index::SearchMode;
+use whereabouts_store::{MapStore, StoreError};
 
 /// Similarities that differ by less are equal: those of the index may be added up in another order.
 const EQUAL: f32 = 1e-5;
@@ -55,7 +55,7 @@ impl Service {
 /// Counts the nearest images that a search has found, if a graph is in use.
 async fn check(
     maps: &dyn MapStore,
-    metrics: &Metrics,
+    metrics: &ServiceMetrics,
     map: &Map,
     query: Descriptor,
     found: &[Candidate],

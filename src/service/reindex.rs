@@ -5,68 +5,21 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
 use tokio::sync::Semaphore;
-use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::models::dimension;
-use super::{ErrorKind, MapState, Service, ServiceError};
-use crate::domain::{Descriptor, DescriptorKind, Image, Map, MapName};
-use crate::retrieve::{Demand, Extractor};
-use crate::store::Draft;
+use super::{Service, ServiceError};
+use whereabouts_api::{ErrorKind, MapState, Reindex, ReindexRequest, ReindexState};
+use whereabouts_core::{Descriptor, DescriptorKind, Image, Map, MapName};
+use whereabouts_store::Draft;
+use whereabouts_vision::{Demand, Extractor};
 
 /// Images that are looked up at a time.
 const PAGE: usize = 256;
 
 /// The pause while there is none.
 const PAUSE: Duration = Duration::from_millis(50);
-
-/// Which descriptors to make.
-#[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ReindexRequest {
-    /// The model that makes them; by default the one that the map has, as it is installed now.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub model: Option<String>,
-    /// `gem` or `cls`; by default the one that the map has.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub descriptor: Option<DescriptorKind>,
-}
-
-/// How far the last reindex of a map has come. It is forgotten when the server ends; the map has its
-/// old descriptors until the reindex has succeeded.
-#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
-pub struct Reindex {
-    /// The model that makes the new descriptors.
-    pub model: String,
-    /// Which descriptors.
-    pub descriptor: DescriptorKind,
-    /// Whether it has ended, and how.
-    pub state: ReindexState,
-    /// Images that have their new descriptor.
-    pub done: usize,
-    /// Images of the map.
-    pub total: usize,
-    /// Why it failed.
-    pub error: Option<String>,
-    /// When it began.
-    pub started_at: Timestamp,
-    /// When it ended.
-    pub finished_at: Option<Timestamp>,
-}
-
-/// Whether a reindex has ended, and how.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum ReindexState {
-    /// It goes on; the old descriptors serve.
-    Running,
-    /// The new descriptors serve.
-    Succeeded,
-    /// It was given up; the old descriptors serve.
-    Failed,
-}
 
 /// The last reindex of every map.
 #[derive(Debug)]

@@ -7,9 +7,9 @@ use jiff::{SignedDuration, Timestamp};
 use tokio_util::sync::CancellationToken;
 
 use super::OnceSettings;
-use crate::domain::utc_day;
-use crate::store::{AnswerStore, KeepJobs, RemovedJobs, Retention, StoreError};
-use crate::telemetry::Metrics;
+use crate::ServiceMetrics;
+use whereabouts_core::utc_day;
+use whereabouts_store::{AnswerStore, KeepJobs, RemovedJobs, Retention, StoreError};
 
 /// How long what is kept, and how it is removed.
 #[derive(Debug, Clone, Copy)]
@@ -37,7 +37,7 @@ pub struct Janitor {
     /// Where answers are that may be given again.
     pub answers: Arc<dyn AnswerStore>,
     /// What is counted.
-    pub metrics: Arc<Metrics>,
+    pub metrics: Arc<ServiceMetrics>,
     /// What is kept.
     pub settings: RetentionSettings,
 }

@@ -5,55 +5,21 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 use uuid::Uuid;
 
-use super::{ErrorKind, Service, ServiceError};
-use crate::domain::{Candidate, DenseFeatures, Descriptor, Digest, Job, Map, MediaType, Priority};
-use crate::refine::DenseKey;
-use crate::store::{JobRecord, Query, StoreError};
-use crate::telemetry::{RefusedFor, traces};
+use super::{Service, ServiceError};
+use crate::RefusedFor;
+use whereabouts_api::{ErrorKind, NoJob, NoJobReason};
+use whereabouts_core::{
+    Candidate, DenseFeatures, Descriptor, Digest, Job, Map, MediaType, Priority,
+};
+use whereabouts_refine::DenseKey;
+use whereabouts_store::{JobRecord, Query, StoreError};
+use whereabouts_telemetry::traces;
 
-/// Why an answer has no job, although one was asked for.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-pub struct NoJob {
-    /// The reason, for programs.
-    pub reason: NoJobReason,
-    /// What happened and what to do next.
-    pub detail: String,
-}
-
-/// Why there is no job.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum NoJobReason {
-    /// The server refines nothing.
-    NoRefiner,
-    /// The map has no images to compare with.
-    EmptyMap,
-    /// As many jobs wait or run as may (`jobs.queue`).
-    QueueFull,
-    /// So many pictures wait that no frame gets a job (`jobs.shed_at`).
-    Overload,
-    /// The disk has no room for the frame (`data.min_free_bytes`).
-    DiskFull,
-}
-
-impl NoJob {
-    fn new(reason: NoJobReason, detail: impl Into<String>) -> Self {
-        Self { reason, detail: detail.into() }
-    }
-
-    fn queue_full(limit: usize) -> Self {
-        let full = StoreError::QueueFull { limit };
-        Self::new(NoJobReason::QueueFull, format!("{full}; post a later frame for a refinement"))
-    }
-
-    /// Whether there would be a job if there were less to do.
-    pub(super) fn is_shedding(&self) -> bool {
-        matches!(self.reason, NoJobReason::QueueFull | NoJobReason::Overload)
-    }
+fn queue_full(limit: usize) -> NoJob {
+    let full = StoreError::QueueFull { limit };
+    NoJob::new(NoJobReason::QueueFull, format!("{full}; post a later frame for a refinement"))
 }
 
 /// A frame that has been localized.
@@ -138,7 +104,7 @@ impl Service {
             Ok(Some(before)) => return Ok(Ok(before)),
             Ok(None) => self.metrics.job_submitted(),
             Err(StoreError::QueueFull { limit }) => {
-                return Ok(Err(self.counted_job(NoJob::queue_full(limit))));
+                return Ok(Err(self.counted_job(queue_full(limit))));
             }
             Err(error) => return Err(error.into()),
         }
@@ -148,7 +114,7 @@ impl Service {
     /// Why no job should be submitted now, if so.
     async fn obstacle(&self) -> Result<Option<NoJob>, ServiceError> {
         if self.jobs.queued().await? >= self.settings.job_queue {
-            return Ok(Some(self.counted_job(NoJob::queue_full(self.settings.job_queue))));
+            return Ok(Some(self.counted_job(queue_full(self.settings.job_queue))));
         }
         if self.admission.pressure() <= self.settings.shed_jobs_at {
             return Ok(None);
@@ -159,7 +125,7 @@ impl Service {
     }
 
     fn counted_job(&self, why: NoJob) -> NoJob {
-        self.metrics.refused(RefusedFor::Jobs);
+        self.metrics.refusals.count(RefusedFor::Jobs);
         why
     }
 

@@ -1,40 +1,18 @@
 //! Maps that come from another store or go there, with the descriptors that their images have.
 
 use bytes::Bytes;
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::images::{check_tags, page_size};
-use super::{ErrorKind, MapState, SUPERSEDED, Service, ServiceError};
-use crate::domain::{Digest, Image, ImageId, Map, MapName, MediaType};
-use crate::retrieve::Demand;
-use crate::store::{Added, ExportedImage, StoreError};
+use super::{SUPERSEDED, Service, ServiceError};
+use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{Digest, Image, ImageId, Map, MapName, MediaType};
+use whereabouts_store::{Added, StoreError};
+use whereabouts_vision::Demand;
 
 /// The most numbers in a descriptor that comes from elsewhere.
 const MAX_DIM: usize = 1 << 16;
-
-/// Some images of a map with their descriptors, by id.
-#[derive(Debug, Serialize, Deserialize, ToSchema)]
-pub struct ExportPage {
-    /// The map as it is stored. If `uid` or `revision` is another than on the page before, the map was
-    /// made anew or reindexed, and the pages do not belong together.
-    pub map: Map,
-    /// The images.
-    pub images: Vec<ExportedImage>,
-    /// Where the next page starts: `cursor=` of the next request. Null on the last page.
-    pub next_cursor: Option<String>,
-}
-
-/// An image that comes from another store; its bytes come beside.
-#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ImportedImage {
-    /// The map that it was part of, as `export` gave it.
-    pub map: Map,
-    /// The image with its descriptor. Without one, the model makes one from the bytes.
-    pub image: ExportedImage,
-}
 
 impl Service {
     /// Images of a map with their descriptors, a page at a time.

@@ -4,7 +4,7 @@ use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::{FirstAnswer, JobRecord, Progress, Release, Step, StoreError, StoredDelivery};
-use crate::domain::{
+use whereabouts_core::{
     Attempt, Delivery, DeliveryState, Descriptor, Image, Job, JobState, Map, Message, Priority,
     StoredWebhook, Then, Usage, WebhookEvent,
 };

@@ -7,7 +7,9 @@ use tokio::sync::broadcast;
 use uuid::Uuid;
 
 use super::{JobFilter, JobList, StoreError};
-use crate::domain::{Candidate, Description, Descriptor, Digest, Job, JobState, MediaType, Usage};
+use whereabouts_core::{
+    Candidate, Description, Descriptor, Digest, Job, JobState, MediaType, Usage,
+};
 
 /// What a robot posted, kept because a job needs it.
 #[derive(Debug, Clone, Serialize, Deserialize)]

@@ -9,7 +9,7 @@ use jiff::civil::Date;
 use tokio::time::Instant;
 
 use super::StoreError;
-use crate::refine::mllm::Spent;
+use whereabouts_core::Spent;
 
 /// What is wanted of a bucket, which fills steadily up to a minute's worth. What it holds may go below zero.
 #[derive(Debug, Clone, Copy, PartialEq)]

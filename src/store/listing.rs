@@ -3,7 +3,7 @@
 use uuid::Uuid;
 
 use super::JobRecord;
-use crate::domain::{Job, JobState, MapName};
+use whereabouts_core::{Job, JobState, MapName};
 
 /// Jobs that one search for a text looks at, at the most: records are read and decoded for it.
 pub(super) const SEARCHED: usize = 5_000;
@@ -68,8 +68,10 @@ mod tests {
     use jiff::Timestamp;
 
     use super::*;
-    use crate::domain::{Candidate, Description, Digest, MediaType, Priority, RefinerKind, Usage};
-    use crate::store::Query;
+    use crate::Query;
+    use whereabouts_core::{
+        Candidate, Description, Digest, MediaType, Priority, RefinerKind, Usage,
+    };
 
     fn record() -> JobRecord {
         let now = Timestamp::now();
@@ -80,7 +82,7 @@ mod tests {
             created_at: now,
             descriptor: None,
         };
-        let image_id: crate::domain::ImageId = "Gate.jpg".parse().unwrap();
+        let image_id: whereabouts_core::ImageId = "Gate.jpg".parse().unwrap();
         let description = Description {
             image_id: image_id.clone(),
             text: "A red door, ΟΔΟΣ on its sign".into(),

@@ -11,7 +11,7 @@ use object_store::path::Path;
 use object_store::{BackoffConfig, ClientOptions, Error, ObjectStore, ObjectStoreExt, RetryConfig};
 
 use super::StoreError;
-use crate::domain::Digest;
+use whereabouts_core::Digest;
 
 /// Where an object store is.
 #[derive(Debug, Clone)]

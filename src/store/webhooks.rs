@@ -6,7 +6,7 @@ use tokio::sync::watch;
 use uuid::Uuid;
 
 use super::StoreError;
-use crate::domain::{Attempt, Delivery, DeliveryState, StoredWebhook};
+use whereabouts_core::{Attempt, Delivery, DeliveryState, StoredWebhook};
 
 /// A delivery with what is posted.
 #[derive(Debug, Clone, PartialEq, Eq)]

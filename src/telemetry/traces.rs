@@ -1,30 +1,26 @@
-//! Traces for OpenTelemetry, sent over OTLP: a span for each request and its stages, for the job that comes of it
-//! in whichever process, and for each call to a model.
+//! Traces for OpenTelemetry: a span for each request and its stages, for the refinement job in whichever process,
+//! and for each call to a model.
 //!
-//! Spans have a target of their own and are in no log. Without `traces.url` nobody wants them, and they cost
-//! next to nothing.
+//! These spans have a target of their own and appear in no log. Without `traces.url` they are disabled and cost
+//! next to nothing. Sending them over OTLP needs the Cargo feature `otel`.
 
-use std::collections::HashMap;
-use std::time::Duration;
+#[cfg(feature = "otel")]
+mod export;
+#[cfg(not(feature = "otel"))]
+#[path = "traces/no_export.rs"]
+mod export;
 
-use axum::http::HeaderMap;
-use opentelemetry::propagation::{Extractor, TextMapPropagator};
-use opentelemetry::trace::{TraceContextExt, TracerProvider};
-use opentelemetry::{Context, KeyValue};
-use opentelemetry_otlp::{Protocol, SpanExporter, WithExportConfig};
-use opentelemetry_sdk::Resource;
-use opentelemetry_sdk::propagation::TraceContextPropagator;
-use opentelemetry_sdk::trace::{Sampler, SdkTracerProvider};
+use http::HeaderMap;
 use serde::{Deserialize, Serialize};
-use tracing::{Metadata, Span, Subscriber, field};
-use tracing_opentelemetry::OpenTelemetrySpanExt;
-use tracing_subscriber::Layer;
-use tracing_subscriber::registry::LookupSpan;
+use tracing::{Metadata, Span, field};
+
+pub use self::export::{Traces, current};
 
 /// The target of all spans that are sent.
 const TARGET: &str = "whereabouts::trace";
 
 const TRACEPARENT: &str = "traceparent";
+const TRACESTATE: &str = "tracestate";
 
 /// `[traces]`
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -52,67 +48,8 @@ impl TraceSettings {
     }
 }
 
-/// What sends traces. Its end sends the last of them.
-#[derive(Debug, Default)]
-pub struct Traces(Option<SdkTracerProvider>);
-
-impl Traces {
-    /// Nothing is sent until [`Traces::layer`] is in use.
-    pub fn start(settings: &TraceSettings) -> Result<Self, String> {
-        if settings.url.is_empty() {
-            return Ok(Self::default());
-        }
-        let timeout = Duration::from_millis(settings.timeout_ms);
-        let exporter = SpanExporter::builder()
-            .with_http()
-            .with_protocol(Protocol::HttpBinary)
-            .with_endpoint(format!("{}/v1/traces", settings.url.trim_end_matches('/')))
-            .with_timeout(timeout)
-            .build()
-            .map_err(|error| format!("traces cannot be sent to traces.url: {error}"))?;
-        let process = KeyValue::new("service.instance.id", uuid::Uuid::now_v7().to_string());
-        let version = KeyValue::new("service.version", env!("CARGO_PKG_VERSION"));
-        let resource = Resource::builder()
-            .with_service_name("whereabouts")
-            .with_attributes([process, version])
-            .build();
-        let by_share = Sampler::TraceIdRatioBased(settings.share);
-        let provider = SdkTracerProvider::builder()
-            .with_batch_exporter(exporter)
-            .with_sampler(Sampler::ParentBased(Box::new(by_share)))
-            .with_resource(resource)
-            .build();
-        Ok(Self(Some(provider)))
-    }
-
-    /// Takes spans from those who make them.
-    pub fn layer<S>(&self) -> Option<impl Layer<S> + use<S>>
-    where
-        S: Subscriber + for<'a> LookupSpan<'a>,
-    {
-        let tracer = self.0.as_ref()?.tracer("whereabouts");
-        let ours = tracing_subscriber::filter::filter_fn(|about| about.is_span() && is_ours(about));
-        let layer = tracing_opentelemetry::layer()
-            .with_tracer(tracer)
-            .with_location(false)
-            .with_threads(false)
-            .with_target(false);
-        Some(layer.with_filter(ours))
-    }
-}
-
-impl Drop for Traces {
-    fn drop(&mut self) {
-        if let Some(provider) = self.0.take()
-            && let Err(error) = provider.shutdown()
-        {
-            tracing::warn!(%error, "the last traces were not sent");
-        }
-    }
-}
-
 /// Whether a span is of a trace.
-pub(super) fn is_ours(about: &Metadata<'_>) -> bool {
+pub(crate) fn is_ours(about: &Metadata<'_>) -> bool {
     about.target() == TARGET
 }
 
@@ -130,7 +67,11 @@ pub fn request(method: &str, route: &str, headers: &HeaderMap) -> Span {
         otel.status_code = field::Empty,
     );
     if !span.is_disabled() {
-        let _ = span.set_parent(TraceContextPropagator::new().extract(&Headers(headers)));
+        export::set_parent(
+            &span,
+            headers.get(TRACEPARENT).and_then(|value| value.to_str().ok()),
+            headers.get(TRACESTATE).and_then(|value| value.to_str().ok()),
+        );
     }
     span
 }
@@ -158,10 +99,7 @@ pub fn job(id: uuid::Uuid, refiner: &str, attempt: u32, traceparent: Option<&str
         job.id = %id,
         job.attempt = attempt,
     );
-    if let Some(traceparent) = traceparent.filter(|_| !span.is_disabled()) {
-        let parent = HashMap::from([(TRACEPARENT.to_owned(), traceparent.to_owned())]);
-        let _ = span.set_parent(TraceContextPropagator::new().extract(&parent));
-    }
+    export::set_parent(&span, traceparent, None);
     span
 }
 
@@ -193,34 +131,5 @@ pub fn model_answered(span: &Span, tokens: Result<(u64, u64), String>) {
             span.record("otel.status_code", "ERROR");
             span.record("otel.status_description", error);
         }
-    }
-}
-
-/// The trace that is going on: its `traceparent` for other processes, and its id; `None` where nothing is traced.
-pub fn current() -> Option<(String, String)> {
-    let context = Span::current().context();
-    let id = {
-        let span = context.span();
-        let span = span.span_context();
-        (span.is_valid() && span.is_sampled()).then(|| span.trace_id().to_string())?
-    };
-    Some((traceparent(&context)?, id))
-}
-
-fn traceparent(context: &Context) -> Option<String> {
-    let mut written = HashMap::new();
-    TraceContextPropagator::new().inject_context(context, &mut written);
-    written.remove(TRACEPARENT)
-}
-
-struct Headers<'a>(&'a HeaderMap);
-
-impl Extractor for Headers<'_> {
-    fn get(&self, key: &str) -> Option<&str> {
-        self.0.get(key)?.to_str().ok()
-    }
-
-    fn keys(&self) -> Vec<&str> {
-        self.0.keys().map(axum::http::HeaderName::as_str).collect()
     }
 }

@@ -13,7 +13,7 @@ fn run(server: &Server, args: &[&str]) -> Output {
 }
 
 fn command(server: &Server, args: &[&str]) -> Command {
-    let mut command = Command::new(BINARY);
+    let mut command = Command::new(&*BINARY);
     command.args(args).args(["--server", &server.url]);
     command
 }
@@ -251,8 +251,9 @@ async fn a_damaged_or_cut_archive_is_refused_before_anything_changes() {
         assert!(why.contains(word) && why.contains("nothing was changed"), "{why}");
     }
     assert_eq!(to.get("/maps").await.expect(200)["maps"], json!([]));
-    let check =
-        |file: &Path| Command::new(BINARY).args(["restore", "--check"]).arg(file).output().unwrap();
+    let check = |file: &Path| {
+        Command::new(&*BINARY).args(["restore", "--check"]).arg(file).output().unwrap()
+    };
     assert!(check(&file).status.success());
     assert!(refused(&check(&damaged)).contains("manifest.json"));
 }

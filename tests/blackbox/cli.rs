@@ -10,7 +10,7 @@ use super::support::{BINARY, Server, frame, reference, server};
 
 fn whereabouts(args: &[&str]) -> Output {
     // Whatever else is installed in the checkout, or could be.
-    Command::new(BINARY).args(args).env("WHEREABOUTS_MODEL__NAME", "xfeat").output().unwrap()
+    Command::new(&*BINARY).args(args).env("WHEREABOUTS_MODEL__NAME", "xfeat").output().unwrap()
 }
 
 fn json(output: &Output) -> Value {
@@ -127,7 +127,7 @@ fn wrong_usage_is_2_and_every_command_explains_itself() {
 fn what_is_missing_at_the_start_is_said_with_what_to_do() {
     let dir = TempDir::new().unwrap();
     let start = |name: &str, value: &str| {
-        let output = Command::new(BINARY)
+        let output = Command::new(&*BINARY)
             .args(["serve", "--listen", "127.0.0.1:0", "--data"])
             .arg(dir.path().join("data"))
             .env(name, value)

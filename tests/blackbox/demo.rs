@@ -21,7 +21,7 @@ fn bench() -> Bench {
     for folder in ["onnxruntime", "models/xfeat"] {
         symlink(checkout.join(folder), bench.assets().join(folder)).unwrap();
     }
-    std::fs::copy(BINARY, binary(&bench)).unwrap();
+    std::fs::copy(&*BINARY, binary(&bench)).unwrap();
     bench
 }
 

@@ -10,8 +10,8 @@ use std::process::Command;
 
 use serde::Deserialize;
 use tempfile::TempDir;
-use whereabouts::domain::DescriptorKind;
-use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
+use whereabouts_core::DescriptorKind;
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
 
 /// The least cosine similarity to the descriptor of the original.
 const SAME: f64 = 0.9999;

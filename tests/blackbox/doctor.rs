@@ -10,7 +10,7 @@ use tempfile::TempDir;
 use super::support::{BINARY, Server, frame, reference};
 
 fn doctor(dir: &Path, args: &[&str]) -> Output {
-    Command::new(BINARY).arg("doctor").args(args).arg("--data").arg(dir).output().unwrap()
+    Command::new(&*BINARY).arg("doctor").args(args).arg("--data").arg(dir).output().unwrap()
 }
 
 /// The report, and the exit code.
@@ -38,7 +38,7 @@ async fn folder() -> TempDir {
 }
 
 fn blob(dir: &Path, bytes: &[u8]) -> PathBuf {
-    let hex = whereabouts::domain::Digest::of(bytes).hex();
+    let hex = whereabouts_core::Digest::of(bytes).hex();
     dir.join("images").join(&hex[..2]).join(&hex[2..])
 }
 

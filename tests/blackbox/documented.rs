@@ -5,7 +5,7 @@ use std::time::Duration;
 use reqwest::multipart::{Form, Part};
 use reqwest::{Method, Response};
 use serde_json::{Value, json};
-use whereabouts::http::{Example, ExampleBody, Taken, examples};
+use whereabouts_server::http::{Example, ExampleBody, Taken, examples};
 
 use super::support::{Server, frame, reference, server};
 

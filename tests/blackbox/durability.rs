@@ -71,7 +71,7 @@ async fn sigterm_drains_and_exits_with_0() {
 async fn a_second_server_on_the_same_folder_is_refused_with_the_reason() {
     let dir = TempDir::new().unwrap();
     let _server = Server::start(dir.path(), &[]);
-    let second = std::process::Command::new(BINARY)
+    let second = std::process::Command::new(&*BINARY)
         .args(["serve", "--listen", "127.0.0.1:0", "--data"])
         .arg(dir.path())
         .output()

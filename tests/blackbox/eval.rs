@@ -49,7 +49,7 @@ impl Folders {
     }
 
     fn command_by(&self, model: &str, args: &[&str]) -> Command {
-        let mut command = Command::new(BINARY);
+        let mut command = Command::new(&*BINARY);
         command
             .current_dir(self.dir.path())
             .args(["eval", "--database", "database", "--queries", "queries", "--work", "work"])
@@ -318,7 +318,7 @@ fn what_is_held_out_is_unknown() {
 fn photographs(set: &str, [database, queries]: [&str; 2], args: &[&str]) -> Option<Value> {
     let folder = data(set)?;
     let work = TempDir::new().unwrap();
-    let output = Command::new(BINARY)
+    let output = Command::new(&*BINARY)
         .args(["eval", "--json", "--scene", "indoor", "--model", "xfeat", "--work"])
         .args([work.path(), Path::new("--database"), &folder.join(database)])
         .args([Path::new("--queries"), &folder.join(queries)])

@@ -16,7 +16,7 @@ const REQUIRED: [(&str, &str); 2] =
 
 /// A key made in the folder of a server that does not run.
 fn create(data: &Path, args: &[&str]) -> String {
-    let output = Command::new(BINARY)
+    let output = Command::new(&*BINARY)
         .args(["keys", "create", "--name", "test", "--data"])
         .arg(data)
         .args(args)
@@ -93,7 +93,7 @@ async fn a_server_that_needs_keys_and_has_none_does_not_start_and_says_how_to_ma
     let everywhere = [("WHEREABOUTS_SERVER__LISTEN", "0.0.0.0:0")];
     let start = |flags: &[&str]| {
         let mut command = Command::new("timeout");
-        command.args(["6", BINARY, "serve", "--data"]).arg(dir.path()).args(flags);
+        command.arg("6").arg(&*BINARY).args(["serve", "--data"]).arg(dir.path()).args(flags);
         command.env("WHEREABOUTS_MODEL__NAME", "xfeat").envs(everywhere);
         let output = command.output().unwrap();
         (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
@@ -364,7 +364,7 @@ async fn a_key_is_bounded_in_requests_and_bytes_and_hears_what_is_left() {
 async fn the_commands_take_the_key_from_the_environment() {
     let Guarded { dir, server, admin, .. } = Guarded::start().await;
     let run = |key: Option<&str>, args: &[&str]| {
-        let mut command = Command::new(BINARY);
+        let mut command = Command::new(&*BINARY);
         command.args(args).env("WHEREABOUTS_SERVER", &server.url);
         if let Some(key) = key {
             command.env("WHEREABOUTS_API_KEY", key);

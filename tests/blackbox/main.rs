@@ -9,9 +9,6 @@
     reason = "clippy lets tests do this, but not what tests call"
 )]
 
-mod deployment;
-mod support;
-
 mod backup;
 mod bad_input;
 mod batch;
@@ -33,13 +30,10 @@ mod keys;
 mod localize;
 mod maps;
 mod mllm;
-mod mock_hub;
-mod mock_mllm;
 mod model_files;
 mod models;
 mod overload;
 mod real_images;
-mod receiver;
 mod reindex;
 mod retention;
 mod scale_out;
@@ -51,3 +45,5 @@ mod tls;
 mod traces;
 mod track;
 mod webhooks;
+
+use whereabouts_testkit::{deployment, mock_hub, mock_mllm, receiver, server as support};

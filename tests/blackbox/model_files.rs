@@ -61,7 +61,7 @@ impl Bench {
     }
 
     fn command(&self, hub: &str, args: &[&str]) -> Command {
-        let mut command = Command::new(BINARY);
+        let mut command = Command::new(&*BINARY);
         command
             .arg("model")
             .args(args)

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use serde_json::Value;
 use tempfile::TempDir;
-use whereabouts::domain::DescriptorKind;
-use whereabouts::retrieve::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
+use whereabouts_core::DescriptorKind;
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
 
 use super::support::{BINARY, Server, frame, reference};
 
@@ -150,7 +150,7 @@ async fn another_provider_gives_the_same_descriptors_and_another_precision_is_re
 #[test]
 fn a_provider_that_is_not_there_is_named_at_the_start() {
     let dir = TempDir::new().unwrap();
-    let output = std::process::Command::new(BINARY)
+    let output = std::process::Command::new(&*BINARY)
         .args(["serve", "--listen", "127.0.0.1:0", "--data"])
         .arg(dir.path())
         .env("WHEREABOUTS_MODEL__PROVIDER", "tensorrt")

@@ -64,7 +64,7 @@ async fn evaluate(set: &str, references: &str, queries: &str) -> Option<(Recall,
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     let references = folder.join(references);
-    let status = Command::new(BINARY)
+    let status = Command::new(&*BINARY)
         .args(["index", references.to_str().unwrap(), "--map", set, "--scene", "indoor"])
         .args(["--server", &server.url])
         .status()

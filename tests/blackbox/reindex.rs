@@ -43,7 +43,7 @@ impl Bench {
             .fold(manifest, |text, old| text.replace(old, &format!("grid = [{grid}, {grid}]")));
         let file = self.dir.path().join("manifest.toml");
         std::fs::write(&file, manifest).unwrap();
-        let output = Command::new(BINARY)
+        let output = Command::new(&*BINARY)
             .args(["model", "add", &format!("{XFEAT}/model.onnx"), "--name", name, "--manifest"])
             .arg(&file)
             .arg("--assets")
@@ -372,7 +372,7 @@ async fn the_command_waits_for_the_end_and_says_how_it_went() {
     let server = bench.server(&[]);
     town(&server, "m", "xfeat", 6).await;
     let run = async |map: &str, more: &[&str]| {
-        let mut command = Command::new(BINARY);
+        let mut command = Command::new(&*BINARY);
         command.args(["index", "--reindex", "--map", map, "--server", &server.url]).args(more);
         tokio::task::spawn_blocking(move || command.output().unwrap()).await.unwrap()
     };
@@ -391,6 +391,6 @@ async fn the_command_waits_for_the_end_and_says_how_it_went() {
         let said = String::from_utf8_lossy(&failed.stderr);
         assert!(said.contains(word), "{said}");
     }
-    let wrong = Command::new(BINARY).args(["index", ".", "--reindex", "--map", "m"]).output();
+    let wrong = Command::new(&*BINARY).args(["index", ".", "--reindex", "--map", "m"]).output();
     assert_eq!(wrong.unwrap().status.code(), Some(2));
 }

@@ -35,7 +35,7 @@ async fn a_newer_folder_is_refused_with_what_to_do() {
     let dir = TempDir::new().unwrap();
     assert!(Server::start(dir.path(), &[]).terminate().success());
     fs::write(dir.path().join("version"), "3\n").unwrap();
-    let refused = Command::new(BINARY)
+    let refused = Command::new(&*BINARY)
         .args(["serve", "--listen", "127.0.0.1:0", "--data"])
         .arg(dir.path())
         .output()

@@ -24,7 +24,7 @@ async fn the_committed_description_is_the_one_the_handlers_give() {
         serde_json::from_str(&std::fs::read_to_string(committed).unwrap()).unwrap();
     assert_eq!(served, committed, "run `make openapi` and commit docs/openapi.json");
     assert_eq!(served["openapi"], "3.1.0");
-    let printed = std::process::Command::new(BINARY).arg("openapi").output().unwrap();
+    let printed = std::process::Command::new(&*BINARY).arg("openapi").output().unwrap();
     assert_eq!(serde_json::from_slice::<Value>(&printed.stdout).unwrap(), committed);
 }
 

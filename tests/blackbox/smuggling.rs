@@ -124,7 +124,7 @@ async fn medians(server: &Server, keys: &[String], rounds: usize) -> Vec<f64> {
 #[tokio::test]
 async fn the_time_of_a_refusal_does_not_tell_how_much_of_a_key_is_right() {
     let dir = tempfile::tempdir().unwrap();
-    let output = std::process::Command::new(super::support::BINARY)
+    let output = std::process::Command::new(&*super::support::BINARY)
         .args(["keys", "create", "--name", "a", "--role", "robot", "--data"])
         .arg(dir.path())
         .output()

@@ -5,7 +5,7 @@ use std::time::Duration;
 use image::{Rgb, RgbImage};
 use jiff::{SignedDuration, Timestamp};
 use serde_json::{Value, json};
-use whereabouts::demo::{Town, TownSpec};
+use whereabouts_town::{Town, TownSpec};
 
 use super::support::{Answer, Server, frame, jpeg, server};
 

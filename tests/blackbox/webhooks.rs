@@ -357,7 +357,7 @@ async fn one_that_is_slow_holds_up_no_other_and_no_end() {
 
 /// A key made in the folder of a server that does not run.
 fn key(data: &Path, role: &str) -> String {
-    let mut command = Command::new(BINARY);
+    let mut command = Command::new(&*BINARY);
     command.args(["keys", "create", "--name", "test", "--role", role, "--data"]).arg(data);
     command.envs(deployment::settings(data));
     let output = command.output().unwrap();

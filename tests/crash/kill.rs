@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use tempfile::TempDir;
-use whereabouts::domain::Digest;
+use whereabouts_core::Digest;
 
 use super::clients::{Chance, Client, Pictures};
 use super::ledger::{Key, Picture};
@@ -112,7 +112,7 @@ impl Driver {
     }
 
     fn kill_while_starting(&mut self) {
-        let mut child = Command::new(BINARY)
+        let mut child = Command::new(&*BINARY)
             .args(["serve", "--listen", "127.0.0.1:0", "--data"])
             .arg(self.dir.path())
             .env("WHEREABOUTS_MODEL__NAME", "xfeat")

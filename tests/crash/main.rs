@@ -4,13 +4,9 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod clients;
-#[path = "../blackbox/deployment.rs"]
-#[allow(dead_code)]
-mod deployment;
 mod disk;
 mod faults;
 mod kill;
 mod ledger;
-#[path = "../blackbox/support.rs"]
-#[allow(dead_code)]
-mod support;
+
+use whereabouts_testkit::server as support;

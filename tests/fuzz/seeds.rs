@@ -11,13 +11,13 @@ use image::{ImageFormat, RgbImage};
 use jiff::Timestamp;
 use rayon::ThreadPoolBuilder;
 use uuid::Uuid;
-use whereabouts::archive::{ArchivedMap, LeftOut, Manifest, Writer};
-use whereabouts::demo::{Town, TownSpec};
-use whereabouts::domain::{
+use whereabouts_archive::{ArchivedMap, LeftOut, Manifest, Writer};
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{
     Descriptor, DescriptorKind, Digest, Frame, Image, Map, MediaType, Precision, Scene,
 };
-use whereabouts::retrieve::index::{IndexSettings, MapIndex, Vectors};
-use whereabouts::store::ExportedImage;
+use whereabouts_index::{IndexSettings, MapIndex, Vectors};
+use whereabouts_town::{Town, TownSpec};
 
 pub fn pictures() -> Vec<Vec<u8>> {
     let town = Town::new(TownSpec { seed: 3, places: 2, width: 96, height: 64 });

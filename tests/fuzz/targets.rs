@@ -9,15 +9,15 @@ use axum::body::Body;
 use axum::http::Request;
 use serde_json::Value;
 use tokio::runtime::{Builder, Runtime};
-use whereabouts::archive::{Item, Reader};
-use whereabouts::domain::{Frame, Pose};
-use whereabouts::evaluate::{PictureFile, PoseSource, TruthSource};
-use whereabouts::http::is_picture_form;
-use whereabouts::refine::mllm::Labels;
-use whereabouts::retrieve::ImageLimits;
-use whereabouts::retrieve::decode::{Needed, decode};
-use whereabouts::retrieve::index::SealedGraph;
-use whereabouts::retrieve::manifest::Manifest;
+use whereabouts_archive::{Item, Reader};
+use whereabouts_core::{Frame, Pose};
+use whereabouts_eval::{PictureFile, PoseSource, TruthSource};
+use whereabouts_index::SealedGraph;
+use whereabouts_refine::mllm::Labels;
+use whereabouts_server::http::is_picture_form;
+use whereabouts_vision::ImageLimits;
+use whereabouts_vision::decode::{Needed, decode};
+use whereabouts_vision::manifest::Manifest;
 
 const LIMITS: ImageLimits = ImageLimits { max_pixels: 1 << 16 };
 

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
-use whereabouts::domain::Digest;
-use whereabouts::store::{FirstAnswer, KeptAnswer, Progress, Store};
+use whereabouts_core::Digest;
+use whereabouts_store::{FirstAnswer, KeptAnswer, Progress, Store};
 
 use crate::support::{Fixture, eventually, odd_texts};
 

@@ -6,8 +6,8 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures_util::future::join_all;
 use jiff::Timestamp;
-use whereabouts::domain::{Digest, Job, JobState};
-use whereabouts::store::{Added, KeepJobs, StoreError};
+use whereabouts_core::{Digest, Job, JobState};
+use whereabouts_store::{Added, KeepJobs, StoreError};
 
 use crate::support::{Fixture, Tuning, add, claim, descriptor, image, is_kept, map, submit};
 

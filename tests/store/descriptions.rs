@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
-use whereabouts::domain::{Descriptor, Digest, Usage};
-use whereabouts::refine::mllm::{CachedDescription, DescribedFrame};
-use whereabouts::store::{DescriptionBounds, Store};
+use whereabouts_core::{CachedDescription, DescribedFrame};
+use whereabouts_core::{Descriptor, Digest, Usage};
+use whereabouts_store::{DescriptionBounds, Store};
 
 use crate::support::{Fixture, Random, Tuning, add, eventually, fill, map, next, odd_texts};
 

@@ -1,8 +1,8 @@
 //! Drafts: whatever happens while the descriptors of a map are made anew.
 
-use whereabouts::domain::{Descriptor, Image, Map, Scene};
-use whereabouts::retrieve::index::SearchMode;
-use whereabouts::store::{Store, StoreError};
+use whereabouts_core::{Descriptor, Image, Map, Scene};
+use whereabouts_index::SearchMode;
+use whereabouts_store::{Store, StoreError};
 
 use crate::support::{Fixture, Tuning, add, descriptor, eventually, fill, image, map, next};
 

@@ -4,9 +4,10 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use futures_util::future::join_all;
-use whereabouts::domain::{GeographicPose, Image, ImageId, Map, MetricPose, Pose};
-use whereabouts::retrieve::index::SearchMode;
-use whereabouts::store::{Added, ExportedImage, Store, StoreError};
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{GeographicPose, Image, ImageId, Map, MetricPose, Pose};
+use whereabouts_index::SearchMode;
+use whereabouts_store::{Added, Store, StoreError};
 
 use crate::support::{Fixture, add, descriptor, fill, image, map, next, odd_texts};
 

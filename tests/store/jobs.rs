@@ -7,10 +7,8 @@ use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast;
 use uuid::Uuid;
-use whereabouts::domain::{
-    Candidate, Description, Digest, Job, JobState, Priority, StandIn, Usage,
-};
-use whereabouts::store::{
+use whereabouts_core::{Candidate, Description, Digest, Job, JobState, Priority, StandIn, Usage};
+use whereabouts_store::{
     Claim, FirstAnswer, JobFilter, JobRecord, Progress, Release, Step, Store, StoreError,
 };
 

@@ -1,8 +1,8 @@
 //! API keys: kept, and replaced by others of the same id.
 
 use jiff::Timestamp;
-use whereabouts::domain::{ApiKey, Digest, KeyLimits, Role, StoredKey};
-use whereabouts::store::Store;
+use whereabouts_core::{ApiKey, Digest, KeyLimits, Role, StoredKey};
+use whereabouts_store::Store;
 
 use crate::support::{Fixture, odd_texts};
 

@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use futures_util::future::join_all;
-use whereabouts::domain::{
+use whereabouts_core::{
     Calibration, CalibrationSettings, DescriptorKind, Digest, Frame, Map, Precision, Scene,
 };
-use whereabouts::retrieve::index::SearchMode;
-use whereabouts::store::{IndexState, Store, StoreError};
+use whereabouts_index::SearchMode;
+use whereabouts_store::{IndexState, Store, StoreError};
 
 use crate::support::{Fixture, add, descriptor, fill, image, is_kept, map, next, odd_texts};
 

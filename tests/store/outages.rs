@@ -14,9 +14,9 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use uuid::Uuid;
-use whereabouts::domain::Digest;
-use whereabouts::store::postgres::{PostgresSettings, PostgresStore, migrate};
-use whereabouts::store::{BlobStore, JobStore, MapStore, Store, StoreError};
+use whereabouts_core::Digest;
+use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
+use whereabouts_store::{BlobStore, JobStore, MapStore, Store, StoreError};
 
 use crate::support::{Database, Pictures, Tuning, eventually, map, record, s3, submit};
 

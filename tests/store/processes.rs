@@ -9,14 +9,15 @@ use jiff::{SignedDuration, Timestamp};
 use sqlx::ConnectOptions;
 use tokio::sync::broadcast;
 use uuid::Uuid;
-use whereabouts::domain::{
+use whereabouts_core::{
     ApiKey, DayUsage, Delivery, Digest, Job, JobState, KeyLimits, Role, StoredKey, StoredWebhook,
     Usage, Webhook, WebhookEvent, WebhookSecret,
 };
-use whereabouts::refine::mllm::{CachedDescription, DescriptionCache, Spent};
-use whereabouts::retrieve::index::SearchMode;
-use whereabouts::store::postgres::{PostgresStore, SchemaState, migrate, schema_of};
-use whereabouts::store::{
+use whereabouts_core::{CachedDescription, Spent};
+use whereabouts_index::SearchMode;
+use whereabouts_store::DescriptionCache;
+use whereabouts_store::postgres::{PostgresStore, SchemaState, migrate, schema_of};
+use whereabouts_store::{
     AnswerStore, DraftStore, Draw, FirstAnswer, JobStore, KeyStore, MapStore, Progress, Retention,
     SharedLimits, StoreError, StoredDelivery, UsageStore, WebhookStore,
 };

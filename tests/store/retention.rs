@@ -2,8 +2,8 @@
 
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
-use whereabouts::domain::{Digest, Job, JobState};
-use whereabouts::store::{JobFilter, KeepJobs, RemovedJobs, Store};
+use whereabouts_core::{Digest, Job, JobState};
+use whereabouts_store::{JobFilter, KeepJobs, RemovedJobs, Store};
 
 use crate::support::{Fixture, claim, submit};
 

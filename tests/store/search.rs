@@ -5,11 +5,11 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use futures_util::StreamExt;
-use whereabouts::domain::{
+use whereabouts_core::{
     CalibrationSettings, Candidate, Descriptor, Digest, Image, Map, MetricPose, Pose,
 };
-use whereabouts::retrieve::index::SearchMode;
-use whereabouts::store::{Store, StoreError};
+use whereabouts_index::SearchMode;
+use whereabouts_store::{Store, StoreError};
 
 use crate::support::{Fixture, Random, Tuning, add, descriptor, eventually, image, map};
 

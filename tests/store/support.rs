@@ -11,14 +11,14 @@ use sqlx::postgres::PgConnectOptions;
 use sqlx::{AssertSqlSafe, ConnectOptions};
 use tempfile::TempDir;
 use uuid::Uuid;
-use whereabouts::domain::{
+use whereabouts_core::{
     Descriptor, DescriptorKind, Digest, Frame, Image, Job, Map, MediaType, Precision, RefinerKind,
     Scene,
 };
-use whereabouts::retrieve::index::IndexSettings;
-use whereabouts::store::embedded::{EmbeddedSettings, EmbeddedStore};
-use whereabouts::store::postgres::{PostgresSettings, PostgresStore, migrate};
-use whereabouts::store::{
+use whereabouts_index::IndexSettings;
+use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
+use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
+use whereabouts_store::{
     Added, DescriptionBounds, Draft, JobRecord, KeepJobs, ObjectSettings, Objects, Query, Store,
 };
 

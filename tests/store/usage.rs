@@ -2,8 +2,8 @@
 
 use futures_util::future::join_all;
 use jiff::civil::{Date, date};
-use whereabouts::domain::{DayUsage, Usage};
-use whereabouts::store::Store;
+use whereabouts_core::{DayUsage, Usage};
+use whereabouts_store::Store;
 
 use crate::support::Fixture;
 

@@ -5,11 +5,11 @@ use std::sync::Arc;
 use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
-use whereabouts::domain::{
+use whereabouts_core::{
     Attempt, Delivery, DeliveryState, Job, JobState, StoredWebhook, Then, Webhook, WebhookEvent,
     WebhookSecret,
 };
-use whereabouts::store::{ForgottenDeliveries, KeepDeliveries, Store, StoreError, StoredDelivery};
+use whereabouts_store::{ForgottenDeliveries, KeepDeliveries, Store, StoreError, StoredDelivery};
 
 use crate::support::{Fixture, claim, eventually, odd_texts, submit};
 

@@ -6,8 +6,8 @@ use super::super::localize::pose_text;
 use super::pictures::picture_of;
 use super::town::Folders;
 use super::{Args, Choice, MAP, Visit, index, shown};
-use crate::demo::SUCCESS_RADIUS_M;
-use crate::domain::Pose;
+use whereabouts_core::Pose;
+use whereabouts_town::SUCCESS_RADIUS_M;
 
 /// Whether the first place was right.
 pub struct Verdict {

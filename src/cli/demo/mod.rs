@@ -21,12 +21,11 @@ use self::model::{Choice, Choosing};
 use self::town::{Folders, Frame};
 use super::client::{Client, ServerArg};
 use super::index;
-use crate::config::{Config, Overrides};
-use crate::demo::TownSpec;
-use crate::domain::{Job, Scene};
-use crate::service::Answer;
-use crate::startup::{self, Role};
-use crate::telemetry;
+use whereabouts_api::Answer;
+use whereabouts_core::{Job, Scene};
+use whereabouts_server::config::{Config, Overrides};
+use whereabouts_server::startup::{self, Role};
+use whereabouts_town::TownSpec;
 
 /// The map's name.
 const MAP: &str = "town";
@@ -80,7 +79,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let choice = choosing.end().await?;
     account::chosen(&args, &choice);
     let server = Server::start(&folders, choice.model.clone()).await?;
-    let client = Client::new(&server.address)?;
+    let client = server.address.client()?;
     let indexed = index_town(&client, &server.address, &folders).await?;
     account::indexed(&args, &indexed, &server.address.server);
 
@@ -149,7 +148,7 @@ impl Server {
         let mut config = Config::load(None, &flags)?;
         "warn".clone_into(&mut config.log.filter);
         let (troubles, _traces) =
-            telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
+            whereabouts_telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
         let listener = TcpListener::bind(config.server.listen).await?;
         let (announce, ready) = oneshot::channel();
         let shutdown = CancellationToken::new();

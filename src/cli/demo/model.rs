@@ -7,9 +7,9 @@ use tokio::task::JoinHandle;
 
 use super::super::model::{Screen, models_folder};
 use super::Args;
-use crate::config::{Config, Overrides};
-use crate::models::{Catalogue, DownloadSettings, Entry};
-use crate::retrieve::{Assets, BUILT_IN_MODEL, PREFERRED_MODELS, WhyModel};
+use whereabouts_models::{Catalogue, DownloadSettings, Entry};
+use whereabouts_server::config::{Config, Overrides};
+use whereabouts_vision::{Assets, BUILT_IN_MODEL, PREFERRED_MODELS, WhyModel};
 
 /// A model and why it is the one.
 pub struct Choice {

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::Visit;
 use super::account::Verdict;
 use super::town::Folders;
-use crate::domain::ImageId;
+use whereabouts_core::ImageId;
 
 const WIDTH: u32 = 400;
 const HEIGHT: u32 = 300;

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use rayon::prelude::*;
 
-use crate::demo::{Shot, Town, TownSpec};
-use crate::domain::{GeographicPose, Pose};
-use crate::retrieve::decode::encode_jpeg;
+use whereabouts_core::{GeographicPose, Pose};
+use whereabouts_town::{Shot, Town, TownSpec};
+use whereabouts_vision::decode::encode_jpeg;
 
 /// Where the demo puts things.
 pub struct Folders {

@@ -13,10 +13,10 @@ use serde::Serialize;
 
 use super::client::{Client, LONGEST_PAUSE, PATIENCE, ServerArg, segment};
 use super::progress::Progress;
-use crate::domain::{DescriptorKind, Frame, MapName, MediaType, Scene};
-use crate::evaluate::{PictureFile, PoseSource, pictures};
-use crate::http::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
-use crate::service::{ErrorKind, ImageMeta, MapChange};
+use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
+use whereabouts_api::{ErrorKind, ImageMeta, MapChange};
+use whereabouts_core::{DescriptorKind, Frame, MapName, MediaType, Scene};
+use whereabouts_eval::{PictureFile, PoseSource, pictures};
 
 /// Poses come from a CSV file (--poses, or poses.csv in the folder), from file names of the form
 /// @easting@northing@..., or from EXIF GPS. It is safe to run this again: what is there already is
@@ -82,7 +82,7 @@ struct Failure {
 }
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
-    let client = Client::new(&args.server)?;
+    let client = args.server.client()?;
     match &args.dir {
         Some(dir) => report(&add_folder(&client, dir, &args).await?, args.json),
         None => reindex::run(&client, &args).await,

@@ -1,13 +1,13 @@
 //! `whereabouts index --reindex`: begins it on the server, and watches until it has ended.
 
 use std::time::Duration;
+use whereabouts_api::{MapState, ReindexRequest, ReindexState};
 
 use anyhow::{Context, bail};
 
 use super::super::client::{Client, segment};
 use super::Args;
-use crate::cli::progress::Progress;
-use crate::service::{MapState, ReindexRequest, ReindexState};
+use crate::progress::Progress;
 
 /// The pause between two looks at the map.
 const PAUSE: Duration = Duration::from_millis(300);

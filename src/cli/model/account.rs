@@ -9,9 +9,9 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::Place;
-use crate::domain::{DescriptorKind, Digest};
-use crate::models::{self, InstallError};
-use crate::retrieve::{AUTO, BUILT_IN_MODEL, MANIFEST, Manifest};
+use whereabouts_core::{DescriptorKind, Digest};
+use whereabouts_models::InstallError;
+use whereabouts_vision::{AUTO, BUILT_IN_MODEL, MANIFEST, Manifest};
 
 /// One model in the list.
 #[derive(Serialize)]
@@ -165,7 +165,7 @@ struct Check {
 
 impl Check {
     fn of(name: String, folder: PathBuf) -> Self {
-        let (ok, pinned, detail) = match models::verify(&folder) {
+        let (ok, pinned, detail) = match whereabouts_models::verify(&folder) {
             Ok(verdict) => {
                 let pinned = verdict.manifest.files().all(|(_, pinned)| pinned.is_some());
                 (true, pinned, words(&verdict.digests))

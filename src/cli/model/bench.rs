@@ -8,7 +8,7 @@ use serde_json::json;
 use toml_edit::{DocumentMut, Item, Table, value};
 
 use super::Place;
-use crate::retrieve::{Bench, BenchRow, BenchSettings, LEAST_SIMILARITY, Layout};
+use whereabouts_vision::{Bench, BenchRow, BenchSettings, LEAST_SIMILARITY, Layout};
 
 /// What to try, and what to do with the result.
 #[derive(Debug, clap::Args)]
@@ -188,8 +188,8 @@ fn write(file: &Path, best: &BenchRow) -> anyhow::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::Precision;
-    use crate::retrieve::{Execution, Figures, Provider};
+    use whereabouts_core::Precision;
+    use whereabouts_vision::{Execution, Figures, Provider};
 
     fn row(
         precision: Precision,
@@ -234,7 +234,8 @@ mod tests {
         for part in ["# ours", "\"xfeat\" # built in", "sessions = 2", "precision = \"bf16\""] {
             assert!(text.contains(part), "{text}");
         }
-        let config = crate::config::Config::load(Some(&file), &Default::default()).unwrap();
+        let config =
+            whereabouts_server::config::Config::load(Some(&file), &Default::default()).unwrap();
         assert_eq!((config.model.sessions, config.model.max_batch), (2, 4));
         std::fs::remove_file(&file).unwrap();
         write(&file, &best).unwrap();

@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 
 pub use self::screen::Screen;
-use crate::config::{Config, Overrides};
-use crate::models::{Added, Catalogue, ModelsFolder, Pulled};
-use crate::retrieve::{AUTO, Assets, BUILT_IN_MODEL};
+use whereabouts_models::{Added, Catalogue, ModelsFolder, Pulled};
+use whereabouts_server::config::{Config, Overrides};
+use whereabouts_vision::{AUTO, Assets, BUILT_IN_MODEL};
 
 /// A map that names no model has the one that the server was started with. Where model.name is
 /// "auto", as it is by default, that is the model that `use` chose; else the first that is installed

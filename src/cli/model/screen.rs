@@ -4,7 +4,7 @@ use std::io::IsTerminal;
 
 use indicatif::{DecimalBytes, ProgressBar, ProgressStyle};
 
-use crate::models::Progress;
+use whereabouts_models::Progress;
 
 /// Shows one download on the standard error.
 pub struct Screen {

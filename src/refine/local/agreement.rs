@@ -8,7 +8,7 @@
 
 use super::mutual::CellPair;
 use super::{LocalSettings, Match};
-use crate::domain::dense::DenseFeatures;
+use whereabouts_core::dense::DenseFeatures;
 
 /// The matches with enough neighbours that moved as they did. `located` are the positions of
 /// `pairs`; `tolerance` is `[x, y]` in fractions of the picture's edges.

@@ -25,10 +25,10 @@ pub use describe::describe;
 pub use motion::Motion;
 pub use rank::rank;
 
-use crate::domain::dense::DenseFeatures;
 use mutual::Mutual;
 use nearest::Nearest;
 use votes::Votes;
+use whereabouts_core::dense::DenseFeatures;
 
 /// What the matcher takes for agreement. The defaults are those measured for XFeat; all lengths are
 /// fractions of the picture, so that they hold for any size of feature map.

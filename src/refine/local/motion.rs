@@ -6,7 +6,7 @@
 //! re-weighted least squares with Tukey's biweight (Holland & Welsch, 1977).
 
 use super::Match;
-use crate::domain::dense::DenseFeatures;
+use whereabouts_core::dense::DenseFeatures;
 
 /// Matches that propose a shift.
 const PROPOSERS: usize = 12;

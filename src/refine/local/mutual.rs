@@ -4,7 +4,7 @@
 
 use super::nearest::Nearest;
 use super::{LocalError, Match};
-use crate::domain::dense::DenseFeatures;
+use whereabouts_core::dense::DenseFeatures;
 
 /// Two cells that choose each other, by index into the row-major grids.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use jiff::civil::Date;
 
-use super::budget::Spent;
-use crate::refine::patience::insist;
-use crate::store::{SharedLimits, StoreError};
+use crate::patience::insist;
+use whereabouts_core::Spent;
+use whereabouts_store::{SharedLimits, StoreError};
 
 /// What is set aside for one call. Dropped unsettled, it goes back: the call was not answered.
 pub(super) struct Aside {

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use jiff::Timestamp;
 use jiff::civil::Date;
 
-use crate::domain::{DayUsage, utc_day};
+use whereabouts_core::{Spent, utc_day};
 
 /// The bounds; 0 stands for none.
 #[derive(Debug, Clone, Copy, Default)]
@@ -25,15 +25,6 @@ pub struct Limits {
     pub price_prompt: f64,
     /// Money for a million tokens received.
     pub price_completion: f64,
-}
-
-/// What was spent.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Spent {
-    /// Tokens, sent and received.
-    pub tokens: u64,
-    /// Money, in the currency of the prices.
-    pub money: f64,
 }
 
 /// A limit that a call would pass.
@@ -64,32 +55,6 @@ impl Limits {
         let money = prompt_tokens as f64 * self.price_prompt
             + completion_tokens as f64 * self.price_completion;
         Spent { tokens: prompt_tokens + completion_tokens, money: money / 1e6 }
-    }
-}
-
-impl From<&DayUsage> for Spent {
-    fn from(day: &DayUsage) -> Self {
-        let tokens = day.usage.prompt_tokens + day.usage.completion_tokens;
-        Self { tokens, money: day.money }
-    }
-}
-
-impl Spent {
-    /// The sum.
-    pub fn plus(self, other: Self) -> Self {
-        Self { tokens: self.tokens + other.tokens, money: self.money + other.money }
-    }
-
-    /// The difference; nothing where more is taken than there is.
-    pub fn minus(self, other: Self) -> Self {
-        Self {
-            tokens: self.tokens.saturating_sub(other.tokens),
-            money: (self.money - other.money).max(0.0),
-        }
-    }
-
-    fn exceeds(self, tokens: u64, money: f64) -> bool {
-        (tokens > 0 && self.tokens > tokens) || (money > 0.0 && self.money > money)
     }
 }
 

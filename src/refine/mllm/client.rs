@@ -15,11 +15,11 @@ use tracing::Instrument;
 use super::breaker::Breaker;
 use super::rate::RateLimiter;
 use super::retry::{CallError, Failure, RetryPolicy, retry_after};
-use super::secret::Secret;
 use super::settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError};
 use super::wire::{ChatAnswer, ChatRequest, ErrorAnswer, Message, Reply, Schema};
-use crate::store::Buckets;
-use crate::telemetry::traces;
+use whereabouts_core::Secret;
+use whereabouts_store::Buckets;
+use whereabouts_telemetry::traces;
 
 /// What is read of a refusal, in bytes, and what is told of it, in characters.
 const REFUSAL_BYTES: usize = 64 << 10;

@@ -5,8 +5,8 @@ use super::rank::Ranked;
 use super::reason::Verdict;
 use super::retry::CallError;
 use super::{RefineError, Refinement};
-use crate::domain::Ranking;
-use crate::refine::milliseconds;
+use crate::milliseconds;
+use whereabouts_core::Ranking;
 
 /// Orders the candidates: those that could be compared as the model says, the others behind them in
 /// coarse order. Without a verdict, all are in coarse order. `ranked` is `None` if there was nothing

@@ -9,8 +9,7 @@ use jiff::Timestamp;
 use tokio::sync::OnceCell;
 
 use super::aside::Aside;
-use super::budget::{Exceeded, JobBudget, Spent};
-use super::cache::{CachedDescription, DescribedFrame, SimilarFrame};
+use super::budget::{Exceeded, JobBudget};
 use super::client::{Answer, Call, estimate_tokens};
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Switches, clean};
@@ -18,13 +17,14 @@ use super::purchase::Purchase;
 use super::retry::CallError;
 use super::wire::{Content, ImageUrl, Message, Part, Role};
 use super::{MllmRefiner, Progress, RefineError};
-use crate::domain::{
+use crate::CacheLookup;
+use crate::milliseconds;
+use crate::patience::{insist, patiently};
+use whereabouts_core::{CachedDescription, DescribedFrame, SimilarFrame, Spent};
+use whereabouts_core::{
     Candidate, Description, Descriptor, Digest, Map, Scene, StandIn, Usage, utc_day,
 };
-use crate::refine::milliseconds;
-use crate::refine::patience::{insist, patiently};
-use crate::store::{JobRecord, Step, StoreError};
-use crate::telemetry::CacheLookup;
+use whereabouts_store::{JobRecord, Step, StoreError};
 
 /// What one refinement goes along with.
 pub(super) struct Work<'a> {

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::OnceCell;
 
-use crate::domain::Digest;
+use whereabouts_core::Digest;
 
 type Cell<T> = Arc<OnceCell<T>>;
 

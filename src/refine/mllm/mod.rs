@@ -15,7 +15,6 @@
 mod aside;
 mod breaker;
 mod budget;
-mod cache;
 mod client;
 mod conclude;
 mod describe;
@@ -27,13 +26,9 @@ mod rank;
 mod rate;
 mod reason;
 mod retry;
-mod secret;
 mod settings;
 mod wire;
 
-#[cfg(test)]
-#[path = "../../../tests/blackbox/mock_mllm.rs"]
-mod mock_mllm;
 #[cfg(test)]
 mod tests;
 
@@ -44,12 +39,9 @@ use async_trait::async_trait;
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
 
-pub use budget::Spent;
-pub use cache::{CacheLevels, CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame};
 pub use prompts::PROMPT_VERSION;
 pub use reason::{AnswerError, Labels, Verdict};
-pub(crate) use retry::{random_fraction, retry_after};
-pub use secret::Secret;
+pub use retry::{random_fraction, retry_after};
 pub use settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError, OnUnavailable};
 
 use self::budget::Budget;
@@ -59,10 +51,12 @@ use self::flight::Flights;
 use self::pictures::Pictures;
 use self::retry::CallError;
 use super::{Progress, RefineError, Refinement, Refiner};
-use crate::domain::{DayUsage, Evidence, Map, RefinerKind, Usage, utc_day};
-use crate::retrieve::ImageLimits;
-use crate::store::{BlobStore, Buckets, JobRecord, LookAlikes, MapStore, SharedLimits, UsageStore};
-use crate::telemetry::Metrics;
+use crate::RefineMetrics;
+use whereabouts_core::{CacheLevels, DayUsage, Evidence, Map, RefinerKind, Spent, Usage, utc_day};
+use whereabouts_store::{
+    BlobStore, Buckets, DescriptionCache, JobRecord, LookAlikes, MapStore, SharedLimits, UsageStore,
+};
+use whereabouts_vision::ImageLimits;
 
 /// What an [`MllmRefiner`] works with.
 pub struct MllmParts {
@@ -77,7 +71,7 @@ pub struct MllmParts {
     /// The limits of all processes, where there are several.
     pub shared: Option<Arc<dyn SharedLimits>>,
     /// What is counted.
-    pub metrics: Arc<Metrics>,
+    pub metrics: Arc<RefineMetrics>,
     /// Bounds on the pictures that are decoded.
     pub limits: ImageLimits,
     /// Who takes a job while no call may be made, if `on_unavailable` is `local`.
@@ -92,7 +86,7 @@ pub struct MllmRefiner {
     cache: Arc<dyn DescriptionCache>,
     usage: Arc<dyn UsageStore>,
     shared: Option<Arc<dyn SharedLimits>>,
-    metrics: Arc<Metrics>,
+    metrics: Arc<RefineMetrics>,
     fallback: Option<Arc<dyn Refiner>>,
     pictures: Pictures,
     client: MllmClient,

@@ -8,11 +8,11 @@ use bytes::Bytes;
 use image::RgbImage;
 use tokio::sync::Semaphore;
 
-use crate::domain::Digest;
-use crate::retrieve::decode::{Needed, decode, encode_jpeg};
-use crate::retrieve::preprocess::shrink_to;
-use crate::retrieve::{CpuPool, ImageLimits};
-use crate::store::{BlobStore, StoreError};
+use whereabouts_core::Digest;
+use whereabouts_store::{BlobStore, StoreError};
+use whereabouts_vision::decode::{Needed, decode, encode_jpeg};
+use whereabouts_vision::preprocess::shrink_to;
+use whereabouts_vision::{CpuPool, ImageLimits};
 
 /// Threads that decode, scale and encode. A picture takes milliseconds, a call seconds.
 const THREADS: usize = 2;

@@ -3,7 +3,7 @@
 //! The words are in `prompts/`, in sections that can be left out. Whatever comes from pictures is
 //! bounded, stripped of control characters and marked as quotation before it is put into a prompt.
 
-use crate::domain::Scene;
+use whereabouts_core::Scene;
 
 /// The version of the texts in `prompts/`. It is part of each description's key: new words, new
 /// descriptions.
@@ -131,7 +131,7 @@ fn fill(template: &str, values: &[(&str, &str)]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::Digest;
+    use whereabouts_core::Digest;
 
     const ALL: Switches = Switches { object_matching: true, constraints: true };
 

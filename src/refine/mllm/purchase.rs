@@ -5,10 +5,11 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::cache::{CachedDescription, DescriptionCache};
-use crate::domain::Digest;
-use crate::refine::patience::{insist, patiently};
-use crate::store::StoreError;
+use crate::patience::{insist, patiently};
+use whereabouts_core::CachedDescription;
+use whereabouts_core::Digest;
+use whereabouts_store::DescriptionCache;
+use whereabouts_store::StoreError;
 
 /// The pause between two looks for a description that another process is buying.
 const PURCHASE_LOOK: Duration = Duration::from_millis(250);

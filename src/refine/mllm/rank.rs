@@ -9,8 +9,8 @@ use super::prompts::{self, Notes, clean};
 use super::reason::{AnswerError, Labels, Verdict};
 use super::retry::CallError;
 use super::wire::Message;
-use crate::domain::Digest;
-use crate::store::Step;
+use whereabouts_core::Digest;
+use whereabouts_store::Step;
 
 /// An order of the candidates, and how long the call took which gave it.
 pub(super) struct Ranked {

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::store::{Buckets, Draw, Drawn};
+use whereabouts_store::{Buckets, Draw, Drawn};
 
 /// Two buckets that fill steadily up to a minute's worth. Callers are served in order.
 #[derive(Debug)]

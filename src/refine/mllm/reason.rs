@@ -8,7 +8,7 @@ use serde_json::json;
 use uuid::Uuid;
 
 use super::wire::Schema;
-use crate::domain::Digest;
+use whereabouts_core::Digest;
 
 /// The candidates under neutral names.
 #[derive(Debug, Clone, PartialEq, Eq)]

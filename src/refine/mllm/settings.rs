@@ -6,7 +6,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::budget::Limits;
-use super::secret::Secret;
+use whereabouts_core::Secret;
 
 /// `[mllm]`
 #[derive(Debug, Clone, Serialize, Deserialize)]

@@ -6,10 +6,10 @@ mod shelf;
 
 use shelf::{Bench, Steps};
 
-use super::mock_mllm::{Reply, Script, ranking};
 use super::*;
-use crate::domain::{Descriptor, Scene};
-use crate::store::JobRecord;
+use whereabouts_core::{Descriptor, Scene};
+use whereabouts_store::JobRecord;
+use whereabouts_testkit::mock_mllm::{Reply, Script, ranking};
 
 /// Names each description after the number of its call; at concurrency 1, that is the coarse rank.
 fn numbered() -> Script {

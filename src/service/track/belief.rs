@@ -12,14 +12,14 @@
 //!
 //! with the similarity s(j) of the frame and the image, s₁ the highest, ē the mean of e over all images,
 //! and g the gap that chance leaves between the first wrong answer and the median of the next, which is
-//! measured in the map ([`Evidence`](crate::domain::Evidence)). ω is the share of frames that say
+//! measured in the map ([`Evidence`](whereabouts_core::Evidence)). ω is the share of frames that say
 //! nothing, because a bus stands before the camera: no single frame can outvote the others for ever.
 //!
 //! Only the images that are likely are kept; the rest of the probability is spread evenly over the map.
 
 use super::TrackSettings;
 use super::places::Places;
-use crate::domain::ImageId;
+use whereabouts_core::ImageId;
 
 /// Beyond so many standard deviations a Gaussian is nothing.
 const TAIL: f64 = 3.0;
@@ -187,7 +187,7 @@ fn merged(mut parts: Vec<(u32, f64)>) -> Vec<(u32, f64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{MetricPose, Pose};
+    use whereabouts_core::{MetricPose, Pose};
 
     /// Images every ten metres along a road.
     fn road(count: usize) -> Places {

@@ -13,13 +13,13 @@ use std::time::{Duration, Instant};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use tokio::sync::Mutex as AsyncMutex;
-use utoipa::ToSchema;
 use uuid::Uuid;
 
 use self::belief::{Belief, Motion};
 use self::places::Places;
-use super::{Caller, ErrorKind, Service, ServiceError};
-use crate::domain::{Calibration, Candidate, ImageId, Map, Pose};
+use super::{Caller, Service, ServiceError};
+use whereabouts_api::{ErrorKind, TrackEstimate};
+use whereabouts_core::{Calibration, Candidate, ImageId, Map};
 
 /// The images of a map that grows are looked up again no sooner than this.
 const REFRESH: Duration = Duration::from_secs(2);
@@ -127,26 +127,6 @@ impl TrackStep {
         let captured_at = captured_at.unwrap_or_else(Timestamp::now);
         Ok(Self { id, owner: caller.scope().to_owned(), captured_at, moved_m })
     }
-}
-
-/// Where the robot is, given all frames of its track.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct TrackEstimate {
-    /// The track.
-    pub id: String,
-    /// Its frames so far, this one included.
-    pub frames: u64,
-    /// The most probable image; null as long as no image with a pose is likely.
-    #[schema(nullable)]
-    pub image_id: Option<ImageId>,
-    /// Its pose.
-    #[schema(nullable)]
-    pub pose: Option<Pose>,
-    /// The probability that the robot is within the size of a place (`confidence.place_m`) of that
-    /// image, 0 to 1, as far as the motion and the share of useless frames are as they are set.
-    pub probability: f64,
-    /// Whether the probability reaches the configured bound.
-    pub known: bool,
 }
 
 /// What is remembered of a track.

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use crate::domain::{EARTH_RADIUS_M, ImageId, Pose};
+use whereabouts_core::{EARTH_RADIUS_M, ImageId, Pose};
 
 /// The least that a place is wide, in metres: maps that have many images of one spot say nothing of it.
 const LEAST_SPACING_M: f64 = 0.5;
@@ -153,7 +153,7 @@ fn in_a_plane(poses: &[Pose]) -> Vec<[f64; 2]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{GeographicPose, MetricPose};
+    use whereabouts_core::{GeographicPose, MetricPose};
 
     fn metric(x: f64, y: f64) -> Pose {
         Pose::Metric(MetricPose { x, y, z: None, qx: None, qy: None, qz: None, qw: None })

@@ -14,10 +14,10 @@ use uuid::Uuid;
 
 use super::WebhookSettings;
 use super::messenger::{Messenger, Reply};
-use crate::domain::{Attempt, Delivery, StoredWebhook, Then};
-use crate::refine::mllm::random_fraction;
-use crate::store::{StoreError, StoredDelivery, WebhookStore};
-use crate::telemetry::{AttemptOutcome, Metrics};
+use crate::{AttemptOutcome, ServiceMetrics};
+use whereabouts_core::{Attempt, Delivery, StoredWebhook, Then};
+use whereabouts_refine::mllm::random_fraction;
+use whereabouts_store::{StoreError, StoredDelivery, WebhookStore};
 
 /// The pause between two looks at what is due, if nothing happens.
 const PAUSE: Duration = Duration::from_secs(1);
@@ -40,7 +40,7 @@ const DISABLED: &str = "the webhook was disabled";
 pub struct Dispatcher {
     store: Arc<dyn WebhookStore>,
     messenger: Messenger,
-    metrics: Arc<Metrics>,
+    metrics: Arc<ServiceMetrics>,
     settings: WebhookSettings,
 }
 
@@ -48,7 +48,7 @@ impl Dispatcher {
     /// One that has nothing in progress.
     pub fn new(
         store: Arc<dyn WebhookStore>,
-        metrics: Arc<Metrics>,
+        metrics: Arc<ServiceMetrics>,
         settings: WebhookSettings,
     ) -> Self {
         Self { store, messenger: Messenger::new(&settings), metrics, settings }

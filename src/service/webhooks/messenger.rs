@@ -10,8 +10,8 @@ use uuid::Uuid;
 use super::WebhookSettings;
 use super::address::{PublicOnly, check};
 use super::signature::sign;
-use crate::domain::StoredWebhook;
-use crate::refine::mllm::retry_after;
+use whereabouts_core::StoredWebhook;
+use whereabouts_refine::mllm::retry_after;
 
 const USER_AGENT: &str = concat!("whereabouts/", env!("CARGO_PKG_VERSION"));
 

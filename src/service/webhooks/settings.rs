@@ -6,8 +6,8 @@ use jiff::{SignedDuration, Timestamp};
 use serde::{Deserialize, Serialize};
 
 use super::super::retention::before;
-use crate::domain::Then;
-use crate::store::KeepDeliveries;
+use whereabouts_core::Then;
+use whereabouts_store::KeepDeliveries;
 
 /// The most tries after the first, and the longest pause between two, in seconds.
 const MOST_RETRIES: usize = 32;
@@ -106,10 +106,12 @@ impl WebhookSettings {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::config::{Config, Overrides};
-
     pub fn defaults() -> WebhookSettings {
-        Config::load(None, &Overrides::default()).unwrap().webhooks
+        #[derive(Deserialize)]
+        struct File {
+            webhooks: WebhookSettings,
+        }
+        toml::from_str::<File>(include_str!("../../../deploy/whereabouts.toml")).unwrap().webhooks
     }
 
     #[test]

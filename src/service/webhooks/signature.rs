@@ -5,7 +5,7 @@ use base64::engine::general_purpose::STANDARD;
 use jiff::Timestamp;
 use ring::hmac;
 
-use crate::domain::WebhookSecret;
+use whereabouts_core::WebhookSecret;
 
 /// The value of `webhook-signature`: HMAC-SHA256 over the id, the time in seconds since 1970, and the body.
 /// Neither of the first two may have a full stop in it.

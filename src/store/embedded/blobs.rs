@@ -11,7 +11,7 @@ use bytes::Bytes;
 use super::super::StoreError;
 use super::make_folder;
 use super::trees::Trees;
-use crate::domain::Digest;
+use whereabouts_core::Digest;
 
 /// The folder. Clones share it.
 #[derive(Clone)]

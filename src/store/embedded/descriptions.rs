@@ -14,10 +14,9 @@ use uuid::Uuid;
 use super::super::{DescriptionBounds, StoreError};
 use super::trees::{Trees, decode, encode, failed, put};
 use super::{EmbeddedStore, blocking};
-use crate::domain::{Descriptor, Digest, StandIn};
-use crate::refine::mllm::{
-    CacheLevels, CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame,
-};
+use crate::DescriptionCache;
+use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, SimilarFrame};
+use whereabouts_core::{Descriptor, Digest, StandIn};
 
 /// As many similar frames are looked at, at the most: a pair that none of them has is bought.
 const SIMILAR_FRAMES: usize = 4;

@@ -19,7 +19,7 @@ use super::live_map::{LiveMap, folder_of};
 use super::maps::{remove_folder, still_there};
 use super::trees::{StoredImage, put};
 use super::{EmbeddedStore, Inner, blocking};
-use crate::domain::{Descriptor, Image, ImageId, Map};
+use whereabouts_core::{Descriptor, Image, ImageId, Map};
 
 struct EmbeddedDraft {
     inner: Arc<Inner>,

@@ -4,10 +4,11 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 
-use super::super::{ExportStore, ExportedImage, StoreError};
+use super::super::{ExportStore, StoreError};
 use super::trees::StoredImage;
 use super::{EmbeddedStore, blocking};
-use crate::domain::{ImageId, Map};
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{ImageId, Map};
 
 #[async_trait]
 impl ExportStore for EmbeddedStore {

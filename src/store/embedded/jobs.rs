@@ -23,7 +23,7 @@ use super::trees::{
 };
 use super::webhooks::WebhookTrees;
 use super::{EmbeddedStore, answers, blocking};
-use crate::domain::{Job, Priority};
+use whereabouts_core::{Job, Priority};
 
 impl EmbeddedStore {
     /// Applies a change to one job and tells the listeners.
@@ -373,8 +373,8 @@ fn write_job(trees: &Trees, record: &JobRecord, place: Place) -> Result<(), Stor
 mod tests {
     use super::super::drafts::tests::settings;
     use super::*;
-    use crate::domain::{Digest, MapName, MediaType, RefinerKind};
-    use crate::store::Query;
+    use crate::Query;
+    use whereabouts_core::{Digest, MapName, MediaType, RefinerKind};
 
     /// A job that waits in a map.
     async fn submitted(store: &EmbeddedStore, map: &str) -> Uuid {

@@ -7,7 +7,7 @@ use async_trait::async_trait;
 use super::super::{KeyStore, StoreError};
 use super::trees::{decode, failed, put};
 use super::{EmbeddedStore, blocking};
-use crate::domain::StoredKey;
+use whereabouts_core::StoredKey;
 
 #[async_trait]
 impl KeyStore for EmbeddedStore {

@@ -8,8 +8,8 @@ use super::super::{LookAlikes, StoreError};
 use super::blobs::replace_durably;
 use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
-use crate::domain::{Calibration, CalibrationSettings, Candidate, ImageId, Map, Pose};
-use crate::retrieve::index::{Found, IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
+use whereabouts_core::{Calibration, CalibrationSettings, Candidate, ImageId, Map, Pose};
+use whereabouts_index::{Found, IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
 
 pub(super) struct LiveMap {
     /// The map as stored; scene and description may change.

@@ -17,11 +17,11 @@ use super::trees::{
     transaction_failed,
 };
 use super::{EmbeddedStore, Inner, blocking};
-use crate::domain::{
+use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Digest, Image, ImageId, Map, MapName,
     Pose,
 };
-use crate::retrieve::index::SearchMode;
+use whereabouts_index::SearchMode;
 
 /// Images removed in one transaction when a whole map goes.
 const SWEEP: usize = 256;

@@ -53,8 +53,8 @@ use self::mark::CommitMark;
 use self::trees::Trees;
 use self::writer::Writer;
 use super::{DescriptionBounds, StoreError};
-use crate::domain::MapName;
-use crate::retrieve::index::IndexSettings;
+use whereabouts_core::MapName;
+use whereabouts_index::IndexSettings;
 
 /// How the embedded store works.
 #[derive(Debug, Clone)]

@@ -11,7 +11,7 @@ use sled::Transactional;
 use super::super::{KeepJobs, RemovedJobs, Retention, StoreError};
 use super::trees::{BlobOwner, Trees, blob_ref_key, ended_job, failed, transaction_failed};
 use super::{EmbeddedStore, blocking};
-use crate::domain::{Digest, MapName};
+use whereabouts_core::{Digest, MapName};
 
 /// What one change took away.
 #[derive(Default)]

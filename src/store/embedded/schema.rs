@@ -20,7 +20,7 @@ use super::super::StoreError;
 use super::super::changes::ended_at;
 use super::blobs::replace_durably;
 use super::trees::{Lease, Trees, decode, ended_key, failed, put, queue_key};
-use crate::store::JobRecord;
+use crate::JobRecord;
 
 const FILE: &str = "version";
 
@@ -186,8 +186,8 @@ mod tests {
     use jiff::Timestamp;
 
     use super::*;
-    use crate::domain::{Digest, Job, JobState, MediaType, RefinerKind};
-    use crate::store::Query;
+    use crate::Query;
+    use whereabouts_core::{Digest, Job, JobState, MediaType, RefinerKind};
 
     fn first(dir: &Path) -> Result<(), StoreError> {
         fs::write(dir.join("db/records"), "two").map_err(|error| cannot("write", dir, &error))

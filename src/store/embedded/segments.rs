@@ -19,8 +19,8 @@ use std::sync::{Arc, PoisonError, RwLock};
 use memmap2::Mmap;
 
 use super::super::StoreError;
-use crate::domain::Descriptor;
-use crate::retrieve::index::Vectors;
+use whereabouts_core::Descriptor;
+use whereabouts_index::Vectors;
 
 const MAGIC: &[u8; 8] = b"WHEREVEC";
 const VERSION: u32 = 1;

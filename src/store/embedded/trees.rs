@@ -12,7 +12,7 @@ use uuid::Uuid;
 use super::super::changes::place;
 use super::super::{JobRecord, StoreError};
 use super::webhooks::WebhookTrees;
-use crate::domain::{Digest, Image, ImageId, Job, JobState, Map};
+use whereabouts_core::{Digest, Image, ImageId, Job, JobState, Map};
 
 /// The sled trees. Clones share them.
 #[derive(Clone)]

@@ -8,7 +8,7 @@ use jiff::civil::Date;
 use super::super::{StoreError, UsageStore};
 use super::trees::{decode, failed, get, put};
 use super::{EmbeddedStore, blocking};
-use crate::domain::DayUsage;
+use whereabouts_core::DayUsage;
 
 /// Sorted by day: dates are written with four, two and two digits.
 fn key(of: &DayUsage) -> Vec<u8> {

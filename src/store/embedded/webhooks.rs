@@ -18,7 +18,7 @@ use super::super::changes::{
 use super::super::{ForgottenDeliveries, KeepDeliveries, StoreError, StoredDelivery, WebhookStore};
 use super::trees::{Trees, decode, failed, put};
 use super::{EmbeddedStore, blocking};
-use crate::domain::{Attempt, Delivery, DeliveryState, StoredWebhook};
+use whereabouts_core::{Attempt, Delivery, DeliveryState, StoredWebhook};
 
 pub(super) use self::trees::WebhookTrees;
 use self::trees::{News, key};

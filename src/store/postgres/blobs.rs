@@ -9,7 +9,7 @@ use bytes::Bytes;
 
 use super::super::{BlobPin, BlobStore, StoreError};
 use super::{Inner, PostgresStore, count};
-use crate::domain::Digest;
+use whereabouts_core::Digest;
 
 /// Bytes of so many pictures are removed in one transaction.
 const REMOVED_AT_ONCE: i64 = 64;

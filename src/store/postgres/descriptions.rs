@@ -12,10 +12,9 @@ use uuid::Uuid;
 use super::super::StoreError;
 use super::blobs::digest_of;
 use super::{Inner, PostgresStore, count, counted, record};
-use crate::domain::{Descriptor, Digest, StandIn};
-use crate::refine::mllm::{
-    CacheLevels, CachedDescription, DescribedFrame, DescriptionCache, SimilarFrame,
-};
+use crate::DescriptionCache;
+use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, SimilarFrame};
+use whereabouts_core::{Descriptor, Digest, StandIn};
 
 /// As many similar frames are looked at, at the most: a pair that none of them has is bought.
 const SIMILAR_FRAMES: i64 = 4;

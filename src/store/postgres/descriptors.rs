@@ -14,8 +14,8 @@ use uuid::Uuid;
 use super::super::changes::removed;
 use super::super::{LookAlikes, StoreError};
 use super::{Inner, count, is_locked, is_missing_table};
-use crate::domain::{CalibrationSettings, Candidate, Descriptor, ImageId, Map, Pose};
-use crate::retrieve::index::SearchMode;
+use whereabouts_core::{CalibrationSettings, Candidate, Descriptor, ImageId, Map, Pose};
+use whereabouts_index::SearchMode;
 
 /// The most numbers that pgvector indexes in 16 bits.
 pub(super) const MOST_INDEXED: usize = 4000;

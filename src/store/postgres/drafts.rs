@@ -8,7 +8,7 @@ use super::super::changes::{being_reindexed, removed};
 use super::super::{Draft, DraftStore, StoreError};
 use super::descriptors::{MOST_INDEXED, drop_table, make_table, table};
 use super::{Inner, PostgresStore, count, record};
-use crate::domain::{Descriptor, Image, Map};
+use whereabouts_core::{Descriptor, Image, Map};
 
 struct PostgresDraft {
     store: PostgresStore,

@@ -9,10 +9,11 @@ use sqlx::types::Json;
 use uuid::Uuid;
 
 use super::super::changes::{removed, same_bytes};
-use super::super::{Added, ExportStore, ExportedImage, StoreError};
+use super::super::{Added, ExportStore, StoreError};
 use super::descriptors::{descriptor_of, image_id, table};
 use super::{Inner, PostgresStore, blobs, count, is_missing_table, record};
-use crate::domain::{Descriptor, Image, ImageId, Map, Pose};
+use whereabouts_core::ExportedImage;
+use whereabouts_core::{Descriptor, Image, ImageId, Map, Pose};
 
 /// Counts of a map are kept in so many parts.
 const PARTS: i16 = 16;

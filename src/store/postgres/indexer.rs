@@ -14,7 +14,7 @@ use uuid::Uuid;
 use super::super::StoreError;
 use super::descriptors::{MOST_INDEXED, graph, table};
 use super::{Inner, count};
-use crate::domain::Map;
+use whereabouts_core::Map;
 
 /// The pause between two looks for maps without an index.
 const PAUSE: Duration = Duration::from_secs(1);

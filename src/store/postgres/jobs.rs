@@ -20,7 +20,7 @@ use super::super::{
 use super::listener::{DELIVERIES, JOBS};
 use super::statements::alone;
 use super::{Inner, PostgresStore, count, counted, record, seconds};
-use crate::domain::{Job, JobState, StoredWebhook};
+use whereabouts_core::{Job, JobState, StoredWebhook};
 
 /// So close to its bound the length of the queue is counted by one submission after another; before that,
 /// as many submissions at once may do no harm.

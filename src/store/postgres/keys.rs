@@ -6,7 +6,7 @@ use tokio::sync::watch;
 use super::super::{KeyStore, StoreError};
 use super::listener::KEYS;
 use super::{PostgresStore, record};
-use crate::domain::StoredKey;
+use whereabouts_core::StoredKey;
 
 #[async_trait]
 impl KeyStore for PostgresStore {

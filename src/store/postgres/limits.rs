@@ -10,7 +10,7 @@ use jiff_sqlx::ToSqlx;
 use super::super::{Draw, Drawn, SharedLimits, StoreError};
 use super::PostgresStore;
 use super::statements::alone;
-use crate::refine::mllm::Spent;
+use whereabouts_core::Spent;
 
 /// The advisory lock of those who set something aside.
 const BUDGET_LOCK: i64 = 0x7768_6572_6561_0003;

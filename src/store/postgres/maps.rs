@@ -11,10 +11,10 @@ use super::super::changes::{changed_map, check_dim, removed};
 use super::super::{Added, IndexState, LookAlikes, MapStore, StoreError};
 use super::descriptors::make_table;
 use super::{Inner, PostgresStore, counted, record};
-use crate::domain::{
+use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Image, ImageId, Map, MapName, Pose,
 };
-use crate::retrieve::index::SearchMode;
+use whereabouts_index::SearchMode;
 
 #[async_trait]
 impl MapStore for PostgresStore {

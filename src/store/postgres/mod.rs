@@ -46,7 +46,7 @@ use self::descriptions::KnownLevels;
 pub use self::schema::{SchemaState, migrate, schema_of};
 use self::schema::{schema_state, too_new};
 use super::{DescriptionBounds, Objects, StoreError};
-use crate::retrieve::index::IndexSettings;
+use whereabouts_index::IndexSettings;
 
 /// How the store in PostgreSQL works.
 #[derive(Debug, Clone)]

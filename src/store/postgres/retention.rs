@@ -7,7 +7,7 @@ use jiff_sqlx::ToSqlx;
 use super::super::{KeepJobs, RemovedJobs, Retention, StoreError};
 use super::descriptors::SIZES;
 use super::{Inner, PostgresStore, count, counted};
-use crate::domain::MapName;
+use whereabouts_core::MapName;
 
 #[async_trait]
 impl Retention for PostgresStore {

@@ -8,7 +8,7 @@ use sqlx::postgres::PgRow;
 
 use super::super::{StoreError, UsageStore};
 use super::PostgresStore;
-use crate::domain::{DayUsage, Usage};
+use whereabouts_core::{DayUsage, Usage};
 
 #[async_trait]
 impl UsageStore for PostgresStore {

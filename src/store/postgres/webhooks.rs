@@ -16,7 +16,7 @@ use super::super::{ForgottenDeliveries, KeepDeliveries, StoreError, StoredDelive
 use super::listener::DELIVERIES;
 use super::statements::alone;
 use super::{Inner, PostgresStore, count, counted, record};
-use crate::domain::{Attempt, Delivery, DeliveryState, StoredWebhook};
+use whereabouts_core::{Attempt, Delivery, DeliveryState, StoredWebhook};
 
 /// The advisory lock of those who add webhooks.
 const WEBHOOKS_LOCK: i64 = 0x7768_6572_6561_0002;

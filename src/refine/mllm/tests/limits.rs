@@ -3,7 +3,7 @@
 use async_trait::async_trait;
 
 use super::*;
-use crate::domain::{Ranking, RefinerKind, Usage};
+use whereabouts_core::{Ranking, RefinerKind, Usage};
 
 /// Stands in for the local refiner: turns the coarse order round.
 struct Reverse;

@@ -10,16 +10,18 @@ use jiff::Timestamp;
 use jiff::civil::Date;
 use uuid::Uuid;
 
-use super::super::mock_mllm::{MockMllm, Script};
 use super::super::settings::tests::defaults;
 use super::*;
-use crate::domain::{
+use whereabouts_core::{CachedDescription, DescribedFrame, Secret, SimilarFrame};
+use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, DayUsage, Descriptor, DescriptorKind, Digest,
     Frame, Image, ImageId, Job, Map, MapName, MediaType, Pose, Precision, RefinerKind, StandIn,
 };
-use crate::retrieve::decode::encode_jpeg;
-use crate::retrieve::index::SearchMode;
-use crate::store::{Added, BlobPin, IndexState, LookAlikes, Query, Step, StoreError};
+use whereabouts_index::SearchMode;
+use whereabouts_store::{Added, BlobPin, IndexState, LookAlikes, Query, Step, StoreError};
+use whereabouts_telemetry::metrics::registry;
+use whereabouts_testkit::mock_mllm::{MockMllm, Script};
+use whereabouts_vision::decode::encode_jpeg;
 
 /// The key that every call must carry.
 pub const KEY: &str = "sk-test-5c1f";
@@ -88,7 +90,7 @@ fn refiner(
         cache: cache.clone(),
         usage: cache.clone(),
         shared: None,
-        metrics: Arc::new(Metrics::new()),
+        metrics: Arc::new(RefineMetrics::register(&mut registry(), Arc::default())),
         limits: ImageLimits { max_pixels: 1_000_000 },
         fallback,
     };

@@ -6,7 +6,7 @@ use super::super::trees::{
     queued_job,
 };
 use super::{Doctor, some};
-use crate::store::{JobRecord, StoreError};
+use crate::{JobRecord, StoreError};
 
 impl Doctor<'_> {
     pub(super) fn jobs(&mut self) -> Result<(), StoreError> {

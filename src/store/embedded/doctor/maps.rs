@@ -12,9 +12,9 @@ use super::super::maps::remove_folder;
 use super::super::segments::VectorFiles;
 use super::super::trees::{BlobOwner, StoredImage, blob_ref_key, decode, failed};
 use super::{Doctor, some};
-use crate::domain::{ImageId, Map, Precision};
-use crate::retrieve::index::SealedGraph;
-use crate::store::StoreError;
+use crate::StoreError;
+use whereabouts_core::{ImageId, Map, Precision};
+use whereabouts_index::SealedGraph;
 
 /// A map and the room it takes.
 #[derive(Debug, Clone, Serialize)]

@@ -16,7 +16,7 @@ pub use self::sizes::Sizes;
 use super::super::StoreError;
 use super::trees::Trees;
 use super::{check_folder, compact, lock, mark, schema};
-use crate::domain::{Digest, ImageId};
+use whereabouts_core::{Digest, ImageId};
 
 const CACHE_BYTES: u64 = 64 << 20;
 /// As many of a kind are named in a finding.

@@ -8,8 +8,8 @@ use walkdir::WalkDir;
 
 use super::super::trees::failed;
 use super::{Doctor, some};
-use crate::domain::Digest;
-use crate::store::StoreError;
+use crate::StoreError;
+use whereabouts_core::Digest;
 
 impl Doctor<'_> {
     /// Where the bytes of a digest are.

@@ -7,7 +7,7 @@ use serde::Serialize;
 use walkdir::WalkDir;
 
 use super::Report;
-use crate::store::StoreError;
+use crate::StoreError;
 
 /// Less room than this is worth a word: a start may need to copy the database.
 const LITTLE_ROOM: u64 = 1 << 30;

@@ -7,11 +7,11 @@ use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::super::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
-use crate::domain::{
+use crate::{Draft, DraftStore, MapStore};
+use whereabouts_core::{
     Descriptor, DescriptorKind, Digest, Frame, Image, Map, MediaType, Precision, Scene,
 };
-use crate::retrieve::index::IndexSettings;
-use crate::store::{Draft, DraftStore, MapStore};
+use whereabouts_index::IndexSettings;
 
 pub fn settings(dir: &Path) -> EmbeddedSettings {
     EmbeddedSettings {

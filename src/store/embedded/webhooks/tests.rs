@@ -5,7 +5,7 @@ use uuid::Uuid;
 
 use super::super::drafts::tests::settings;
 use super::*;
-use crate::domain::{Then, Webhook, WebhookEvent, WebhookSecret};
+use whereabouts_core::{Then, Webhook, WebhookEvent, WebhookSecret};
 
 /// A webhook of which so many pings wait.
 async fn pinged(store: &EmbeddedStore, pings: usize) -> (Uuid, Vec<Uuid>) {

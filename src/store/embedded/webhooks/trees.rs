@@ -8,7 +8,7 @@ use uuid::Uuid;
 use super::super::super::changes::{check_enabled, news_of, no_webhook};
 use super::super::super::{KeepDeliveries, StoreError};
 use super::super::trees::{decode, encode, failed, get, transaction_failed};
-use crate::domain::{Delivery, DeliveryState, Job, StoredWebhook};
+use whereabouts_core::{Delivery, DeliveryState, Job, StoredWebhook};
 
 /// The sled trees of webhooks.
 #[derive(Clone)]

@@ -1,0 +1,26 @@
+//! Compiles the gRPC contract, without a protoc on the machine.
+
+use std::error::Error;
+use std::path::PathBuf;
+use std::{env, fs};
+
+use prost::Message as _;
+
+const CONTRACT: [&str; 4] = ["types", "job", "localization", "map"];
+
+fn main() -> Result<(), Box<dyn Error>> {
+    println!("cargo::rerun-if-changed=../../proto");
+    let files = CONTRACT.map(|name| format!("../../proto/whereabouts/v1/{name}.proto"));
+    let mut compiler = protox::Compiler::new(["../../proto"])?;
+    compiler.include_imports(true).include_source_info(true).open_files(files)?;
+    tonic_prost_build::configure()
+        .build_client(false)
+        .build_transport(false)
+        .bytes(".whereabouts.v1")
+        .compile_fds(compiler.file_descriptor_set())?;
+    // What reflection tells, without the comments.
+    let mut told = compiler.file_descriptor_set();
+    told.file.iter_mut().for_each(|file| file.source_code_info = None);
+    let out = PathBuf::from(env::var("OUT_DIR")?).join("whereabouts.v1.bin");
+    Ok(fs::write(out, told.encode_to_vec())?)
+}

@@ -1,0 +1,44 @@
+//! The contract in types: what travels between clients and the server.
+
+mod batch;
+#[cfg(feature = "client")]
+mod client;
+#[cfg(feature = "grpc")]
+mod convert;
+mod error;
+mod images;
+mod jobs;
+mod keys;
+mod localize;
+mod maps;
+mod usage;
+mod webhooks;
+
+pub use self::batch::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
+#[cfg(feature = "client")]
+pub use self::client::{Client, LONGEST_PAUSE, PATIENCE, explained, segment};
+#[cfg(feature = "grpc")]
+pub use self::convert::{job_state_to, moment_to};
+pub use self::error::ErrorKind;
+pub use self::images::{ExportPage, ImageMeta, ImagePage, ImportedImage};
+pub use self::jobs::{JobChange, JobPage, JobStatus, Missed, PairDescribed, PairRegions};
+pub use self::keys::{MadeKey, NewKey};
+pub use self::localize::{
+    Answer, JobLink, NoJob, NoJobReason, RefineMode, TimingMs, TrackEstimate,
+};
+pub use self::maps::{
+    CalibrationState, IndexKind, MapChange, MapState, Reindex, ReindexRequest, ReindexState,
+};
+pub use self::usage::{Today, Total, UsageReport};
+pub use self::webhooks::{DeliveryPage, MadeWebhook, NewWebhook};
+
+/// The messages and services of the contract in `proto/`, as generated.
+#[cfg(feature = "grpc")]
+#[allow(missing_docs, clippy::all, clippy::pedantic)]
+pub mod proto {
+    tonic::include_proto!("whereabouts.v1");
+}
+
+/// The contract as an encoded `FileDescriptorSet`, for gRPC reflection.
+#[cfg(feature = "grpc")]
+pub const DESCRIPTOR_SET: &[u8] = tonic::include_file_descriptor_set!("whereabouts.v1");

@@ -1,0 +1,46 @@
+//! The words of the service as plain types: map, image, pose, descriptor, candidate, job.
+//!
+//! A value of these types obeys its rules by construction (a [`Descriptor`] has unit norm, a
+//! [`Ranking`] is a permutation), so nobody downstream checks again. No I/O happens here.
+
+mod candidate;
+pub mod confidence;
+pub mod dense;
+mod description;
+mod descriptor;
+mod digest;
+mod image;
+mod job;
+mod key;
+mod map;
+mod pose;
+mod secret;
+mod service_time;
+mod spend;
+mod webhook;
+
+pub use self::image::{ExportedImage, Image, ImageId, MediaType};
+pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
+pub use confidence::{Calibration, CalibrationSettings, Estimate, Evidence};
+pub use dense::DenseFeatures;
+pub use description::{CacheLevels, CachedDescription, DescribedFrame, PairRegion, SimilarFrame};
+pub use descriptor::{Descriptor, DescriptorError, dot};
+pub use digest::Digest;
+pub use job::{
+    DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage, utc_day,
+};
+pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
+pub use map::{DescriptorKind, Frame, Map, MapName, Precision, Scene};
+pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError};
+pub use secret::Secret;
+pub use service_time::ServiceTime;
+pub use spend::Spent;
+pub use webhook::{
+    Attempt, Delivery, DeliveryState, Message, StoredWebhook, Then, Webhook, WebhookEvent,
+    WebhookSecret,
+};
+
+/// A text that does not obey the rules of the type it was meant for.
+#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+#[error("{0}")]
+pub struct InvalidName(pub String);

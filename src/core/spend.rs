@@ -1,0 +1,39 @@
+//! What calls to a paid model cost.
+
+use crate::DayUsage;
+
+/// An amount spent on model calls.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Spent {
+    /// Prompt and completion tokens.
+    pub tokens: u64,
+    /// Money, in the currency of the prices.
+    pub money: f64,
+}
+
+impl From<&DayUsage> for Spent {
+    fn from(day: &DayUsage) -> Self {
+        let tokens = day.usage.prompt_tokens + day.usage.completion_tokens;
+        Self { tokens, money: day.money }
+    }
+}
+
+impl Spent {
+    /// The sum.
+    pub fn plus(self, other: Self) -> Self {
+        Self { tokens: self.tokens + other.tokens, money: self.money + other.money }
+    }
+
+    /// The difference; nothing where more is taken than there is.
+    pub fn minus(self, other: Self) -> Self {
+        Self {
+            tokens: self.tokens.saturating_sub(other.tokens),
+            money: (self.money - other.money).max(0.0),
+        }
+    }
+
+    /// Whether either limit is exceeded; a limit of 0 means no limit.
+    pub fn exceeds(self, tokens: u64, money: f64) -> bool {
+        (tokens > 0 && self.tokens > tokens) || (money > 0.0 && self.money > money)
+    }
+}

@@ -1,0 +1,218 @@
+//! Where the images of a folder were taken: a CSV file, their names, or their EXIF GPS.
+
+use std::collections::HashMap;
+use std::io::Cursor;
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use exif::{In, Rational, Tag, Value};
+use serde::Deserialize;
+
+use super::PictureFile;
+use whereabouts_core::{Frame, GeographicPose, MetricPose, Pose};
+
+/// Where poses come from; one source for a whole folder.
+#[derive(Debug)]
+pub enum PoseSource {
+    /// A CSV file.
+    Csv {
+        /// The frame of all of them.
+        frame: Frame,
+        /// By path below the folder, or by file name.
+        poses: HashMap<String, Pose>,
+    },
+    /// `@easting@northing@…` in the file names: metres of a UTM zone.
+    Names,
+    /// GPS in the EXIF block of each file.
+    Exif,
+}
+
+impl PoseSource {
+    /// The CSV file that was named or lies in the folder; else the names, if they hold positions;
+    /// else EXIF.
+    pub fn find(dir: &Path, csv: Option<&Path>, files: &[PictureFile]) -> anyhow::Result<Self> {
+        let beside = dir.join("poses.csv");
+        match csv.or(beside.is_file().then_some(beside.as_path())) {
+            Some(file) => Self::from_csv(file),
+            None if files.iter().all(|file| in_name(file_name(file.id.as_str())).is_some()) => {
+                Ok(Self::Names)
+            }
+            None => Ok(Self::Exif),
+        }
+    }
+
+    fn from_csv(file: &Path) -> anyhow::Result<Self> {
+        let mut reader = csv::ReaderBuilder::new()
+            .trim(csv::Trim::All)
+            .from_path(file)
+            .with_context(|| format!("cannot read {}", file.display()))?;
+        let mut poses = HashMap::new();
+        let mut frame = None;
+        for (index, row) in reader.deserialize::<Row>().enumerate() {
+            // The header is line 1.
+            let line = index + 2;
+            let row = row.with_context(|| format!("{} line {line}", file.display()))?;
+            let name = row.file.clone();
+            let pose = row.pose().with_context(|| format!("{} line {line}", file.display()))?;
+            if *frame.get_or_insert(pose.frame()) != pose.frame() {
+                bail!("{} line {line}: lat,lon and x,y in one file", file.display());
+            }
+            poses.insert(name, pose);
+        }
+        let frame = frame.with_context(|| format!("{} has no rows", file.display()))?;
+        Ok(Self::Csv { frame, poses })
+    }
+
+    /// Where it looks, in a few words.
+    pub fn said(&self) -> &'static str {
+        match self {
+            Self::Csv { .. } => "the CSV of positions",
+            Self::Names => "their names",
+            Self::Exif => "their EXIF data",
+        }
+    }
+
+    /// The frame of the poses, as far as the source decides it.
+    pub fn frame(&self) -> Option<Frame> {
+        match self {
+            Self::Csv { frame, .. } => Some(*frame),
+            Self::Names => Some(Frame::Metric),
+            Self::Exif => None,
+        }
+    }
+
+    /// The pose of one image; `None` if the source does not know it.
+    pub fn pose(&self, id: &str, bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
+        match self {
+            Self::Csv { poses, .. } => {
+                Ok(poses.get(id).or_else(|| poses.get(file_name(id))).copied())
+            }
+            Self::Names => Ok(in_name(file_name(id))),
+            Self::Exif => in_exif(bytes),
+        }
+    }
+}
+
+#[derive(Debug, Deserialize)]
+struct Row {
+    #[serde(alias = "image", alias = "id", alias = "name", alias = "filename")]
+    file: String,
+    lat: Option<f64>,
+    lon: Option<f64>,
+    alt: Option<f64>,
+    heading: Option<f64>,
+    x: Option<f64>,
+    y: Option<f64>,
+    z: Option<f64>,
+    qx: Option<f64>,
+    qy: Option<f64>,
+    qz: Option<f64>,
+    qw: Option<f64>,
+}
+
+impl Row {
+    fn pose(self) -> anyhow::Result<Pose> {
+        let pose = match (self.lat.zip(self.lon), self.x.zip(self.y)) {
+            (Some((lat, lon)), None) => {
+                let Self { alt, heading, .. } = self;
+                Pose::Geographic(GeographicPose { lat, lon, alt, heading })
+            }
+            (None, Some((x, y))) => {
+                let Self { z, qx, qy, qz, qw, .. } = self;
+                Pose::Metric(MetricPose { x, y, z, qx, qy, qz, qw })
+            }
+            _ => bail!("a row needs lat and lon, or x and y"),
+        };
+        Ok(pose.checked()?)
+    }
+}
+
+fn file_name(id: &str) -> &str {
+    id.rsplit('/').next().unwrap_or(id)
+}
+
+/// The first two fields of `@easting@northing@…`, the names that the field's data sets share.
+fn in_name(name: &str) -> Option<Pose> {
+    let mut fields = name.strip_prefix('@')?.split('@');
+    let (x, y) = (fields.next()?.parse().ok()?, fields.next()?.parse().ok()?);
+    let pose = MetricPose { x, y, z: None, qx: None, qy: None, qz: None, qw: None };
+    Pose::Metric(pose).checked().ok()
+}
+
+fn in_exif(bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
+    let Ok(exif) = exif::Reader::new().read_from_container(&mut Cursor::new(bytes)) else {
+        return Ok(None);
+    };
+    let rationals = |tag: Tag| match exif.get_field(tag, In::PRIMARY).map(|field| &field.value) {
+        Some(Value::Rational(values)) => values.iter().map(Rational::to_f64).collect(),
+        _ => Vec::new(),
+    };
+    let is = |tag: Tag, word: &str| {
+        exif.get_field(tag, In::PRIMARY)
+            .is_some_and(|field| field.display_value().to_string().starts_with(word))
+    };
+    let degrees = |tag: Tag| match rationals(tag)[..] {
+        [degrees, minutes, seconds] => Some(degrees + minutes / 60.0 + seconds / 3600.0),
+        _ => None,
+    };
+    let (Some(lat), Some(lon)) = (degrees(Tag::GPSLatitude), degrees(Tag::GPSLongitude)) else {
+        return Ok(None);
+    };
+    let below_sea = exif
+        .get_field(Tag::GPSAltitudeRef, In::PRIMARY)
+        .and_then(|field| field.value.get_uint(0))
+        .is_some_and(|reference| reference == 1);
+    let alt = rationals(Tag::GPSAltitude).first().map(|&alt| if below_sea { -alt } else { alt });
+    let heading = rationals(Tag::GPSImgDirection).first().copied();
+    let pose = Pose::Geographic(GeographicPose {
+        lat: if is(Tag::GPSLatitudeRef, "S") { -lat } else { lat },
+        lon: if is(Tag::GPSLongitudeRef, "W") { -lon } else { lon },
+        alt: alt.filter(|alt| alt.is_finite()),
+        heading: heading.filter(|heading| heading.is_finite()),
+    });
+    Ok(Some(pose.checked().context("its EXIF GPS position is out of range")?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn csv(text: &str) -> anyhow::Result<PoseSource> {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        PoseSource::from_csv(file.path())
+    }
+
+    #[test]
+    fn the_fields_file_names_hold_metres() {
+        let Some(Pose::Metric(pose)) = in_name("@0584522.50@4477231.25@17@T@40.4@-80.0@.jpg")
+        else {
+            panic!("no pose");
+        };
+        assert_eq!((pose.x, pose.y), (584522.5, 4477231.25));
+        for name in ["a.jpg", "@.jpg", "@1@.jpg", "@x@y@.jpg", "@nan@1@.jpg", "@1e30@1@.jpg"] {
+            assert!(in_name(name).is_none(), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_csv_names_files_by_path_or_by_name() {
+        let source =
+            csv("file, lat, lon, heading\na/1.jpg, 35.5, 139.5, 90\n2.jpg,1,2,\n").unwrap();
+        assert_eq!(source.frame(), Some(Frame::Wgs84));
+        assert!(source.pose("a/1.jpg", b"").unwrap().is_some());
+        assert!(source.pose("b/2.jpg", b"").unwrap().is_some());
+        assert!(source.pose("3.jpg", b"").unwrap().is_none());
+    }
+
+    #[test]
+    fn a_bad_row_is_named_by_its_line() {
+        for text in
+            ["file,lat,lon\na,1,2\nb,95,2", "file,x,y\na,1,2\nb,,2", "file,x,y\na,1,2\nb,q,2"]
+        {
+            let error = format!("{:#}", csv(text).unwrap_err());
+            assert!(error.contains("line 3"), "{error}");
+        }
+        assert!(csv("file,lat,lon\n").is_err());
+    }
+}

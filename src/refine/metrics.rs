@@ -1,0 +1,127 @@
+//! Metric families of refinement: jobs that ended, what they cost, and lookups in the description cache.
+
+use std::sync::Arc;
+
+use jiff::Timestamp;
+use prometheus_client::encoding::EncodeLabelSet;
+use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::histogram::Histogram;
+use whereabouts_core::{Job, JobState};
+use whereabouts_telemetry::LastHour;
+use whereabouts_telemetry::metrics::{Registry, latency, register};
+
+/// Metric families of refinement jobs and of the description cache.
+#[derive(Debug)]
+pub struct RefineMetrics {
+    hourly: Arc<LastHour>,
+    jobs: Family<JobLabels, Counter>,
+    job_seconds: Family<RefinerLabels, Histogram, fn() -> Histogram>,
+    model_calls: Family<RefinerLabels, Counter>,
+    cached_descriptions: Family<RefinerLabels, Counter>,
+    tokens: Family<TokenLabels, Counter>,
+    description_lookups: Family<LookupLabels, Counter>,
+}
+
+/// What came of looking for a pair's description.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum CacheLookup {
+    /// It was there.
+    Hit,
+    /// That of a similar frame was there.
+    Similar,
+    /// It had to be bought.
+    Miss,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct JobLabels {
+    refiner: &'static str,
+    state: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct RefinerLabels {
+    refiner: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct TokenLabels {
+    refiner: &'static str,
+    direction: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct LookupLabels {
+    result: &'static str,
+}
+
+impl RefineMetrics {
+    /// Registers the families; all counts are zero.
+    pub fn register(registry: &mut Registry, hourly: Arc<LastHour>) -> Self {
+        Self {
+            hourly,
+            jobs: register(registry, "jobs_ended", "Jobs that ended", Family::default()),
+            job_seconds: register(
+                registry,
+                "job_seconds",
+                "Time from a job's submission to its end",
+                Family::new_with_constructor(latency),
+            ),
+            model_calls: register(
+                registry,
+                "model_calls",
+                "Calls to a model outside, by jobs that ended",
+                Family::default(),
+            ),
+            cached_descriptions: register(
+                registry,
+                "cached_descriptions",
+                "Descriptions that were known from an earlier job",
+                Family::default(),
+            ),
+            tokens: register(
+                registry,
+                "tokens",
+                "Tokens sent to a model outside (prompt) and received (completion)",
+                Family::default(),
+            ),
+            description_lookups: register(
+                registry,
+                "description_lookups",
+                "Pairs whose description was looked for: known (hit), known of a nearly equal frame \
+                 (similar), or bought (miss)",
+                Family::default(),
+            ),
+        }
+    }
+
+    /// Counts an ended job.
+    pub fn job_ended(&self, job: &Job) {
+        self.hourly.job_ended(Timestamp::now(), job.state == JobState::Failed);
+        let refiner = job.refiner.as_str();
+        self.jobs.get_or_create(&JobLabels { refiner, state: job.state.as_str() }).inc();
+        let (of, usage) = (RefinerLabels { refiner }, job.usage);
+        self.model_calls.get_or_create(&of).inc_by(usage.calls.into());
+        self.cached_descriptions.get_or_create(&of).inc_by(usage.cached.into());
+        for (direction, tokens) in
+            [("prompt", usage.prompt_tokens), ("completion", usage.completion_tokens)]
+        {
+            self.tokens.get_or_create(&TokenLabels { refiner, direction }).inc_by(tokens);
+        }
+        if let Some(finished) = job.finished_at {
+            let took = finished.duration_since(job.created_at).as_secs_f64();
+            self.job_seconds.get_or_create(&RefinerLabels { refiner }).observe(took.max(0.0));
+        }
+    }
+
+    /// Counts a search for a pair's description.
+    pub fn description_lookup(&self, found: CacheLookup) {
+        let result = match found {
+            CacheLookup::Hit => "hit",
+            CacheLookup::Similar => "similar",
+            CacheLookup::Miss => "miss",
+        };
+        self.description_lookups.get_or_create(&LookupLabels { result }).inc();
+    }
+}

@@ -1,0 +1,372 @@
+//! Settings: typed, with every default in one commented file, checked together at start.
+//!
+//! Defaults (`deploy/whereabouts.toml`) < the file of `--config` < environment < flags.
+
+mod answers;
+mod database;
+mod model;
+mod overrides;
+mod server;
+
+use std::path::{Path, PathBuf};
+
+use figment::Figment;
+use figment::providers::{Env, Format, Serialized, Toml};
+use serde::{Deserialize, Serialize};
+
+pub use self::answers::{Confidence, Idempotency, Jobs, Localize, Refine, Refiner};
+pub use self::database::{Database, ObjectStore};
+pub use self::model::{Image, Model, PrecisionWish, ProviderWish, cores_unless};
+pub use self::overrides::Overrides;
+pub use self::server::Server;
+use crate::http::Tiles;
+use whereabouts_refine::mllm::MllmSettings;
+use whereabouts_service::{BulkSettings, TrackSettings, WebhookSettings};
+use whereabouts_telemetry::{LogSettings, TraceSettings};
+
+/// The default settings, every key with a comment.
+pub const DEFAULTS: &str = include_str!("../../deploy/whereabouts.toml");
+
+/// All settings.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// The HTTP server.
+    pub server: Server,
+    /// The embedded store.
+    pub data: Data,
+    /// The store of many processes.
+    pub database: Database,
+    /// Where it keeps pictures.
+    pub objects: ObjectStore,
+    /// The model.
+    pub model: Model,
+    /// Decoding.
+    pub image: Image,
+    /// Search.
+    pub index: Index,
+    /// Who may ask.
+    pub auth: Auth,
+    /// Answers.
+    pub localize: Localize,
+    /// How maps are measured.
+    pub confidence: Confidence,
+    /// The frames of one robot, one after another.
+    pub track: TrackSettings,
+    /// Many images in one request.
+    pub bulk: BulkSettings,
+    /// Requests that may be sent again.
+    pub idempotency: Idempotency,
+    /// Refinement jobs.
+    pub jobs: Jobs,
+    /// Who is told of the ends of jobs.
+    pub webhooks: WebhookSettings,
+    /// The refiner.
+    pub refine: Refine,
+    /// The multimodal LLM.
+    pub mllm: MllmSettings,
+    /// The operator's console.
+    pub console: Console,
+    /// Logs.
+    pub log: LogSettings,
+    /// Traces.
+    pub traces: TraceSettings,
+}
+
+/// `[data]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Data {
+    /// The folder of the embedded store.
+    pub dir: PathBuf,
+    /// sled's page cache, in bytes.
+    pub db_cache_bytes: u64,
+    /// Bytes of the disk that stay free.
+    pub min_free_bytes: u64,
+    /// The most changes in one commit.
+    pub commit_batch: usize,
+    /// Descriptions that were paid for, in bytes.
+    pub description_cache_bytes: u64,
+    /// How long they are used, in days.
+    pub description_cache_days: u64,
+    /// For how many days it is known what was spent.
+    pub usage_days: u32,
+}
+
+/// `[index]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Index {
+    /// The largest map that is searched exactly, in images.
+    pub exact_up_to: usize,
+    /// HNSW: neighbours of a point.
+    pub m: usize,
+    /// HNSW: points looked at when inserting.
+    pub ef_construction: usize,
+    /// HNSW: points looked at when searching.
+    pub ef_search: usize,
+    /// Threads that build graphs; 0 for half of the cores.
+    pub threads: usize,
+    /// The share of dead points from which a graph is built again.
+    pub max_dead_share: f32,
+    /// The pause between two searches that are held against exact search; 0 for none.
+    pub check_s: u64,
+}
+
+/// `[auth]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Auth {
+    /// Whether callers need a key.
+    pub keys: KeysWanted,
+}
+
+/// Whether callers need a key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum KeysWanted {
+    /// Unless the server listens on loopback.
+    Auto,
+    /// Always.
+    Required,
+    /// Never: whoever reaches the server may do everything.
+    Off,
+}
+
+/// `[console]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Console {
+    /// Where the pictures behind a plan come from; empty for none.
+    pub tiles_url: String,
+    /// Whom to thank for them.
+    pub tiles_attribution: String,
+}
+
+impl Console {
+    /// The server of map tiles, if there is one.
+    pub fn tiles(&self) -> Option<Tiles> {
+        let (url, attribution) = (self.tiles_url.clone(), self.tiles_attribution.clone());
+        (!url.is_empty()).then_some(Tiles { url, attribution })
+    }
+
+    fn contradiction(&self) -> Option<String> {
+        let url = &self.tiles_url;
+        if url.is_empty() {
+            return None;
+        }
+        // It becomes a part of a header.
+        let whole = ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part));
+        let plain = url.bytes().all(|byte| byte.is_ascii_graphic() && !b";,'\"".contains(&byte));
+        let known = ["https://", "http://"].iter().any(|scheme| url.starts_with(scheme));
+        (!(whole && plain && known)).then(|| {
+            "console.tiles_url must be an address like https://HOST/{z}/{x}/{y}.png".to_owned()
+        })
+    }
+}
+
+/// Settings that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// A value is missing, unknown or of the wrong type.
+    #[error("the configuration cannot be read: {0}")]
+    Malformed(Box<figment::Error>),
+    /// The file that was named is not there.
+    #[error("there is no configuration file {0}")]
+    NoFile(PathBuf),
+    /// Values contradict each other.
+    #[error("the configuration contradicts itself: {0}")]
+    Contradiction(String),
+}
+
+impl Config {
+    /// Layers the defaults, the file, the environment and the flags.
+    pub fn load(file: Option<&Path>, flags: &Overrides) -> Result<Self, ConfigError> {
+        let mut layers = Figment::from(Toml::string(DEFAULTS));
+        if let Some(file) = file {
+            if !file.is_file() {
+                return Err(ConfigError::NoFile(file.to_owned()));
+            }
+            layers = layers.merge(Toml::file_exact(file));
+        }
+        // A variable without "__" names no setting: WHEREABOUTS_DATA and the like are for others.
+        let environment =
+            Env::prefixed("WHEREABOUTS_").filter(|key| key.as_str().contains("__")).split("__");
+        let config: Self = layers
+            .merge(environment)
+            .merge(Serialized::defaults(flags))
+            .extract()
+            .map_err(|error| ConfigError::Malformed(Box::new(error)))?;
+        match config.contradiction() {
+            Some(why) => Err(ConfigError::Contradiction(why)),
+            None => Ok(config),
+        }
+    }
+
+    /// Whether callers need a key.
+    pub fn keys_required(&self) -> bool {
+        match self.auth.keys {
+            KeysWanted::Auto => !self.server.listen.ip().is_loopback(),
+            KeysWanted::Required => true,
+            KeysWanted::Off => false,
+        }
+    }
+
+    fn contradiction_of_a_section(&self) -> Option<String> {
+        let track = || self.track.contradiction();
+        if self.bulk.memory_bytes < self.server.body_limit_bytes {
+            return Some("bulk.memory_bytes must not be less than server.body_limit_bytes".into());
+        }
+        if self.jobs.workers == 0 && !self.database.is_set() {
+            return Some(
+                "jobs.workers must be at least 1: only with a database (database.url) do other processes \
+                 refine"
+                    .into(),
+            );
+        }
+        let timeout = self.server.request_timeout().as_secs();
+        let console = || self.console.contradiction();
+        let objects = || self.objects.contradiction(timeout);
+        let scale = || match self.database.is_set() {
+            true => self.database.contradiction().or_else(objects),
+            false => None,
+        };
+        let traces = || self.traces.contradiction();
+        self.server.contradiction().or_else(track).or_else(console).or_else(scale).or_else(traces)
+    }
+
+    fn contradiction(&self) -> Option<String> {
+        let at_least_one = [
+            ("server.body_limit_bytes", self.server.body_limit_bytes),
+            ("server.max_requests", self.server.max_requests),
+            ("server.max_streams", self.server.max_streams),
+            ("server.max_connections", self.server.max_connections),
+            ("server.max_headers", self.server.max_headers),
+            ("server.max_concurrent", self.server.max_concurrent as usize),
+            ("server.stream_idle_s", self.server.stream_idle_s as usize),
+            ("server.header_timeout_s", self.server.header_timeout_s as usize),
+            ("server.body_timeout_s", self.server.body_timeout_s as usize),
+            ("server.body_pause_s", self.server.body_pause_s as usize),
+            ("server.write_timeout_s", self.server.write_timeout_s as usize),
+            ("data.usage_days", self.data.usage_days as usize),
+            ("data.commit_batch", self.data.commit_batch),
+            ("model.max_batch", self.model.max_batch),
+            ("model.download_attempts", self.model.download_attempts as usize),
+            ("model.download_stall_s", self.model.download_stall_s as usize),
+            ("image.queue", self.image.queue),
+            ("image.max_wait_ms", self.image.max_wait_ms as usize),
+            ("image.max_retry_after_s", self.image.max_retry_after_s as usize),
+            ("index.m", self.index.m),
+            ("index.ef_construction", self.index.ef_construction),
+            ("index.ef_search", self.index.ef_search),
+            ("localize.k", self.localize.k),
+            ("bulk.in_flight", self.bulk.in_flight),
+            ("bulk.max_images", self.bulk.max_images),
+            ("jobs.queue", self.jobs.queue),
+            ("jobs.attempts", self.jobs.attempts as usize),
+            ("jobs.sweep_s", self.jobs.sweep_s as usize),
+            ("jobs.sweep_batch", self.jobs.sweep_batch),
+            ("refine.candidates", self.refine.candidates),
+            ("refine.local_candidates", self.refine.local_candidates),
+        ];
+        if let Some((key, _)) = at_least_one.iter().find(|(_, value)| *value == 0) {
+            return Some(format!("{key} must be at least 1"));
+        }
+        if self.model.loaded < 2 {
+            return Some("model.loaded must be at least 2: a reindex needs two models".into());
+        }
+        if self.localize.max_k > 100 || self.localize.k > self.localize.max_k {
+            return Some("localize.k <= localize.max_k <= 100 must hold".into());
+        }
+        if self.jobs.lease_s > 24 * 3600 {
+            return Some("jobs.lease_s must be at most a day".into());
+        }
+        if self.refine.candidates.max(self.refine.local_candidates) > self.localize.max_k {
+            return Some(
+                "refine.candidates and refine.local_candidates must not exceed localize.max_k"
+                    .into(),
+            );
+        }
+        if !self.model.hub.starts_with("https://") && !self.model.hub.starts_with("http://") {
+            return Some("model.hub must begin with https:// or http://".into());
+        }
+        if self.index.m > 256 {
+            return Some("index.m must not exceed 256".into());
+        }
+        if self.refine.refiner == Refiner::Mllm
+            && let Some(why) = self.mllm.contradiction(self.jobs.timeout_s)
+        {
+            return Some(why);
+        }
+        if let Some(why) = self.contradiction_of_a_section() {
+            return Some(why);
+        }
+        if let Some(why) = self.webhooks.contradiction() {
+            return Some(why);
+        }
+        if !(0.0..=1.0).contains(&self.jobs.shed_at) {
+            return Some("jobs.shed_at must be from 0 to 1".into());
+        }
+        if self.jobs.lease_s <= self.jobs.timeout_s {
+            return Some(format!(
+                "jobs.lease_s ({}) must outlast jobs.timeout_s ({}), or two workers would refine \
+                 one job",
+                self.jobs.lease_s, self.jobs.timeout_s
+            ));
+        }
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use whereabouts_core::RefinerKind;
+
+    fn with_file(text: &str) -> Result<Config, ConfigError> {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        Config::load(Some(file.path()), &Overrides::default())
+    }
+
+    #[test]
+    fn the_defaults_are_whole_and_consistent() {
+        let config = Config::load(None, &Overrides::default()).unwrap();
+        assert_eq!(config.localize.k, 10);
+        assert_eq!(config.refine.refiner.kind(), Some(RefinerKind::Local));
+    }
+
+    #[test]
+    fn a_flag_goes_over_the_file() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "[model]\nname = \"a\"\nthreads = 3").unwrap();
+        let flags = Overrides::default().model(Some("b".into()));
+        let config = Config::load(Some(file.path()), &flags).unwrap();
+        assert_eq!((config.model.name.as_str(), config.model.threads), ("b", 3));
+    }
+
+    #[test]
+    fn a_misspelt_key_is_named() {
+        let error = with_file("[server]\nlisen = \"1.2.3.4:5\"").unwrap_err().to_string();
+        assert!(error.contains("lisen"), "{error}");
+    }
+
+    #[test]
+    fn a_lease_shorter_than_the_job_is_refused() {
+        let error = with_file("[jobs]\nlease_s = 10\ntimeout_s = 10").unwrap_err().to_string();
+        assert!(error.contains("must outlast"), "{error}");
+    }
+
+    #[test]
+    fn a_body_that_may_take_longer_than_its_request_is_refused() {
+        let file = "[server]\nbody_timeout_s = 30\nrequest_timeout_s = 30";
+        let error = with_file(file).unwrap_err().to_string();
+        assert!(error.contains("must outlast"), "{error}");
+    }
+
+    #[test]
+    fn a_missing_file_is_an_error() {
+        let error = Config::load(Some(Path::new("no-such.toml")), &Overrides::default());
+        assert!(matches!(error, Err(ConfigError::NoFile(_))));
+    }
+}

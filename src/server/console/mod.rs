@@ -1,0 +1,141 @@
+//! The operator's console: a page of plain modules and one stylesheet, all in the binary. It knows no more than
+//! the API gives, to whoever has signed in.
+
+use axum::Router;
+use axum::extract::Path;
+use axum::http::header::{
+    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, ETAG, IF_NONE_MATCH,
+};
+use axum::http::header::{REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS};
+use axum::http::{HeaderMap, HeaderValue, StatusCode};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+
+use whereabouts_core::Digest;
+
+/// The page.
+const PAGE: &str = "index.html";
+
+macro_rules! assets {
+    ($($name:literal),+ $(,)?) => {
+        &[$(($name, include_str!(concat!("assets/", $name)))),+]
+    };
+}
+
+/// Every file of the page.
+const ASSETS: &[(&str, &str)] = assets![
+    "api.js",
+    "app.js",
+    "chart.js",
+    "dom.js",
+    "format.js",
+    "health.js",
+    "icon.svg",
+    "images.js",
+    "index.html",
+    "job.js",
+    "jobs.js",
+    "map.js",
+    "maps.js",
+    "pair.js",
+    "plan.js",
+    "points.js",
+    "style.css",
+    "try.js",
+    "words.js",
+];
+
+/// What a browser is told to allow the page.
+#[derive(Debug, Clone)]
+struct Guarded {
+    policy: Option<HeaderValue>,
+    referrer: &'static str,
+}
+
+/// The routes of the page. `tiles` is the address of map tiles, from whose host pictures may come.
+pub fn routes<S: Clone + Send + Sync + 'static>(tiles: Option<&str>) -> Router<S> {
+    let guarded = Guarded {
+        policy: HeaderValue::from_str(&policy(tiles)).ok(),
+        // Servers of tiles want to know who asks.
+        referrer: if tiles.is_some() { "strict-origin" } else { "no-referrer" },
+    };
+    let of_page = guarded.clone();
+    Router::new()
+        .route("/", get(move |headers: HeaderMap| async move { file(PAGE, &headers, of_page) }))
+        .route(
+            "/console/{file}",
+            get(move |Path(name): Path<String>, headers: HeaderMap| async move {
+                file(&name, &headers, guarded)
+            }),
+        )
+}
+
+/// Nothing but what this server serves, and the tiles; no script or style within the page.
+fn policy(tiles: Option<&str>) -> String {
+    let origin = tiles.and_then(|url| {
+        let (scheme, rest) = url.split_once("://")?;
+        Some(format!(" {scheme}://{}", rest.split('/').next()?))
+    });
+    format!(
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:{}; connect-src 'self'; \
+         base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+        origin.unwrap_or_default()
+    )
+}
+
+fn file(name: &str, headers: &HeaderMap, guarded: Guarded) -> Response {
+    let Some((_, text)) = ASSETS.iter().find(|(known, _)| *known == name) else {
+        return StatusCode::NOT_FOUND.into_response();
+    };
+    let tag = format!("\"{}\"", &Digest::of(text.as_bytes()).hex()[..16]);
+    let known = headers.get(IF_NONE_MATCH).is_some_and(|sent| sent.as_bytes() == tag.as_bytes());
+    let mut response = match known {
+        true => StatusCode::NOT_MODIFIED.into_response(),
+        false => ([(CONTENT_TYPE, media_type(name))], *text).into_response(),
+    };
+    let told = response.headers_mut();
+    // Asked for each time, and sent again only when it has changed.
+    told.insert(CACHE_CONTROL, HeaderValue::from_static("no-cache"));
+    told.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    told.insert(REFERRER_POLICY, HeaderValue::from_static(guarded.referrer));
+    told.extend(HeaderValue::from_str(&tag).ok().map(|tag| (ETAG, tag)));
+    told.extend(guarded.policy.map(|policy| (CONTENT_SECURITY_POLICY, policy)));
+    response
+}
+
+fn media_type(name: &str) -> &'static str {
+    match name.rsplit('.').next() {
+        Some("html") => "text/html; charset=utf-8",
+        Some("css") => "text/css; charset=utf-8",
+        Some("svg") => "image/svg+xml",
+        Some("webmanifest") => "application/manifest+json",
+        _ => "text/javascript; charset=utf-8",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_file_of_the_folder_is_served_and_all_are_small() {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("console/assets");
+        let mut there: Vec<_> = std::fs::read_dir(folder)
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .collect();
+        there.sort();
+        let mut served: Vec<_> = ASSETS.iter().map(|(name, _)| (*name).to_owned()).collect();
+        served.sort();
+        assert_eq!(served, there);
+        let bytes: usize = ASSETS.iter().map(|(_, text)| text.len()).sum();
+        assert!(bytes < 200_000, "{bytes} bytes");
+    }
+
+    #[test]
+    fn pictures_may_come_from_the_host_of_the_tiles_and_nothing_else_from_anywhere() {
+        assert!(policy(None).contains("img-src 'self' blob:;"));
+        let with_tiles = policy(Some("https://tiles.example:8443/{z}/{x}/{y}.png"));
+        assert!(with_tiles.contains("img-src 'self' blob: https://tiles.example:8443;"));
+    }
+}

@@ -1,0 +1,149 @@
+//! Between the messages of the contract and the types of the service.
+
+use jiff::Timestamp;
+use serde_json::{Map as JsonObject, Value};
+
+use super::proto;
+use whereabouts_api::RefineMode;
+use whereabouts_core::{DescriptorKind, Frame, JobState, Priority, Scene};
+use whereabouts_service::ServiceError;
+
+/// The value of an enum by its number.
+fn known<T: TryFrom<i32>>(field: &str, number: i32) -> Result<T, ServiceError> {
+    T::try_from(number).map_err(|_| {
+        ServiceError::malformed(format!("{field} is {number}, which this server does not know"))
+    })
+}
+
+pub(super) fn refine_mode(number: i32) -> Result<RefineMode, ServiceError> {
+    Ok(match known("refine", number)? {
+        proto::RefineMode::Unspecified | proto::RefineMode::Async => RefineMode::Async,
+        proto::RefineMode::Wait => RefineMode::Wait,
+        proto::RefineMode::Off => RefineMode::Off,
+    })
+}
+
+pub(super) fn priority(number: i32) -> Result<Priority, ServiceError> {
+    Ok(match known("priority", number)? {
+        proto::Priority::Unspecified | proto::Priority::Normal => Priority::Normal,
+        proto::Priority::Low => Priority::Low,
+        proto::Priority::High => Priority::High,
+    })
+}
+
+/// `None` for any.
+pub(super) fn job_state(number: i32) -> Result<Option<JobState>, ServiceError> {
+    Ok(match known("state", number)? {
+        proto::JobState::Unspecified => None,
+        proto::JobState::Queued => Some(JobState::Queued),
+        proto::JobState::Running => Some(JobState::Running),
+        proto::JobState::Succeeded => Some(JobState::Succeeded),
+        proto::JobState::Degraded => Some(JobState::Degraded),
+        proto::JobState::Failed => Some(JobState::Failed),
+        proto::JobState::Cancelled => Some(JobState::Cancelled),
+    })
+}
+
+/// `None` for as it is.
+pub(super) fn scene(number: i32) -> Result<Option<Scene>, ServiceError> {
+    Ok(match known("scene", number)? {
+        proto::Scene::Unspecified => None,
+        proto::Scene::Indoor => Some(Scene::Indoor),
+        proto::Scene::Outdoor => Some(Scene::Outdoor),
+    })
+}
+
+/// `None` for as it is.
+pub(super) fn descriptor(number: i32) -> Result<Option<DescriptorKind>, ServiceError> {
+    Ok(match known("descriptor", number)? {
+        proto::Descriptor::Unspecified => None,
+        proto::Descriptor::Gem => Some(DescriptorKind::Gem),
+        proto::Descriptor::Cls => Some(DescriptorKind::Cls),
+    })
+}
+
+/// `None` for as it is.
+pub(super) fn frame(number: i32) -> Result<Option<Frame>, ServiceError> {
+    Ok(match known("frame", number)? {
+        proto::Frame::Unspecified => None,
+        proto::Frame::Wgs84 => Some(Frame::Wgs84),
+        proto::Frame::Metric => Some(Frame::Metric),
+    })
+}
+
+pub(super) fn moment(moment: prost_types::Timestamp) -> Result<Timestamp, ServiceError> {
+    Timestamp::new(moment.seconds, moment.nanos)
+        .map_err(|error| ServiceError::unprocessable(format!("captured_at: {error}")))
+}
+
+/// A pose in the form in which the service checks it against the map.
+pub(super) fn pose(pose: proto::Pose) -> Result<Value, ServiceError> {
+    let fields = match pose.frame {
+        None => Vec::new(),
+        Some(proto::pose::Frame::Geographic(pose)) => vec![
+            ("lat", Some(pose.lat)),
+            ("lon", Some(pose.lon)),
+            ("alt", pose.alt),
+            ("heading", pose.heading),
+        ],
+        Some(proto::pose::Frame::Metric(pose)) => {
+            let part = |of: fn(&proto::Quaternion) -> f64| pose.orientation.as_ref().map(of);
+            vec![
+                ("x", Some(pose.x)),
+                ("y", Some(pose.y)),
+                ("z", pose.z),
+                ("qx", part(|q| q.x)),
+                ("qy", part(|q| q.y)),
+                ("qz", part(|q| q.z)),
+                ("qw", part(|q| q.w)),
+            ]
+        }
+    };
+    let mut given = JsonObject::new();
+    for (field, value) in fields {
+        let Some(value) = value else { continue };
+        // JSON has no word for it.
+        if !value.is_finite() {
+            let detail = format!("{field} is {value}; it must be a number");
+            return Err(ServiceError::unprocessable(detail));
+        }
+        given.insert(field.to_owned(), value.into());
+    }
+    Ok(Value::Object(given))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use whereabouts_api::moment_to;
+    use whereabouts_core::Pose;
+
+    #[test]
+    fn a_pose_comes_back_as_it_was_sent() {
+        let sent = proto::Pose {
+            frame: Some(proto::pose::Frame::Metric(proto::MetricPose {
+                x: 1.5,
+                y: -2.0,
+                z: None,
+                orientation: Some(proto::Quaternion { x: 0.0, y: 0.0, z: 0.6, w: 0.8 }),
+            })),
+        };
+        let read = Pose::from_json(Frame::Metric, pose(sent).unwrap()).unwrap();
+        assert_eq!(proto::Pose::from(read), sent);
+        assert!(Pose::from_json(Frame::Wgs84, pose(sent).unwrap()).is_err());
+        assert!(
+            Pose::from_json(Frame::Metric, pose(proto::Pose { frame: None }).unwrap()).is_err()
+        );
+        let nowhere = proto::MetricPose { x: 0.0, y: 0.0, z: Some(f64::NAN), orientation: None };
+        let nowhere = proto::Pose { frame: Some(proto::pose::Frame::Metric(nowhere)) };
+        assert!(pose(nowhere).unwrap_err().detail.contains('z'));
+    }
+
+    #[test]
+    fn moments_before_1970_have_positive_nanoseconds() {
+        let at: Timestamp = "1969-12-31T23:59:59.25Z".parse().unwrap();
+        let message = moment_to(at);
+        assert_eq!((message.seconds, message.nanos), (-1, 250_000_000));
+        assert_eq!(moment(message).unwrap(), at);
+    }
+}

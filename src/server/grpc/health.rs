@@ -1,0 +1,93 @@
+//! The standard services of health and reflection.
+
+use futures_util::{StreamExt, stream};
+use tonic::{Request, Response, Status};
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_server::Health;
+use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
+use tonic_reflection::server::{Builder, Error};
+
+use super::streams::{Answers, until_over};
+use super::{Api, CONTRACT, status};
+use whereabouts_service::Phase;
+
+/// The services that the contract names; the empty name is the server as a whole.
+const SERVICES: [&str; 4] = [
+    "",
+    "whereabouts.v1.LocalizationService",
+    "whereabouts.v1.MapService",
+    "whereabouts.v1.JobService",
+];
+
+fn answer(phase: Phase) -> HealthCheckResponse {
+    let status = match phase {
+        Phase::Open => ServingStatus::Serving,
+        Phase::Starting | Phase::Draining => ServingStatus::NotServing,
+    };
+    HealthCheckResponse { status: status.into() }
+}
+
+#[tonic::async_trait]
+impl Health for Api {
+    type WatchStream = Answers<HealthCheckResponse>;
+
+    async fn check(
+        &self,
+        request: Request<HealthCheckRequest>,
+    ) -> Result<Response<HealthCheckResponse>, Status> {
+        let asked = &request.get_ref().service;
+        if !SERVICES.contains(&asked.as_str()) {
+            let shown: String = asked.chars().take(80).collect();
+            let known = SERVICES[1..].join(", ");
+            return Err(Status::not_found(format!(
+                "there is no service {shown:?}; there are {known}"
+            )));
+        }
+        Ok(Response::new(answer(*self.door.phases().borrow())))
+    }
+
+    async fn watch(
+        &self,
+        request: Request<HealthCheckRequest>,
+    ) -> Result<Response<Self::WatchStream>, Status> {
+        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        if !SERVICES.contains(&request.get_ref().service.as_str()) {
+            // As the protocol has it: the service might appear later.
+            let unknown = HealthCheckResponse { status: ServingStatus::ServiceUnknown.into() };
+            let unknown = stream::iter([Ok(unknown)]).chain(stream::pending());
+            return Ok(Response::new(until_over(unknown, &self.door, asked)));
+        }
+        let mut phases = self.door.phases();
+        phases.mark_changed();
+        let changes = stream::unfold(phases, |mut phases| async {
+            phases.changed().await.ok()?;
+            let now = answer(*phases.borrow_and_update());
+            Some((Ok(now), phases))
+        });
+        Ok(Response::new(until_over(changes, &self.door, asked)))
+    }
+}
+
+fn reflection() -> Builder<'static> {
+    Builder::configure()
+        .register_encoded_file_descriptor_set(CONTRACT)
+        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+}
+
+pub(super) fn reflection_v1() -> Result<
+    tonic_reflection::server::v1::ServerReflectionServer<
+        impl tonic_reflection::server::v1::ServerReflection,
+    >,
+    Error,
+> {
+    reflection().build_v1()
+}
+
+pub(super) fn reflection_v1alpha() -> Result<
+    tonic_reflection::server::v1alpha::ServerReflectionServer<
+        impl tonic_reflection::server::v1alpha::ServerReflection,
+    >,
+    Error,
+> {
+    reflection().build_v1alpha()
+}

@@ -1,0 +1,142 @@
+//! Jobs: show, follow, list, cancel, retry.
+
+use std::time::Duration;
+
+use futures_util::StreamExt;
+use tonic::{Request, Response, Status};
+
+use super::proto::job_service_server::JobService;
+use super::proto::watch_job_response::Event;
+use super::proto::{
+    CancelJobRequest, CancelJobResponse, GetJobRequest, GetJobResponse, JobStatus, ListJobsRequest,
+    ListJobsResponse, PairDescribed, RetryJobRequest, RetryJobResponse, WatchJobRequest,
+    WatchJobResponse,
+};
+use super::streams::{Answers, until_over};
+use super::{Api, Asked, convert, status};
+use whereabouts_api::ErrorKind;
+use whereabouts_core::Job;
+use whereabouts_service::{JobEvent, ServiceError, search_text, uuid};
+use whereabouts_store::JobFilter;
+
+/// Jobs in a page unless more are asked for: clients take no more than four megabytes at a time by themselves.
+const PAGE_SIZE: usize = 20;
+
+#[tonic::async_trait]
+impl JobService for Api {
+    type WatchJobStream = Answers<WatchJobResponse>;
+
+    async fn get_job(
+        &self,
+        request: Request<GetJobRequest>,
+    ) -> Result<Response<GetJobResponse>, Status> {
+        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let GetJobRequest { id, wait_s } = request.into_inner();
+        let job = asked.job(&id, wait_s).await.map_err(status::of)?;
+        Ok(Response::new(GetJobResponse { job: Some(job.into()) }))
+    }
+
+    async fn watch_job(
+        &self,
+        request: Request<WatchJobRequest>,
+    ) -> Result<Response<Self::WatchJobStream>, Status> {
+        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let following = async {
+            let id = asked.job(&request.into_inner().id, 0.0).await?.id;
+            asked.service.follow_job(id).await
+        };
+        let events = following.await.map_err(status::of)?;
+        let events = events.map(|event| {
+            let event = match event {
+                JobEvent::State(now) => Event::Status(JobStatus {
+                    state: whereabouts_api::job_state_to(now.state).into(),
+                    attempts: now.attempts,
+                    error: now.error.unwrap_or_default(),
+                }),
+                JobEvent::Described(pair) => Event::Described(PairDescribed {
+                    described: pair.described as u32,
+                    of: pair.of as u32,
+                    description: Some(pair.description.into()),
+                }),
+                JobEvent::Ended(job) => Event::Ended((*job).into()),
+            };
+            Ok(WatchJobResponse { event: Some(event) })
+        });
+        Ok(Response::new(until_over(events, &self.door, asked)))
+    }
+
+    async fn list_jobs(
+        &self,
+        request: Request<ListJobsRequest>,
+    ) -> Result<Response<ListJobsResponse>, Status> {
+        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let page = asked.jobs(request.into_inner()).await.map_err(status::of)?;
+        Ok(Response::new(page))
+    }
+
+    async fn cancel_job(
+        &self,
+        request: Request<CancelJobRequest>,
+    ) -> Result<Response<CancelJobResponse>, Status> {
+        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let cancelling = async {
+            let id = asked.job(&request.into_inner().id, 0.0).await?.id;
+            asked.service.cancel_job(id).await
+        };
+        let job = cancelling.await.map_err(status::of)?;
+        Ok(Response::new(CancelJobResponse { job: Some(job.into()) }))
+    }
+
+    async fn retry_job(
+        &self,
+        request: Request<RetryJobRequest>,
+    ) -> Result<Response<RetryJobResponse>, Status> {
+        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let retrying = async {
+            let id = asked.job(&request.into_inner().id, 0.0).await?.id;
+            asked.service.retry_job(id).await
+        };
+        let job = retrying.await.map_err(status::of)?;
+        Ok(Response::new(RetryJobResponse { job: Some(job.into()) }))
+    }
+}
+
+impl Asked {
+    /// A job of a map that the caller may use, at once or when it has ended.
+    async fn job(&self, id: &str, wait_s: f64) -> Result<Job, ServiceError> {
+        let id = uuid("job", id)?;
+        let job = self.service.get_job(id, None).await?;
+        self.caller.check_map(&job.map)?;
+        if wait_s == 0.0 {
+            return Ok(job);
+        }
+        let wait = Duration::try_from_secs_f64(wait_s).map_err(|_| {
+            ServiceError::unprocessable(format!("wait_s is {wait_s}; it must be 0 or more"))
+        })?;
+        self.service.get_job(id, Some(wait)).await
+    }
+
+    async fn jobs(&self, request: ListJobsRequest) -> Result<ListJobsResponse, ServiceError> {
+        let ListJobsRequest { map, state, page_size, page_token, text } = request;
+        let map = (!map.is_empty()).then(|| self.map(&map)).transpose()?;
+        if map.is_none() && !self.caller.may_use_all() {
+            return Err(ServiceError::new(
+                ErrorKind::Forbidden,
+                "this key is for some maps only, and the request is about all; name one in `map`, or ask an \
+                 admin for another key",
+            ));
+        }
+        let (state, text) = (convert::job_state(state)?, search_text(&text)?);
+        let filter = JobFilter { map, state, text };
+        let cursor = (!page_token.is_empty()).then(|| uuid("job", &page_token)).transpose()?;
+        let limit = match page_size {
+            0 => PAGE_SIZE,
+            size => size as usize,
+        };
+        let page = self.service.list_jobs(filter, cursor, Some(limit)).await?;
+        Ok(ListJobsResponse {
+            jobs: page.jobs.into_iter().map(Into::into).collect(),
+            next_page_token: page.next_cursor.map(|id| id.to_string()).unwrap_or_default(),
+        })
+    }
+}

@@ -1,0 +1,113 @@
+//! Many images in a form, part by part.
+
+use axum::extract::multipart::{Field, MultipartError};
+use axum::extract::{FromRequest, Multipart, Request};
+use bytes::{Bytes, BytesMut};
+use futures_util::{Stream, stream};
+use tokio::sync::OwnedSemaphorePermit;
+
+use super::{LARGEST_META, Room, STEP, described, unreadable};
+use crate::http::problem::Problem;
+use whereabouts_api::ErrorKind;
+use whereabouts_service::{BulkImage, ServiceError};
+
+/// The images of a form, as its parts come in.
+pub(super) async fn images(
+    request: Request,
+    room: Room,
+) -> Result<impl Stream<Item = Result<Result<BulkImage, ServiceError>, Problem>> + Send, Problem> {
+    let malformed = |detail: String| Problem::new(ErrorKind::Malformed, detail);
+    let form = Multipart::from_request(request, &())
+        .await
+        .map_err(|rejection| malformed(rejection.body_text()))?;
+    Ok(stream::try_unfold(Parts { form, room }, |mut parts| async {
+        Ok(parts.next().await?.map(|image| (image, parts)))
+    }))
+}
+
+struct Parts {
+    form: Multipart,
+    room: Room,
+}
+
+impl Parts {
+    async fn next(&mut self) -> Result<Option<Result<BulkImage, ServiceError>>, Problem> {
+        let malformed = |detail: String| Problem::new(ErrorKind::Malformed, detail);
+        let mut meta = None;
+        while let Some(part) = self.form.next_field().await.map_err(broken)? {
+            let name = part.name().unwrap_or("").chars().take(80).collect::<String>();
+            match name.as_str() {
+                "meta" if meta.is_none() => {
+                    meta = Some(whole(part, LARGEST_META, "a part \"meta\"").await?);
+                }
+                "meta" => {
+                    return Err(malformed(
+                        "two parts \"meta\" follow one another; each is about the part \"image\" after it"
+                            .into(),
+                    ));
+                }
+                "image" => {
+                    let file = part.file_name().map(str::to_owned);
+                    let picture = picture(&self.room, part).await?;
+                    self.room.allow(0);
+                    let meta = described(meta.as_deref(), file.as_deref());
+                    return Ok(Some(picture.and_then(|(bytes, memory)| {
+                        Ok(BulkImage { bytes, meta: meta?, memory: Some(memory) })
+                    })));
+                }
+                other => {
+                    return Err(malformed(format!(
+                        "the form has a part {other:?}; only \"image\" and \"meta\" are known"
+                    )));
+                }
+            }
+        }
+        match meta {
+            None => Ok(None),
+            Some(_) => {
+                Err(malformed("the last part is \"meta\", and no \"image\" follows it".into()))
+            }
+        }
+    }
+}
+
+/// The bytes of a picture, and the memory that they take. Of one that is too large the rest is left out.
+async fn picture(
+    room: &Room,
+    mut part: Field<'_>,
+) -> Result<Result<(Bytes, OwnedSemaphorePermit), ServiceError>, Problem> {
+    let limit = room.settings.body_limit_bytes;
+    let mut held = room.take(STEP.min(limit)).await?;
+    let (mut bytes, mut too_large) = (BytesMut::new(), false);
+    while let Some(chunk) = part.chunk().await.map_err(broken)? {
+        room.allow(0);
+        let so_far = bytes.len() + chunk.len();
+        too_large |= room.is_too_small(so_far);
+        if too_large {
+            continue;
+        }
+        if held.num_permits() < so_far {
+            held.merge(room.take(limit - held.num_permits()).await?);
+        }
+        bytes.extend_from_slice(&chunk);
+    }
+    drop(held.split(held.num_permits().saturating_sub(bytes.len())));
+    Ok(if too_large { Err(room.too_large()) } else { Ok((bytes.freeze(), held)) })
+}
+
+/// A whole part of at most so many bytes.
+async fn whole(mut part: Field<'_>, most: usize, what: &str) -> Result<Vec<u8>, Problem> {
+    let mut bytes = Vec::new();
+    while let Some(chunk) = part.chunk().await.map_err(broken)? {
+        if bytes.len() + chunk.len() > most {
+            let detail = format!("{what} exceeds {most} bytes");
+            return Err(Problem::new(ErrorKind::TooLarge, detail));
+        }
+        bytes.extend_from_slice(&chunk);
+    }
+    Ok(bytes)
+}
+
+fn broken(error: MultipartError) -> Problem {
+    unreadable(&error, &error.body_text())
+}

@@ -1,0 +1,96 @@
+//! `X-Deadline-Ms`: how long a client is willing to wait for an answer.
+
+use std::convert::Infallible;
+use std::time::Duration;
+
+use axum::extract::FromRequestParts;
+use axum::http::request::Parts;
+use axum::http::{HeaderMap, HeaderName};
+
+use super::problem::Problem;
+use super::state::AppState;
+use whereabouts_api::ErrorKind;
+use whereabouts_service::Deadline;
+
+/// Milliseconds from the arrival of the request's head.
+pub(super) const DEADLINE: HeaderName = HeaderName::from_static("x-deadline-ms");
+
+/// The longest wait that can be asked for: longer than any request may take.
+const LONGEST_MS: u64 = 3_600_000;
+
+/// The deadline of a call of gRPC: up to eight digits and a unit.
+const GRPC_TIMEOUT: HeaderName = HeaderName::from_static("grpc-timeout");
+
+/// The wait that the headers allow.
+pub(super) fn allowed(headers: &HeaderMap) -> Result<Option<Duration>, Problem> {
+    if let Some(value) = headers.get(GRPC_TIMEOUT) {
+        let wait = value.to_str().ok().and_then(grpc_timeout);
+        return wait.map(Some).ok_or_else(|| {
+            let detail =
+                format!("grpc-timeout is {value:?}; it must be up to 8 digits and one of HMSmun");
+            Problem::new(ErrorKind::Malformed, detail)
+        });
+    }
+    let Some(value) = headers.get(DEADLINE) else { return Ok(None) };
+    let milliseconds = value.to_str().ok().and_then(|text| text.parse::<u64>().ok());
+    match milliseconds {
+        Some(wait @ 1..=LONGEST_MS) => Ok(Some(Duration::from_millis(wait))),
+        _ => Err(Problem::new(
+            ErrorKind::Malformed,
+            format!(
+                "X-Deadline-Ms is {value:?}; it must be a whole number of milliseconds from 1 to \
+                 {LONGEST_MS}"
+            ),
+        )),
+    }
+}
+
+fn grpc_timeout(text: &str) -> Option<Duration> {
+    let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
+    if !(1..=8).contains(&digits.len()) || !digits.bytes().all(|byte| byte.is_ascii_digit()) {
+        return None;
+    }
+    let amount: u64 = digits.parse().ok()?;
+    Some(match unit {
+        "H" => Duration::from_secs(amount * 3600),
+        "M" => Duration::from_secs(amount * 60),
+        "S" => Duration::from_secs(amount),
+        "m" => Duration::from_millis(amount),
+        "u" => Duration::from_micros(amount),
+        "n" => Duration::from_nanos(amount),
+        _ => return None,
+    })
+}
+
+pub(super) fn passed(wait: Duration) -> Problem {
+    Problem::new(
+        ErrorKind::DeadlinePassed,
+        format!(
+            "the {} ms that the request was given (X-Deadline-Ms, grpc-timeout) have passed, and it was \
+             given up; allow more time, or send a later frame",
+            wait.as_millis()
+        ),
+    )
+}
+
+impl FromRequestParts<AppState> for Deadline {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(parts: &mut Parts, _: &AppState) -> Result<Self, Infallible> {
+        Ok(parts.extensions.get().copied().unwrap_or_default())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_deadline_of_a_call_has_digits_and_a_unit() {
+        assert_eq!(grpc_timeout("250m"), Some(Duration::from_millis(250)));
+        assert_eq!(grpc_timeout("99999999H"), Some(Duration::from_secs(99_999_999 * 3600)));
+        for bad in ["", "S", "5", "123456789S", "-1S", "+1S", "5s", "5é"] {
+            assert_eq!(grpc_timeout(bad), None, "{bad}");
+        }
+    }
+}

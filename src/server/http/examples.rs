@@ -1,0 +1,206 @@
+//! An example of each call, for its description. The tests execute all of them
+//! (`tests/blackbox/documented.rs`), and write the answers of `docs/examples.json`.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use utoipa::openapi::extensions::ExtensionsBuilder;
+use utoipa::openapi::path::Operation;
+use utoipa::openapi::{OpenApi, RefOr};
+
+/// All examples, in an order in which they can be executed.
+const EXAMPLES: &str = include_str!("../../../docs/examples.json");
+
+/// A request, and how it is answered.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Example {
+    /// Method and route, as the description has them.
+    pub call: String,
+    /// The path of the request, with its query; what is in braces was taken from an answer before.
+    pub path: String,
+    /// The body of the request.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub body: Option<ExampleBody>,
+    /// The status of the answer.
+    pub status: u16,
+    /// The media type of the answer; none without a body.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub media_type: Option<String>,
+    /// The answer: JSON, or the beginning of a text; none of a picture.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub answer: Option<Value>,
+    /// What later requests take from the answer: by name, where it is (RFC 6901).
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub takes: BTreeMap<String, String>,
+}
+
+/// What requests take from the answers of others, by name.
+pub type Taken = BTreeMap<String, String>;
+
+/// The body of a request.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ExampleBody {
+    /// JSON.
+    Json(Value),
+    /// The JSON in a file.
+    JsonFile(String),
+    /// The picture in a file.
+    Picture(String),
+    /// A form.
+    Form(Vec<ExamplePart>),
+}
+
+/// A part of a form.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExamplePart {
+    /// Its name.
+    pub name: String,
+    /// What it has: JSON, or the name of a file after `@`, or after `<` if its text is meant.
+    pub value: Value,
+}
+
+/// All examples, in an order in which they can be executed.
+pub fn examples() -> Result<Vec<Example>, serde_json::Error> {
+    serde_json::from_str(EXAMPLES)
+}
+
+impl Example {
+    /// The method of the request.
+    pub fn method(&self) -> &str {
+        self.call.split(' ').next().unwrap_or_default()
+    }
+
+    /// The path with what was taken.
+    pub fn path(&self, taken: &Taken) -> String {
+        let fill = |path: String, (name, value): (&String, &String)| {
+            path.replace(&format!("{{{name}}}"), value)
+        };
+        taken.iter().fold(self.path.clone(), fill)
+    }
+
+    /// Takes what later requests need from an answer.
+    pub fn take(&self, answer: &Value, taken: &mut Taken) {
+        for (name, place) in &self.takes {
+            let value = answer.pointer(place).and_then(Value::as_str);
+            taken.insert(name.clone(), value.unwrap_or_default().to_owned());
+        }
+    }
+
+    /// The request as it would be typed.
+    fn curl(&self, taken: &Taken) -> String {
+        let mut typed = "curl".to_owned();
+        let implied = if self.body.is_some() { "POST" } else { "GET" };
+        if self.method() != implied {
+            typed += &format!(" -X {}", self.method());
+        }
+        match &self.body {
+            None => {}
+            Some(ExampleBody::Json(value)) => {
+                let _ = write!(typed, " -H 'Content-Type: application/json' -d '{value}'");
+            }
+            Some(ExampleBody::JsonFile(file)) => {
+                let _ = write!(typed, " -H 'Content-Type: application/json' -d @{file}");
+            }
+            Some(ExampleBody::Picture(file)) => {
+                let _ = write!(typed, " -H 'Content-Type: image/jpeg' --data-binary @{file}");
+            }
+            Some(ExampleBody::Form(parts)) => {
+                for ExamplePart { name, value } in parts {
+                    let _ = match value.as_str() {
+                        Some(file) => write!(typed, " -F {name}={file}"),
+                        None => write!(typed, " -F '{name}={value}'"),
+                    };
+                }
+            }
+        }
+        let _ = write!(typed, " 'http://localhost:8080{}'", self.path(taken));
+        typed
+    }
+}
+
+/// Shows the examples beside their calls.
+pub(super) fn show(description: &mut OpenApi) {
+    let examples = match examples() {
+        Ok(examples) => examples,
+        Err(error) => return tracing::error!(%error, "there are no examples in the description"),
+    };
+    let mut taken = Taken::new();
+    for example in &examples {
+        example.take(example.answer.as_ref().unwrap_or(&Value::Null), &mut taken);
+    }
+    for (route, item) in &mut description.paths.paths {
+        let operations = [
+            ("GET", &mut item.get),
+            ("PUT", &mut item.put),
+            ("POST", &mut item.post),
+            ("DELETE", &mut item.delete),
+        ];
+        for (method, operation) in operations {
+            let Some(operation) = operation else { continue };
+            let call = format!("{method} {route}");
+            let of_call: Vec<_> = examples.iter().filter(|example| example.call == call).collect();
+            of_call.iter().rev().for_each(|example| show_one(operation, example));
+            let typed: Vec<_> = of_call
+                .iter()
+                .map(|example| json!({"lang": "curl", "source": example.curl(&taken)}))
+                .collect();
+            let extension = ExtensionsBuilder::new().add("x-codeSamples", typed).build();
+            operation.extensions = Some(extension);
+        }
+    }
+}
+
+fn show_one(operation: &mut Operation, example: &Example) {
+    if let (Some(ExampleBody::Json(value)), Some(RefOr::T(body))) =
+        (&example.body, &mut operation.request_body)
+        && let Some(RefOr::T(content)) = body.content.get_mut("application/json")
+    {
+        content.example = Some(value.clone());
+    }
+    if let (Some(media_type), Some(answer)) = (&example.media_type, &example.answer)
+        && let Some(RefOr::T(response)) =
+            operation.responses.responses.get_mut(&example.status.to_string())
+        && let Some(RefOr::T(content)) = response.content.get_mut(media_type.as_str())
+    {
+        content.example = Some(answer.clone());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_call_of_the_description_has_an_example_of_what_it_does() {
+        let examples = examples().unwrap();
+        let description = serde_json::to_value(super::super::openapi()).unwrap();
+        let mut calls = Vec::new();
+        for (route, methods) in description["paths"].as_object().unwrap() {
+            for (method, operation) in methods.as_object().unwrap() {
+                let call = format!("{} {route}", method.to_uppercase());
+                let of_call = examples.iter().filter(|example| example.call == call);
+                let statuses: Vec<_> = of_call.map(|example| example.status.to_string()).collect();
+                assert!(!statuses.is_empty(), "{call} has no example");
+                for status in statuses {
+                    let response = &operation["responses"][&status];
+                    assert!(response.is_object(), "{call} does not describe {status}");
+                    let shown = response.to_string().contains("\"example\":");
+                    assert!(
+                        shown || response["content"]["image/jpeg"].is_object() || status == "204",
+                        "{call}"
+                    );
+                }
+                assert!(
+                    operation["x-codeSamples"][0]["source"].as_str().unwrap().starts_with("curl ")
+                );
+                calls.push(call);
+            }
+        }
+        assert!(examples.iter().all(|example| calls.contains(&example.call)));
+    }
+}

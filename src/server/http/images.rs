@@ -1,0 +1,259 @@
+//! `/maps/{map}/images`.
+
+use axum::Json;
+use axum::extract::{Request, State};
+use axum::http::StatusCode;
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::IntoResponse;
+use bytes::Bytes;
+use jiff::Timestamp;
+use serde::Deserialize;
+use serde_json::{Map as JsonObject, Value};
+use utoipa::IntoParams;
+
+use super::body::{Params, PictureBody, Segments};
+use super::maps::map_name;
+use super::problem::Problem;
+use super::state::{AppState, Ready};
+use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
+use whereabouts_core::{Image, ImageId, MediaType};
+use whereabouts_service::{Deadline, NewImage, ServiceError};
+use whereabouts_store::Added;
+use whereabouts_vision::{Class, Demand};
+
+/// What can be said about a raw image in the query string; a form says it in its part `meta`.
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct MetaParams {
+    /// The id; without one, the head of the digest of the bytes.
+    id: Option<String>,
+    /// When it was taken (RFC 3339).
+    #[param(value_type = Option<String>, format = DateTime)]
+    captured_at: Option<Timestamp>,
+    /// Words, separated by commas.
+    tags: Option<String>,
+    /// Latitude in degrees, in a `wgs84` map.
+    lat: Option<f64>,
+    /// Longitude in degrees.
+    lon: Option<f64>,
+    /// Height in metres.
+    alt: Option<f64>,
+    /// Degrees clockwise from north.
+    heading: Option<f64>,
+    /// Metres, in a `metric` map.
+    x: Option<f64>,
+    /// Metres.
+    y: Option<f64>,
+    /// Metres.
+    z: Option<f64>,
+    /// Unit quaternion.
+    qx: Option<f64>,
+    /// Unit quaternion.
+    qy: Option<f64>,
+    /// Unit quaternion.
+    qz: Option<f64>,
+    /// Unit quaternion.
+    qw: Option<f64>,
+}
+
+impl MetaParams {
+    fn is_empty(&self) -> bool {
+        self.id.is_none()
+            && self.captured_at.is_none()
+            && self.tags.is_none()
+            && self.pose().is_none()
+    }
+
+    fn pose(&self) -> Option<Value> {
+        let fields = [
+            ("lat", self.lat),
+            ("lon", self.lon),
+            ("alt", self.alt),
+            ("heading", self.heading),
+            ("x", self.x),
+            ("y", self.y),
+            ("z", self.z),
+            ("qx", self.qx),
+            ("qy", self.qy),
+            ("qz", self.qz),
+            ("qw", self.qw),
+        ];
+        let given: JsonObject<String, Value> = fields
+            .into_iter()
+            .filter_map(|(field, value)| Some((field.to_owned(), value?.into())))
+            .collect();
+        (!given.is_empty()).then_some(Value::Object(given))
+    }
+
+    fn into_meta(self) -> ImageMeta {
+        let pose = self.pose();
+        let tags = self.tags.map(|tags| tags.split(',').map(|tag| tag.trim().to_owned()).collect());
+        ImageMeta {
+            id: self.id,
+            pose,
+            captured_at: self.captured_at,
+            tags: tags.unwrap_or_default(),
+        }
+    }
+}
+
+/// Add an image
+///
+/// Either a raw picture, with what is known about it in the query string, or a form with the parts
+/// `image` (the picture) and `meta` (JSON). The same id with the same bytes again is answered 200.
+#[utoipa::path(post, path = "/maps/{map}/images", tag = "images",
+    params(("map" = String, Path), MetaParams,
+        ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,
+        description = "How many milliseconds from its arrival the client waits for the answer. After \
+                       504 the image may be stored or not; send it again.")),
+    request_body(content(
+        (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"),
+        (ImageForm = "multipart/form-data"),
+    )),
+    responses(
+        (status = 200, body = Image, description = "It was there already"),
+        (status = 201, body = Image, description = "Stored"),
+        (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The id is taken by other bytes", content_type = "application/problem+json"),
+        (status = 408, body = Problem, description = "The body came too slowly", content_type = "application/problem+json"),
+        (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
+        (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "Cannot be decoded, or a pose out of range", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 504, body = Problem, description = "X-Deadline-Ms has passed", content_type = "application/problem+json"),
+        (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn add_image(
+    State(state): State<AppState>,
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+    Params(params): Params<MetaParams>,
+    Deadline(deadline): Deadline,
+    request: Request,
+) -> Result<(StatusCode, Json<Image>), Problem> {
+    let demand = Demand { class: Class::Index, deadline };
+    let body = PictureBody::read(request, &state, &service, demand).await?;
+    let meta = match body.meta {
+        Some(_) if !params.is_empty() => {
+            let detail = "say what is known about the image in the part \"meta\" or in the query \
+                          string, not in both";
+            return Err(Problem::new(ErrorKind::Malformed, detail));
+        }
+        Some(meta) => meta_from_part(&meta)?,
+        None => params.into_meta(),
+    };
+    let new = NewImage { bytes: body.picture, meta, demand };
+    Ok(match service.add_image(&map_name(&map)?, new).await? {
+        Added::Created(image) => (StatusCode::CREATED, Json(image)),
+        Added::Present(image) => (StatusCode::OK, Json(image)),
+    })
+}
+
+/// The form of an upload.
+#[derive(utoipa::ToSchema)]
+#[expect(dead_code, reason = "describes the form; the body is read part by part")]
+struct ImageForm {
+    /// The picture.
+    #[schema(value_type = String, format = Binary)]
+    image: Vec<u8>,
+    /// What is known about it.
+    meta: Option<ImageMeta>,
+}
+
+fn meta_from_part(part: &Bytes) -> Result<ImageMeta, Problem> {
+    serde_json::from_slice(part).map_err(|error| {
+        let detail = format!("the part \"meta\" is not the JSON expected: {error}");
+        Problem::new(ErrorKind::Malformed, detail)
+    })
+}
+
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct PageParams {
+    /// `next_cursor` of the page before.
+    pub cursor: Option<String>,
+    /// Images in a page, 1 to 1000; 100 by default.
+    pub limit: Option<usize>,
+}
+
+/// List the images of a map, by id
+#[utoipa::path(get, path = "/maps/{map}/images", tag = "images",
+    params(("map" = String, Path), PageParams), responses(
+    (status = 200, body = ImagePage),
+    (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "limit is out of range", content_type = "application/problem+json"),
+))]
+pub(super) async fn list_images(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+    Params(page): Params<PageParams>,
+) -> Result<Json<ImagePage>, Problem> {
+    let cursor = page.cursor.as_deref().map(image_id).transpose()?;
+    Ok(Json(service.list_images(&map_name(&map)?, cursor.as_ref(), page.limit).await?))
+}
+
+/// One image
+#[utoipa::path(get, path = "/maps/{map}/images/{id}", tag = "images",
+    params(("map" = String, Path), ("id" = String, Path)), responses(
+    (status = 200, body = Image),
+    (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
+))]
+pub(super) async fn get_image(
+    Ready(service): Ready,
+    Segments((map, id)): Segments<(String, String)>,
+) -> Result<Json<Image>, Problem> {
+    Ok(Json(service.get_image(&map_name(&map)?, &image_id(&id)?).await?))
+}
+
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ContentParams {
+    /// The longest edge in pixels, 16 to 4096; without it the picture comes as it was sent.
+    pub max_edge: Option<u32>,
+}
+
+/// The picture of an image
+#[utoipa::path(get, path = "/maps/{map}/images/{id}/content", tag = "images",
+    params(("map" = String, Path), ("id" = String, Path), ContentParams), responses(
+    (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"))),
+    (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "max_edge is out of range", content_type = "application/problem+json"),
+    (status = 429, body = Problem, description = "Overloaded, and max_edge asks for a smaller picture", content_type = "application/problem+json"),
+))]
+pub(super) async fn image_content(
+    Ready(service): Ready,
+    Segments((map, id)): Segments<(String, String)>,
+    Params(content): Params<ContentParams>,
+) -> Result<impl IntoResponse, Problem> {
+    let (media_type, bytes) =
+        service.image_content(&map_name(&map)?, &image_id(&id)?, content.max_edge).await?;
+    Ok(picture(media_type, bytes))
+}
+
+/// A picture, which an id keeps until it is deleted.
+pub(super) fn picture(media_type: MediaType, bytes: Bytes) -> impl IntoResponse {
+    let headers = [(CONTENT_TYPE, media_type.as_str()), (CACHE_CONTROL, "private, max-age=3600")];
+    (headers, bytes)
+}
+
+/// Remove an image
+#[utoipa::path(delete, path = "/maps/{map}/images/{id}", tag = "images",
+    params(("map" = String, Path), ("id" = String, Path)), responses(
+    (status = 204, description = "Removed: no later answer names it"),
+    (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
+))]
+pub(super) async fn delete_image(
+    Ready(service): Ready,
+    Segments((map, id)): Segments<(String, String)>,
+) -> Result<StatusCode, Problem> {
+    service.delete_image(&map_name(&map)?, &image_id(&id)?).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+pub(super) fn image_id(text: &str) -> Result<ImageId, Problem> {
+    Ok(text.parse().map_err(ServiceError::from)?)
+}

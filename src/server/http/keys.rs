@@ -1,0 +1,55 @@
+//! `/keys`.
+
+use axum::Json;
+use axum::http::StatusCode;
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::body::{JsonBody, Segments};
+use super::problem::Problem;
+use super::state::Ready;
+use whereabouts_api::{MadeKey, NewKey};
+use whereabouts_core::ApiKey;
+
+/// All keys.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct KeyList {
+    /// The newest first; those that were revoked or have expired too.
+    keys: Vec<ApiKey>,
+}
+
+/// Make an API key
+///
+/// The answer is the only place where the key is shown: a hash of it is stored.
+#[utoipa::path(post, path = "/keys", tag = "keys", request_body = NewKey, responses(
+    (status = 201, body = MadeKey, description = "Made"),
+    (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+    (status = 409, body = Problem, description = "There are too many", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "A value is out of range", content_type = "application/problem+json"),
+))]
+pub(super) async fn create_key(
+    Ready(service): Ready,
+    JsonBody(wanted): JsonBody<NewKey>,
+) -> Result<(StatusCode, Json<MadeKey>), Problem> {
+    Ok((StatusCode::CREATED, Json(service.keys.create(wanted).await?)))
+}
+
+/// List the API keys
+#[utoipa::path(get, path = "/keys", tag = "keys", responses((status = 200, body = KeyList)))]
+pub(super) async fn list_keys(Ready(service): Ready) -> Result<Json<KeyList>, Problem> {
+    Ok(Json(KeyList { keys: service.keys.list() }))
+}
+
+/// Revoke an API key
+///
+/// From the moment this returns nobody gets in with it. It stays in the list.
+#[utoipa::path(delete, path = "/keys/{id}", tag = "keys", params(("id" = String, Path)), responses(
+    (status = 200, body = ApiKey, description = "Revoked, now or before"),
+    (status = 404, body = Problem, description = "No such key", content_type = "application/problem+json"),
+))]
+pub(super) async fn revoke_key(
+    Ready(service): Ready,
+    Segments(id): Segments<String>,
+) -> Result<Json<ApiKey>, Problem> {
+    Ok(Json(service.keys.revoke(&id).await?))
+}

@@ -1,0 +1,120 @@
+//! `/localize`.
+
+use axum::extract::{Request, State};
+use axum::{Extension, Json};
+use jiff::Timestamp;
+use serde::Deserialize;
+use utoipa::IntoParams;
+
+use super::body::{Params, PictureBody};
+use super::idempotency::OnceId;
+use super::maps::map_name;
+use super::problem::Problem;
+use super::state::{AppState, Ready};
+use whereabouts_api::{Answer, RefineMode};
+use whereabouts_core::Priority;
+use whereabouts_service::{Caller, Deadline, LocalizeRequest, ServiceError, TrackStep};
+use whereabouts_vision::{Class, Demand};
+
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct LocalizeParams {
+    /// In which map.
+    map: String,
+    /// How many candidates, 1 to 100.
+    k: Option<usize>,
+    /// `async` (default): a job refines the candidates. `wait`: the answer waits for it. `off`:
+    /// no job.
+    #[serde(default)]
+    refine: RefineMode,
+    /// How soon the job is taken: before all others (`high`), in its turn (`normal`, default), or
+    /// when nothing else waits (`low`).
+    #[serde(default)]
+    priority: Priority,
+    /// The frames of one robot, one after another: an id of its own choice, 1 to 64 letters, digits, `-`,
+    /// `_`, `.` and `:`. The answer then says in `track` where the robot is, given all of them. The
+    /// map's images need poses; a track is forgotten when no frame comes for a while.
+    track: Option<String>,
+    /// When the frame was taken (RFC 3339), of a frame with `track`; by default now.
+    captured_at: Option<Timestamp>,
+    /// The metres that the robot has come since the frame before, by its odometry, of a frame with
+    /// `track`; without it, it can have come as far as its greatest speed (`track.max_speed_m_s`) allows.
+    moved_m: Option<f64>,
+}
+
+impl LocalizeParams {
+    fn step(&mut self, caller: &Caller) -> Result<Option<TrackStep>, ServiceError> {
+        match self.track.take() {
+            Some(id) => TrackStep::new(caller, id, self.captured_at, self.moved_m).map(Some),
+            None if self.captured_at.is_some() || self.moved_m.is_some() => {
+                Err(ServiceError::unprocessable(
+                    "captured_at and moved_m are of a frame with track; name the track too",
+                ))
+            }
+            None => Ok(None),
+        }
+    }
+}
+
+/// The form of a frame.
+#[derive(utoipa::ToSchema)]
+#[expect(dead_code, reason = "describes the form; the body is read part by part")]
+struct FrameForm {
+    /// The frame.
+    #[schema(value_type = String, format = Binary)]
+    image: Vec<u8>,
+}
+
+/// Localize a frame
+///
+/// Answers with the most similar images of the map; a job then compares the frame with the first of them,
+/// `refine.local_candidates` or `refine.candidates` whatever `k` is, and orders those anew. Under load, jobs are given up before frames: with `refine=async` the
+/// answer comes with `job: null` and a `no_job` that says why, with `refine=wait` it is 429.
+#[utoipa::path(post, path = "/localize", tag = "localize", 
+    params(LocalizeParams, ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,
+        description = "How many milliseconds from its arrival the client waits for the answer. A \
+                       request that cannot be answered in time is refused with 429 at once, and one \
+                       whose time passes is given up with 504. refine=wait then answers in time, \
+                       refined or not.")),
+    request_body(content(
+        (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"),
+        (FrameForm = "multipart/form-data"),
+    )),
+    responses(
+        (status = 200, body = Answer),
+        (status = 400, body = Problem, description = "Malformed, or an empty body", content_type = "application/problem+json"),
+        (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The map's model is not installed, or is another by now", content_type = "application/problem+json"),
+        (status = 408, body = Problem, description = "The body came too slowly", content_type = "application/problem+json"),
+        (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
+        (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "Cannot be decoded, k or a parameter of the track out of range, or a track in a map without poses", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 504, body = Problem, description = "X-Deadline-Ms has passed", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn localize(
+    State(state): State<AppState>,
+    Ready(service): Ready,
+    Extension(caller): Extension<Caller>,
+    Params(mut params): Params<LocalizeParams>,
+    Deadline(deadline): Deadline,
+    request: Request,
+) -> Result<Json<Answer>, Problem> {
+    let once = request.extensions().get().map(|OnceId(id): &OnceId| id.clone());
+    let map = map_name(&params.map)?;
+    let track = params.step(&caller)?;
+    let demand = Demand { class: Class::Localize, deadline };
+    let body = PictureBody::read(request, &state, &service, demand).await?;
+    let request = LocalizeRequest {
+        map,
+        k: params.k,
+        refine: params.refine,
+        priority: params.priority,
+        frame: body.picture,
+        deadline,
+        track,
+        once,
+    };
+    Ok(Json(service.localize(request).await?))
+}

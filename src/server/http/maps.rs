@@ -1,0 +1,106 @@
+//! `/maps`.
+
+use axum::http::StatusCode;
+use axum::{Extension, Json};
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::body::{JsonBody, Segments};
+use super::problem::Problem;
+use super::state::Ready;
+use whereabouts_api::{MapChange, MapState, ReindexRequest};
+use whereabouts_core::MapName;
+use whereabouts_service::Caller;
+
+/// All maps.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct MapList {
+    /// By name.
+    maps: Vec<MapState>,
+}
+
+pub(super) fn map_name(text: &str) -> Result<MapName, Problem> {
+    Ok(text.parse().map_err(whereabouts_service::ServiceError::from)?)
+}
+
+/// List the maps
+///
+/// Those that the caller's key is for.
+#[utoipa::path(get, path = "/maps", tag = "maps", responses(
+    (status = 200, body = MapList),
+    (status = 503, body = Problem, description = "Starting", content_type = "application/problem+json"),
+))]
+pub(super) async fn list_maps(
+    Ready(service): Ready,
+    Extension(caller): Extension<Caller>,
+) -> Result<Json<MapList>, Problem> {
+    let mut maps = service.list_maps().await?;
+    maps.retain(|map| caller.may_use(&map.name));
+    Ok(Json(MapList { maps }))
+}
+
+/// One map
+#[utoipa::path(get, path = "/maps/{map}", tag = "maps", params(("map" = String, Path)), responses(
+    (status = 200, body = MapState),
+    (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+))]
+pub(super) async fn get_map(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+) -> Result<Json<MapState>, Problem> {
+    Ok(Json(service.get_map(&map_name(&map)?).await?))
+}
+
+/// Create a map, or change it
+#[utoipa::path(put, path = "/maps/{map}", tag = "maps", params(("map" = String, Path)),
+    request_body(content = MapChange, description = "What to set; what is left out keeps its value"),
+    responses(
+        (status = 200, body = MapState, description = "Changed"),
+        (status = 201, body = MapState, description = "Created"),
+        (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "Fixed, because the map has images", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "Not installed, or not possible with this model", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn put_map(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+    JsonBody(change): JsonBody<MapChange>,
+) -> Result<(StatusCode, Json<MapState>), Problem> {
+    let (state, new) = service.put_map(map_name(&map)?, change).await?;
+    Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(state)))
+}
+
+/// Make all descriptors of a map anew, with another model
+///
+/// Answers at once. The old descriptors serve until the new ones are all there; then the map changes
+/// over in one step. `reindex` of the map says how far that has come.
+#[utoipa::path(post, path = "/maps/{map}/reindex", tag = "maps", params(("map" = String, Path)),
+    request_body(content = ReindexRequest, description = "Which descriptors; what is left out stays as it is"),
+    responses(
+        (status = 202, body = MapState, description = "Begun"),
+        (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The map is being reindexed already", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "Not installed, or not possible with this model", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn reindex(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+    JsonBody(request): JsonBody<ReindexRequest>,
+) -> Result<(StatusCode, Json<MapState>), Problem> {
+    let state = service.reindex(&map_name(&map)?, request).await?;
+    Ok((StatusCode::ACCEPTED, Json(state)))
+}
+
+/// Remove a map with all its images
+#[utoipa::path(delete, path = "/maps/{map}", tag = "maps", params(("map" = String, Path)), responses(
+    (status = 204, description = "Removed"),
+    (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+))]
+pub(super) async fn delete_map(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+) -> Result<StatusCode, Problem> {
+    service.delete_map(&map_name(&map)?).await?;
+    Ok(StatusCode::NO_CONTENT)
+}

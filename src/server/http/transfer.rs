@@ -1,0 +1,104 @@
+//! `/maps/{map}/export` and `/maps/{map}/import`: what `whereabouts backup` and `restore` speak.
+
+use axum::Json;
+use axum::extract::{Request, State};
+use axum::http::StatusCode;
+use utoipa::ToSchema;
+
+use super::body::{JsonBody, Params, PictureBody, Segments};
+use super::images::{PageParams, image_id};
+use super::maps::map_name;
+use super::problem::Problem;
+use super::state::{AppState, Ready};
+use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
+use whereabouts_core::{Image, Map};
+use whereabouts_store::Added;
+use whereabouts_vision::{Class, Demand};
+
+/// The images of a map with their descriptors, by id
+///
+/// The bytes of each are at `/maps/{map}/images/{id}/content`. `whereabouts backup` writes all of it
+/// into one file.
+#[utoipa::path(get, path = "/maps/{map}/export", tag = "maps",
+    params(("map" = String, Path), PageParams), responses(
+    (status = 200, body = ExportPage),
+    (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "limit is out of range", content_type = "application/problem+json"),
+))]
+pub(super) async fn export(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+    Params(page): Params<PageParams>,
+) -> Result<Json<ExportPage>, Problem> {
+    let cursor = page.cursor.as_deref().map(image_id).transpose()?;
+    Ok(Json(service.export(&map_name(&map)?, cursor.as_ref(), page.limit).await?))
+}
+
+/// Make a map like one that was exported
+///
+/// A map that is there and takes the same descriptors is left as it is. The model need not be installed
+/// yet.
+#[utoipa::path(put, path = "/maps/{map}/import", tag = "maps", params(("map" = String, Path)),
+    request_body(content = Map, description = "`map` of an export"),
+    responses(
+        (status = 200, body = MapState, description = "It was there"),
+        (status = 201, body = MapState, description = "Created"),
+        (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "It has images, and other descriptors", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "A value is out of range", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn import_map(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+    JsonBody(from): JsonBody<Map>,
+) -> Result<(StatusCode, Json<MapState>), Problem> {
+    let (state, new) = service.import_map(&map_name(&map)?, from).await?;
+    Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(state)))
+}
+
+/// The form of an image that was exported.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "describes the form; the body is read part by part")]
+pub(super) struct ImportForm {
+    /// The picture.
+    #[schema(value_type = String, format = Binary)]
+    image: Vec<u8>,
+    /// What the export says about it.
+    meta: ImportedImage,
+}
+
+/// Add an image with the descriptor that it has elsewhere
+///
+/// The same id with the same bytes again is answered 200, so that it is safe to send all of it again.
+#[utoipa::path(post, path = "/maps/{map}/import", tag = "maps", params(("map" = String, Path)),
+    request_body(content = ImportForm, content_type = "multipart/form-data"),
+    responses(
+        (status = 200, body = Image, description = "It was there already"),
+        (status = 201, body = Image, description = "Stored"),
+        (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The id is taken by other bytes, or the map has other descriptors", content_type = "application/problem+json"),
+        (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
+        (status = 415, body = Problem, description = "Not a form", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "The bytes are not those of the digest, or a value is out of range", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn import_image(
+    State(state): State<AppState>,
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+    request: Request,
+) -> Result<(StatusCode, Json<Image>), Problem> {
+    let demand = Demand { class: Class::Index, deadline: None };
+    let body = PictureBody::read(request, &state, &service, demand).await?;
+    let meta = body.meta.unwrap_or_default();
+    let from: ImportedImage = serde_json::from_slice(&meta).map_err(|error| {
+        let detail = format!("the part \"meta\" is not the JSON expected: {error}");
+        Problem::new(ErrorKind::Malformed, detail)
+    })?;
+    Ok(match service.import_image(&map_name(&map)?, from, body.picture, demand).await? {
+        Added::Created(image) => (StatusCode::CREATED, Json(image)),
+        Added::Present(image) => (StatusCode::OK, Json(image)),
+    })
+}

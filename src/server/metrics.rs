@@ -1,0 +1,127 @@
+//! Metrics of requests and connections, and the registry that all members put their families into.
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use prometheus_client::encoding::EncodeLabelSet;
+use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::Gauge;
+use prometheus_client::metrics::histogram::Histogram;
+use whereabouts_refine::RefineMetrics;
+use whereabouts_service::{Refusals, RefusedFor, ServiceMetrics};
+use whereabouts_telemetry::LastHour;
+use whereabouts_telemetry::metrics::{self, Registry, latency, register};
+
+use super::levels::{Gauges, Levels};
+
+/// The routes that localize a frame.
+const FRAME_ROUTES: [&str; 2] = ["/localize", "/whereabouts.v1.LocalizationService/Localize"];
+
+/// All metrics of a process: those of the server itself, and those that other members registered.
+#[derive(Debug)]
+pub struct Metrics {
+    /// Statistics of the last hour.
+    pub last_hour: Arc<LastHour>,
+    /// Of refinement.
+    pub refine: Arc<RefineMetrics>,
+    /// Of the use cases.
+    pub service: Arc<ServiceMetrics>,
+    registry: Registry,
+    levels: Gauges,
+    requests: Family<RequestLabels, Counter>,
+    request_seconds: Family<RouteLabels, Histogram, fn() -> Histogram>,
+    connections: Gauge,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct RequestLabels {
+    method: String,
+    route: String,
+    status: u16,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct RouteLabels {
+    route: String,
+}
+
+impl Default for Metrics {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Metrics {
+    /// Registers all families; all counts are zero.
+    pub fn new() -> Self {
+        let mut all = metrics::registry();
+        let registry = &mut all;
+        let last_hour = Arc::new(LastHour::default());
+        let refusals = Arc::new(Refusals::register(registry));
+        let service = ServiceMetrics::register(registry, refusals);
+        Self {
+            refine: Arc::new(RefineMetrics::register(registry, Arc::clone(&last_hour))),
+            service: Arc::new(service),
+            last_hour,
+            requests: register(registry, "http_requests", "Requests answered", Family::default()),
+            request_seconds: register(
+                registry,
+                "http_request_seconds",
+                "Time from the request's head to the answer's",
+                Family::new_with_constructor(latency),
+            ),
+            connections: register(
+                registry,
+                "connections",
+                "Connections that are open",
+                Gauge::default(),
+            ),
+            levels: Gauges::new(registry),
+            registry: all,
+        }
+    }
+
+    /// Counts an answered request.
+    pub fn request(&self, method: &str, route: &str, status: u16, took: Duration) {
+        let is_frame = status == 200 && FRAME_ROUTES.contains(&route);
+        self.last_hour.answered(Timestamp::now(), status, is_frame.then_some(took));
+        let route = route.to_owned();
+        self.request_seconds
+            .get_or_create(&RouteLabels { route: route.clone() })
+            .observe(took.as_secs_f64());
+        self.requests.get_or_create(&RequestLabels { method: method.into(), route, status }).inc();
+    }
+
+    /// Counts a frame of a stream of gRPC that was localized.
+    pub fn frame_of_stream(&self, took: Duration) {
+        self.last_hour.answered(Timestamp::now(), 200, Some(took));
+    }
+
+    /// Counts a rejection.
+    pub fn refused(&self, reason: RefusedFor) {
+        self.service.refusals.count(reason);
+    }
+
+    /// Counts a connection that was opened.
+    pub fn connection_opened(&self) {
+        self.connections.inc();
+    }
+
+    /// Counts a connection that was closed.
+    pub fn connection_closed(&self) {
+        self.connections.dec();
+    }
+
+    /// Sets what is measured when it is asked for.
+    pub fn set_levels(&self, levels: &Levels) {
+        self.levels.set(levels);
+    }
+
+    /// All metrics in the OpenMetrics text format.
+    pub fn encode(&self) -> Result<String, fmt::Error> {
+        metrics::encode(&self.registry)
+    }
+}

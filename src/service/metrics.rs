@@ -1,0 +1,154 @@
+//! Metric families of the use cases: stages of localization, checked searches, retention and webhooks.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use prometheus_client::encoding::EncodeLabelSet;
+use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
+use whereabouts_store::RemovedJobs;
+use whereabouts_telemetry::metrics::{Registry, latency, register};
+use whereabouts_vision::Extraction;
+
+use crate::refused::Refusals;
+
+/// Metric families of the use cases.
+#[derive(Debug)]
+pub struct ServiceMetrics {
+    /// Rejections, by reason.
+    pub refusals: Arc<Refusals>,
+    stage_seconds: Family<StageLabels, Histogram, fn() -> Histogram>,
+    batch_pictures: Histogram,
+    neighbours_checked: Family<CheckLabels, Counter>,
+    submitted_jobs: Counter,
+    removed_jobs: Family<RemovedLabels, Counter>,
+    removed_frame_bytes: Counter,
+    webhook_attempts: Family<OutcomeLabels, Counter>,
+}
+
+/// What came of an attempt to deliver a message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AttemptOutcome {
+    /// It was taken.
+    Delivered,
+    /// It is tried again.
+    Failed,
+    /// It is given up.
+    Dead,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct StageLabels {
+    stage: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct RemovedLabels {
+    why: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct CheckLabels {
+    map: String,
+    found: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct OutcomeLabels {
+    outcome: &'static str,
+}
+
+impl ServiceMetrics {
+    /// Registers the families; all counts are zero.
+    pub fn register(registry: &mut Registry, refusals: Arc<Refusals>) -> Self {
+        Self {
+            refusals,
+            stage_seconds: register(
+                registry,
+                "stage_seconds",
+                "Time in one stage of localizing or indexing a picture",
+                Family::new_with_constructor(latency),
+            ),
+            batch_pictures: register(
+                registry,
+                "batch_pictures",
+                "Pictures that the model was run on together, counted for each picture",
+                Histogram::new(exponential_buckets(1.0, 2.0, 7)),
+            ),
+            neighbours_checked: register(
+                registry,
+                "neighbours_checked",
+                "Nearest images, by exact search, of frames whose search was checked: whether the index had \
+                 found them (index.check_s)",
+                Family::default(),
+            ),
+            submitted_jobs: register(registry, "jobs_submitted", "Jobs queued", Counter::default()),
+            removed_jobs: register(
+                registry,
+                "jobs_removed",
+                "Ended jobs that were removed, because of their age or of their number (count)",
+                Family::default(),
+            ),
+            removed_frame_bytes: register(
+                registry,
+                "frame_bytes_removed",
+                "Bytes of frames removed with their jobs",
+                Counter::default(),
+            ),
+            webhook_attempts: register(
+                registry,
+                "webhook_attempts",
+                "Attempts to deliver a message to a webhook: delivered, failed (it is tried again) or dead \
+                 (it is given up)",
+                Family::default(),
+            ),
+        }
+    }
+
+    /// Counts one extraction.
+    pub fn observe_extraction(&self, extraction: &Extraction) {
+        self.batch_pictures.observe(extraction.batch as f64);
+        let times = extraction.times;
+        for (stage, time) in [("decode", times.decode), ("extract", times.extract)] {
+            self.stage_seconds.get_or_create(&StageLabels { stage }).observe(time.as_secs_f64());
+        }
+    }
+
+    /// Counts a search.
+    pub fn observe_search(&self, took: Duration) {
+        let stage = StageLabels { stage: "search" };
+        self.stage_seconds.get_or_create(&stage).observe(took.as_secs_f64());
+    }
+
+    /// Counts the nearest images of a frame whose search was checked, and those of them that it had found.
+    pub fn search_checked(&self, map: &str, nearest: usize, found: usize) {
+        for (word, count) in [("yes", found), ("no", nearest.saturating_sub(found))] {
+            let labels = CheckLabels { map: map.to_owned(), found: word };
+            self.neighbours_checked.get_or_create(&labels).inc_by(count as u64);
+        }
+    }
+
+    /// Counts a queued job.
+    pub fn job_submitted(&self) {
+        self.submitted_jobs.inc();
+    }
+
+    /// Counts jobs that had their time.
+    pub fn jobs_removed(&self, removed: &RemovedJobs) {
+        for (why, jobs) in [("age", removed.by_age), ("count", removed.by_count)] {
+            self.removed_jobs.get_or_create(&RemovedLabels { why }).inc_by(jobs as u64);
+        }
+        self.removed_frame_bytes.inc_by(removed.bytes);
+    }
+
+    /// Counts an attempt to deliver a message to a webhook.
+    pub fn webhook_attempt(&self, outcome: AttemptOutcome) {
+        let outcome = match outcome {
+            AttemptOutcome::Delivered => "delivered",
+            AttemptOutcome::Failed => "failed",
+            AttemptOutcome::Dead => "dead",
+        };
+        self.webhook_attempts.get_or_create(&OutcomeLabels { outcome }).inc();
+    }
+}

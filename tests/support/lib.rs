@@ -1,0 +1,17 @@
+//! What tests and benchmarks share: the real server as a child process ([`server`]), the store that it is given
+//! ([`deployment`]), and scripted peers: a multimodal LLM ([`mock_mllm`]), a model hub ([`mock_hub`]) and a
+//! receiver of webhooks ([`receiver`]).
+
+#![allow(
+    missing_docs,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::unwrap_used,
+    reason = "only tests call it; a panic is a failed test"
+)]
+
+pub mod deployment;
+pub mod mock_hub;
+pub mod mock_mllm;
+pub mod receiver;
+pub mod server;

@@ -1,0 +1,364 @@
+//! A mock of an MLLM server: a real HTTP server on a free port that speaks the chat-completions
+//! format, refuses what the real API would refuse, and answers from a script, with faults on demand.
+
+mod checks;
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use axum::Router;
+use axum::body::{Body, Bytes};
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, Uri, header};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream;
+use serde_json::{Value, json};
+use tokio::net::TcpListener;
+use tokio::sync::Barrier;
+use tokio::task::JoinHandle;
+
+use checks::{Asked, check_envelope, check_request, notes_in};
+
+/// The hashes of the two pictures of a describe call, as they were sent.
+pub type Pair = (String, String);
+
+/// A describe call, as the script sees it.
+pub struct DescribeCall {
+    /// 1 for the first describe call.
+    pub number: usize,
+    pub pair: Pair,
+    pub prompt: String,
+}
+
+/// A reason call, as the script sees it.
+pub struct ReasonCall {
+    /// 1 for the first reason call.
+    pub number: usize,
+    /// Label and text, in the order of the prompt.
+    pub notes: Vec<(String, String)>,
+    pub prompt: String,
+    /// Whether an earlier answer was refused.
+    pub repair: bool,
+    /// Whether the answer is to follow a schema.
+    pub structured: bool,
+}
+
+impl ReasonCall {
+    pub fn labels(&self) -> Vec<&str> {
+        self.notes.iter().map(|(label, _)| label.as_str()).collect()
+    }
+
+    /// The labels, those first whose notes hold `text`.
+    pub fn labels_with_first(&self, text: &str) -> Vec<&str> {
+        let (mut first, rest): (Vec<_>, Vec<_>) =
+            self.notes.iter().partition(|(_, notes)| notes.contains(text));
+        first.extend(rest);
+        first.iter().map(|(label, _)| label.as_str()).collect()
+    }
+}
+
+/// What the mock does with a call.
+#[derive(Clone)]
+pub enum Reply {
+    /// Answers with these words.
+    Text(String),
+    /// Answers 429 with this `Retry-After`.
+    Busy(String),
+    /// Answers with this status and message.
+    Status(u16, String),
+    /// Never answers.
+    Hang,
+    /// Breaks the connection before the body.
+    Cut,
+    /// Breaks the connection in the middle of the body.
+    HalfBody,
+    /// Answers 200 with a page that is not JSON.
+    NotJson,
+    /// Answers 200 with a body of so many bytes and more.
+    Huge(usize),
+}
+
+/// A well-formed reasoning answer.
+pub fn ranking(labels: &[&str]) -> Reply {
+    Reply::Text(json!({"reasoning": "because", "ranking": labels}).to_string())
+}
+
+type Describe = Box<dyn Fn(&DescribeCall) -> Reply + Send + Sync>;
+type Reason = Box<dyn Fn(&ReasonCall) -> Reply + Send + Sync>;
+
+/// How the mock behaves.
+pub struct Script {
+    pub describe: Describe,
+    pub reason: Reason,
+    /// Whether `response_format` is taken; else it is answered 400.
+    pub structured: bool,
+    /// Whether answers say what they cost.
+    pub counts_tokens: bool,
+    /// The key that every call must carry.
+    pub key: Option<String>,
+    /// The longest edge that a picture may have, in pixels.
+    pub max_edge: u32,
+    /// How long each call takes.
+    pub latency: Duration,
+    /// Describe calls are held until so many are there.
+    pub together: Option<usize>,
+}
+
+impl Default for Script {
+    /// Names the pair in each description, and ranks in the order of the prompt.
+    fn default() -> Self {
+        Self {
+            describe: Box::new(|call| {
+                Reply::Text(format!("notes on {} {}", call.pair.0, call.pair.1))
+            }),
+            reason: Box::new(|call| ranking(&call.labels())),
+            structured: true,
+            counts_tokens: true,
+            key: None,
+            max_edge: 768,
+            latency: Duration::ZERO,
+            together: None,
+        }
+    }
+}
+
+/// What the mock has seen.
+#[derive(Default)]
+struct Seen {
+    describe_calls: usize,
+    reason_calls: usize,
+    in_flight: usize,
+    max_in_flight: usize,
+    /// How often each pair was asked, and how often answered.
+    pairs: HashMap<Pair, (usize, usize)>,
+    asked_again: usize,
+    structure_refused: usize,
+    violations: Vec<String>,
+    reason_prompts: Vec<String>,
+    /// Bytes of describe requests and of reason requests.
+    request_bytes: (usize, usize),
+}
+
+struct Shared {
+    script: Script,
+    together: Option<Barrier>,
+    seen: Mutex<Seen>,
+}
+
+/// The running mock; it ends when dropped.
+pub struct MockMllm {
+    url: String,
+    shared: Arc<Shared>,
+    server: JoinHandle<()>,
+}
+
+impl Drop for MockMllm {
+    fn drop(&mut self) {
+        self.server.abort();
+    }
+}
+
+impl MockMllm {
+    pub async fn start(script: Script) -> Self {
+        let together = script.together.map(Barrier::new);
+        let shared = Arc::new(Shared { script, together, seen: Mutex::default() });
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let url = format!("http://{}/v1", listener.local_addr().unwrap());
+        let router = Router::new().fallback(answer).with_state(Arc::clone(&shared));
+        let server = tokio::spawn(async move { axum::serve(listener, router).await.unwrap() });
+        Self { url, shared, server }
+    }
+
+    /// The base URL.
+    pub fn url(&self) -> String {
+        self.url.clone()
+    }
+
+    pub fn describe_calls(&self) -> usize {
+        self.seen(|seen| seen.describe_calls)
+    }
+
+    pub fn reason_calls(&self) -> usize {
+        self.seen(|seen| seen.reason_calls)
+    }
+
+    pub fn in_flight(&self) -> usize {
+        self.seen(|seen| seen.in_flight)
+    }
+
+    pub fn max_in_flight(&self) -> usize {
+        self.seen(|seen| seen.max_in_flight)
+    }
+
+    /// How often each pair was asked, and how often answered.
+    pub fn pairs(&self) -> HashMap<Pair, (usize, usize)> {
+        self.seen(|seen| seen.pairs.clone())
+    }
+
+    /// Describe calls for pairs that had been answered before.
+    pub fn asked_again(&self) -> usize {
+        self.seen(|seen| seen.asked_again)
+    }
+
+    /// Calls that were refused because of their `response_format`.
+    pub fn structure_refused(&self) -> usize {
+        self.seen(|seen| seen.structure_refused)
+    }
+
+    /// What the real API would not have accepted.
+    pub fn violations(&self) -> Vec<String> {
+        self.seen(|seen| seen.violations.clone())
+    }
+
+    /// The prompts of the reason calls so far.
+    pub fn reason_prompts(&self) -> Vec<String> {
+        self.seen(|seen| seen.reason_prompts.clone())
+    }
+
+    /// Bytes of the describe requests and of the reason requests so far.
+    pub fn request_bytes(&self) -> (usize, usize) {
+        self.seen(|seen| seen.request_bytes)
+    }
+
+    fn seen<T>(&self, look: impl FnOnce(&Seen) -> T) -> T {
+        look(&self.shared.seen.lock().unwrap())
+    }
+}
+
+/// Counts a call as long as it lasts, also if the caller hangs up.
+struct InFlight<'a>(&'a Mutex<Seen>);
+
+impl<'a> InFlight<'a> {
+    fn new(seen: &'a Mutex<Seen>) -> Self {
+        let mut counts = seen.lock().unwrap();
+        counts.in_flight += 1;
+        counts.max_in_flight = counts.max_in_flight.max(counts.in_flight);
+        Self(seen)
+    }
+}
+
+impl Drop for InFlight<'_> {
+    fn drop(&mut self) {
+        self.0.lock().unwrap().in_flight -= 1;
+    }
+}
+
+async fn answer(
+    State(shared): State<Arc<Shared>>,
+    uri: Uri,
+    headers: HeaderMap,
+    body: Bytes,
+) -> Response {
+    let _in_flight = InFlight::new(&shared.seen);
+    let script = &shared.script;
+    let asked = check_envelope(&uri, &headers, script)
+        .and_then(|()| serde_json::from_slice(&body).map_err(|error| error.to_string()))
+        .and_then(|request: Value| check_request(&request, script.max_edge));
+    let asked = match asked {
+        Ok(asked) => asked,
+        Err(violation) => {
+            shared.seen.lock().unwrap().violations.push(violation.clone());
+            return refusal(400, &violation);
+        }
+    };
+    if asked.structured && !script.structured {
+        shared.seen.lock().unwrap().structure_refused += 1;
+        return refusal(400, "Unsupported parameter: 'response_format'");
+    }
+    if let (Some(barrier), 2) = (&shared.together, asked.pictures.len()) {
+        barrier.wait().await;
+    }
+    if !script.latency.is_zero() {
+        tokio::time::sleep(script.latency).await;
+    }
+    {
+        let mut seen = shared.seen.lock().unwrap();
+        let (describe, reason) = &mut seen.request_bytes;
+        *if asked.pictures.is_empty() { reason } else { describe } += body.len();
+    }
+    let prompt_tokens = body.len() / 100;
+    let reply = shared.reply(asked);
+    render(reply, script.counts_tokens.then_some(prompt_tokens)).await
+}
+
+impl Shared {
+    fn reply(&self, asked: Asked) -> Reply {
+        let mut seen = self.seen.lock().unwrap();
+        let Asked { pictures, prompt, repair, structured } = asked;
+        let [frame, candidate] = pictures.as_slice() else {
+            seen.reason_calls += 1;
+            seen.reason_prompts.push(prompt.clone());
+            let number = seen.reason_calls;
+            let notes = notes_in(&prompt);
+            return (self.script.reason)(&ReasonCall { number, notes, prompt, repair, structured });
+        };
+        seen.describe_calls += 1;
+        let pair = (frame.clone(), candidate.clone());
+        let call = DescribeCall { number: seen.describe_calls, pair: pair.clone(), prompt };
+        let (asked, answered) = seen.pairs.entry(pair.clone()).or_default();
+        *asked += 1;
+        let again = usize::from(*answered > 0);
+        seen.asked_again += again;
+        let reply = (self.script.describe)(&call);
+        if matches!(reply, Reply::Text(_)) {
+            seen.pairs.entry(pair).or_default().1 += 1;
+        }
+        reply
+    }
+}
+
+async fn render(reply: Reply, prompt_tokens: Option<usize>) -> Response {
+    let json = |body: Body| ([(header::CONTENT_TYPE, "application/json")], body).into_response();
+    let broken = |start: &'static str| {
+        let cut = Err(std::io::Error::other("cut on purpose"));
+        json(Body::from_stream(stream::iter([Ok(Bytes::from_static(start.as_bytes())), cut])))
+    };
+    match reply {
+        Reply::Text(text) => json(Body::from(completion(&text, prompt_tokens).to_string())),
+        Reply::Busy(wait) => {
+            let refused = refusal(429, "Rate limit reached");
+            ([(header::RETRY_AFTER, wait)], refused).into_response()
+        }
+        Reply::Status(status, message) => refusal(status, &message),
+        Reply::Hang => std::future::pending().await,
+        Reply::Cut => broken(""),
+        Reply::HalfBody => broken(r#"{"id": "chatcmpl-1", "choices": [{"mess"#),
+        Reply::NotJson => "<html>502 Bad Gateway</html>".into_response(),
+        Reply::Huge(bytes) => {
+            let words = "wall ".repeat(bytes / 5 + 1);
+            json(Body::from(completion(&words, prompt_tokens).to_string()))
+        }
+    }
+}
+
+fn completion(text: &str, prompt_tokens: Option<usize>) -> Value {
+    let mut completion = json!({
+        "id": "chatcmpl-1",
+        "object": "chat.completion",
+        "created": 1,
+        "model": "mock",
+        "choices": [{
+            "index": 0,
+            "message": {"role": "assistant", "content": text, "refusal": null},
+            "finish_reason": "stop",
+        }],
+    });
+    if let Some(prompt) = prompt_tokens {
+        let answer = text.len() / 4;
+        completion["usage"] = json!({
+            "prompt_tokens": prompt,
+            "completion_tokens": answer,
+            "total_tokens": prompt + answer,
+        });
+    }
+    completion
+}
+
+fn refusal(status: u16, message: &str) -> Response {
+    let body = json!({"error": {
+        "message": message, "type": "invalid_request_error", "param": null, "code": null,
+    }});
+    let json = [(header::CONTENT_TYPE, "application/json")];
+    (StatusCode::from_u16(status).unwrap(), json, body.to_string()).into_response()
+}
