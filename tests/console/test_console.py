@@ -127,7 +127,7 @@ class Jobs(Console):
         expect(candidates).to_have_count(len(job["ranking"]))
         for at, ranked in enumerate(job["ranking"][:5]):
             same = ranked["rank"] == ranked["coarse_rank"]
-            expect(candidates.nth(at)).to_contain_text("unmoved" if same else f"{ranked['rank']} from {ranked['coarse_rank']}")
+            expect(candidates.nth(at)).to_contain_text("unchanged" if same else f"{ranked['rank']} from {ranked['coarse_rank']}")
             expect(candidates.nth(at)).to_contain_text(ranked["image_id"])
         expect(page.locator(".apart .agree li").first).to_contain_text("have a counterpart")
         expect(page.locator(".apart .differ li").first).to_be_visible()
