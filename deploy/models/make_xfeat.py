@@ -298,12 +298,12 @@ def finish(graph: GraphBuilder) -> onnx.ModelProto:
 
 def write(model: onnx.ModelProto, path: Path) -> None:
     """Writes the model to a temporary file and renames it, so that the write is atomic."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        beside.write_bytes(model.SerializeToString(deterministic=True))
-        beside.replace(path)
+        temporary.write_bytes(model.SerializeToString(deterministic=True))
+        temporary.replace(path)
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def main() -> None:

@@ -271,11 +271,11 @@ class RealServer(unittest.TestCase):
 
     def test_the_example_explains_errors(self) -> None:
         town, frames = str(self.town), str(self.town / "frames")
-        nobody = f"http://127.0.0.1:{free_port()}"
+        unreachable = f"http://127.0.0.1:{free_port()}"
         for images, queries, name, url, hint in [
             (town, frames, "m", self.server.url, "no JPEG"),
             (frames, frames + "-not", "m", self.server.url, "is not a folder"),
-            (frames, frames, "m", nobody, "whereabouts serve"),
+            (frames, frames, "m", unreachable, "whereabouts serve"),
             (frames, frames, "No Name", self.server.url, "No Name"),
         ]:
             code, _, err = run_example(images, queries, "--map", name, "--server", url)

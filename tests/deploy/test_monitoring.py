@@ -130,7 +130,7 @@ class Rules(unittest.TestCase):
         self.assertEqual(named - set(METRICS) - families(), set(), "metrics that are mentioned and do not exist")
 
     def test_the_binary_has_the_settings_of_this_tree(self):
-        self.assertEqual(tomllib.loads((SCRATCH / "defaults.toml").read_text()), DEFAULTS, "another version of the binary")
+        self.assertEqual(tomllib.loads((SCRATCH / "defaults.toml").read_text()), DEFAULTS, "the binary is outdated")
 
     @unittest.skipUnless(shutil.which("promtool"), "promtool is not installed")
     def test_promtool_accepts_the_rules_and_they_fire_as_expected(self):

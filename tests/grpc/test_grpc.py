@@ -376,8 +376,8 @@ class Contract(unittest.TestCase):
     def test_a_key_grants_only_its_role_and_maps(self) -> None:
         frame = pictures("frames")[0][1]
         here = self.message("LocalizeRequest", map="town", image=frame, refine=3)
-        nobody, stranger = Services(None), Services("wab_" + "0" * 77)
-        for services in (nobody, stranger):
+        anonymous, unknown = Services(None), Services("wab_" + "0" * 77)
+        for services in (anonymous, unknown):
             error = self.refused(
                 grpc.StatusCode.UNAUTHENTICATED,
                 lambda s=services: s.call("LocalizationService", "Localize", here),

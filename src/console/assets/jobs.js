@@ -199,7 +199,7 @@ export async function show({ root, query, signal, setQuery, title }) {
     status(state) {
       live.className = `live ${state}`;
       live.textContent = state === "live" ? "live" : "reconnecting";
-      if (state === "live" && loaded) load(); // what happened while nobody listened
+      if (state === "live" && loaded) load(); // catch up on events missed while disconnected
     },
     failed(problem) { live.className = "live off"; live.textContent = "not live"; live.title = problem.detail; },
   });

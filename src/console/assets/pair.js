@@ -76,7 +76,7 @@ function draw(canvas, stage, frame, image, regions, on, near) {
   const line = (region, at) => {
     const [x0, y0] = place(region.frame, a);
     const [x1, y1] = place(region.image, b);
-    // The hue goes with the place in the frame: what moved together has lines that run together.
+    // The hue depends on the place in the frame, so that regions that moved together have lines of similar colour.
     const hue = 20 + 300 * region.frame[1];
     ink.strokeStyle = ink.fillStyle = at === near ? "#fff" : `hsl(${hue} 90% 62% / ${many > 300 ? 0.3 : many > 100 ? 0.45 : 0.75})`;
     ink.lineWidth = at === near ? 3 : 1;
@@ -94,7 +94,7 @@ function draw(canvas, stage, frame, image, regions, on, near) {
   if (near >= 0 && near < many) line(regions[near], near);
 }
 
-// Regions are told in shares of the width and the height.
+// Region coordinates are fractions of the width and the height.
 const place = ([x, y], box) => [box.left + x * box.width, box.top + y * box.height];
 
 function nearest(event, frame, image, regions) {
