@@ -121,7 +121,7 @@ function signIn() {
     h("pre", { class: "command", tabindex: "0" }, h("code", {}, "whereabouts keys create --role operator --name 'my name'")),
     h("p", { class: "muted" }, "The first key is created in the data folder while the server is stopped: add ",
       h("code", {}, "--data DIR --role admin"), "."));
-  if (refused) said.textContent = "The key is invalid or has expired.";
+  if (refused) said.textContent = "The key is invalid, expired or revoked.";
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     key.set(input.value.trim());
