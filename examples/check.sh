@@ -3,8 +3,8 @@
 #
 #     check.sh BINARY VENV
 #
-# VENV is a folder for a Python environment with the tools (check-requirements.txt); it is made if it is not
-# there. Takes about a minute once it is. Ends with 1 if anything fails.
+# VENV is the folder of a Python virtual environment with the tools (check-requirements.txt); it is created if
+# missing. After that, a run takes about a minute. Exits with 1 if anything fails.
 set -euo pipefail
 
 if [ $# -ne 2 ]; then
@@ -12,7 +12,7 @@ if [ $# -ne 2 ]; then
     exit 2
 fi
 if [ ! -x "$1" ]; then
-    echo "$1 is not a program; \`make build\` makes target/release/whereabouts" >&2
+    echo "$1 is not executable; \`make build\` builds target/release/whereabouts" >&2
     exit 2
 fi
 binary=$(realpath "$1")
@@ -27,7 +27,7 @@ step() {
 
 # shellcheck source-path=SCRIPTDIR source=../tests/server.sh
 . ../tests/server.sh
-if [ ! -e "$venv/complete" ]; then step "an environment with the tools, in $venv"; fi
+if [ ! -e "$venv/complete" ]; then step "create a virtual environment with the tools in $venv"; fi
 environment "$venv" python/requirements.txt check-requirements.txt
 export PATH=$venv/bin:$PATH PYTHONDONTWRITEBYTECODE=1
 
@@ -39,19 +39,19 @@ step "mypy --strict"
 types=(mypy --strict --python-version 3.10 --cache-dir "$venv/mypy-cache")
 (cd python && "${types[@]}" whereabouts_client.py index_and_localize.py test_client.py)
 (cd ros2 && "${types[@]}" localizer.py test_localizer.py)
-# Of ROS there are no types here.
+# The ROS packages have no type stubs here.
 (cd ros2 && "${types[@]}" --ignore-missing-imports --allow-subclassing-any whereabouts_node.py)
 
 step shellcheck
 shellcheck -x ./*.sh "$load"/*.sh ../tests/*.sh ../tests/api/*.sh ../tests/grpc/*.sh ../tests/console/*.sh ../tests/deploy/*.sh
 
-step "tests of the localizer of the ROS 2 node"
+step "tests of the ROS 2 localizer"
 (cd ros2 && timeout 60 python -m unittest)
 
 step "tests of the Python client"
 (cd python && WHEREABOUTS_BIN=$binary timeout 120 python -m unittest)
 
-step "a server with a small town"
+step "index and localize a small town"
 if ! "$binary" demo --offline --json --places 6 --out "$scratch/town" > "$scratch/log" 2>&1; then
     cat "$scratch/log" >&2
     exit 1
@@ -69,4 +69,4 @@ step localize.sh
 step jobs.sh
 "$load/jobs.sh" "$url" town "$scratch/town/frames" 2 10
 
-step "all is well"
+step "all checks passed"

@@ -3,10 +3,10 @@
 #
 #     curl.sh URL FOLDER
 #
-# URL '' is http://127.0.0.1:8080, where a server listens unless told otherwise. A key, where one is wanted,
-# comes from WHEREABOUTS_API_KEY and is not printed.
-# FOLDER has at least two JPEGs, such as demo-out/frames. The maps `curl-example` and `curl-copy` are made
-# and removed. Prints each command before it runs it; ends with 1 if an answer is not the one expected.
+# An empty URL means http://127.0.0.1:8080, the server's default. An API key, if required, is read from
+# WHEREABOUTS_API_KEY and not printed.
+# FOLDER contains at least two JPEGs, such as demo-out/frames. The maps `curl-example` and `curl-copy` are created
+# and deleted. Prints each command before running it; exits with 1 if a response is not the expected one.
 set -euo pipefail
 
 if [ $# -ne 2 ]; then
@@ -19,7 +19,7 @@ folder=$2
 shopt -s nullglob
 pictures=("$folder"/*.jpg "$folder"/*.jpeg)
 if [ ${#pictures[@]} -lt 2 ]; then
-    echo "$folder has fewer than two JPEGs; \`whereabouts demo\` draws some" >&2
+    echo "$folder has fewer than two JPEGs; \`whereabouts demo\` renders some" >&2
     exit 1
 fi
 first=${pictures[0]} second=${pictures[1]}
@@ -31,7 +31,7 @@ headers=$scratch/headers
 (umask 077 && printf '%s' "${WHEREABOUTS_API_KEY:+Authorization: Bearer $WHEREABOUTS_API_KEY}" > "$headers")
 failed=0
 
-# An argument as it would be typed.
+# Prints an argument, quoted for a shell.
 typed() {
     if [[ $1 =~ ^[A-Za-z0-9_./:=@%+,-]+$ ]]; then
         printf ' %s' "$1"
@@ -40,7 +40,8 @@ typed() {
     fi
 }
 
-# call STATUS[|STATUS] ARGUMENT...: runs curl, shows it and the beginning of its answer, keeps that in $body.
+# call STATUS[|STATUS] ARGUMENT...: runs curl, prints the command and the start of the response, and saves the
+# response in $body.
 call() {
     local expected=$1 status argument
     shift
@@ -61,7 +62,7 @@ call() {
     fi
 }
 
-# The first match of a sed expression with one group in the last answer.
+# Prints the first match of a sed expression with one group in the last response.
 pick() {
     sed -nE "s/$1/\1/p" "$body" | head -n 1
 }
@@ -69,7 +70,7 @@ pick() {
 json='Content-Type: application/json'
 jpeg='Content-Type: image/jpeg'
 
-# Is it there?
+# Is the server up?
 call 200 "$url/livez"
 if [ "$failed" -gt 0 ]; then
     echo "$url does not answer; \`whereabouts serve\` starts a server" >&2
@@ -77,7 +78,7 @@ if [ "$failed" -gt 0 ]; then
 fi
 call 200 "$url/readyz"
 
-# Maps. What an earlier run may have left is removed first.
+# Maps. Leftovers of an earlier run are deleted first.
 call '204|404' -X DELETE "$url/maps/curl-example"
 call '204|404' -X DELETE "$url/maps/curl-copy"
 call 201 -X PUT "$url/maps/curl-example" -H "$json" -d '{"scene": "outdoor", "frame": "wgs84"}'
@@ -108,7 +109,7 @@ call 200 -H "$jpeg" --data-binary "@$second" \
     "$url/localize?map=curl-example&refine=off&track=robot-7&captured_at=2026-03-01T12:00:02Z&moved_m=16.5"
 call 404 -H "$jpeg" --data-binary "@$first" "$url/localize?map=curl-nowhere"
 
-# Jobs. One that has succeeded is not tried again.
+# Jobs. A succeeded job cannot be retried.
 call 200 "$url/jobs/$job?wait=30"
 call 200 -N "$url/jobs/$job/events"
 call 200 "$url/jobs?map=curl-example&state=succeeded&limit=2"
@@ -118,7 +119,7 @@ call '200|404' "$url/jobs/$job/matches/gate"
 call 200 -X POST "$url/jobs/$job/cancel"
 call '200|409' -X POST "$url/jobs/$job/retry"
 
-# From one server to another: the map, then each image with its descriptor and its bytes.
+# Export and import between servers: the map, then each image with its descriptor and bytes.
 call 200 "$url/maps/curl-example/export?limit=1"
 map=$(pick '^\{"map":(\{.*\}),"images":\[.*')
 map=${map/'"name":"curl-example"'/'"name":"curl-copy"'}
@@ -131,7 +132,7 @@ cp "$body" "$scratch/picture"
 call 201 -X PUT "$url/maps/curl-copy/import" -H "$json" -d "@$scratch/map.json"
 call 201 -F "image=@$scratch/picture" -F "meta=<$scratch/meta.json" "$url/maps/curl-copy/import"
 
-# Many images in one request: a form, or an archive with what is known of each beside it.
+# Batch upload: a form, or an archive with a metadata file next to each image.
 call 200 -F 'meta={"id": "gate"}' -F "image=@$first" -F "image=@$second" "$url/maps/curl-copy/images:batch"
 cp "$first" "$scratch/arch.jpg"
 echo '{"pose": {"lat": 45.0007, "lon": -30.0005}}' > "$scratch/arch.jpg.json"
@@ -139,16 +140,16 @@ tar c -C "$scratch" arch.jpg arch.jpg.json > "$scratch/images.tar"
 call 200 -H 'Content-Type: application/x-tar' --data-binary "@$scratch/images.tar" \
     "$url/maps/curl-copy/images:batch"
 
-# Descriptors anew, in the background.
+# Reindex: recompute the descriptors in the background.
 call 202 -X POST "$url/maps/curl-example/reindex" -H "$json" -d '{}'
 
-# Keys: the answer is the only place that shows one.
+# API keys: only this response contains the key.
 call 201 "$url/keys" -H "$json" -d '{"name": "made by curl.sh", "role": "robot", "maps": ["curl-example"]}'
 key=$(pick '.*"key":\{"id":"([^"]*)".*')
 call 200 "$url/keys"
 call 200 -X DELETE "$url/keys/$key"
 
-# Webhooks: a program is told when a job ends. The answer is the only place that shows the secret.
+# Webhooks: notify a program when a job ends. Only this response contains the secret.
 call 201 "$url/webhooks" -H "$json" -d '{"url": "https://fleet.example.com/hooks", "map": "curl-example"}'
 webhook=$(pick '.*"id":"([^"]*)".*')
 call 200 "$url/webhooks"
@@ -159,7 +160,7 @@ delivery=$(pick '.*"deliveries":\[\{"id":"([^"]*)".*')
 call '202|409' -X POST "$url/webhooks/$webhook/deliveries/$delivery/redeliver"
 call 204 -X DELETE "$url/webhooks/$webhook"
 
-# What an operator looks at.
+# Operations.
 call 200 "$url/status"
 call 200 "$url/usage?map=curl-example&days=7"
 call 200 "$url/metrics"
@@ -171,7 +172,7 @@ call 204 -X DELETE "$url/maps/curl-example"
 call 204 -X DELETE "$url/maps/curl-copy"
 
 if [ "$failed" -gt 0 ]; then
-    echo "$failed calls were not answered as expected" >&2
+    echo "$failed calls did not get the expected response" >&2
     exit 1
 fi
-echo "every call was answered as expected"
+echo "every call got the expected response"

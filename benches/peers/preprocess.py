@@ -1,7 +1,7 @@
-"""Measures how long a JPEG takes to become a 224×224 tensor, on one core.
+"""Benchmarks turning a JPEG into a 224×224 tensor, on one core.
 
 usage: preprocess.py FOLDER ROUNDS
-prints: one line for each peer, `NAME MILLISECONDS`, the median over the files of the least of ROUNDS
+prints: one line per peer, `NAME MILLISECONDS`: the median over the files of the minimum of ROUNDS
 """
 
 import sys
@@ -31,7 +31,7 @@ def by_opencv(data, flags=cv2.IMREAD_COLOR):
 
 
 def by_opencv_reduced(data):
-    """OpenCV's own reduction in the frequency domain, to a half."""
+    """Decodes at half size with OpenCV's reduction in the frequency domain."""
     return by_opencv(data, cv2.IMREAD_REDUCED_COLOR_2)
 
 

@@ -1,8 +1,8 @@
-"""Measures one peer on the vectors that benches/search.rs wrote, one thread.
+"""Benchmarks one peer on the vectors written by benches/search.rs, on one thread.
 
 usage: search.py PEER FOLDER DIM K M EF_CONSTRUCTION EF...
-       PEER is hnswlib, faiss or usearch (with 16-bit floats, its own default being 32)
-prints: the seconds that building took; then for each EF, `RECALL QUERIES_A_SECOND`
+       PEER is hnswlib, faiss or usearch (with 16-bit floats; its default is 32-bit)
+prints: the build time in seconds; then for each EF, `RECALL QUERIES_PER_SECOND`
 """
 
 import sys

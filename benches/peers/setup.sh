@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Gets the peers of the benchmarks into a virtual environment, once, and prints its Python.
+# Installs the peers of the benchmarks into a virtual environment, once, and prints the path of its Python.
 #
 # usage: PYTHON=$(benches/peers/setup.sh) cargo bench …
 set -euo pipefail
@@ -8,9 +8,9 @@ here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 dest=$here/../../target/peers
 wanted=$(cat "$here/requirements.txt")
 if [ "$(cat "$dest/.installed" 2>/dev/null)" != "$wanted" ]; then
-    echo 'getting the peers of the benchmarks: some gigabytes, most of them PyTorch' >&2
+    echo 'installing the peers of the benchmarks: several gigabytes, mostly PyTorch' >&2
     "${PYTHON:-python3}" -m venv "$dest" || {
-        echo 'Python cannot make a virtual environment: apt-get install python3-venv' >&2
+        echo 'Python cannot create a virtual environment: apt-get install python3-venv' >&2
         exit 1
     }
     "$dest/bin/pip" install --quiet --requirement "$here/requirements.txt" >&2

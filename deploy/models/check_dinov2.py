@@ -1,18 +1,18 @@
 #!/usr/bin/env python3
-"""Compare the ONNX model of DINOv2 with transformers'. For developers.
+"""Compare the ONNX model of DINOv2 with the one in transformers. For developers.
 
     pip install torch torchvision transformers numpy onnx onnxruntime==1.24.4
     check_dinov2.py tests/fixtures/dinov2
 
-Both get the same seeded weights and the same pictures, those in the folder and their reflections.
-For `--position original` transformers' treatment of the position embedding is replaced by that of
-the authors' code, written again here. The large and the giant variant are cut to one block. Fails
-if a descriptor's cosine with transformers' is below 0.99999, or a position embedding changes at
-518×518.
+Both get the same seeded weights and the same pictures: those in the folder and their reflections.
+For `--position original`, the interpolation of the position embedding in transformers is replaced
+by that of the authors' code, reimplemented here. The large and giant variants are cut to one block.
+Fails if the cosine of a descriptor with that of transformers is below 0.99999, or if a position
+embedding changes at 518×518.
 
-What it printed, in several runs, with torch 2.15.0, transformers 5.23.0, onnxruntime 1.24.4 and
-numpy 2.4.6 on x86_64: the largest difference of a token, whose numbers reach about ±5, and the
-largest 1 − cosine of a descriptor, over batches of 1 and 8 and over graphs for any size and for one:
+Results of several runs with torch 2.15.0, transformers 5.23.0, onnxruntime 1.24.4 and
+numpy 2.4.6 on x86_64: the largest difference of a token, whose values reach about ±5, and the
+largest 1 − cosine of a descriptor, over batches of 1 and 8 and graphs of dynamic and fixed size:
 
     model             blocks  sizes                      hub               original
     small                 12  224×224, 322×224, 322×322  1.0e-05  1.9e-12  1.9e-05  9.9e-13
@@ -25,7 +25,7 @@ largest 1 − cosine of a descriptor, over batches of 1 and 8 and over graphs fo
     large                  1  224×224                    6.0e-06  5.3e-13  2.4e-05  3.2e-12
     giant                  1  224×224                    6.9e-06  2.3e-12  2.4e-05  2.6e-11
 
-The position embeddings were the same at 518×518.
+The position embeddings were identical at 518×518.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ CASES: list[tuple[str, int | None, list[tuple[int, int]]]] = [
 def authors_positions(
     embeddings: torch.nn.Module, tokens: torch.Tensor, height: int, width: int
 ) -> torch.Tensor:
-    """The position embedding as the authors' code stretches it, for the variants without registers.
+    """Interpolates the position embedding like the authors' code, for variants without registers.
 
-    It names both the size and, 0.1 too large, the factor; PyTorch samples by the factor.
+    That code passes both the size and a scale factor with 0.1 added; PyTorch samples by the factor.
     """
     table = embeddings.position_embeddings
     rows, columns = height // 14, width // 14
@@ -82,7 +82,7 @@ def authors_positions(
 
 
 def batch_of(pictures: list[Image.Image], count: int, size: tuple[int, int]) -> np.ndarray:
-    """So many pictures: the given ones, reflected, turned over, and both."""
+    """Returns `count` pictures: the given ones, mirrored, flipped, and both."""
     mirror, flip = Image.Transpose.FLIP_LEFT_RIGHT, Image.Transpose.FLIP_TOP_BOTTOM
     many = [*pictures, *(picture.transpose(mirror) for picture in pictures)]
     many += [picture.transpose(flip) for picture in many]
@@ -90,7 +90,7 @@ def batch_of(pictures: list[Image.Image], count: int, size: tuple[int, int]) -> 
 
 
 def session_of(name: str, depth: int | None, **choices: Any) -> onnxruntime.InferenceSession:
-    """Our model, on one thread."""
+    """Loads our model, on one thread."""
     variant = VARIANTS[name]
     if depth:
         variant = dataclasses.replace(variant, depth=depth)
@@ -105,7 +105,7 @@ def session_of(name: str, depth: int | None, **choices: Any) -> onnxruntime.Infe
 def compare(
     theirs: torch.nn.Module, ours: onnxruntime.InferenceSession, pixels: np.ndarray, registers: int
 ) -> str:
-    """Runs both; says how far apart they are, or ends the program if it is too far."""
+    """Runs both and formats their difference; exits if it is too large."""
     begin = time.perf_counter()
     with torch.inference_mode():
         truth = theirs(torch.from_numpy(pixels)).last_hidden_state
@@ -136,7 +136,7 @@ def compare(
 
 
 def native_positions_stay(name: str, position: str) -> bool:
-    """Whether the position embedding comes out as it went in at 518×518, to the last digit."""
+    """Whether the position embedding at 518×518 is bitwise unchanged."""
     variant = dataclasses.replace(VARIANTS[name], depth=1)
     model = build_model(variant, random_weights(variant, SEED), position=position)
     placed = model.graph.output.add()
@@ -150,9 +150,9 @@ def native_positions_stay(name: str, position: str) -> bool:
 
 
 def main() -> None:
-    """Prints a line for each comparison, and fails if one of them is off."""
+    """Prints one line per comparison; fails if one exceeds its tolerance."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("folder", type=Path, help="where the pictures are")
+    parser.add_argument("folder", type=Path, help="folder of the pictures")
     folder: Path = parser.parse_args().folder
     torch.set_num_threads(1)
     pictures = [Image.open(path).convert("RGB") for path in sorted(folder.glob("*.jpg"))]
@@ -187,7 +187,7 @@ def main() -> None:
     ]:
         if not native_positions_stay(name, position):
             sys.exit(f"check_dinov2: {name}, {position}: positions change at 518×518")
-    print("position embeddings are the same at 518×518")
+    print("position embeddings are identical at 518×518")
 
 
 if __name__ == "__main__":

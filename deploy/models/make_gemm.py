@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Make the graph by which `whereabouts model bench` measures the peak of a processor.
+"""Build the graph that `whereabouts model bench` uses to measure peak GEMM throughput.
 
     make_gemm.py src/retrieve/gemm.onnx
 
     input   x   float32 [1024, 1024]
     output  y   float32 [1024, 1024]   x times the same matrix, 8 times over: 17.18 GFLOP
 
-All elements of the matrix are 1/1024, so that ones stay ones. It is given as a shape and a number,
-which the runtime folds into a constant: the file has a few hundred bytes. The same version of onnx
-gives the same bytes.
+All elements of the matrix are 1/1024, so that ones stay ones. The matrix is stored as a shape and
+a number, which the runtime folds into a constant, so the file has only a few hundred bytes. The
+output is reproducible with the same version of onnx.
 """
 
 from __future__ import annotations

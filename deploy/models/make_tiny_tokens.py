@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Make the tiny token model that the tests use in place of a vision transformer.
+"""Build the tiny token model that the tests use instead of a vision transformer.
 
     make_tiny_tokens.py tests/fixtures/models/tiny-tokens
 
@@ -11,21 +11,21 @@ random weights:
 
     patches   = a 14×14 convolution of stride 14 to 8 channels, row by row
     CLS token = cls + 0.5 · mean of the patches
-    registers = two constants, 100 times as large, so that a reader who pools them is found out
+    registers = two constants, 100 times as large, so that code that pools them fails the test
 
-`manifest.toml` describes it. `expected.json` holds what a reader should get for one image, worked
-out here with numpy from the same weights, without ONNX. The image is 56×42 pixels, just what the
-model takes, so nothing is resized or cropped:
+`manifest.toml` describes it. `expected.json` contains the expected descriptors of one image,
+computed here with numpy from the same weights, without ONNX. The image has 56×42 pixels, the input
+size of the model, so nothing is resized or cropped:
 
     r = (7x + 13y) mod 256,  g = (11x + 3y + 50) mod 256,  b = (5x + 17y + 101) mod 256
 
-with x to the right and y down, then scaled to 0..1 and normalised by ImageNet's mean and deviation.
-The two descriptors, both brought to unit length:
+with x to the right and y down, then scaled to 0..1 and normalised with ImageNet's mean and standard
+deviation. The two descriptors, both L2-normalised:
 
     cls   the CLS token
     gem   for each channel, m = mean of x³ over the patches, then sign(m) · |m|^(1/3)
 
-The same version of numpy and onnx gives the same bytes.
+The output is reproducible with the same versions of numpy and onnx.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Weights:
 
     @classmethod
     def seeded(cls) -> Weights:
-        """The weights that the fixture has."""
+        """The weights of the fixture."""
         rng = np.random.default_rng(SEED)
 
         def normal(*shape: int) -> np.ndarray:
@@ -111,7 +111,7 @@ class Weights:
 
 
 def build_model(weights: Weights) -> onnx.ModelProto:
-    """The model as an ONNX graph."""
+    """Builds the model as an ONNX graph."""
     constants = {
         "kernel": weights.kernel,
         "bias": weights.bias,
@@ -167,7 +167,7 @@ def build_model(weights: Weights) -> onnx.ModelProto:
 
 
 def test_image() -> np.ndarray:
-    """The image of the docstring: bytes [HEIGHT, WIDTH, 3], RGB."""
+    """The image described at the top: bytes [HEIGHT, WIDTH, 3], RGB."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     colours = [7 * x + 13 * y, 11 * x + 3 * y + 50, 5 * x + 17 * y + 101]
     return (np.stack(colours, axis=-1) % 256).astype(np.uint8)
@@ -184,12 +184,12 @@ def expected_tokens(weights: Weights, image: np.ndarray) -> tuple[np.ndarray, np
 
 
 def unit(vector: np.ndarray) -> list[float]:
-    """The vector brought to unit length."""
+    """Normalises a vector to unit length."""
     return [round(float(value), 9) for value in vector / np.linalg.norm(vector)]
 
 
 def signed_gem(tokens: np.ndarray) -> np.ndarray:
-    """Generalised mean with p = 3 over the tokens, keeping the sign."""
+    """Signed generalised mean (GeM) over the tokens, with p = 3."""
     return np.cbrt((tokens**3).mean(axis=0))
 
 
@@ -197,9 +197,9 @@ def main() -> None:
     """Writes the three files."""
     parser = argparse.ArgumentParser(
         description=(__doc__ or "").partition("\n")[0],
-        epilog="See the top of this file for what the files hold.",
+        epilog="The top of this script describes the files.",
     )
-    parser.add_argument("folder", type=Path, help="where the three files go")
+    parser.add_argument("folder", type=Path, help="output folder of the three files")
     folder: Path = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
 

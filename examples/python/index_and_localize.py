@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Index a folder of images, localize the frames of another, and print what came of it."""
+"""Index a folder of images, localize the frames of another folder, and print the results."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ PICTURES = {".jpg", ".jpeg", ".png", ".webp"}
 
 
 class Failure(Exception):
-    """Something that the user has to do something about."""
+    """An error that the user can fix."""
 
 
 def arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__,
-        epilog="Poses are read from poses.csv in the folder of images, if it is there: a header with `file` "
+        epilog="Poses are read from poses.csv in the folder of images, if present: a header with `file` "
         "and lat,lon[,alt,heading] (degrees, metres) or x,y[,z,qx,qy,qz,qw] (metres, unit quaternion). "
-        "`whereabouts demo` draws two such folders: demo-out/map and demo-out/frames. "
-        "A key, where one is wanted, comes from WHEREABOUTS_API_KEY.",
+        "`whereabouts demo` renders two such folders: demo-out/map and demo-out/frames. "
+        "An API key, if required, is read from WHEREABOUTS_API_KEY.",
     )
     parser.add_argument("images", type=Path, help="the folder of reference images")
     parser.add_argument("frames", type=Path, help="the folder of frames to localize")
-    parser.add_argument("--map", required=True, help="the map; it is created if it is not there")
+    parser.add_argument("--map", required=True, help="the map; created if it does not exist")
     parser.add_argument(
         "--server", default="http://localhost:8080", metavar="URL", help="default: %(default)s"
     )
     parser.add_argument(
         "--scene", choices=["outdoor", "indoor"], default="outdoor", help="default: %(default)s"
     )
-    parser.add_argument("-k", type=int, default=5, help="candidates in an answer; default: %(default)s")
+    parser.add_argument("-k", type=int, default=5, help="candidates per answer; default: %(default)s")
     parser.add_argument(
-        "--parallel", type=int, default=4, metavar="N", help="images sent at a time; default: %(default)s"
+        "--parallel", type=int, default=4, metavar="N", help="concurrent uploads; default: %(default)s"
     )
     parser.add_argument(
         "--wait",
         type=float,
         default=60,
         metavar="SECONDS",
-        help="how long to wait for a job, for a server that is overloaded, and for a map to be calibrated; "
+        help="how long to wait for a job, for an overloaded server, and for a map to be calibrated; "
         "default: %(default)s",
     )
     return parser.parse_args(argv)
@@ -63,7 +63,7 @@ def pictures(folder: Path) -> list[Path]:
 
 
 def read_poses(folder: Path) -> dict[str, Pose]:
-    """The poses of poses.csv by file name."""
+    """Reads poses.csv; returns poses by file name."""
     path = folder / "poses.csv"
     if not path.exists():
         return {}
@@ -76,7 +76,7 @@ def read_poses(folder: Path) -> dict[str, Pose]:
                 poses[name] = GeographicPose(**numbers) if "lat" in numbers else MetricPose(**numbers)
             except (KeyError, TypeError, ValueError) as error:
                 hint = "it needs the columns file,lat,lon[,alt,heading] or file,x,y[,z,qx,qy,qz,qw]"
-                raise Failure(f"{path}: a row cannot be read ({error}); {hint}") from error
+                raise Failure(f"{path}: invalid row ({error}); {hint}") from error
     return poses
 
 
@@ -87,7 +87,7 @@ def index(service: Whereabouts, options: argparse.Namespace) -> None:
     service.put_map(options.map, scene=options.scene, frame=frame if poses else None)
 
     def add(path: Path) -> str | None:
-        """Why it could not be added."""
+        """Adds one image; returns the error, if any."""
         try:
             service.add_image(options.map, path, id=path.name, pose=poses.get(path.name))
         except (Problem, ValueError) as error:
@@ -100,18 +100,18 @@ def index(service: Whereabouts, options: argparse.Namespace) -> None:
     took = time.monotonic() - began
     print(f"indexed {len(images) - len(failed)} of {len(images)} images in {took:.1f} s")
     if failed:
-        raise Failure("\n".join([*failed, "run it again: what is in the map already is left as it is"]))
+        raise Failure("\n".join([*failed, "run it again: images already in the map are skipped"]))
 
 
 def wait_for_calibration(service: Whereabouts, options: argparse.Namespace) -> None:
-    """Confidence is measured in the background after images were added, and is 0 until then."""
+    """Waits for the background calibration of the map; confidence is 0 until then."""
     end = time.monotonic() + options.wait
     while True:
         state = service.map(options.map)
         if state.calibration and state.calibration.images == state.images:
             return
         if time.monotonic() > end:
-            print("the map is not calibrated yet, so confidence may be 0; try again later", file=sys.stderr)
+            print("the map is not calibrated yet, so confidence may be 0; run again later", file=sys.stderr)
             return
         time.sleep(0.2)
 
@@ -139,7 +139,7 @@ def localize(service: Whereabouts, options: argparse.Namespace) -> None:
         unended += bool(job and not job.ended)
         print(row(frame.name, answer, job))
     if unended:
-        raise Failure(f"{unended} jobs have not ended; see GET /jobs?map={options.map}, or give --wait more")
+        raise Failure(f"{unended} jobs have not ended; see GET /jobs?map={options.map}, or increase --wait")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,6 +1,6 @@
-"""Tests of the client and the example against a real server, and a scripted one where it has to misbehave.
+"""Tests of the client and the example against a real server, and against a scripted one for faults.
 
-WHEREABOUTS_BIN names the binary of the server:
+WHEREABOUTS_BIN is the path of the server binary:
 
     WHEREABOUTS_BIN=../../target/release/whereabouts python -m unittest
 """
@@ -31,7 +31,7 @@ from whereabouts_client import GeographicPose, Job, MetricPose, PairDescribed, P
 
 PLACES = 6
 CONTRACT = Path(__file__).resolve().parents[2] / "docs" / "openapi.json"
-JPEG = b"\xff\xd8\xff\xe0 not looked at by a scripted server"
+JPEG = b"\xff\xd8\xff\xe0 ignored by the scripted server"
 
 
 def binary() -> str:
@@ -39,13 +39,13 @@ def binary() -> str:
     if not os.access(path, os.X_OK):
         raise SystemExit(
             "WHEREABOUTS_BIN must name the whereabouts binary, such as target/release/whereabouts; "
-            f"it is {path!r}. `make build` makes one."
+            f"it is {path!r}. `make build` builds it."
         )
     return str(Path(path).resolve())
 
 
 def draw_town(folder: Path) -> None:
-    """`map/place-N.jpg` with poses, and `frames/frame-N.jpg`, taken near by."""
+    """Renders `map/place-N.jpg` with poses, and `frames/frame-N.jpg` taken nearby."""
     command = [binary(), "demo", "--offline", "--json", "--places", str(PLACES), "--out", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     if done.returncode:
@@ -86,7 +86,7 @@ class Server:
 
 
 class RealServer(unittest.TestCase):
-    """One server with the map `town` for all tests."""
+    """All tests share one server with the map `town`."""
 
     folder: tempfile.TemporaryDirectory[str]
     town: Path
@@ -115,7 +115,7 @@ class RealServer(unittest.TestCase):
     def frame(self, number: int) -> Path:
         return self.town / "frames" / f"frame-{number:04}.jpg"
 
-    def test_a_frame_with_a_key_is_localized_once(self) -> None:
+    def test_a_frame_with_an_idempotency_key_is_localized_once(self) -> None:
         first, again, other = (
             self.service.localize("town", self.frame(0), idempotency_key=key) for key in ("a", "a", "b")
         )
@@ -140,7 +140,7 @@ class RealServer(unittest.TestCase):
         self.assertTrue(all(description.took_ms is not None for description in job.descriptions))
         self.assertIsNone(job.reasoning_took_ms)
 
-    def test_refined_frames_from_near_by_are_at_their_places(self) -> None:
+    def test_refined_frames_from_nearby_match_their_places(self) -> None:
         for number in range(PLACES):
             answer = self.service.localize("town", self.frame(number), refine="wait", priority="high")
             assert answer.job
@@ -154,7 +154,7 @@ class RealServer(unittest.TestCase):
         self.assertIsNone(answer.job)
         self.assertEqual(len(answer.candidates), PLACES)
 
-    def test_a_track_adds_up_its_frames(self) -> None:
+    def test_a_track_accumulates_its_frames(self) -> None:
         taken = datetime(2026, 3, 1, 12, tzinfo=timezone.utc)
         track = None
         for frames in (1, 2, 3):
@@ -174,7 +174,7 @@ class RealServer(unittest.TestCase):
         self.assertIsInstance(track.pose, GeographicPose)
         self.assertIsNone(self.service.localize("town", self.frame(2), refine="off").track)
 
-    def test_a_moment_without_a_time_zone_is_not_sent(self) -> None:
+    def test_a_time_without_a_time_zone_is_refused(self) -> None:
         with self.assertRaisesRegex(ValueError, "time zone"):
             self.service.localize("town", self.frame(2), track="r", captured_at=datetime(2026, 3, 1))
 
@@ -186,7 +186,7 @@ class RealServer(unittest.TestCase):
         self.assertIn("nowhere", problem.detail)
         self.assertTrue(problem.request_id)
 
-    def test_events_tell_every_pair_and_end_with_the_job(self) -> None:
+    def test_events_report_every_pair_and_end_with_the_job(self) -> None:
         answer = self.service.localize("town", self.frame(1))
         assert answer.job
         events = list(self.service.job_events(answer.job.id))
@@ -201,19 +201,19 @@ class RealServer(unittest.TestCase):
             list(self.service.job_events("018f0000-0000-7000-8000-000000000000"))
         self.assertEqual(raised.exception.status, 404)
 
-    def test_a_job_that_is_not_awaited_long_enough_is_given_as_it_is(self) -> None:
+    def test_waiting_for_a_job_returns_it_unfinished_after_the_timeout(self) -> None:
         answer = self.service.localize("town", self.frame(3), priority="low")
         assert answer.job
         began = time.monotonic()
         self.assertEqual(self.service.wait_for_job(answer.job.id, 0).id, answer.job.id)
         self.assertLess(time.monotonic() - began, 5)
 
-    def test_a_deadline_that_cannot_be_kept_is_a_problem(self) -> None:
+    def test_a_missed_deadline_is_a_problem(self) -> None:
         with self.assertRaises(Problem) as raised, Whereabouts(self.server.url) as service:
             service.localize("town", self.frame(0), refine="off", deadline_ms=1)
         self.assertIn(raised.exception.status, (429, 504))
 
-    def test_images_are_added_listed_page_by_page_and_removed(self) -> None:
+    def test_images_are_added_listed_page_by_page_and_deleted(self) -> None:
         state = self.service.put_map("yard", frame="metric", scene="indoor")
         self.assertEqual((state.frame, state.scene, state.images), ("metric", "indoor", 0))
         pose = MetricPose(x=1.5, y=-2.0, z=0.25, qx=0.0, qy=0.0, qz=0.0, qw=1.0)
@@ -234,20 +234,20 @@ class RealServer(unittest.TestCase):
         self.assertEqual(raised.exception.status, 404)
         self.assertLessEqual({"town", "yard"}, {state.name for state in self.service.maps()})
 
-    def test_the_same_image_is_welcome_twice_and_another_of_its_id_is_not(self) -> None:
+    def test_adding_the_same_image_twice_succeeds_and_other_bytes_conflict(self) -> None:
         again = self.service.add_image("town", self.place(0), id="place-0000.jpg")
         self.assertEqual(again.tags, ("drawn, by day",))
         with self.assertRaises(Problem) as raised:
             self.service.add_image("town", self.place(1), id="place-0000.jpg")
         self.assertEqual(raised.exception.status, 409)
 
-    def test_an_address_that_would_mean_the_map_is_not_sent(self) -> None:
+    def test_an_id_that_would_change_the_path_is_refused(self) -> None:
         for id in ("..", ".", ""):
             with self.assertRaises(ValueError):
                 self.service.delete_image("town", id)
         self.assertEqual(self.service.map("town").images, PLACES)
 
-    def test_what_is_no_picture_is_not_sent(self) -> None:
+    def test_a_file_that_is_not_a_picture_is_refused(self) -> None:
         with self.assertRaisesRegex(ValueError, "poses.csv is not a JPEG"):
             self.service.localize("town", self.town / "map" / "poses.csv")
 
@@ -269,13 +269,13 @@ class RealServer(unittest.TestCase):
             self.assertTrue(0 <= float(confidence) <= 1 and float(ms) > 0, row)
             self.assertEqual(state, "succeeded")
 
-    def test_the_example_says_what_is_wrong(self) -> None:
+    def test_the_example_explains_errors(self) -> None:
         town, frames = str(self.town), str(self.town / "frames")
-        nobody = f"http://127.0.0.1:{free_port()}"
+        unreachable = f"http://127.0.0.1:{free_port()}"
         for images, queries, name, url, hint in [
             (town, frames, "m", self.server.url, "no JPEG"),
             (frames, frames + "-not", "m", self.server.url, "is not a folder"),
-            (frames, frames, "m", nobody, "whereabouts serve"),
+            (frames, frames, "m", unreachable, "whereabouts serve"),
             (frames, frames, "No Name", self.server.url, "No Name"),
         ]:
             code, _, err = run_example(images, queries, "--map", name, "--server", url)
@@ -302,7 +302,7 @@ Reply: TypeAlias = tuple[int, dict[str, str], str]
 
 
 class Script:
-    """A server that gives the answers it was told, the last one again and again; it keeps the requests."""
+    """A server that replays scripted responses, repeating the last one, and records the requests."""
 
     def __init__(self, *answers: Reply) -> None:
         self.requests: list[tuple[str, str, dict[str, str]]] = []
@@ -346,7 +346,7 @@ def problem(status: int, retry_after: int | None = None) -> Reply:
     headers = {"Content-Type": "application/problem+json"}
     if retry_after is not None:
         headers["Retry-After"] = str(retry_after)
-    return status, headers, json.dumps({"title": "Scripted", "status": status, "detail": "as told"})
+    return status, headers, json.dumps({"title": "Scripted", "status": status, "detail": "as scripted"})
 
 
 ANSWER: dict[str, object] = {
@@ -358,7 +358,7 @@ LOCALIZED: Reply = (200, {}, json.dumps(ANSWER))
 
 
 class ScriptedServer(unittest.TestCase):
-    def test_a_refused_frame_is_posted_again_after_the_time_that_the_server_says(self) -> None:
+    def test_a_429_is_retried_after_retry_after(self) -> None:
         script = Script(problem(429, 1), LOCALIZED)
         began = time.monotonic()
         with script.serving() as url, Whereabouts(url, retry_for_s=5) as service:
@@ -372,14 +372,14 @@ class ScriptedServer(unittest.TestCase):
             self.assertEqual((method, path), ("POST", "/localize?map=m&k=7&refine=async"))
             self.assertEqual((headers["Content-Type"], headers["X-Deadline-Ms"]), ("image/jpeg", "250"))
 
-    def test_nothing_is_sent_twice_unless_asked(self) -> None:
+    def test_requests_are_not_retried_by_default(self) -> None:
         script = Script(problem(429, 0), LOCALIZED)
         with script.serving() as url, Whereabouts(url) as service, self.assertRaises(Problem) as raised:
             service.localize("m", JPEG)
         self.assertEqual((raised.exception.status, raised.exception.retry_after_s), (429, 0))
         self.assertEqual(len(script.requests), 1)
 
-    def test_a_wait_beyond_the_callers_time_is_not_waited_for(self) -> None:
+    def test_a_retry_after_beyond_the_retry_budget_fails_at_once(self) -> None:
         script = Script(problem(429, 30), LOCALIZED)
         began = time.monotonic()
         with (
@@ -391,7 +391,7 @@ class ScriptedServer(unittest.TestCase):
         self.assertLess(time.monotonic() - began, 2)
         self.assertEqual(len(script.requests), 1)
 
-    def test_retries_end_with_the_callers_time(self) -> None:
+    def test_retries_end_with_the_retry_budget(self) -> None:
         script = Script(problem(503, 1))
         began = time.monotonic()
         with (
@@ -404,7 +404,7 @@ class ScriptedServer(unittest.TestCase):
         self.assertLess(time.monotonic() - began, 3)
         self.assertEqual(len(script.requests), 2)
 
-    def test_what_may_have_been_carried_out_is_not_sent_again(self) -> None:
+    def test_calls_that_are_not_idempotent_are_not_retried_after_503(self) -> None:
         script = Script(problem(503, 0))
         with script.serving() as url, Whereabouts(url, retry_for_s=1) as service:
             calls: list[Callable[[], object]] = [
@@ -417,7 +417,7 @@ class ScriptedServer(unittest.TestCase):
                 self.assertEqual(raised.exception.status, 503)
         self.assertEqual([method for method, _, _ in script.requests], ["POST", "DELETE"])
 
-    def test_a_frame_with_a_key_is_sent_again_after_503_with_the_same_key(self) -> None:
+    def test_a_frame_with_an_idempotency_key_is_retried_after_503_with_the_same_key(self) -> None:
         script = Script(problem(503, 0), problem(404))
         with (
             script.serving() as url,
@@ -428,7 +428,7 @@ class ScriptedServer(unittest.TestCase):
         keys = [{name.lower(): value for name, value in sent.items()} for _, _, sent in script.requests]
         self.assertEqual([sent["idempotency-key"] for sent in keys], ["k", "k"])
 
-    def test_an_image_is_sent_again_after_503_as_the_same_bytes_are_welcome_twice(self) -> None:
+    def test_adding_an_image_is_retried_after_503(self) -> None:
         stored = {"id": "i", "digest": "sha256:0", "media_type": "image/jpeg", "width": 1, "height": 1}
         body = json.dumps({**stored, "created_at": "2026-11-22T14:27:26.095151545Z", "pose": None})
         script = Script(problem(503, 0), (201, {}, body))
@@ -448,7 +448,7 @@ class ScriptedServer(unittest.TestCase):
                 service.maps()
             self.assertEqual(len(script.requests), 1, answer)
 
-    def test_the_key_is_sent_as_a_bearer_token_and_only_if_there_is_one(self) -> None:
+    def test_the_api_key_is_sent_as_a_bearer_token_only_if_set(self) -> None:
         script = Script((200, {}, '{"maps": []}'))
         with script.serving() as url:
             for key in ("s3cret", None):
@@ -457,7 +457,7 @@ class ScriptedServer(unittest.TestCase):
         sent = [headers.get("Authorization") for _, _, headers in script.requests]
         self.assertEqual(sent, ["Bearer s3cret", None])
 
-    def test_a_refused_connection_says_what_to_do(self) -> None:
+    def test_a_refused_connection_explains_how_to_start_a_server(self) -> None:
         url = f"http://127.0.0.1:{free_port()}"
         with Whereabouts(url, retry_for_s=5) as service:
             calls: list[Callable[[], object]] = [
@@ -472,7 +472,7 @@ class ScriptedServer(unittest.TestCase):
                 self.assertIn(url, str(raised.exception))
                 self.assertIn("whereabouts serve", raised.exception.detail)
 
-    def test_a_silent_server_is_not_waited_for_forever(self) -> None:
+    def test_a_server_that_does_not_respond_times_out(self) -> None:
         with socket.create_server(("127.0.0.1", 0)) as listener:
             url = f"http://127.0.0.1:{listener.getsockname()[1]}"
             with Whereabouts(url, timeout_s=0.3) as service, self.assertRaises(Problem) as raised:
@@ -483,7 +483,7 @@ class ScriptedServer(unittest.TestCase):
         with Script(problem(503, 2)).serving() as url, Whereabouts(url) as service:
             self.assertEqual(service.health(), client.Health(False, "as told"))
 
-    def test_events_of_other_kinds_and_comments_are_passed_over(self) -> None:
+    def test_unknown_events_and_comments_are_skipped(self) -> None:
         state = 'event: state\ndata: {"state": "running",\ndata: "attempts": 1, "error": null}\n\n'
         body = ": still here\n\nevent: of tomorrow\ndata: ?\n\n" + state
         script = Script((200, {"Content-Type": "text/event-stream"}, body))
@@ -494,7 +494,7 @@ class ScriptedServer(unittest.TestCase):
                 next(events)
         self.assertEqual((raised.exception.status, raised.exception.title), (0, "Stream ended"))
 
-    def test_an_answer_of_something_else_is_a_problem(self) -> None:
+    def test_a_response_of_another_server_is_a_problem(self) -> None:
         for body in ("<html>", "[]", '{"candidates": 3}'):
             with (
                 Script((200, {}, body)).serving() as url,
@@ -511,13 +511,13 @@ class ScriptedServer(unittest.TestCase):
             service.maps()
         self.assertEqual((raised.exception.status, raised.exception.title), (502, "Bad Gateway"))
 
-    def test_an_address_without_a_scheme_is_refused(self) -> None:
+    def test_a_url_without_a_scheme_is_refused(self) -> None:
         with self.assertRaisesRegex(ValueError, "http://HOST:PORT"):
             Whereabouts("localhost:8080")
 
 
 class Contract(unittest.TestCase):
-    def test_the_classes_have_the_fields_of_the_contract(self) -> None:
+    def test_the_classes_have_the_fields_of_the_openapi_schemas(self) -> None:
         schemas = json.loads(CONTRACT.read_text())["components"]["schemas"]
         ours = [kind for kind in vars(client).values() if isinstance(kind, type) and is_dataclass(kind)]
         self.assertGreater(len(ours), 15)
@@ -526,7 +526,7 @@ class Contract(unittest.TestCase):
                 names = {field.name for field in fields(kind)}
                 self.assertEqual(names, set(schemas[kind.__name__]["properties"]), kind.__name__)
 
-    def test_the_words_are_those_of_the_contract(self) -> None:
+    def test_the_literals_are_the_enum_values_of_the_openapi_schemas(self) -> None:
         schemas = json.loads(CONTRACT.read_text())["components"]["schemas"]
         for name in ("Scene", "Frame", "DescriptorKind", "Priority", "JobState"):
             self.assertEqual(set(getattr(client, name).__args__), set(words(schemas[name])), name)

@@ -1,4 +1,4 @@
-"""A client of whereabouts, the service that tells a robot where it is from one camera frame.
+"""A client for whereabouts, the service that localizes a robot from a single camera frame.
 
     with Whereabouts("http://localhost:8080") as service:
         answer = service.localize("town", "frame.jpg", k=5)
@@ -6,9 +6,9 @@
         if answer.job:
             print(service.wait_for_job(answer.job.id, 60).estimate)
 
-It needs Python 3.10 and httpx, and is one file: copy it. A client may be used by several threads at once.
-The classes are those of the service's description (`GET /openapi.json`), under the same names; fields that
-a newer server adds are ignored.
+It needs Python 3.10 or later and httpx, and is a single file: copy it. A client is thread-safe.
+The classes have the names of the API schemas (`GET /openapi.json`); fields added by a newer server are
+ignored.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ JobState: TypeAlias = Literal["queued", "running", "succeeded", "degraded", "fai
 T = TypeVar("T")
 
 Picture: TypeAlias = "bytes | str | os.PathLike[str]"
-"""A JPEG, PNG or WebP picture: its bytes, or the path of its file."""
+"""A JPEG, PNG or WebP picture: its bytes or the path of a file."""
 
 
 class Problem(Exception):
-    """A call that failed: the server's RFC 9457 problem, or why there was no answer at all (status 0).
+    """A failed call: the server's RFC 9457 problem, or the reason for no response (status 0).
 
-    A problem with status 0 or 503 leaves open whether the server did what it was asked.
+    After status 0 or 503, the server may or may not have carried out the request.
     """
 
     def __init__(
@@ -63,20 +63,20 @@ class Problem(Exception):
         where = f" (request {request_id})" if request_id else ""
         super().__init__(f"{f'{status} ' if status else ''}{title}: {detail}{where}")
         self.status = status
-        """The HTTP status; 0 if there was no answer."""
+        """The HTTP status; 0 if there was no response."""
         self.title = title
         self.detail = detail
         """What happened and what to do next."""
         self.type = type
         self.request_id = request_id
-        """As in the server's log."""
+        """The id of the request in the server's log."""
         self.retry_after_s = retry_after_s
-        """After how many seconds it is worth trying again, if the server said so."""
+        """Seconds to wait before a retry, if the server gave them."""
 
 
 @dataclass(frozen=True)
 class GeographicPose:
-    """A pose on the globe (WGS84)."""
+    """A geographic pose (WGS84)."""
 
     lat: float
     """Degrees, -90 to 90."""
@@ -90,7 +90,7 @@ class GeographicPose:
 
 @dataclass(frozen=True)
 class MetricPose:
-    """A pose in a map's own frame: metres, and a unit quaternion of which all parts are given or none."""
+    """A pose in a map's local frame: metres, and optionally a unit quaternion (all components or none)."""
 
     x: float
     y: float
@@ -113,7 +113,7 @@ class Image:
     """`sha256:` and 64 hexadecimal digits."""
     media_type: str
     width: int
-    """Pixels, as shown (after the EXIF orientation)."""
+    """Pixels, after EXIF orientation."""
     height: int
     created_at: datetime
     pose: Pose | None = None
@@ -123,19 +123,19 @@ class Image:
 
 @dataclass(frozen=True)
 class CalibrationState:
-    """What confidence in a map rests on."""
+    """The sample that a map's confidence was calibrated on."""
 
     images: int
-    """Images that the map had when it was measured."""
+    """Images in the map when it was calibrated."""
     asked: int
-    """Images that were asked as if they were frames."""
+    """Images that were queried as if they were frames."""
     refined: int
-    """Of these, how many were refined too."""
+    """How many of those were also refined."""
 
 
 @dataclass(frozen=True)
 class Reindex:
-    """How far the last reindex of a map has come."""
+    """Progress of the last reindex of a map."""
 
     model: str
     descriptor: DescriptorKind
@@ -159,43 +159,43 @@ class MapState:
     model_digest: str
     precision: Literal["full", "bf16"]
     dim: int
-    """Numbers in a descriptor."""
+    """Dimension of the descriptors."""
     images: int
     index: Literal["exact", "building", "hnsw"]
     created_at: datetime
     reindex: Reindex | None = None
     calibration: CalibrationState | None = None
-    """None until it is measured, a moment after images were added; until then every confidence is 0."""
+    """None until the map is calibrated, shortly after images are added; until then every confidence is 0."""
     description: str | None = None
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A reference image that looks like the frame."""
+    """A reference image that is similar to the frame."""
 
     rank: int
-    """Its place in the coarse order; 1 is the most similar."""
+    """Rank in the coarse order; 1 is the most similar."""
     image_id: str
     similarity: float
-    """Cosine similarity of its descriptor to the frame's, -1 to 1."""
+    """Cosine similarity of its descriptor and the frame's, -1 to 1."""
     pose: Pose | None = None
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The best guess of where a frame was taken."""
+    """The best estimate of where a frame was taken."""
 
     image_id: str
     confidence: float
-    """0 to 1: of frames from outside the map, at most the rest to 1 get so much."""
+    """Calibrated, 0 to 1: of frames from outside the map, at most a share of 1 - confidence reach it."""
     known: bool
-    """Whether the confidence reaches the server's bound; below it the place is perhaps not in the map."""
+    """Whether the confidence reaches the server's threshold; below it, the place may not be in the map."""
     pose: Pose | None = None
 
 
 @dataclass(frozen=True)
 class JobLink:
-    """Where to find a job."""
+    """A reference to a job."""
 
     id: str
     href: str
@@ -204,7 +204,7 @@ class JobLink:
 
 @dataclass(frozen=True)
 class NoJob:
-    """Why an answer has no job, although one was asked for."""
+    """Why an answer has no job although one was requested."""
 
     reason: Literal["no_refiner", "empty_map", "queue_full", "overload", "disk_full"]
     detail: str
@@ -212,7 +212,7 @@ class NoJob:
 
 @dataclass(frozen=True)
 class TimingMs:
-    """How long the stages of an answer took in the server, in milliseconds."""
+    """Duration of each stage in the server, in milliseconds."""
 
     decode: float
     extract: float
@@ -222,22 +222,22 @@ class TimingMs:
 
 @dataclass(frozen=True)
 class TrackEstimate:
-    """Where a robot is, given all frames of its track."""
+    """A robot's place given all frames of its track."""
 
     id: str
     frames: int
-    """Frames of the track so far, this one included."""
+    """Number of frames in the track so far, including this one."""
     probability: float
-    """0 to 1: that the robot is within the size of a place of the image, as the filter sees it."""
+    """The filter's probability that the robot is within one place radius of the image, 0 to 1."""
     known: bool
     image_id: str | None = None
-    """The most probable image; None as long as none is likely."""
+    """The most probable image; None while none is likely."""
     pose: Pose | None = None
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Where a frame was probably taken."""
+    """The answer to a frame: candidates and the estimated place."""
 
     query_id: str
     map: str
@@ -246,29 +246,29 @@ class Answer:
     """The most similar images, best first."""
     timing_ms: TimingMs
     estimate: Estimate | None = None
-    """None in an empty map."""
+    """None for an empty map."""
     job: JobLink | None = None
-    """The refinement, if there is one."""
+    """The refinement job, if there is one."""
     no_job: NoJob | None = None
     track: TrackEstimate | None = None
-    """None for a frame of no track."""
+    """None without a track."""
 
 
 @dataclass(frozen=True)
 class Usage:
-    """What a refinement cost."""
+    """The cost of a refinement."""
 
     calls: int
     cached: int
     prompt_tokens: int
     completion_tokens: int
     estimated: int = 0
-    """Of the calls, those whose tokens are a guess."""
+    """Calls whose tokens are estimated."""
 
 
 @dataclass(frozen=True)
 class StandIn:
-    """An earlier frame that is nearly the same."""
+    """An earlier, nearly identical frame whose description was reused."""
 
     query_id: str
     similarity: float
@@ -276,7 +276,7 @@ class StandIn:
 
 @dataclass(frozen=True)
 class Description:
-    """The text that compares the frame with one candidate."""
+    """A text that compares the frame with one candidate."""
 
     image_id: str
     text: str
@@ -284,7 +284,7 @@ class Description:
     usage: Usage
     stands_in: StandIn | None = None
     took_ms: int | None = None
-    """Milliseconds that the model took to write it; None for a text that was known."""
+    """Latency of the model in milliseconds; None for a cached text."""
 
 
 @dataclass(frozen=True)
@@ -292,7 +292,7 @@ class RankedCandidate:
     """A candidate after refinement."""
 
     rank: int
-    """Its place in the refined order; 1 is the most likely same place."""
+    """Rank in the refined order; 1 is most likely the same place."""
     image_id: str
     coarse_rank: int
     pose: Pose | None = None
@@ -300,7 +300,7 @@ class RankedCandidate:
 
 @dataclass(frozen=True)
 class Job:
-    """One refinement."""
+    """A refinement job."""
 
     id: str
     map: str
@@ -315,25 +315,25 @@ class Job:
     started_at: datetime | None = None
     finished_at: datetime | None = None
     ranking: tuple[RankedCandidate, ...] | None = None
-    """The refined order, once there is one. The server may compare more candidates than it answered."""
+    """The refined order, once there is one. It may have more candidates than the answer."""
     reasoning: str | None = None
     reasoning_took_ms: int | None = None
-    """Milliseconds that the call took which ordered the candidates, if there was one."""
+    """Latency of the call that ranked the candidates in milliseconds, if there was one."""
     estimate: Estimate | None = None
-    """Where the frame was probably taken, by the refined order."""
+    """The estimated place according to the refined order."""
     error: str | None = None
     trace_id: str | None = None
-    """The trace of its request and its refinement, where the server sends traces."""
+    """Trace id of its request and refinement, if the server exports traces."""
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will happen to it."""
+        """Whether the job has ended."""
         return self.state not in ("queued", "running")
 
 
 @dataclass(frozen=True)
 class JobStatus:
-    """Event: a job's state or attempt has changed."""
+    """Event: the state or attempt of a job changed."""
 
     state: JobState
     attempts: int
@@ -342,7 +342,7 @@ class JobStatus:
 
 @dataclass(frozen=True)
 class PairDescribed:
-    """Event: one more pair of a job is described."""
+    """Event: one more pair of a job was described."""
 
     described: int
     of: int
@@ -354,24 +354,23 @@ JobEvent: TypeAlias = JobStatus | PairDescribed | Job
 
 @dataclass(frozen=True)
 class Health:
-    """What a server says of itself."""
+    """The readiness of a server."""
 
     ready: bool
-    """Whether it takes requests."""
+    """Whether it accepts requests."""
     detail: str
-    """`ready`, or why not."""
+    """`ready`, or the reason it is not."""
 
 
 class Whereabouts:
-    """A server. Every call raises `Problem` when it fails.
+    """A connection to a server. Every call raises `Problem` if it fails.
 
-    `api_key` is sent as a bearer token, where a key is wanted. `timeout_s` bounds each wait for the server
-    within a call, on top of the time that the call itself asks the server to wait.
+    `api_key` is sent as a bearer token, if given. `timeout_s` is the timeout of each network operation, in
+    addition to the time that a call asks the server to wait.
 
-    `retry_for_s` is how many seconds a call may spend on being refused: after 429, or 503 with
-    `Retry-After`, it is sent again as soon as that says, if that is within this time. 0, the default, never
-    sends anything twice. A call that may have been carried out and would be carried out twice (`localize`
-    and `delete_image` after 503) is never sent again.
+    `retry_for_s` is the time budget for retries, in seconds: after 429 or 503 with `Retry-After`, the call is
+    sent again after that delay if it is within the budget. The default, 0, never retries. Calls that are not
+    idempotent (`localize` and `delete_image`) are not retried after 503, which may have carried them out.
     """
 
     def __init__(
@@ -384,7 +383,7 @@ class Whereabouts:
         retry_for_s: float = 0.0,
     ) -> None:
         if not base_url.startswith(("http://", "https://")):
-            raise ValueError(f"{base_url!r} is not an address of a server; give http://HOST:PORT")
+            raise ValueError(f"{base_url!r} is not the URL of a server; give http://HOST:PORT")
         self._timeout_s = timeout_s
         self._connect_timeout_s = connect_timeout_s
         self._retry_for_s = retry_for_s
@@ -404,7 +403,7 @@ class Whereabouts:
         self._http.close()
 
     def health(self) -> Health:
-        """Whether the server takes requests. One that is not there is a `Problem` with status 0."""
+        """Returns whether the server accepts requests; `Problem` with status 0 if it is unreachable."""
         try:
             response = self._once("GET", "/readyz", 0.0)
         except Problem as problem:
@@ -423,18 +422,18 @@ class Whereabouts:
         model: str | None = None,
         description: str | None = None,
     ) -> MapState:
-        """Creates a map, or changes one. What is left out keeps its value, or its default in a new map."""
+        """Creates or updates a map. Omitted fields keep their values, or get defaults in a new map."""
         change = _given(
             scene=scene, frame=frame, descriptor=descriptor, model=model, description=description
         )
         return self._call(MapState, "PUT", f"/maps/{_segment(map)}", json=change)
 
     def map(self, map: str) -> MapState:
-        """One map."""
+        """Returns one map."""
         return self._call(MapState, "GET", f"/maps/{_segment(map)}")
 
     def maps(self) -> list[MapState]:
-        """All maps, by name."""
+        """Returns all maps, sorted by name."""
         response = self._send("GET", "/maps")
         return list(_read(response, lambda body: _decode(tuple[MapState, ...], body["maps"])))
 
@@ -449,7 +448,7 @@ class Whereabouts:
         tags: Sequence[str] = (),
         deadline_ms: int | None = None,
     ) -> Image:
-        """Adds an image to a map. The same id with the same bytes again is welcome; with others it is 409."""
+        """Adds an image to a map. Repeating an id is allowed with the same bytes, and 409 with others."""
         name, data, media_type = _load(picture)
         meta = _given(
             id=id,
@@ -470,7 +469,7 @@ class Whereabouts:
         )
 
     def images(self, map: str, *, page_size: int = 100) -> Iterator[Image]:
-        """The images of a map, by id; asks for a page when it is needed."""
+        """Iterates over the images of a map, sorted by id, fetching pages lazily."""
         cursor: str | None = None
         while True:
             params = _given(limit=page_size, cursor=cursor)
@@ -481,7 +480,7 @@ class Whereabouts:
                 return
 
     def delete_image(self, map: str, id: str) -> None:
-        """Removes an image from a map."""
+        """Deletes an image from a map."""
         self._send("DELETE", f"/maps/{_segment(map)}/images/{_segment(id)}", repeatable=False)
 
     def localize(
@@ -498,19 +497,18 @@ class Whereabouts:
         deadline_ms: int | None = None,
         idempotency_key: str | None = None,
     ) -> Answer:
-        """Localizes a frame: the `k` most similar images of the map, and a job that orders them anew.
+        """Localizes a frame: returns the `k` most similar images of the map and a job that re-ranks them.
 
-        `refine="wait"` answers when the job has ended, `"off"` makes none. `deadline_ms` tells the server
-        for how many milliseconds the answer is of use, from the arrival of the request: it then refuses
-        at once (429) what it cannot answer in time, and gives up (504) what takes longer.
+        `refine="wait"` waits for the job to end; `"off"` creates none. `deadline_ms` is how long the answer
+        is useful, counted from the arrival of the request: the server rejects the request immediately (429)
+        if it cannot meet the deadline, and aborts it (504) if it takes longer.
 
-        A robot that names its `track`, an id of its own choice, also hears where it is given all frames of
-        that track. `captured_at` is then when the frame was taken, by default when it came, and `moved_m`
-        how many metres the robot has come since the frame before, by its odometry.
+        With a `track`, an id chosen by the robot, the answer also contains the robot's place given all frames
+        of that track. `captured_at` is when the frame was taken (default: its time of arrival), and `moved_m`
+        the distance travelled since the previous frame in metres, from odometry.
 
-        With an `idempotency_key`, a text that no other request has, the same frame can be sent again
-        after an answer was lost, and gets its first answer: no second job. `retry_for_s` then does so
-        after 503 too.
+        With a unique `idempotency_key`, the same frame can be sent again after its answer was lost, and gets
+        the first answer instead of a second job. `retry_for_s` then also covers 503.
         """
         _, data, media_type = _load(frame)
         return self._call(
@@ -537,15 +535,15 @@ class Whereabouts:
         )
 
     def job(self, id: str, *, wait_s: float = 0.0) -> Job:
-        """A job. With `wait_s` the server answers when it has ended, or after so many seconds (at most 60
-        with its default settings)."""
+        """Returns a job. With `wait_s`, the server waits that many seconds for it to end (at most 60 with its
+        default settings)."""
         params = {"wait": wait_s} if wait_s > 0 else {}
         return self._call(Job, "GET", f"/jobs/{_segment(id)}", wait_s=wait_s, params=params)
 
     def wait_for_job(self, id: str, timeout_s: float, *, poll_s: float = 20.0) -> Job:
-        """The job once it has ended, or as it is after `timeout_s` seconds: look at `ended`.
+        """Returns the job once it has ended, or unfinished after `timeout_s` seconds: check `ended`.
 
-        It asks the server to wait, for at most `poll_s` seconds at a time.
+        It long-polls, for at most `poll_s` seconds at a time.
         """
         end = time.monotonic() + timeout_s
         while True:
@@ -554,9 +552,9 @@ class Whereabouts:
                 return job
 
     def job_events(self, id: str) -> Iterator[JobEvent]:
-        """Follows a job: what has happened, then what happens, and at last the `Job` that has ended.
+        """Streams the events of a job: past events, then live ones, and finally the `Job` that has ended.
 
-        A stream that breaks off before that is a `Problem` with status 0; ask again, all of it is told anew.
+        Raises `Problem` with status 0 if the stream is interrupted; a new call replays all events.
         """
         path = f"/jobs/{_segment(id)}/events"
         request = self._http.build_request("GET", path, timeout=self._timeout(_KEEP_ALIVE_S))
@@ -574,7 +572,7 @@ class Whereabouts:
                 response.close()
         except httpx.HTTPError as error:
             raise self._no_answer(error) from error
-        raise Problem(0, "Stream ended", "the server ended the events before the job; follow it again")
+        raise Problem(0, "Stream ended", "the server closed the stream before the job ended; follow it again")
 
     def _call(self, kind: type[T], method: str, path: str, **more: Any) -> T:
         response = self._send(method, path, **more)
@@ -590,7 +588,7 @@ class Whereabouts:
         wait_s: float = 0.0,
         **more: Any,
     ) -> httpx.Response:
-        """Sends a request, again where that is allowed: 429 says that nothing was done, 503 does not."""
+        """Sends a request, with retries: always safe after 429, but after 503 only if it is `repeatable`."""
         repeatable = method != "POST" if repeatable is None else repeatable
         end = time.monotonic() + self._retry_for_s
         while True:
@@ -621,18 +619,18 @@ class Whereabouts:
             detail = f"cannot connect to {url} ({error}); `whereabouts serve` starts a server"
             return Problem(0, "Unreachable", detail)
         if isinstance(error, httpx.TimeoutException):
-            detail = f"{url} was silent for too long; allow more time (timeout_s), or look at its GET /readyz"
+            detail = f"{url} did not respond in time; increase timeout_s, or check its GET /readyz"
             return Problem(0, "No answer in time", detail)
-        return Problem(0, "No answer", f"the connection to {url} broke ({error!r}); try again")
+        return Problem(0, "No answer", f"the connection to {url} failed ({error!r}); try again")
 
 
-# The longest that a server holds back an answer with its default settings, in seconds (jobs.max_wait_s).
+# The longest wait of a server with default settings, in seconds (jobs.max_wait_s).
 _LONGEST_WAIT_S = 60.0
 
-# Between two tries, whatever Retry-After says, in seconds.
+# Minimum delay between two attempts, whatever Retry-After says, in seconds.
 _SHORTEST_PAUSE_S = 0.1
 
-# An event stream is never silent for longer, in seconds.
+# Interval of keep-alive comments on an event stream, in seconds.
 _KEEP_ALIVE_S = 15.0
 
 _EVENTS: dict[str, type[JobStatus | PairDescribed | Job]] = {
@@ -643,7 +641,7 @@ _EVENTS: dict[str, type[JobStatus | PairDescribed | Job]] = {
 
 
 def _events(lines: Iterator[str]) -> Iterator[JobEvent]:
-    """Server-sent events; comments and kinds that this client does not know are passed over."""
+    """Parses server-sent events; skips comments and unknown event types."""
     name, data = "", []
     for line in (line.rstrip("\r\n") for line in lines):
         field, _, value = line.partition(":")
@@ -659,7 +657,7 @@ def _events(lines: Iterator[str]) -> Iterator[JobEvent]:
 
 
 def _problem(response: httpx.Response) -> Problem:
-    """The problem in an answer, also where a proxy on the way wrote it."""
+    """Parses the problem of an error response, including one written by a proxy."""
     wait = response.headers.get("retry-after", "")
     retry_after_s = float(wait) if wait.isdecimal() else None
     try:
@@ -667,7 +665,7 @@ def _problem(response: httpx.Response) -> Problem:
     except ValueError:
         body = None
     if not isinstance(body, Mapping):
-        body = {"detail": response.text[:200].strip() or "the answer has no body"}
+        body = {"detail": response.text[:200].strip() or "the response has no body"}
     return Problem(
         response.status_code,
         str(body.get("title", response.reason_phrase)),
@@ -682,12 +680,12 @@ def _read(response: httpx.Response, decode: Any) -> Any:
     try:
         return decode(response.json())
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        detail = f"{response.url} answers, but not as whereabouts does ({error!r}); is the URL right?"
+        detail = f"{response.url} did not respond like a whereabouts server ({error!r}); is the URL right?"
         raise Problem(response.status_code, "Not understood", detail) from error
 
 
 def _decode(kind: Any, value: Any) -> Any:
-    """JSON as a value of one of the types above."""
+    """Converts JSON to one of the types above."""
     if isinstance(kind, type) and is_dataclass(kind):
         hints = _hints(kind)
         given = {
@@ -712,14 +710,14 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _instant(text: str) -> datetime:
-    """A moment of RFC 3339, to the microsecond."""
+    """Parses an RFC 3339 time, to the microsecond."""
     text = re.sub(r"\.(\d+)", lambda digits: "." + digits[1].ljust(6, "0")[:6], text)
     return datetime.fromisoformat(text.replace("Z", "+00:00"))
 
 
 def _rfc3339(moment: datetime) -> str:
     if moment.tzinfo is None:
-        raise ValueError("captured_at has no time zone; use datetime.now(timezone.utc) or the like")
+        raise ValueError("captured_at has no time zone; use, for example, datetime.now(timezone.utc)")
     return moment.isoformat()
 
 
@@ -732,14 +730,14 @@ def _deadline(ms: int | None) -> dict[str, str]:
 
 
 def _segment(text: str) -> str:
-    """A name or an id within a path. `.` and `..` would change which path it is."""
+    """Quotes a name or an id as one path segment. `.` and `..` would change the path."""
     if text in ("", ".", ".."):
-        raise ValueError(f"{text!r} cannot be asked for by its address; use another id")
+        raise ValueError(f"{text!r} cannot be part of a URL path; use another id")
     return quote(text, safe="")
 
 
 def _load(picture: Picture) -> tuple[str, bytes, str]:
-    """File name, bytes and media type of a picture."""
+    """Returns the file name, bytes and media type of a picture."""
     if isinstance(picture, bytes):
         name, data = "picture", picture
     else:

@@ -1,14 +1,14 @@
-"""What the ROS 2 node does, without ROS: newest frame first, answers as poses with covariances.
+"""The logic of the ROS 2 node, without ROS: newest frame first, answers as poses with covariances.
 
-A pose here is that of the camera of the reference image that an estimate names. How far the robot may be
-from it, and how much the candidates contradict each other, is in the covariance:
+A pose here is the camera pose of the reference image named by an estimate. The covariance covers how far the
+robot may be from it, and how much the candidates disagree:
 
     C = s² I + Σ wᵢ dᵢ dᵢᵀ,    wᵢ = exp((simᵢ − sim₁) / τ) / Σⱼ exp((simⱼ − sim₁) / τ)
 
-over the candidates that have a pose: dᵢ is the way from the estimate to candidate i, simᵢ its cosine
-similarity, sim₁ the largest of them, s and τ are in `Spread`. Position and orientation have a block each,
-dᵢ of the second being the rotation vector from the estimate's orientation to the candidate's, over those
-that have one. It is a measure of disagreement, not a calibrated error: candidates that look alike and are
+over the candidates that have a pose: dᵢ is the vector from the estimate to candidate i, simᵢ its cosine
+similarity, sim₁ the largest one; s and τ are in `Spread`. Position and orientation have one block each;
+in the second, dᵢ is the rotation vector from the estimate's orientation to the candidate's, over those
+that have one. It measures disagreement and is not a calibrated error: candidates that look alike and are
 far apart make it large; a wrong estimate on which all candidates agree does not.
 """
 
@@ -45,11 +45,11 @@ T = TypeVar("T")
 S_contra = TypeVar("S_contra", contravariant=True)
 
 UNKNOWN_VARIANCE = 1e6
-"""Of what nothing is known about, in m² or rad²: large enough for any filter to leave it out."""
+"""Variance of an unknown value, in m² or rad²: large enough for any filter to ignore it."""
 
 
 class Refused(Exception):
-    """An answer or a frame that cannot be used; says why and what to do."""
+    """An answer or a frame that cannot be used; the message says why and what to do."""
 
 
 # --- From poses of a map to ROS ---------------------------------------------------------------------------
@@ -57,40 +57,40 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Placed:
-    """A pose in metres: x east, y north, z up in a map on the globe, else the map's own axes."""
+    """A pose in metres: x east, y north, z up for a wgs84 map, else in the map's own axes."""
 
     position: Vector
     height_known: bool
     orientation: Quaternion | None
     tilt_known: bool
-    """Whether roll and pitch are known, and not the yaw only."""
+    """Whether roll and pitch are known, not only yaw."""
 
 
 @dataclass(frozen=True)
 class PoseWithCovariance:
-    """What goes into geometry_msgs/PoseWithCovariance."""
+    """The content of geometry_msgs/PoseWithCovariance."""
 
     position: Vector
     orientation: Quaternion
     covariance: tuple[float, ...]
-    """6 × 6, row by row: x, y, z in m², then rotations about the fixed axes x, y, z in rad²."""
+    """6 × 6, row-major: x, y, z in m², then rotations about the fixed axes x, y, z in rad²."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How far apart the place of an image and the robot may be."""
+    """How far the robot may be from the place of an image."""
 
     place_m: float = 5.0
-    """Standard deviation of the way from the reference image's camera to the robot's, in metres."""
+    """Standard deviation of the distance between the reference image's camera and the robot's, in metres."""
     turn_rad: float = 0.5
-    """The same of the angle between the two, in radians."""
+    """Standard deviation of the angle between the two, in radians."""
     similarity_scale: float = 0.02
-    """A candidate whose similarity is less than the first one's by so much has 1/e of its weight."""
+    """A candidate whose similarity is this much below the first one's has 1/e of its weight."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The point on the globe that is (0, 0, 0) in ROS."""
+    """The geographic point that is (0, 0, 0) in ROS."""
 
     lat: float
     lon: float
@@ -98,10 +98,10 @@ class Origin:
 
     def __post_init__(self) -> None:
         if not (abs(self.lat) <= 90 and abs(self.lon) <= 180 and math.isfinite(self.alt)):
-            raise Refused(f"the origin {self.lat}, {self.lon}, {self.alt} is not a point on the globe")
+            raise Refused(f"the origin {self.lat}, {self.lon}, {self.alt} is not a valid geographic point")
 
     def east_north_up(self, lat: float, lon: float, alt: float) -> Vector:
-        """A point of WGS84 in metres from the origin, on the plane that touches the ellipsoid there."""
+        """Converts a WGS84 point to metres east, north and up from the origin (local tangent plane)."""
         dx, dy, dz = (
             there - here
             for there, here in zip(_earth_fixed(lat, lon, alt), _earth_fixed(self.lat, self.lon, self.alt))
@@ -129,11 +129,11 @@ def _earth_fixed(lat: float, lon: float, alt: float) -> Vector:
 
 
 def place(pose: Pose, origin: Origin | None) -> Placed:
-    """A pose of a map as ROS has it."""
+    """Converts a pose of a map to ROS conventions."""
     if isinstance(pose, MetricPose):
         if origin is not None:
             raise Refused(
-                "the map's poses are metres in its own frame, to which an origin on the globe does not "
+                "the map's poses are metres in a local frame, to which a geographic origin does not "
                 "apply; unset the parameters origin_lat and origin_lon"
             )
         quaternion = None
@@ -162,7 +162,7 @@ def pose_with_covariance(
     origin: Origin | None = None,
     spread: Spread = Spread(),
 ) -> PoseWithCovariance | None:
-    """An estimate as ROS has it; None if the image that it names has no pose."""
+    """Converts an estimate to ROS conventions; None if its image has no pose."""
     if estimate.pose is None:
         return None
     centre = place(estimate.pose, origin)
@@ -192,7 +192,7 @@ def pose_with_covariance(
 def _second_moment(
     vectors: Sequence[tuple[Vector, float]], floor: float, similarity_scale: float
 ) -> list[list[float]]:
-    """Σ wᵢ dᵢ dᵢᵀ with the weights above, and floor² on the diagonal."""
+    """Returns Σ wᵢ dᵢ dᵢᵀ with the weights above, plus floor² on the diagonal."""
     best = max((similarity for _, similarity in vectors), default=0.0)
     weights = [math.exp((similarity - best) / similarity_scale) for _, similarity in vectors]
     total = sum(weights)
@@ -217,7 +217,7 @@ def _minus(a: Vector, b: Vector) -> Vector:
 
 
 def _rotation_vector(start: Quaternion, end: Quaternion) -> Vector:
-    """The rotation about fixed axes that turns `start` into `end`: its axis times its angle, at most π."""
+    """The rotation about fixed axes from `start` to `end`: its axis times its angle, at most π."""
     (ax, ay, az, aw), (bx, by, bz, bw) = end, start
     # end × conjugate of start
     x = -aw * bx + ax * bw - ay * bz + az * by
@@ -234,37 +234,36 @@ def _rotation_vector(start: Quaternion, end: Quaternion) -> Vector:
 # --- Odometry ---------------------------------------------------------------------------------------------
 
 MOST_READINGS = 10_000
-"""What is remembered of the odometry: at 50 Hz, more than three minutes."""
+"""Number of odometry readings kept: at 50 Hz, more than three minutes."""
 LONGEST_GAP = timedelta(seconds=1)
-"""Between two readings further apart, the robot may have come any way."""
+"""Across a longer gap between two readings, the path of the robot is unknown."""
 LONGEST_STEP_M = 100.0
-"""Between two readings further apart, the odometry was set anew and the robot did not move."""
+"""A longer step between two readings means that the odometry was reset, not that the robot moved."""
 LATEST = timedelta(seconds=0.2)
-"""A frame may be ahead of the newest reading by so much: readings are on their way, too."""
+"""How far a frame may be ahead of the newest reading: readings have latency, too."""
 
 
 def instant(sec: int, nanosec: int) -> datetime | None:
-    """A stamp of ROS, to the microsecond; None for zero, which means that it is not known."""
+    """Converts a ROS stamp to a time, to the microsecond; None for zero, which means unknown."""
     if sec == nanosec == 0:
         return None
     return datetime(1970, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=sec, microseconds=nanosec // 1000)
 
 
 class Odometer:
-    """The length of the path that a robot has come, by its odometry. May be used by several threads."""
+    """The path length of a robot from its odometry. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._readings: deque[tuple[datetime, float]] = deque(maxlen=MOST_READINGS)
-        """Without a gap and in order: when, and the metres from where the path begins."""
+        """Times and path lengths in metres since the start of the path, in order and without a gap."""
         self._position: Vector = (0.0, 0.0, 0.0)
-        """Where the newest of them was taken."""
+        """The position of the newest reading."""
 
     def add(self, at: datetime, position: Vector) -> None:
-        """A position in metres, in the odometry's own frame.
+        """Adds a position in metres, in the odometry's own frame.
 
-        One that comes late is left out. After a gap, a leap, or a clock that was set back, the path begins
-        anew.
+        A late reading is dropped. After a gap, a jump, or a clock that was set back, a new path starts.
         """
         if not all(map(math.isfinite, position)):
             return
@@ -283,7 +282,7 @@ class Odometer:
             self._position = position
 
     def metres(self, start: datetime, end: datetime) -> float | None:
-        """The metres from one moment to another, in either order; None if the path does not cover both."""
+        """The path length between two times, in either order; None if the path does not cover both."""
         start, end = min(start, end), max(start, end)
         with self._lock:
             readings = list(self._readings)
@@ -294,7 +293,7 @@ class Odometer:
 
 
 def _metres_at(readings: Sequence[tuple[datetime, float]], moment: datetime) -> float:
-    """The metres at a moment that is not before the first reading; between two, at constant speed."""
+    """The path length at a time not before the first reading, linearly interpolated between readings."""
     after = bisect_left(readings, moment, key=lambda reading: reading[0])
     if after == len(readings):
         return readings[-1][1]
@@ -308,11 +307,11 @@ def _metres_at(readings: Sequence[tuple[datetime, float]], moment: datetime) -> 
 
 
 def encode(encoding: str, width: int, height: int, step: int, data: bytes) -> bytes:
-    """A raw sensor_msgs/Image as a JPEG. Needs Pillow (python3-pil)."""
+    """Encodes a raw sensor_msgs/Image as JPEG. Needs Pillow (python3-pil)."""
     layouts = {"rgb8": ("RGB", "RGB", 3), "bgr8": ("RGB", "BGR", 3), "mono8": ("L", "L", 1)}
     if encoding not in layouts:
         known = ", ".join(layouts)
-        raise Refused(f"the encoding {encoding} is not among {known}; take a compressed image instead")
+        raise Refused(f"the encoding {encoding} is not supported (only {known}); use compressed images")
     mode, layout, channels = layouts[encoding]
     if width < 1 or height < 1 or step < width * channels or len(data) < step * height:
         size = f"{width} × {height} pixels of {encoding} in rows of {step} bytes"
@@ -320,7 +319,7 @@ def encode(encoding: str, width: int, height: int, step: int, data: bytes) -> by
     try:
         from PIL import Image
     except ImportError as error:
-        hint = "install it (python3-pil), or take a compressed image"
+        hint = "install it (python3-pil), or use compressed images"
         raise Refused(f"raw images need Pillow; {hint}") from error
     picture = Image.frombytes(mode, (width, height), data, "raw", layout, step, 1)
     encoded = io.BytesIO()
@@ -330,24 +329,24 @@ def encode(encoding: str, width: int, height: int, step: int, data: bytes) -> by
 
 @dataclass(frozen=True)
 class Shot(Generic[T]):
-    """A frame with what its pose is published under: in ROS the header's stamp."""
+    """A frame, with the stamp that its pose is published under (in ROS, that of the header)."""
 
     stamp: T
     picture: Callable[[], bytes]
-    """Gives the bytes of a JPEG, PNG or WebP; called only if the frame is posted."""
+    """Returns the bytes of a JPEG, PNG or WebP; called only if the frame is posted."""
     taken_at: datetime | None = None
-    """When the frame was taken, with a time zone, if that is known."""
+    """When the frame was taken, with a time zone, if known."""
 
 
 class Newest(Generic[T]):
-    """A place for one item: a newer one takes the place of one that nobody has taken yet."""
+    """A queue of length one: a newer item replaces one that was not taken yet."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._item: T | None = None
         self._closed = False
         self.dropped = 0
-        """Items that a newer one replaced."""
+        """Number of items replaced by a newer one."""
 
     def put(self, item: T) -> None:
         with self._changed:
@@ -356,7 +355,7 @@ class Newest(Generic[T]):
             self._changed.notify()
 
     def take(self) -> T | None:
-        """The newest item, once there is one; None when nothing more is to be done."""
+        """Waits for an item and returns the newest; None once closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._item is not None)
             item, self._item = self._item, None
@@ -369,7 +368,7 @@ class Newest(Generic[T]):
 
 
 class Service(Protocol):
-    """What is asked of a client: `whereabouts_client.Whereabouts` has it."""
+    """The part of `whereabouts_client.Whereabouts` that the localizer uses."""
 
     def localize(
         self,
@@ -389,22 +388,22 @@ class Service(Protocol):
 
 @dataclass(frozen=True)
 class Wishes:
-    """How to localize."""
+    """Parameters of the localizer."""
 
     map: str
     k: int = 10
     refine: bool = True
-    """Whether a job orders the candidates anew."""
+    """Whether a job re-ranks the candidates."""
     deadline_ms: int = 2000
-    """How long an answer is of use, in milliseconds."""
+    """Deadline for an answer, in milliseconds."""
     job_timeout_s: float = 60.0
     """How long to wait for a job, in seconds."""
     only_known: bool = True
-    """Whether to give no pose where the service is not sure that the place is in the map."""
+    """Whether to publish only poses that the service calls known."""
     origin: Origin | None = None
     spread: Spread = field(default_factory=Spread)
     track: str | None = None
-    """The robot's name for its frames one after another; None if each of them is for itself."""
+    """Id of the robot's track; None to localize each frame on its own."""
 
     def __post_init__(self) -> None:
         if self.track is not None and not re.fullmatch(r"[A-Za-z0-9_.:-]{1,64}", self.track):
@@ -412,57 +411,57 @@ class Wishes:
 
 
 class Sink(Protocol[S_contra]):
-    """Who is told, from the localizer's own two threads."""
+    """Receives the results, on the localizer's own two threads."""
 
     def coarse(self, stamp: S_contra, pose: PoseWithCovariance) -> None:
-        """The pose by the most similar image, at once."""
+        """The pose of the most similar image, immediately."""
 
     def refined(self, stamp: S_contra, pose: PoseWithCovariance) -> None:
-        """The pose by the refined order, once the job has ended."""
+        """The pose after refinement, once the job has ended."""
 
     def tracked(self, stamp: S_contra, pose: PoseWithCovariance) -> None:
-        """The pose by all frames of the track, at once."""
+        """The pose given all frames of the track, immediately."""
 
     def job(self, text: str) -> None:
-        """A job that has ended, or was given up waiting for, as JSON."""
+        """A job as JSON, once it has ended or the wait has timed out."""
 
     def trouble(self, text: str) -> None:
-        """Why a frame or a job came to nothing, and what to do."""
+        """Why a frame or a job failed, and what to do."""
 
 
 class Localizer(Generic[T]):
-    """Posts the newest frame while no other is in flight, and follows the newest job."""
+    """Posts the newest frame, one at a time, and follows the newest job."""
 
     def __init__(
         self, service: Service, wishes: Wishes, sink: Sink[T], odometer: Odometer | None = None
     ) -> None:
         self._service, self._wishes, self._sink, self._odometer = service, wishes, sink, odometer
         self._last: datetime | None = None
-        """When the last frame that the service has in the track was taken; None if that is not certain."""
+        """Capture time of the last frame that is certainly in the track; None if that is uncertain."""
         self._frames: Newest[Shot[T]] = Newest()
         self._jobs: Newest[tuple[T, Answer, str]] = Newest()
         self.posted = 0
-        """Frames that were posted."""
+        """Number of frames posted."""
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._post, self._follow)]
         for thread in self._threads:
             thread.start()
 
     @property
     def dropped(self) -> int:
-        """Frames that were not posted, because a newer one came while another was in flight."""
+        """Number of frames replaced by a newer one while a request was in flight."""
         return self._frames.dropped
 
     @property
     def unfollowed(self) -> int:
-        """Jobs that were not waited for, because a newer one came while another was."""
+        """Number of jobs replaced by a newer one while another job was being followed."""
         return self._jobs.dropped
 
     def offer(self, shot: Shot[T]) -> None:
-        """A new frame. Returns at once."""
+        """Offers a new frame. Returns immediately."""
         self._frames.put(shot)
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Posts no more; waits so many seconds for what is in flight."""
+        """Stops posting; waits up to `timeout_s` seconds for the requests in flight."""
         self._frames.close()
         self._jobs.close()
         for thread in self._threads:
@@ -492,7 +491,7 @@ class Localizer(Generic[T]):
             )
         except Problem as problem:
             if not 400 <= problem.status < 500:
-                # The frame may be in the track all the same; one that was refused is not.
+                # The frame may be in the track nevertheless; a rejected (4xx) frame is not.
                 self._last = None
             raise
         if answer.track:
@@ -506,7 +505,7 @@ class Localizer(Generic[T]):
             self._tell(self._sink.tracked, shot.stamp, answer.track, answer)
 
     def _moved_m(self, shot: Shot[T]) -> float | None:
-        """How far the robot has come since the last frame of the track, in metres, if that is known."""
+        """Distance travelled since the last frame of the track, in metres, if known."""
         if self._odometer is None or self._last is None or shot.taken_at is None:
             return None
         return self._odometer.metres(self._last, shot.taken_at)
@@ -539,15 +538,15 @@ class Localizer(Generic[T]):
 
 
 def job_text(job: Job) -> str:
-    """A job as JSON, under the names that the service has."""
+    """Serializes a job as JSON, with the field names of the API."""
 
     def plain(value: object) -> str:
         if isinstance(value, datetime):
             return value.isoformat()
-        raise TypeError(f"{value!r} has no JSON")
+        raise TypeError(f"{value!r} is not JSON serializable")
 
     def bare(items: list[tuple[str, object]]) -> dict[str, object]:
-        # As the service does, a pose has no parts that are not known.
+        # Like the service, leave the unknown parts of a pose out.
         pose = any(name in ("lat", "x") for name, _ in items)
         return {name: value for name, value in items if not (pose and value is None)}
 
@@ -555,7 +554,7 @@ def job_text(job: Job) -> str:
 
 
 def origin_of(lat: float, lon: float, alt: float) -> Origin | None:
-    """The origin that three parameters name, none of which is set while the first two are NaN."""
+    """The origin from three parameters; None while `lat` and `lon` are NaN (unset)."""
     if math.isnan(lat) and math.isnan(lon):
         return None
     return Origin(lat, lon, 0.0 if math.isnan(alt) else alt)

@@ -5,7 +5,7 @@ NAME = "whereabouts_ros"
 setup(
     name=NAME,
     version="0.1.0",
-    description="Tells where a camera is, by asking a whereabouts server.",
+    description="Publishes the pose of a camera, localized by a whereabouts server.",
     license="Apache-2.0",
     maintainer="whereabouts",
     maintainer_email="maintainers@whereabouts.invalid",

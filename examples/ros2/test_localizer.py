@@ -1,4 +1,4 @@
-"""Tests of the localizer with a client that answers as told, and of the node with stubs in place of ROS."""
+"""Tests of the localizer with a fake client, and of the node with stubs of ROS."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Covariance(unittest.TestCase):
                 self.assertEqual(found.covariance[6 * row + column], found.covariance[6 * column + row])
         return found
 
-    def test_agreeing_candidates_leave_the_spread_of_a_place(self) -> None:
+    def test_agreeing_candidates_have_the_covariance_of_one_place(self) -> None:
         here = MetricPose(1, 2, 3, 0, 0, 0, 1)
         found = self.given(here, candidates((here, 0.9), (here, 0.8)), place_m=2, turn_rad=0.1)
         self.assertEqual((found.position, found.orientation), ((1, 2, 3), (0, 0, 0, 1)))
@@ -94,7 +94,7 @@ class Covariance(unittest.TestCase):
                 for j, value in enumerate(row):
                     self.assertAlmostEqual(value, variance if i == j else 0)
 
-    def test_candidates_weigh_by_their_similarity(self) -> None:
+    def test_candidates_are_weighted_by_similarity(self) -> None:
         # The second has 1/e of the first one's weight, and is 3 m east and 4 m north of it.
         others = candidates((MetricPose(0, 0, 0), 0.90), (MetricPose(3, 4, 0), 0.85))
         found = self.given(MetricPose(0, 0, 0), others, place_m=1, similarity_scale=0.05)
@@ -105,8 +105,8 @@ class Covariance(unittest.TestCase):
         self.assertAlmostEqual(position[0][1], 12 * share)
         self.assertAlmostEqual(position[2][2], 1)
 
-    def test_it_is_spread_around_the_estimate_and_not_around_the_mean(self) -> None:
-        # A refined estimate far from all that look alike has a large covariance.
+    def test_the_covariance_is_around_the_estimate_not_the_mean(self) -> None:
+        # A refined estimate far from all similar candidates has a large covariance.
         others = candidates((MetricPose(0, 0, 0), 0.9), (MetricPose(0, 0, 0), 0.9))
         found = self.given(MetricPose(10, 0, 0), others, place_m=1)
         self.assertAlmostEqual(block(found, 0)[0][0], 101)
@@ -117,7 +117,7 @@ class Covariance(unittest.TestCase):
         self.assertAlmostEqual(block(found, 0)[1][1], 5)
         self.assertIsNone(pose_with_covariance(estimate(None), others))
 
-    def test_what_is_not_known_has_a_large_variance(self) -> None:
+    def test_unknown_values_have_a_large_variance(self) -> None:
         others = candidates((MetricPose(0, 1, 7, 0, 0, 0, 1), 0.9))
         found = self.given(MetricPose(0, 0), others, place_m=1)
         self.assertEqual(found.position, (0, 0, 0))
@@ -126,8 +126,8 @@ class Covariance(unittest.TestCase):
         unknown = UNKNOWN_VARIANCE
         self.assertEqual(block(found, 3), [[unknown, 0, 0], [0, unknown, 0], [0, 0, unknown]])
 
-    def test_orientations_differ_by_the_shorter_turn(self) -> None:
-        # A quarter turn about z, the same written with the opposite sign, and none.
+    def test_orientations_differ_by_the_shorter_rotation(self) -> None:
+        # A quarter turn about z, the same with opposite sign, and no turn.
         quarter = MetricPose(0, 0, 0, 0, 0, -HALF, -HALF)
         others = candidates((MetricPose(0, 0, 0, 0, 0, 0, 1), 0.9), (quarter, 0.9))
         found = self.given(MetricPose(0, 0, 0, 0, 0, HALF, HALF), others, turn_rad=0.1)
@@ -135,7 +135,7 @@ class Covariance(unittest.TestCase):
         self.assertAlmostEqual(turns[2][2], 0.01 + (math.pi / 2) ** 2 / 2)
         self.assertAlmostEqual(turns[0][0], 0.01)
 
-    def test_turns_are_about_the_fixed_axes(self) -> None:
+    def test_rotations_are_about_the_fixed_axes(self) -> None:
         # Yawed by a quarter turn, then rolled about the camera's own x axis, which is the fixed y axis.
         yawed = (0.0, 0.0, HALF, HALF)
         rolled = (0.5, 0.5, 0.5, 0.5)
@@ -161,7 +161,7 @@ class Globe(unittest.TestCase):
             for value, wanted in zip(position, expected, strict=True):
                 self.assertAlmostEqual(value, wanted, delta=0.01)
 
-    def test_a_heading_becomes_a_yaw_of_which_roll_and_pitch_are_not_known(self) -> None:
+    def test_a_heading_becomes_a_yaw_with_unknown_roll_and_pitch(self) -> None:
         for heading, (z, w) in {90.0: (0, 1), 0.0: (HALF, HALF), 180.0: (-HALF, HALF)}.items():
             found = pose_with_covariance(estimate(GeographicPose(45, -30, None, heading)), [], self.ORIGIN)
             assert found
@@ -173,7 +173,7 @@ class Globe(unittest.TestCase):
             self.assertEqual(found.position[2], 0)
             self.assertEqual(block(found, 0)[2][2], UNKNOWN_VARIANCE)
 
-    def test_without_an_origin_degrees_are_refused(self) -> None:
+    def test_geographic_poses_without_an_origin_are_refused(self) -> None:
         with self.assertRaisesRegex(Refused, "origin_lat"):
             pose_with_covariance(estimate(GeographicPose(45, -30)), [])
 
@@ -181,7 +181,7 @@ class Globe(unittest.TestCase):
         with self.assertRaisesRegex(Refused, "unset"):
             pose_with_covariance(estimate(MetricPose(1, 2)), [], self.ORIGIN)
 
-    def test_an_origin_off_the_globe_is_refused(self) -> None:
+    def test_an_invalid_origin_is_refused(self) -> None:
         nan = math.nan
         self.assertIsNone(origin_of(nan, nan, nan))
         self.assertEqual(origin_of(45, -30, nan), Origin(45, -30, 0))
@@ -195,7 +195,7 @@ def at(seconds: float) -> datetime:
 
 
 def driven(start: float, end: float, speed_m_s: float = 10.0) -> Odometer:
-    """An odometer of a robot that drives along x, read every 0.1 s."""
+    """An odometer of a robot that drives along x, with a reading every 0.1 s."""
     odometer = Odometer()
     for tenth in range(round(start * 10), round(end * 10) + 1):
         odometer.add(at(tenth / 10), (tenth / 10 * speed_m_s, 0.0, 0.0))
@@ -210,51 +210,51 @@ class Odometry(unittest.TestCase):
         else:
             self.assertAlmostEqual(found, expected)
 
-    def test_a_stamp_is_a_moment_and_zero_is_none(self) -> None:
+    def test_a_stamp_is_a_time_and_zero_is_none(self) -> None:
         self.assertIsNone(instant(0, 0))
         moment = instant(1_767_323_045, 250_000_999)
         self.assertEqual(moment, at(0.25))
         assert moment
         self.assertEqual(moment.isoformat(), "2026-01-02T03:04:05.250000+00:00")
 
-    def test_the_path_is_measured_and_not_the_way_as_the_crow_flies(self) -> None:
+    def test_the_distance_is_the_path_length_not_the_straight_line(self) -> None:
         odometer = Odometer()
         for second, position in enumerate([(0, 0, 0), (3, 4, 0), (3, 4, 2), (0, 0, 0)]):
             odometer.add(at(second), position)
         self.metres(odometer, 0, 3, 5 + 2 + math.sqrt(29))
 
-    def test_between_two_readings_the_speed_is_constant(self) -> None:
+    def test_distances_are_interpolated_between_readings(self) -> None:
         odometer = driven(0, 2)
         self.metres(odometer, 0.5, 1.25, 7.5)
         self.metres(odometer, 0.51, 0.53, 0.2)
         self.metres(odometer, 1, 1, 0)
-        # A frame before the last one: the robot has come as far, the other way.
+        # A frame before the last one: the same distance in the other direction.
         self.metres(odometer, 1.25, 0.5, 7.5)
 
-    def test_what_was_not_measured_is_not_known(self) -> None:
+    def test_times_outside_the_readings_are_unknown(self) -> None:
         self.metres(Odometer(), 0, 1, None)
         odometer = driven(1, 2)
         self.metres(odometer, 0.95, 1.5, None)
         self.metres(odometer, 1.5, 2.25, None)
         self.metres(odometer, 1, 2, 10)
-        # The reading after the frame is on its way.
+        # The reading after the frame has not arrived yet.
         self.metres(odometer, 1.5, 2.15, 5)
 
-    def test_after_a_gap_it_begins_anew(self) -> None:
+    def test_a_gap_starts_a_new_path(self) -> None:
         odometer = driven(0, 1)
         for seconds in (2.0, 4.0, 5.0):
             odometer.add(at(seconds), (10 * seconds, 0, 0))
         self.metres(odometer, 1, 4, None)
         self.metres(odometer, 4, 5, 10)
 
-    def test_odometry_that_was_set_anew_is_no_way(self) -> None:
+    def test_an_odometry_reset_starts_a_new_path(self) -> None:
         odometer = driven(0, 1)
         for seconds, x in ((1.1, 500_000.0), (1.2, 500_001.0)):
             odometer.add(at(seconds), (x, 0, 0))
         self.metres(odometer, 1, 1.2, None)
         self.metres(odometer, 1.1, 1.2, 1)
 
-    def test_late_and_broken_readings_are_left_out(self) -> None:
+    def test_late_and_invalid_readings_are_dropped(self) -> None:
         odometer = driven(0, 1)
         odometer.add(at(0.45), (900, 0, 0))
         odometer.add(at(1), (900, 0, 0))
@@ -262,14 +262,14 @@ class Odometry(unittest.TestCase):
         odometer.add(at(1.1), (11, 0, 0))
         self.metres(odometer, 0, 1.1, 11)
 
-    def test_a_clock_that_was_set_back_begins_anew(self) -> None:
+    def test_a_clock_set_back_starts_a_new_path(self) -> None:
         odometer = driven(100, 101)
         for seconds in (1.0, 1.5):
             odometer.add(at(seconds), (10 * seconds, 0, 0))
         self.metres(odometer, 100, 101, None)
         self.metres(odometer, 1, 1.5, 5)
 
-    def test_it_remembers_so_much_and_no_more(self) -> None:
+    def test_the_number_of_readings_is_bounded(self) -> None:
         end = MOST_READINGS / 10 + 5
         odometer = driven(0, end)
         self.assertEqual(len(odometer._readings), MOST_READINGS)
@@ -297,13 +297,13 @@ class Encoding(unittest.TestCase):
         self.assertEqual(grey.mode, "L")
         self.assertAlmostEqual(grey.getpixel((3, 3)), 128, delta=2)
 
-    def test_what_cannot_be_encoded_is_refused(self) -> None:
+    def test_an_image_that_cannot_be_encoded_is_refused(self) -> None:
         with self.assertRaisesRegex(Refused, "bayer_rggb8"):
             encode("bayer_rggb8", 4, 4, 4, b"\0" * 16)
         with self.assertRaisesRegex(Refused, "11 bytes are not"):
             encode("rgb8", 2, 2, 6, b"\0" * 11)
 
-    def test_without_pillow_it_says_what_to_do(self) -> None:
+    def test_a_missing_pillow_is_explained(self) -> None:
         with mock.patch.dict(sys.modules, {"PIL": None}), self.assertRaisesRegex(Refused, "python3-pil"):
             encode("mono8", 1, 1, 1, b"\0")
 
@@ -334,18 +334,18 @@ def job(id: str, state: Any = "succeeded") -> Job:
 
 
 def tracked(number: int, known: bool = True, pose: Pose | None = None) -> Answer:
-    """An answer that has the robot elsewhere, given its track."""
+    """An answer whose track places the robot elsewhere."""
     track = TrackEstimate("robot-7", number, 0.9, known, "first", pose or MetricPose(0.0, float(number)))
     return replace(answer(number), track=track)
 
 
 class Client:
-    """Answers when it is let, and keeps what it was asked."""
+    """A fake client that answers when permitted and records its calls."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[bytes, int | None, str, int | None]] = []
         self.steps: list[tuple[str | None, datetime | None, float | None]] = []
-        """Track, time and way of each frame."""
+        """Track, time and distance of each frame."""
         self.waited: list[str] = []
         self.may_answer = threading.Semaphore(0)
         self.answers: Callable[[int], Answer] = answer
@@ -375,7 +375,7 @@ class Client:
 
 
 class Told:
-    """A sink that keeps what it is told."""
+    """A sink that records the results."""
 
     def __init__(self) -> None:
         self.poses: list[tuple[int, PoseWithCovariance]] = []
@@ -413,7 +413,7 @@ class WithLocalizer(unittest.TestCase):
         end = time.monotonic() + 10
         while not holds():
             if time.monotonic() > end:
-                self.fail(f"never came; told: {vars(self.told)}, asked: {self.client.asked}")
+                self.fail(f"timed out; received: {vars(self.told)}, asked: {self.client.asked}")
             time.sleep(0.002)
 
 
@@ -432,21 +432,21 @@ class Frames(WithLocalizer):
         self.assertEqual([stamp for stamp, _ in self.told.poses], [1, 4])
         self.assertEqual((self.localizer.dropped, self.localizer.posted), (2, 2))
 
-    def test_a_job_is_told_and_its_pose_under_the_stamp_of_the_frame(self) -> None:
+    def test_a_job_and_its_pose_are_published_with_the_stamp_of_the_frame(self) -> None:
         self.start()
         self.offer(7)
         self.client.may_answer.release()
         self.until(lambda: self.told.refined_poses)
         (stamp, pose), = self.told.refined_poses
         self.assertEqual((stamp, pose.position), (7, (0, 5, 0)))
-        # The candidate that looked most alike is elsewhere, which the covariance tells.
+        # The most similar candidate is elsewhere, which the covariance shows.
         self.assertAlmostEqual(block(pose, 0)[1][1], Spread().place_m ** 2 + 25)
         (told,) = self.told.jobs
         self.assertEqual((told["id"], told["state"]), ("job-1", "succeeded"))
         self.assertEqual(told["ranking"][0]["pose"], {"x": 0.0, "y": 5.0})
         self.assertEqual(told["created_at"], "2026-01-02T03:04:05+00:00")
 
-    def test_a_job_that_has_not_ended_gives_no_pose(self) -> None:
+    def test_an_unfinished_job_gives_no_pose(self) -> None:
         self.start()
         self.client.jobs = lambda id: job(id, "running")
         self.offer(1)
@@ -456,7 +456,7 @@ class Frames(WithLocalizer):
         self.localizer.close()
         self.assertEqual(self.told.refined_poses, [])
 
-    def test_jobs_do_not_hold_up_frames(self) -> None:
+    def test_jobs_do_not_delay_frames(self) -> None:
         self.start()
         go_on = threading.Event()
         self.addCleanup(go_on.set)
@@ -476,7 +476,7 @@ class Frames(WithLocalizer):
         self.assertEqual([told["id"] for told in self.told.jobs], ["job-1", "job-3"])
         self.assertEqual(self.localizer.unfollowed, 1)
 
-    def test_a_place_that_is_perhaps_not_in_the_map_gives_no_pose_unless_wished(self) -> None:
+    def test_an_unknown_place_gives_no_pose_unless_configured(self) -> None:
         for only_known, poses in ((True, 0), (False, 1)):
             self.start(Wishes("town", only_known=only_known, refine=False))
             self.client.answers = lambda number: answer(number, known=False, job=False)
@@ -488,7 +488,7 @@ class Frames(WithLocalizer):
             self.assertEqual(self.client.asked[0][2], "off")
             self.assertEqual(self.told.troubles, ["no refinement: too much to do"])
 
-    def test_it_goes_on_after_trouble(self) -> None:
+    def test_it_continues_after_errors(self) -> None:
         self.start()
 
         def refused(number: int) -> Answer:
@@ -508,7 +508,7 @@ class Frames(WithLocalizer):
         self.assertIn("429 Overloaded: drop the frame", self.told.troubles)
         self.assertTrue(any("origin_lat" in trouble for trouble in self.told.troubles))
 
-    def test_a_frame_that_cannot_be_encoded_is_trouble_and_not_posted(self) -> None:
+    def test_a_frame_that_cannot_be_encoded_is_reported_and_not_posted(self) -> None:
         self.start()
 
         def broken() -> bytes:
@@ -518,7 +518,7 @@ class Frames(WithLocalizer):
         self.until(lambda: self.told.troubles == ["cannot be encoded"])
         self.assertEqual((self.localizer.posted, self.client.asked), (0, []))
 
-    def test_nothing_is_taken_after_the_end(self) -> None:
+    def test_no_frame_is_posted_after_close(self) -> None:
         newest: Newest[int] = Newest()
         newest.put(1)
         newest.close()
@@ -533,7 +533,7 @@ class Tracks(WithLocalizer):
         self.client.answers = tracked
 
     def frame(self, number: int, taken_at: datetime | None = None) -> None:
-        """Offers a frame, and waits until it is dealt with."""
+        """Offers a frame and waits until it is processed."""
         before = len(self.told.poses) + len(self.told.troubles)
         self.client.may_answer.release()
         self.localizer.offer(Shot(number, lambda: b"frame", taken_at or at(number)))
@@ -543,7 +543,7 @@ class Tracks(WithLocalizer):
         return [None if way is None else round(way, 6) for _, _, way in self.client.steps]
 
     def failing(self, *problems: Problem | None) -> None:
-        """Frame after frame is answered so."""
+        """Sets the answer to every frame."""
 
         def answers(number: int) -> Answer:
             if number <= len(problems) and (problem := problems[number - 1]):
@@ -552,34 +552,34 @@ class Tracks(WithLocalizer):
 
         self.client.answers = answers
 
-    def test_without_a_track_every_frame_is_for_itself(self) -> None:
+    def test_without_a_track_no_time_or_distance_is_sent(self) -> None:
         self.start(Wishes("town"), driven(0, 10))
         for number in (1, 2):
             self.frame(number)
         self.assertEqual(self.client.steps, [(None, None, None)] * 2)
         self.assertEqual(self.told.tracked_poses, [])
 
-    def test_frames_of_a_track_have_a_time_and_the_way_since_the_one_before(self) -> None:
+    def test_frames_of_a_track_carry_their_time_and_the_distance_since_the_previous_one(self) -> None:
         for number in (1, 2, 5):
             self.frame(number)
         times = [("robot-7", at(number)) for number in (1, 2, 5)]
         self.assertEqual([(track, taken) for track, taken, _ in self.client.steps], times)
         self.assertEqual(self.ways(), [None, 10, 30])
 
-    def test_without_odometry_no_way_is_told(self) -> None:
+    def test_without_odometry_no_distance_is_sent(self) -> None:
         self.start(Wishes("town", track="robot-7"))
         self.client.answers = tracked
         for number in (1, 2):
             self.frame(number)
         self.assertEqual(self.client.steps, [("robot-7", at(1), None), ("robot-7", at(2), None)])
 
-    def test_after_a_frame_that_was_refused_the_way_is_since_the_last_one_of_the_track(self) -> None:
+    def test_after_a_rejected_frame_the_distance_is_from_the_last_frame_in_the_track(self) -> None:
         self.failing(None, Problem(429, "Overloaded", "drop the frame"), None)
         for number in (1, 2, 3, 4):
             self.frame(number)
         self.assertEqual(self.ways(), [None, 10, 20, 10])
 
-    def test_after_a_frame_that_is_perhaps_in_the_track_no_way_is_told_once(self) -> None:
+    def test_after_a_frame_of_unknown_outcome_one_frame_has_no_distance(self) -> None:
         for status in (0, 500, 504):
             with self.subTest(status):
                 self.setUp()
@@ -598,7 +598,7 @@ class Tracks(WithLocalizer):
         self.frame(3)
         self.assertEqual(self.ways(), [None, 20])
 
-    def test_a_frame_of_an_unknown_time_has_no_way_and_neither_has_the_next(self) -> None:
+    def test_a_frame_without_a_time_and_the_next_one_have_no_distance(self) -> None:
         self.frame(1)
         self.client.may_answer.release()
         self.localizer.offer(Shot(2, lambda: b"frame"))
@@ -608,21 +608,21 @@ class Tracks(WithLocalizer):
         self.assertEqual([taken for _, taken, _ in self.client.steps], [at(1), None, at(3), at(4)])
         self.assertEqual(self.ways(), [None, None, None, 10])
 
-    def test_where_the_odometry_ends_the_way_is_not_known(self) -> None:
+    def test_beyond_the_odometry_the_distance_is_unknown(self) -> None:
         for number in (9, 10, 11):
             self.frame(number)
         self.assertEqual(self.ways(), [None, 10, None])
 
-    def test_the_pose_by_the_track_is_told_beside_that_of_the_frame(self) -> None:
+    def test_the_pose_of_the_track_is_published_in_addition_to_that_of_the_frame(self) -> None:
         self.frame(3, at(0))
         self.until(lambda: self.told.tracked_poses)
         (stamp, pose), = self.told.tracked_poses
         self.assertEqual((stamp, pose.position), (3, (0, 1, 0)))
         self.assertEqual(self.told.poses[0][1].position, (1, 0, 0))
-        # The frame's candidate is elsewhere, which the covariance tells.
+        # The frame's candidate is elsewhere, which the covariance shows.
         self.assertAlmostEqual(block(pose, 0)[0][0], Spread().place_m ** 2 + 1)
 
-    def test_a_track_that_does_not_know_the_place_gives_no_pose_unless_wished(self) -> None:
+    def test_an_unknown_place_of_a_track_gives_no_pose_unless_configured(self) -> None:
         for only_known, poses in ((True, 0), (False, 1)):
             self.start(Wishes("town", track="robot-7", only_known=only_known))
             self.client.answers = lambda number: tracked(number, known=False)
@@ -630,7 +630,7 @@ class Tracks(WithLocalizer):
             self.localizer.close()
             self.assertEqual((len(self.told.poses), len(self.told.tracked_poses)), (1, poses))
 
-    def test_a_track_without_a_likely_image_gives_no_pose_and_no_trouble(self) -> None:
+    def test_a_track_without_a_likely_image_gives_no_pose_and_no_error(self) -> None:
         self.start(Wishes("town", track="robot-7", only_known=False))
         self.client.answers = lambda number: replace(
             answer(number), track=TrackEstimate("robot-7", number, 0.0, False)
@@ -639,7 +639,7 @@ class Tracks(WithLocalizer):
         self.localizer.close()
         self.assertEqual((self.told.tracked_poses, self.told.troubles), ([], []))
 
-    def test_an_id_that_the_service_would_not_take_is_refused_at_once(self) -> None:
+    def test_an_invalid_track_id_is_refused_at_once(self) -> None:
         for id in ("r", "Robot-7_a.b:c", "x" * 64):
             self.assertEqual(Wishes("town", track=id).track, id)
         for id in ("", "robot 7", "x" * 65, "röbot", "robot-7\n"):
@@ -648,7 +648,7 @@ class Tracks(WithLocalizer):
 
 
 class Anything(types.SimpleNamespace):
-    """A message stub: whatever is asked of it is there."""
+    """A message stub that has every attribute."""
 
     def __getattr__(self, name: str) -> Anything:
         value = Anything()
@@ -657,7 +657,7 @@ class Anything(types.SimpleNamespace):
 
 
 class StubNode:
-    """What the node uses of rclpy.node.Node."""
+    """The part of rclpy.node.Node that the node uses."""
 
     settings: dict[str, Any] = {}  # noqa: RUF012
 
@@ -685,7 +685,7 @@ class StubNode:
 
 
 def stubs() -> dict[str, Any]:
-    """Modules in place of ROS."""
+    """Stub modules of ROS."""
     messages = dict.fromkeys(
         ["Time", "PoseWithCovarianceStamped", "CompressedImage", "Image", "Odometry", "String"], Anything
     )
@@ -700,7 +700,7 @@ def stubs() -> dict[str, Any]:
 
 
 class NodeWithStubs(unittest.TestCase):
-    """The node against stubs of ROS: it shows that the shell holds together, not that it runs in ROS."""
+    """Tests the node against stubs of ROS, which does not prove that it runs in ROS."""
 
     def node(self, **settings: Any) -> Any:
         client = Client()
@@ -749,7 +749,7 @@ class NodeWithStubs(unittest.TestCase):
         node.timer()
         self.assertIn("1 frames posted, 0 dropped", node.warnings[-1])
 
-    def test_a_raw_frame_in_an_unknown_encoding_is_a_warning(self) -> None:
+    def test_a_raw_frame_in_an_unknown_encoding_logs_a_warning(self) -> None:
         node = self.node(image_transport="raw")
         self.assertEqual(list(node.subscriptions), ["image"])
         raw = Anything(encoding="16UC1", width=1, height=1, step=2, data=b"\0\0")
@@ -759,7 +759,7 @@ class NodeWithStubs(unittest.TestCase):
         self.assertIn("16UC1", node.warnings[0])
         self.assertEqual(self.client.asked, [])
 
-    def test_frames_of_a_track_have_the_way_by_the_odometry(self) -> None:
+    def test_frames_of_a_track_carry_the_odometry_distance(self) -> None:
         node = self.node(track="robot-7", odometry_topic="/odom")
         self.client.answers = tracked
         for tenth in range(21):
@@ -779,7 +779,7 @@ class NodeWithStubs(unittest.TestCase):
         self.assertEqual(node.published["~/track_pose"][1].pose.pose.position.y, 2)
         self.assertIs(node.published["~/track_pose"][1].header.stamp, stamp)
 
-    def test_without_a_track_there_is_no_need_of_odometry(self) -> None:
+    def test_without_a_track_odometry_is_not_subscribed(self) -> None:
         node = self.node(odometry_topic="/odom")
         self.assertEqual(list(node.subscriptions), ["image/compressed"])
 

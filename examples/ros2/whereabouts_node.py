@@ -1,4 +1,4 @@
-"""A ROS 2 node that tells where its camera is: a thin shell around `localizer`."""
+"""A ROS 2 node that localizes a camera: a thin wrapper around `localizer`."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class WhereaboutsNode(Node):
         self._refined_pose = self.create_publisher(PoseWithCovarianceStamped, "~/refined_pose", 10)
         self._track_pose = self.create_publisher(PoseWithCovarianceStamped, "~/track_pose", 10)
         self._job = self.create_publisher(String, "~/job", 10)
-        # The key is no parameter, as everybody may read those.
+        # The API key is not a ROS parameter, because parameters are readable by every node.
         self._service = Whereabouts(
             self.declare_parameter("server_url", "http://localhost:8080").value,
             api_key=os.environ.get("WHEREABOUTS_API_KEY"),
@@ -109,11 +109,11 @@ class WhereaboutsNode(Node):
     def _report(self) -> None:
         at = self._localizer
         self.get_logger().info(
-            f"{at.posted} frames posted, {at.dropped} dropped for newer ones; "
-            f"{at.unfollowed} jobs not followed for newer ones"
+            f"{at.posted} frames posted, {at.dropped} dropped in favour of newer ones; "
+            f"{at.unfollowed} jobs not followed because of newer ones"
         )
 
-    # What the localizer tells, from its own threads.
+    # Callbacks of the localizer, called from its own threads.
 
     def coarse(self, stamp: Time, pose: PoseWithCovariance) -> None:
         self._pose.publish(self._message(stamp, pose))

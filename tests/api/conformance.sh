@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Holds the server against its own description with schemathesis: no status that is not described, no answer
-# of another shape, no server error. Requests are made up from the description, right ones and wrong ones.
+# Checks the server against its OpenAPI description with schemathesis: no undocumented status, no response that
+# violates its schema, no server error. Valid and invalid requests are generated from the description.
 #
 #     conformance.sh BINARY VENV [EXAMPLES]
 #
-# VENV is a folder for a Python environment with schemathesis (requirements.txt); it is made if it is not
-# there. EXAMPLES is how many requests are made up for each call, beside those that cover its parameters one
-# by one; 5 unless told otherwise. Ends with 1 if anything is not as described.
+# VENV is the folder of a Python virtual environment with schemathesis (requirements.txt); it is created if missing.
+# EXAMPLES is the number of requests generated for each call (default 5), in addition to those that cover its
+# parameters one by one. Exits with 1 if a response does not match the description.
 set -euo pipefail
 
 if [ $# -lt 2 ] || [ $# -gt 3 ]; then
@@ -26,8 +26,8 @@ serve "$binary"
 curl --silent --fail --output /dev/null -X PUT "$url/maps/town" -H 'Content-Type: application/json' \
     -d '{"scene": "outdoor"}'
 
-# The stream of all jobs has no end. One worker: Python before 3.11.5 breaks off now and then when two threads
-# parse Python, as schemathesis does.
+# /events is excluded because it never ends. One worker, because Python before 3.11.5 crashes occasionally when two
+# threads parse Python code, as schemathesis does.
 (cd "$scratch" && "$venv/bin/schemathesis" --config-file "$OLDPWD/schemathesis.toml" run "$url/openapi.json" \
     --exclude-path /events --max-examples "$examples" --seed 1 --workers 1 --phases examples,coverage,fuzzing \
     --checks not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance \

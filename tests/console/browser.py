@@ -1,4 +1,4 @@
-"""A browser, a console in it, and what must be true of every page that a test opens."""
+"""A browser with the console, and the checks that apply to every page that a test opens."""
 
 import json
 import os
@@ -26,7 +26,7 @@ def frame(number=0):
 
 
 def call(method, path, body=None, media_type="application/json"):
-    """A call to the API, as the admin."""
+    """Calls the API as admin."""
     if isinstance(body, dict):
         body = json.dumps(body).encode()
     headers = {"Authorization": f"Bearer {KEYS['admin']}", "Content-Type": media_type}
@@ -41,12 +41,12 @@ def localize(number=0, refine="async"):
 
 
 class Console(unittest.TestCase):
-    """Tests on pages that are signed in, unless they say otherwise."""
+    """A test case whose pages are signed in by default."""
 
     @classmethod
     def setUpClass(cls):
         cls.playwright = sync_playwright().start()
-        # Root has no sandbox to give.
+        # Chromium cannot use its sandbox as root.
         cls.chromium = cls.playwright.chromium.launch(executable_path=os.environ["CHROMIUM"], args=["--no-sandbox"])
 
     @classmethod
@@ -61,23 +61,23 @@ class Console(unittest.TestCase):
     def tearDown(self):
         for page in getattr(self, "pages", []):
             if not page.is_closed():
-                self.assertIsNone(page.evaluate("window.pwned ?? null"), "script of others ran")
+                self.assertIsNone(page.evaluate("window.pwned ?? null"), "injected script ran")
                 page.context.close()
         self.assertEqual(self.violations, [], "the content security policy was violated")
         self.assertEqual(self.errors, [], "the browser's console has errors")
 
     def page(self, path="", key="admin", width=1280, height=800, **options):
-        """A new page of a new visitor."""
+        """Opens a page in a new browser context."""
         context = self.chromium.new_context(viewport={"width": width, "height": height}, **options)
         context.expose_function("violated", lambda what: self.violations.append(what))
         context.add_init_script(WATCH)
         if key:
-            # Once: who has signed out stays signed out.
+            # Only once, so that signing out lasts.
             context.add_init_script(f"""if (location.protocol !== "about:" && !sessionStorage.getItem("test")) {{
                 sessionStorage.setItem("test", "1"); sessionStorage.setItem("whereabouts-key", "{KEYS[key]}"); }}""")
         page = context.new_page()
         page.on("pageerror", lambda error: self.errors.append(str(error)))
-        # A status that is not 200 is told there too; what comes of it is what the tests look at.
+        # Failed requests are logged there too; the tests check their effect instead.
         page.on("console", lambda said: self.errors.append(said.text)
                 if said.type == "error" and "Failed to load resource" not in said.text else None)
         self.pages = [*getattr(self, "pages", []), page]
@@ -88,22 +88,22 @@ class Console(unittest.TestCase):
         return call("GET", "/jobs?state=succeeded&limit=1")["jobs"][0]
 
     def views(self):
-        """The address of each view, with something to see in it."""
+        """The URL of each view, with content to show."""
         job = self.ended_job()["id"]
         return {"jobs": "#/jobs", "job": f"#/jobs/{job}", "maps": "#/maps", "map": f"#/maps/town?query={job}",
                 "try": "#/try", "health": "#/health"}
 
     def until(self, page, expression):
-        """Waits until an expression is true; what the driver has for that needs `eval`, which the policy forbids."""
+        """Waits until an expression is true; the driver's own method needs `eval`, which the policy forbids."""
         for _ in range(150):
             found = page.evaluate(expression)
             if found:
                 return found
             page.wait_for_timeout(100)
-        return self.fail(f"this did not become true: {expression}")
+        return self.fail(f"did not become true: {expression}")
 
     def settled(self, page, view):
-        """Waits until a view shows what it is for."""
+        """Waits until a view shows its main content."""
         sign = {"jobs": "table.jobs tbody tr", "job": ".answer .picture.here", "maps": ".cards li", "map": ".images button",
                 "try": ".drop", "health": ".stats .value"}[view]
         page.locator(sign).first.wait_for()

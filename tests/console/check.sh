@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Opens the operator's console in a real browser and uses it: signs in, localizes a picture and watches its job,
-# looks at jobs, maps and health, on a wide screen and on a phone, in light and dark.
+# Tests the operator console in a real browser: signs in, localizes a picture and follows its job,
+# views jobs, maps and health, on a wide screen and on a phone, in light and dark.
 #
 #     check.sh BINARY VENV
 #
-# VENV is a folder for a Python environment with playwright (requirements.txt); it is made if it is not there.
-# The browser is Debian's chromium, or the one that CHROMIUM names. With SCREENSHOTS=FOLDER, pictures of the
-# views are left there. Takes about two minutes. Ends with 1 if anything fails.
+# VENV is the folder of a Python virtual environment with playwright (requirements.txt); it is created if missing.
+# The browser is chromium from the PATH, or the one in CHROMIUM. With SCREENSHOTS=FOLDER, screenshots of the
+# views are written there. Takes about two minutes. Exits with 1 if anything fails.
 set -euo pipefail
 
 if [ $# -ne 2 ]; then
@@ -27,7 +27,7 @@ cd "$(dirname "$0")"
 browser
 environment "$venv" requirements.txt
 
-# The town's own data folder: a map with images, and the jobs of its frames.
+# Serve the demo's own data folder: a map with images, and the jobs of its frames.
 town "$binary" 12
 mv "$scratch/town/data" "$scratch/data"
 export WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_AUTH__KEYS=required

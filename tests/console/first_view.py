@@ -1,7 +1,7 @@
-"""How large and how quick the console is when it is opened, on a server with much to show.
+"""Measures the size and load time of the console on a server with much data.
 
-Run by first_view.sh: fills a server that is empty, with jobs of 20 candidates last, opens views in a browser that
-has nothing of them yet, and prints a table. Ends with 1 if a view is above its bounds.
+Run by first_view.sh: fills an empty server, with jobs of 20 candidates last, opens views in a browser with an empty
+cache, and prints a table. Exits with 1 if the first view exceeds its bounds.
 """
 
 import http.client
@@ -17,7 +17,7 @@ import urllib.parse
 
 JOBS, IMAGES = 10_000, 5_000
 WHOLE_JOBS = 100
-"""Of the jobs, the newest, which have 20 candidates."""
+"""How many of the jobs, the newest ones, have 20 candidates."""
 ROUNDS = 7
 BOUNDS = {"kB": 200, "ms": 300}
 
@@ -31,7 +31,7 @@ SHOWN = """new MutationObserver((_, observer) => {
 
 
 class Views:
-    """Opens a view in a page as if for the first time; it is there when an expression of JavaScript is true."""
+    """Opens views with an empty cache; a view is complete when a JavaScript expression is true."""
 
     def __init__(self, page, shown=FIRST_JOB):
         self.page, self.taken = page, []
@@ -42,7 +42,7 @@ class Views:
         page.add_init_script(SHOWN % shown)
 
     def open(self, url):
-        """Milliseconds until it is there, and the bytes that came within another half second."""
+        """Returns the milliseconds until it is complete, and the bytes received up to half a second later."""
         self.page.goto("about:blank")
         self.taken.clear()
         self.page.goto(url)
@@ -51,20 +51,20 @@ class Views:
                 break
             self.page.wait_for_timeout(50)
         else:
-            raise TimeoutError(f"{url} does not show what it is for")
+            raise TimeoutError(f"{url} did not show its main content")
         self.page.wait_for_timeout(500)
         return shown, sum(self.taken)
 
 
 class Server:
-    """The API of a server that asks for no key."""
+    """A client of a server without API keys."""
 
     def __init__(self, url):
         self.host = urllib.parse.urlparse(url).netloc
         self.here = threading.local()
 
     def call(self, method, path, body=None, media_type="application/json"):
-        """The answer; asked again while the server is busy."""
+        """Sends a request, with retries while the server is overloaded; returns the response."""
         if not hasattr(self.here, "connection"):
             self.here.connection = http.client.HTTPConnection(self.host, timeout=60)
         while True:
@@ -73,17 +73,17 @@ class Server:
                 answer = self.here.connection.getresponse()
                 text = answer.read()
             except ConnectionError:
-                # The server hangs up on who has been silent for long.
+                # The server closes connections that have been idle for long.
                 self.here.connection.close()
                 continue
             if answer.status < 300:
                 return json.loads(text)
             if answer.status != 429:
-                raise RuntimeError(f"{method} {path} was answered with {answer.status}: {text[:300]}")
+                raise RuntimeError(f"{method} {path} returned {answer.status}: {text[:300]}")
             time.sleep(0.1)
 
     def side_by_side(self, paths, picture):
-        """Posts a picture to each of the paths, four at a time; returns the answers."""
+        """Posts a picture to each of the paths, four at a time; returns the responses."""
         answers, todo, lock = [], iter(paths), threading.Lock()
 
         def work():
@@ -102,7 +102,7 @@ class Server:
         return answers
 
     def jobs(self, path, picture, count):
-        """Makes jobs: a busy server answers some frames without."""
+        """Creates jobs; a busy server answers some frames without a job, so it repeats them."""
         while count > 0:
             answers = self.side_by_side([path] * count, picture)
             count -= sum(answer["job"] is not None for answer in answers)
@@ -114,7 +114,7 @@ class Server:
 
 
 def fill(server, picture):
-    """A map of many images, a map of one, and jobs in both."""
+    """Creates a map of many images, a map of one image, and jobs in both."""
     chance = random.Random(1)
     for name in ("one", "town"):
         server.call("PUT", f"/maps/{name}", b"{}")
@@ -129,7 +129,7 @@ def fill(server, picture):
 
 
 def main():
-    """Fills, opens and prints."""
+    """Fills the server, opens the views and prints the table."""
     from playwright.sync_api import sync_playwright
 
     url = os.environ["URL"]
@@ -137,7 +137,7 @@ def main():
     picture = sorted((pathlib.Path(os.environ["TOWN"]) / "frames").glob("*.jpg"))[0].read_bytes()
     began = time.monotonic()
     fill(server, picture)
-    print(f"{JOBS:,} jobs and {IMAGES:,} images, made in {time.monotonic() - began:.0f} s\n")
+    print(f"{JOBS:,} jobs and {IMAGES:,} images, created in {time.monotonic() - began:.0f} s\n")
     newest = server.call("GET", "/jobs?limit=1")["jobs"][0]["id"]
     views = [
         ("jobs, the first view", "/", FIRST_JOB, True),
@@ -149,7 +149,7 @@ def main():
     print("| view | kB | ms, median | ms, each |\n|---|---|---|---|")
     bounded = True
     with sync_playwright() as playwright:
-        # Root has no sandbox to give.
+        # Chromium cannot use its sandbox as root.
         chromium = playwright.chromium.launch(executable_path=os.environ["CHROMIUM"], args=["--no-sandbox"])
         for name, path, shown, bound in views:
             page = chromium.new_page(viewport={"width": 1280, "height": 800})
@@ -169,9 +169,9 @@ def main():
             cursor = server.call("GET", f"/jobs?{query}")["next_cursor"]
             looked += 1
         took = time.monotonic() - began
-        print(f"\nGET /jobs?q={text} looks through all jobs in {looked} requests of {took / looked * 1000:.0f} ms")
+        print(f"\nGET /jobs?q={text} searches all jobs in {looked} requests of {took / looked * 1000:.0f} ms")
     if not bounded:
-        print(f"\nthe first view is above its bounds of {BOUNDS['kB']} kB and {BOUNDS['ms']} ms", file=sys.stderr)
+        print(f"\nthe first view exceeds its bounds of {BOUNDS['kB']} kB and {BOUNDS['ms']} ms", file=sys.stderr)
     return 0 if bounded else 1
 
 

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Says how large and how quick the operator's console is when it is opened: fills a server of its own with 10,000
-# jobs and 5,000 images and opens views in a browser that has nothing of them yet.
+# Measures the size and load time of the operator console: fills a temporary server with 10,000 jobs and 5,000 images
+# and opens views in a browser with an empty cache.
 #
 #     first_view.sh BINARY VENV
 #
-# VENV and the browser are those of check.sh. Takes several minutes, most of them to fill the server. Ends with 1
+# VENV and the browser are those of check.sh. Takes several minutes, mostly to fill the server. Exits with 1
 # if the first view is above 200 kB or 300 ms.
 set -euo pipefail
 

@@ -1,4 +1,4 @@
-"""Whoever uses it: by keyboard, with a screen reader, on a phone, in the dark. And pictures of all of it."""
+"""Accessibility: keyboard, screen reader, phone and dark theme; and screenshots."""
 
 import os
 import pathlib
@@ -12,7 +12,7 @@ SCREENSHOTS = os.environ.get("SCREENSHOTS")
 
 
 class Access(Console):
-    def test_axe_finds_nothing_serious_in_any_view(self):
+    def test_axe_finds_no_serious_violation_in_any_view(self):
         axe = Axe()
         for scheme in ("light", "dark"):
             page = self.page(color_scheme=scheme, reduced_motion="reduce")
@@ -33,7 +33,7 @@ class Access(Console):
         expect(page.locator("#sign-in")).to_be_visible()
         self.assertEqual([one["id"] for one in axe.run(page).response["violations"] if one["impact"] in ("serious", "critical")], [])
 
-    def test_a_phone_scrolls_in_one_direction_only(self):
+    def test_a_phone_scrolls_only_vertically(self):
         page = self.page(width=360, height=740, has_touch=True, is_mobile=True)
         for view, address in self.views().items():
             with self.subTest(view=view):
@@ -41,7 +41,7 @@ class Access(Console):
                 self.settled(page, view)
                 self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth"), 360)
 
-    def test_the_keyboard_reaches_what_matters(self):
+    def test_the_keyboard_reaches_the_main_controls(self):
         page = self.page("#/jobs")
         self.settled(page, "jobs")
         page.keyboard.press("Tab")
@@ -63,9 +63,9 @@ class Access(Console):
     def screenshot(cls, page, name):
         page.screenshot(path=pathlib.Path(SCREENSHOTS) / f"console-{name}.png")
 
-    def test_pictures_for_the_readme(self):
+    def test_screenshots_for_the_readme(self):
         if not SCREENSHOTS:
-            self.skipTest("SCREENSHOTS names no folder")
+            self.skipTest("SCREENSHOTS is not set")
         for scheme in ("light", "dark"):
             page = self.page(color_scheme=scheme, reduced_motion="reduce", width=1280, height=860)
             for view, address in self.views().items():

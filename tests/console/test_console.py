@@ -1,4 +1,4 @@
-"""The console as its users meet it."""
+"""Tests of the console in a browser."""
 
 import json
 import os
@@ -13,13 +13,13 @@ import first_view
 from browser import KEYS, MARKUP, URL, Console, call, frame, localize
 
 
-def patience():
-    """How much longer than alone everything takes, on a machine that has other work to do."""
+def load_factor():
+    """A factor for time limits: how much slower the machine is because of other load."""
     return max(1, os.getloadavg()[0] / os.cpu_count())
 
 
 class SigningIn(Console):
-    def test_a_key_is_asked_for_and_kept_until_signing_out(self):
+    def test_a_key_is_required_and_kept_until_signing_out(self):
         page = self.page("#/jobs?state=succeeded", key=None)
         expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
         expect(page.locator("#key")).to_be_focused()
@@ -37,23 +37,23 @@ class SigningIn(Console):
         page.get_by_role("button", name="Sign out").click()
         expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
 
-    def test_a_key_of_too_small_a_role_is_told_which_role_it_takes(self):
+    def test_a_key_without_permission_shows_the_required_role(self):
         page = self.page("#/jobs", key="robot")
         expect(page.get_by_role("alert")).to_contain_text("operator")
 
 
 class Jobs(Console):
-    def test_the_first_view_is_small_and_quick(self):
+    def test_the_first_view_is_small_and_fast(self):
         views = first_view.Views(self.page("docs"))
         times, sizes = [], []
-        # Other work on the machine can make one of them slow, but not the page quick.
+        # Other load on the machine can make a measurement slow, but never fast, so take the minimum.
         while len(times) < 3 or (min(times) >= 300 and len(times) < 10):
             ms, size = views.open(URL + "/")
             times.append(ms)
             sizes.append(size)
         print(f"\nfirst view: {min(times):.0f} ms at best of {[round(at) for at in times]}, {max(sizes) / 1000:.0f} kB")
         self.assertLess(max(sizes), 200_000)
-        self.assertLess(min(times), 300 * patience())
+        self.assertLess(min(times), 300 * load_factor())
 
     def test_the_list_is_live(self):
         page = self.page("#/jobs")
@@ -64,9 +64,9 @@ class Jobs(Console):
         expect(row.locator(".badge")).to_have_text("succeeded")
         expect(row).to_contain_text(re.compile(r"\d (ms|s)\b"))
         expect(page.locator("table.jobs tbody tr").first.locator("a")).to_have_attribute("href", f"#/jobs/{job}")
-        self.assertTrue(page.evaluate("window.same"), "the page was loaded again")
+        self.assertTrue(page.evaluate("window.same"), "the page was reloaded")
 
-    def test_filter_and_search_are_in_the_address_and_survive_a_reload(self):
+    def test_filters_and_search_are_in_the_url_and_survive_a_reload(self):
         job = self.ended_job()["id"]
         page = self.page("#/jobs")
         self.settled(page, "jobs")
@@ -90,7 +90,7 @@ class Jobs(Console):
         expect(page.locator("#f-state")).to_have_value("succeeded")
         expect(page.locator("table.jobs tbody tr").first).to_be_visible()
 
-    def test_search_is_the_servers_and_goes_through_older_jobs_until_there_are_enough(self):
+    def test_the_search_runs_on_the_server_and_continues_with_older_jobs_until_there_are_enough(self):
         job = call("GET", f"/jobs/{localize(9, 'wait')['job']['id']}")
         asked = []
         page = self.page("#/jobs")
@@ -99,9 +99,9 @@ class Jobs(Console):
         page.locator("#f-q").press_sequentially("Regions of THE query", delay=10)
         expect(page.locator("table.jobs tbody tr").first).to_be_visible()
         expect(page.locator(".after")).to_contain_text("found")
-        self.assertEqual(len(asked), 1, "typing asks once, when it has come to rest")
+        self.assertEqual(len(asked), 1, "typing must be debounced to one request")
         self.assertIn("brief=true", asked[0])
-        # Another job that contains it shows by itself.
+        # A new job that matches appears automatically.
         newer = localize(10)["job"]["id"]
         expect(page.locator(f'a[href="#/jobs/{newer}"]')).to_be_visible()
         page.fill("#f-q", "no job says so")
@@ -109,7 +109,7 @@ class Jobs(Console):
         page.fill("#f-q", job["query_id"])
         expect(page.locator("table.jobs tbody tr a")).to_have_attribute("href", f"#/jobs/{job['id']}")
 
-        # The server looks at some thousand jobs for one page.
+        # The server examines a bounded number of jobs per page.
         older = job | {"id": "00" + job["id"][2:]}
         pages = [{"jobs": [], "next_cursor": job["id"]}, {"jobs": [older], "next_cursor": older["id"]}, {"jobs": [], "next_cursor": None}]
         page.route("**/jobs?*q=older*", lambda route: route.fulfill(json=pages.pop(0)) if pages else route.abort())
@@ -119,7 +119,7 @@ class Jobs(Console):
         self.assertEqual(pages, [])
         self.assertEqual([urllib.parse.parse_qs(url).get("cursor") for url in asked[-3:]], [None, [job["id"]], [older["id"]]])
 
-    def test_one_job_shows_pictures_ranks_and_words(self):
+    def test_a_job_shows_pictures_ranks_and_descriptions(self):
         job = call("GET", f"/jobs/{localize(3, 'wait')['job']['id']}")
         page = self.page(f"#/jobs/{job['id']}")
         expect(page.locator(".pair .picture.here")).to_have_count(2)
@@ -127,7 +127,7 @@ class Jobs(Console):
         expect(candidates).to_have_count(len(job["ranking"]))
         for at, ranked in enumerate(job["ranking"][:5]):
             same = ranked["rank"] == ranked["coarse_rank"]
-            expect(candidates.nth(at)).to_contain_text("unmoved" if same else f"{ranked['rank']} from {ranked['coarse_rank']}")
+            expect(candidates.nth(at)).to_contain_text("unchanged" if same else f"{ranked['rank']} from {ranked['coarse_rank']}")
             expect(candidates.nth(at)).to_contain_text(ranked["image_id"])
         expect(page.locator(".apart .agree li").first).to_contain_text("have a counterpart")
         expect(page.locator(".apart .differ li").first).to_be_visible()
@@ -140,7 +140,7 @@ class Jobs(Console):
         page.reload()
         expect(page.locator('.candidates a[aria-current="true"]')).to_contain_text(second)
 
-    def test_what_agrees_and_what_differs_is_found_in_the_forms_that_models_write(self):
+    def test_agreements_and_differences_are_parsed_from_the_formats_that_models_write(self):
         page = self.page("#/maps")
         for text, agree, differ in [
             ("**Similarities:**\n- Same red awning\n\n**Differences:**\n1. The lamp is missing", ["Same red awning"], ["The lamp is missing"]),
@@ -152,7 +152,7 @@ class Jobs(Console):
             self.assertEqual((found["agree"], found["differ"]), (agree, differ), text)
         self.assertIsNone(page.evaluate("import('/console/words.js').then(({ apart }) => apart('A wall.'))"))
 
-    def test_lines_join_the_matched_regions_of_both_pictures(self):
+    def test_lines_connect_the_matched_regions_of_both_pictures(self):
         job = localize(4, "wait")["job"]["id"]
         first = call("GET", f"/jobs/{job}")["ranking"][0]["image_id"]
         matches = call("GET", f"/jobs/{job}/matches/{urllib.parse.quote(first)}")
@@ -198,13 +198,13 @@ class Jobs(Console):
         expect(page.get_by_role("button", name="Cancel")).to_be_visible()
         self.assertEqual(asked, ["cancel", "retry"])
 
-    def test_a_job_that_is_not_there_is_told_in_plain_words(self):
+    def test_an_unknown_job_shows_an_error(self):
         page = self.page(f"#/jobs/{uuid.uuid4()}")
         expect(page.get_by_role("alert")).to_contain_text("Not found")
 
 
 class TryIt(Console):
-    def test_a_picture_is_localized_and_its_job_watched_until_it_ends(self):
+    def test_a_picture_is_localized_and_its_job_followed_until_it_ends(self):
         page = self.page("#/try?map=town")
         page.set_input_files("#try-file", frame(1))
         expect(page.locator(".guess .big")).to_contain_text("%")
@@ -218,19 +218,19 @@ class TryIt(Console):
         expect(page.locator(".heading .badge")).to_have_text("succeeded")
         expect(page.locator(".pair .picture.here")).to_have_count(2)
 
-    def test_what_is_no_picture_is_refused_in_plain_words(self):
+    def test_a_file_that_is_not_a_picture_shows_an_error(self):
         page = self.page("#/try?map=town")
         page.set_input_files("#try-file", {"name": "a.jpg", "mimeType": "image/jpeg", "buffer": b"no picture"})
         expect(page.get_by_role("alert")).to_contain_text(re.compile("decode|picture|image"))
 
 
 class Maps(Console):
-    def test_the_plan_shows_the_images_and_a_click_the_picture(self):
+    def test_the_plan_shows_the_images_and_a_click_shows_the_picture(self):
         page = self.page("#/maps")
         page.get_by_role("link", name="town", exact=True).click()
         self.settled(page, "map")
         expect(page.locator(".legend")).to_contain_text("(12)")
-        # Where a point is, is asked of the canvas itself: a pixel in the colour of the youngest images.
+        # Find a point on the canvas: a pixel in the colour of the newest images.
         find = """() => { const canvas = document.querySelector(".plan canvas");
             const probe = document.createElement("span"); probe.style.color = "var(--age-1)"; document.body.append(probe);
             const colour = getComputedStyle(probe).color.match(/\\d+/g).map(Number); probe.remove();
@@ -248,7 +248,7 @@ class Maps(Console):
         page.get_by_role("button", name="place-0007.jpg").click()
         expect(page.locator(".chosen-image h2")).to_have_text("place-0007.jpg")
 
-    def test_the_plan_moves_by_keys(self):
+    def test_the_plan_can_be_moved_with_the_keyboard(self):
         page = self.page("#/maps/town")
         self.settled(page, "map")
         canvas = page.locator(".plan canvas")
@@ -272,7 +272,7 @@ class Maps(Console):
         asked.get_by_role("button").first.click()
         expect(page.locator(".chosen-image h2")).to_have_text(job["ranking"][0]["image_id"])
 
-    def test_an_image_is_uploaded_and_deleted(self):
+    def test_an_image_can_be_uploaded_and_deleted(self):
         call("PUT", "/maps/yard", {"frame": "metric"})
         page = self.page("#/maps/yard")
         expect(page.get_by_text("whereabouts index FOLDER --map yard").first).to_be_visible()
@@ -327,11 +327,11 @@ class Maps(Console):
             return [took.sort((a, b) => a - b)[took.length >> 1], moving, await median(() => {})];
         }""")
         print(f"\n5,000 points are drawn in {drawing:.1f} ms; a frame while they move takes {moving:.1f} ms, at rest {still:.1f} ms")
-        self.assertLess(drawing, 8 * patience())
+        self.assertLess(drawing, 8 * load_factor())
 
 
 class Health(Console):
-    def test_the_last_hour_and_what_is_configured_are_told(self):
+    def test_health_shows_the_last_hour_and_the_configuration(self):
         localize(6, "off")
         page = self.page("#/health")
         self.settled(page, "health")
@@ -344,7 +344,7 @@ class Health(Console):
 
 
 class Trouble(Console):
-    def test_while_the_server_is_away_the_page_says_so_and_comes_back_by_itself(self):
+    def test_an_outage_is_shown_and_the_page_recovers_by_itself(self):
         page = self.page("#/jobs")
         self.settled(page, "jobs")
         page.context.set_offline(True)
@@ -355,7 +355,7 @@ class Trouble(Console):
         expect(page.locator("#outage")).to_be_hidden()
         expect(page.locator(".cards li").first).to_be_visible()
 
-    def test_what_others_wrote_is_shown_as_text(self):
+    def test_untrusted_content_is_shown_as_text(self):
         path = f"/maps/hostile/images?id={urllib.parse.quote(MARKUP)}&lat=1&lon=1&tags={urllib.parse.quote(MARKUP)}"
         call("PUT", "/maps/hostile", {"description": MARKUP})
         call("POST", path, frame(7).read_bytes(), "image/jpeg")
@@ -385,7 +385,7 @@ class Trouble(Console):
         page.close()
         call("DELETE", "/maps/hostile")
 
-    def test_the_page_may_run_and_load_nothing_but_its_own(self):
+    def test_the_page_loads_only_its_own_resources(self):
         page = self.page("#/jobs")
         answer = page.request.get(URL + "/")
         policy = answer.headers["content-security-policy"]

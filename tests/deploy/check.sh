@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Holds the files of deploy/ against the server that they run: starts it as they do, makes traffic until every
-# metric is there, and checks that each query of the rules and of the dashboard finds its metric and labels,
-# that every setting exists, that files agree on names, ports and times, and that each is valid for what it is.
+# Checks the files of deploy/ against the server that they run: starts it the same way, generates traffic until every
+# metric exists, and checks that each query of the alert rules and the dashboard finds its metric and labels, that
+# every setting exists, that the files agree on names, ports and times, and that each file is valid.
 #
 #     check.sh BINARY VENV
 #
-# VENV is a folder for a Python environment (requirements.txt); it is made if it is not there. Takes about
-# half a minute once it is. Ends with 1 if anything fails, and says at its end what could not be run here.
+# VENV is the folder of a Python virtual environment (requirements.txt); it is created if missing. After that, a run
+# takes about half a minute. Exits with 1 if anything fails, and prints at the end which checks could not be run.
 # Uses docker compose, haproxy, kubectl (or kustomize), promtool and systemd-analyze where they are installed.
 set -euo pipefail
 
@@ -23,11 +23,11 @@ cd "$(dirname "$0")"
 environment "$venv" requirements.txt
 
 "$venv/bin/shellcheck" --external-sources check.sh ../../deploy/database/whereabouts.sh
-echo "check.sh, whereabouts.sh: shellcheck finds nothing"
+echo "check.sh, whereabouts.sh: shellcheck found no problems"
 "$venv/bin/hadolint" ../../Dockerfile
-echo "Dockerfile: hadolint finds nothing"
+echo "Dockerfile: hadolint found no problems"
 
-# What the server asks outside: an MLLM, and two receivers of webhooks.
+# The external services: an MLLM and two webhook receivers.
 export PYTHONDONTWRITEBYTECODE=1
 "$venv/bin/python" outside.py "$scratch/outside" &
 outside=$!
@@ -39,7 +39,7 @@ cp -r "$scratch/town/data" "$scratch/data"
 for role in admin operator robot; do
     "$binary" keys create --data "$scratch/data" --name "$role" --role "$role" 2> /dev/null > "$scratch/$role.key"
 done
-# All that makes metrics appear within seconds which otherwise take days.
+# Settings that make metrics appear within seconds which would otherwise take days.
 export WHEREABOUTS_AUTH__KEYS=required WHEREABOUTS_MODEL__NAME=xfeat WHEREABOUTS_JOBS__SWEEP_S=1
 export WHEREABOUTS_INDEX__EXACT_UP_TO=1 WHEREABOUTS_INDEX__CHECK_S=1
 export WHEREABOUTS_REFINE__REFINER=mllm WHEREABOUTS_REFINE__CANDIDATES=2
@@ -55,11 +55,11 @@ if grep -q panicked "$scratch/log"; then
 fi
 
 echo
-echo "Not run, because nothing here can: no container engine built the image or started a Compose file, no"
-echo "cluster took the manifests, no systemd started a unit, no Grafana drew the dashboard."
+echo "Not run by this script: building the image, starting the Compose files, applying the manifests to a cluster,"
+echo "starting the units with systemd, and rendering the dashboard in Grafana."
 missing() { echo "Not run, because $1 is not installed: $2."; }
-command -v kubectl kustomize > /dev/null || missing kubectl "the manifests as kustomize builds them"
-command -v promtool > /dev/null || missing promtool "its check of prometheus.yml and scale.yml, and alerts_test.yaml"
-command -v haproxy > /dev/null || missing haproxy "its look at haproxy.cfg"
-command -v systemd-analyze > /dev/null || missing systemd-analyze "its look at the units"
-docker compose version > /dev/null 2>&1 || missing "docker compose" "its look at the Compose files"
+command -v kubectl kustomize > /dev/null || missing kubectl "building the manifests with kustomize"
+command -v promtool > /dev/null || missing promtool "checking prometheus.yml and scale.yml, and running alerts_test.yaml"
+command -v haproxy > /dev/null || missing haproxy "validating haproxy.cfg"
+command -v systemd-analyze > /dev/null || missing systemd-analyze "verifying the units"
+docker compose version > /dev/null 2>&1 || missing "docker compose" "validating the Compose files"

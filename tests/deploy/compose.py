@@ -1,15 +1,15 @@
-"""What holds of every Compose file here, and what the image is that they run."""
+"""Checks shared by all Compose files, and access to the image that they run."""
 
 import re
 import subprocess
 
 import yaml
 from compose_spec import PyCompose
-from files import DEPLOY, ROOT, check_settings, documents, read, told
+from files import DEPLOY, ROOT, check_settings, documents, read, report
 
 
 def instructions():
-    """The instructions of the Dockerfile's last stage, by name."""
+    """The instructions of the last stage of the Dockerfile, by name."""
     text = re.sub(r"\\\n\s*", "", re.sub(r"^#.*\n", "", read("Dockerfile"), flags=re.M))
     lines = re.findall(r"^([A-Z]+) (.*)$", text[text.rindex("\nFROM ") :], flags=re.M)
     return {name: [rest for other, rest in lines if other == name] for name, _ in lines}
@@ -20,13 +20,13 @@ def image_environment():
 
 
 def with_variables(text):
-    """A Compose file with the default of each variable, and something for those that have to be given."""
+    """Substitutes the default of each variable, and a placeholder for each required one."""
     text = re.sub(r"\$\{(\w+):-([^}]*)\}", r"\2", text)
     return re.sub(r"\$\{(\w+):\?[^}]*\}", lambda found: f"given-{found[1].lower()}", text)
 
 
 def required(text):
-    """The variables that have to be given."""
+    """The required variables."""
     return set(re.findall(r"\$\{(\w+):\?", text))
 
 
@@ -39,7 +39,7 @@ def has_docker_compose():
 
 
 class ComposeFile:
-    """Tests of `FILE`, whose services have the profiles of `PROFILES`."""
+    """Tests of `FILE`, with the services' profiles in `PROFILES`."""
 
     FILE, PROFILES = None, None
 
@@ -48,10 +48,10 @@ class ComposeFile:
         self.file = yaml.safe_load(self.text)
         self.services = self.file["services"]
 
-    def test_it_is_what_the_specification_allows(self):
-        # Written anew, as its reader does not know merged keys.
+    def test_it_conforms_to_the_compose_specification(self):
+        # Dumped again, because the parser does not support merge keys.
         PyCompose.from_yaml(yaml.safe_dump(self.file)).validate()
-        self.assertNotIn("${", self.text, "a variable that is neither given nor has a default")
+        self.assertNotIn("${", self.text, "a variable that is neither required nor has a default")
         by_docker = ["docker", "compose", "--file", ROOT / self.FILE]
         by_docker += [part for profile in set(self.PROFILES.values()) for part in ("--profile", profile)]
         if has_docker_compose():
@@ -60,25 +60,25 @@ class ComposeFile:
                 [*by_docker, "config", "--quiet"], env=given, capture_output=True, text=True, check=False
             )
             self.assertEqual(ran.returncode, 0, ran.stderr)
-        told(f"{self.FILE}: {len(self.services)} services, valid by the Compose specification")
+        report(f"{self.FILE}: {len(self.services)} services, valid according to the Compose specification")
 
-    def test_every_service_is_closed(self):
+    def test_every_service_is_hardened(self):
         for name, service in self.services.items():
             with self.subTest(name):
                 self.assertIs(service.get("read_only"), True)
                 self.assertEqual(service.get("cap_drop"), ["ALL"])
                 self.assertEqual(service.get("security_opt"), ["no-new-privileges:true"])
                 self.assertLessEqual({"cpus", "memory", "pids"}, set(service["deploy"]["resources"]["limits"]))
-                self.assertRegex(service["image"], r":v?\d+\.\d+\.\d+(-\w+)?$", "an image without its version")
+                self.assertRegex(service["image"], r":v?\d+\.\d+\.\d+(-\w+)?$", "an image without a version")
                 for port in service.get("ports", []):
-                    self.assertEqual(port["host_ip"], "127.0.0.1", "open to the network")
+                    self.assertEqual(port["host_ip"], "127.0.0.1", "exposed to the network")
                 profile = self.PROFILES.get(name)
                 self.assertEqual(service.get("profiles"), [profile] if profile else None)
 
     def test_its_settings_exist(self):
         check_settings(self, self.FILE)
 
-    def test_what_it_mounts_is_there_and_used(self):
+    def test_its_mounts_exist_and_are_used(self):
         used = set()
         for name, service in self.services.items():
             with self.subTest(name):
@@ -92,7 +92,7 @@ class ComposeFile:
                     self.assertIn(secret, self.file["secrets"])
         self.assertEqual(used, set(self.file["volumes"]))
 
-    def test_prometheus_and_grafana_find_what_they_look_for(self):
+    def test_prometheus_and_grafana_find_their_files(self):
         prometheus, grafana = self.services["prometheus"], self.services["grafana"]
         file = next(one.split("=")[1] for one in prometheus["command"] if "config.file" in one)
         folder, name = file.rsplit("/", 1)
@@ -113,4 +113,4 @@ class ComposeFile:
         self.assertEqual(source["jsonData"]["timeInterval"], config["global"]["scrape_interval"])
         password = grafana["environment"]["GF_SECURITY_ADMIN_PASSWORD__FILE"]
         self.assertEqual(password, f"/run/secrets/{grafana['secrets'][0]}")
-        told(f"{name} and Grafana's provisioning: keys, mounts and addresses are those of {self.FILE}")
+        report(f"{name} and Grafana's provisioning: keys, mounts and addresses match {self.FILE}")

@@ -1,4 +1,4 @@
-"""What a server tells at /metrics: families with their type, and the labels of each sample."""
+"""Parses /metrics: families with their types, and the labels of each sample."""
 
 import re
 from dataclasses import dataclass, field
@@ -11,18 +11,18 @@ SUFFIXES = {"counter": ["_total"], "histogram": ["_bucket", "_sum", "_count"], "
 
 @dataclass
 class Metric:
-    """A name that a query can ask for."""
+    """A metric name that a query can use."""
 
     type: str
     help: str
-    # The values seen of each label.
+    # The values seen for each label.
     labels: dict[str, set[str]] = field(default_factory=dict)
 
 
 def parse(text):
-    """The metrics of an answer, by the name of their samples."""
+    """Parses a response into metrics by sample name."""
     if not text.endswith("# EOF\n"):
-        raise ValueError("the answer has no end")
+        raise ValueError("the response has no # EOF")
     about, metrics = {}, {}
     for line in text.splitlines()[:-1]:
         if known := FAMILY.fullmatch(line):
@@ -34,7 +34,7 @@ def parse(text):
             continue
         sample = SAMPLE.fullmatch(line)
         if not sample or sample[1] not in metrics:
-            raise ValueError(f"no sample of a family before it: {line}")
+            raise ValueError(f"not a sample of a declared family: {line}")
         for name, value in LABEL.findall(sample[2] or ""):
             metrics[sample[1]].labels.setdefault(name, set()).add(value)
     return metrics

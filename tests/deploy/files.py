@@ -1,4 +1,4 @@
-"""The files under test, and the settings that they speak of."""
+"""The files under test, and the settings that they mention."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def read(name):
 
 
 def documents(name):
-    """All documents of a file of YAML."""
+    """All documents of a YAML file."""
     return [one for one in yaml.safe_load_all(read(name)) if one is not None]
 
 
@@ -34,12 +34,12 @@ def dashboard():
 
 
 def drain_times():
-    """The longest that a server takes to end: requests, work on frames and refinement, one after another."""
+    """The maximum shutdown time: requests, work on frames and refinement drain one after another."""
     return 3 * DEFAULTS["server"]["drain_timeout_s"]
 
 
 def unknown_settings(text):
-    """Settings and their variables that are named in a text and do not exist."""
+    """Settings and environment variables that a text mentions and that do not exist."""
     named = [(section, key, f"{section}.{key}") for section, key in SETTING.findall(text)]
     named += [
         (section.lower(), key.lower(), f"WHEREABOUTS_{section}__{key}")
@@ -53,14 +53,14 @@ def unknown_settings(text):
 
 
 def check_settings(case, *names):
-    """Fails if one of these files names a setting that does not exist."""
+    """Fails if one of these files mentions a setting that does not exist."""
     for name in names:
         unknown = ", ".join(unknown_settings(read(name)))
-        case.assertFalse(unknown, f"{name} names settings that do not exist: {unknown}")
+        case.assertFalse(unknown, f"{name} mentions settings that do not exist: {unknown}")
 
 
 def settings_in_force(environment):
-    """What `whereabouts config` makes of these variables and nothing else."""
+    """The output of `whereabouts config` with only these variables set."""
     ours = {key: value for key, value in environment.items() if key.startswith("WHEREABOUTS_")}
     ran = subprocess.run([BINARY, "config"], env=ours, capture_output=True, text=True, check=False)
     if ran.returncode:
@@ -69,11 +69,11 @@ def settings_in_force(environment):
 
 
 def seconds(text):
-    """Of 75, 75s or 1m15s."""
+    """Parses 75, 75s or 1m15s."""
     parts = re.findall(r"(\d+)(ms|s|m|h|)", str(text))
     return sum(int(number) * {"ms": 0.001, "s": 1, "": 1, "m": 60, "h": 3600}[unit] for number, unit in parts)
 
 
-def told(*words):
-    """Says what was checked."""
+def report(*words):
+    """Prints what was checked."""
     print("  ", *words, flush=True)

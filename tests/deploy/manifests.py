@@ -1,4 +1,4 @@
-"""The manifests as kustomize builds them, and what holds of every one."""
+"""The manifests as built by kustomize, and the checks shared by all of them."""
 
 import shutil
 import subprocess
@@ -6,15 +6,15 @@ import subprocess
 import kubernetes_validate
 import yaml
 from compose import instructions
-from files import DEPLOY, documents, told
+from files import DEPLOY, documents, report
 
 FOLDER = DEPLOY / "kubernetes"
-# The oldest that has ReadWriteOncePod for everybody, and the newest whose schemas there are.
+# The oldest version with ReadWriteOncePod generally available, and the newest with published schemas.
 VERSIONS = ["1.29", "1.37"]
 
 
 def built(overlay):
-    """What kustomize makes of the overlay, and the tool; without one, the files as they are."""
+    """The overlay as built by kustomize, and the tool; without a tool, the files unchanged."""
     for tool in (["kubectl", "kustomize"], ["kustomize", "build"]):
         if shutil.which(tool[0]):
             ran = subprocess.run([*tool, FOLDER / overlay], capture_output=True, text=True, check=False)
@@ -27,14 +27,14 @@ def built(overlay):
 
 
 def settings_of(overlay):
-    """The name of the overlay's ConfigMap, and what is in it."""
+    """The name of the overlay's ConfigMap, and its content."""
     [file] = documents(f"deploy/kubernetes/{overlay}/kustomization.yaml")
     [made] = file["configMapGenerator"]
     return made["name"], dict(literal.split("=", 1) for literal in made["literals"])
 
 
 def check_resources(case, overlay, resources, tool):
-    """Fails if one is not what Kubernetes takes, or if a file of the overlay is not part of it."""
+    """Fails if a resource is invalid, or if a file in the overlay's folder is not part of it."""
     for resource in resources:
         for version in VERSIONS:
             with case.subTest(resource["kind"], version=version):
@@ -43,12 +43,12 @@ def check_resources(case, overlay, resources, tool):
         [listed] = documents(f"deploy/kubernetes/{folder}/kustomization.yaml")
         files = {file.name for file in (FOLDER / folder).glob("*.yaml")} - {"kustomization.yaml"}
         case.assertEqual({name for name in listed["resources"] if name.endswith(".yaml")}, files, folder)
-    how = f"as `{tool}` builds them" if tool else "as they are, because there is no kubectl to build them"
-    told(f"kubernetes/{overlay}: {len(resources)} resources, {how}, valid for {' and '.join(VERSIONS)}")
+    how = f"built by `{tool}`" if tool else "not built, because kubectl is not installed"
+    report(f"kubernetes/{overlay}: {len(resources)} resources, {how}, valid for {' and '.join(VERSIONS)}")
 
 
 def fault(resource, version):
-    """Where a resource is not what Kubernetes takes, if so."""
+    """The validation error of a resource, if any."""
     try:
         kubernetes_validate.validate(resource, version, strict=True)
     except kubernetes_validate.ValidationError as error:
@@ -57,7 +57,7 @@ def fault(resource, version):
 
 
 def check_restricted(case, pod):
-    """Fails if a pod is not within the profile `restricted`, or may do more than ours need."""
+    """Fails if a pod violates the profile `restricted`, or has more privileges than ours need."""
     of_pod = pod["securityContext"]
     case.assertIs(of_pod["runAsNonRoot"], True)
     case.assertEqual(of_pod["seccompProfile"], {"type": "RuntimeDefault"})
@@ -65,7 +65,7 @@ def check_restricted(case, pod):
     case.assertEqual([user], instructions()["USER"])
     case.assertEqual(of_pod["fsGroup"], of_pod["runAsGroup"])
     case.assertIs(pod["automountServiceAccountToken"], False)
-    # The variables would be WHEREABOUTS_PORT and the like.
+    # They would set variables such as WHEREABOUTS_PORT.
     case.assertIs(pod["enableServiceLinks"], False)
     for container in pod["containers"] + pod.get("initContainers", []):
         of_container = container["securityContext"]
@@ -75,11 +75,11 @@ def check_restricted(case, pod):
         case.assertLessEqual({"cpu", "memory"}, set(container["resources"]["limits"]))
         for variable in container.get("env", []):
             if "KEY" in variable["name"] or variable["name"].endswith("DATABASE__URL"):
-                case.assertIn("secretKeyRef", variable["valueFrom"], "a secret that is not only referred to")
+                case.assertIn("secretKeyRef", variable["valueFrom"], "a secret must be referenced, not inlined")
 
 
 def check_probes(case, container):
-    """Fails if a probe asks for anything but what the server answers without a key."""
+    """Fails if a probe uses a path that needs an API key."""
     for probe, path in (("livenessProbe", "/livez"), ("readinessProbe", "/readyz")):
         asked = container[probe]["httpGet"]
         case.assertEqual([asked["path"], asked["port"]], [path, container["ports"][0]["name"]])

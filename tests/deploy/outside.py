@@ -1,9 +1,9 @@
-"""What a server asks outside: an MLLM that answers everything with the same words, and two receivers of
-webhooks, of which one takes what comes and the other nothing.
+"""The external services: an MLLM that always gives the same answer, and two webhook receivers, one that accepts
+every message and one that rejects every message.
 
     outside.py FILE
 
-writes its address to FILE, and runs until it is ended.
+writes its URL to FILE, and runs until it is stopped.
 """
 
 import json

@@ -1,30 +1,30 @@
-"""Holds a query against the metrics that there are: each name, label and value, and whether functions and
-operators get what they can work with."""
+"""Checks a query against the existing metrics: each name, label and value, and whether functions and
+operators get suitable operands."""
 
 import re
 
 import promql_parser as promql
 
-# What the scrape adds to each sample, and the metric that Prometheus makes itself.
+# Labels that the scrape adds to each sample, and metrics that Prometheus itself generates.
 OF_TARGET = {"job", "instance", "deployment", "role"}
 OF_PROMETHEUS = {"up"}
-# Functions of ranges: of counters, and of gauges.
+# Range functions for counters and for gauges.
 OF_COUNTERS = {"rate", "irate", "increase", "resets"}
 OF_GAUGES = {"avg_over_time", "max_over_time", "min_over_time", "predict_linear", "deriv", "delta"}
-# Grafana's, by something that parses.
+# Grafana's variables, each with a value that parses.
 VARIABLES = {"$__rate_interval": "5m", "$__range": "3h", "$__interval": "1m"}
 WORDS = re.compile(r"[\w /.-]+(\|[\w /.-]+)*")
 
 
 class Wrong(Exception):
-    """What is wrong with a query."""
+    """A query is invalid."""
 
 
 class Query:
-    """A query: the labels of its result, and what it asks for."""
+    """A query: the labels of its result, and the metrics that it uses."""
 
     def __init__(self, text, metrics, words):
-        """`words` has the values that a label may have though none was seen, by metric and label."""
+        """`words(metric, label)` returns label values that are valid even if they were not seen."""
         self.metrics, self.words = metrics, words
         self.asked, self.numbers = set(), []
         for variable, value in VARIABLES.items():
@@ -36,7 +36,7 @@ class Query:
         self.labels = self.of(parsed)
 
     def of(self, expr):
-        """The labels of what `expr` gives; None for a number."""
+        """The labels of the result of `expr`; None for a number."""
         return getattr(self, "of_" + type(expr).__name__)(expr)
 
     def of_NumberLiteral(self, expr):
@@ -76,15 +76,15 @@ class Query:
         return set(labels) | OF_TARGET
 
     def check_value(self, name, label, value, seen):
-        """A value has to have been seen, or to be known from elsewhere; of a regular expression, something
-        that it matches."""
+        """Checks that a value was seen or is otherwise known; for a regular expression, that it matches
+        one."""
         known = seen | self.words(name, label)
         if WORDS.fullmatch(value) and "." not in value.replace(".v1.", ""):
             missing = [word for word in value.split("|") if word not in known]
         else:
             missing = [] if any(re.fullmatch(value, word) for word in known) else [value]
         if missing:
-            raise Wrong(f"{name} has never {label}={missing[0]!r}, only {', '.join(sorted(known))}")
+            raise Wrong(f"{name} never has {label}={missing[0]!r}, only {', '.join(sorted(known))}")
 
     def of_Call(self, expr):
         function = expr.func.name
@@ -100,7 +100,7 @@ class Query:
                 raise Wrong(f"{function} of {name}, which is a {self.metrics[name].type}")
         if function == "histogram_quantile":
             if "le" not in of_metric:
-                raise Wrong("histogram_quantile of what has no label le")
+                raise Wrong("histogram_quantile of a metric without the label le")
             return of_metric - {"le"}
         return of_metric
 

@@ -1,4 +1,4 @@
-"""compose.scale.yaml, and what stands before and behind its servers: valid, closed, and of one mind."""
+"""compose.scale.yaml, its proxy and its stores: valid, hardened and consistent."""
 
 import re
 import shutil
@@ -16,9 +16,9 @@ from files import (
     documents,
     drain_times,
     read,
+    report,
     seconds,
     settings_in_force,
-    told,
 )
 
 PROXY = "deploy/proxy/haproxy.cfg"
@@ -37,7 +37,7 @@ class Scale(ComposeFile, unittest.TestCase):
         given = self.services[name]["environment"]
         return settings_in_force(image_environment() | given)
 
-    def test_servers_and_workers_run_the_image_and_keep_nothing(self):
+    def test_servers_and_workers_run_the_image_and_are_stateless(self):
         of = instructions()
         for name in OURS:
             with self.subTest(name):
@@ -55,16 +55,16 @@ class Scale(ComposeFile, unittest.TestCase):
         commands = [" ".join(self.services[name]["command"]) for name in OURS]
         self.assertEqual(commands, ["serve --no-workers", "worker", "migrate"])
 
-    def test_nobody_is_root_and_logs_are_bounded(self):
+    def test_no_service_runs_as_root_and_logs_are_bounded(self):
         for name, service in self.services.items():
             with self.subTest(name):
                 self.assertIn("max-size", service["logging"]["options"])
                 self.assertIn("max-file", service["logging"]["options"])
-                # Those of Prometheus and Grafana name a user of their own.
+                # The images of Prometheus and Grafana set their own user.
                 if name not in self.PROFILES:
                     self.assertRegex(service["user"], r"^[1-9]\d+:[1-9]\d+$")
 
-    def test_each_starts_when_what_it_needs_is_there(self):
+    def test_each_service_starts_after_its_dependencies(self):
         for name, service in self.services.items():
             needed = service.get("depends_on", {})
             for other, how in needed.items() if isinstance(needed, dict) else []:
@@ -83,7 +83,7 @@ class Scale(ComposeFile, unittest.TestCase):
         for name in OURS:
             with self.subTest(name):
                 settings = self.settings(name)
-                # The program shows no address: it may hold a password.
+                # The program hides the URL, because it may contain a password.
                 self.assertEqual(settings["database"]["url"], "[hidden]")
                 address = urlsplit(self.services[name]["environment"]["WHEREABOUTS_DATABASE__URL"])
                 made = read("deploy/database/whereabouts.sh")
@@ -115,19 +115,19 @@ class Scale(ComposeFile, unittest.TestCase):
         for folder in (garage["metadata_dir"], garage["data_dir"]):
             self.assertTrue(any(folder.startswith(mount + "/") for mount in mounts), folder)
         self.assertTrue(garage["metadata_fsync"] and garage["data_fsync"])
-        told(f"{self.FILE}: database, bucket, addresses, regions and keys are the same on both sides")
+        report(f"{self.FILE}: database, bucket, addresses, regions and keys are the same on both sides")
 
-    def test_the_database_takes_the_connections_of_all(self):
+    def test_the_database_accepts_the_connections_of_all_processes(self):
         [most] = [int(one.split("=")[1]) for one in self.services["database"]["command"] if "max_conn" in one]
         processes = sum(self.services[name]["deploy"].get("replicas", 1) for name in OURS)
-        # Twice, so that there may be more, and some for people.
+        # Twice, to leave room for scaling, plus some for operators.
         self.assertLess(2 * processes * DEFAULTS["database"]["max_connections"] + 10, most)
 
-    def test_what_has_to_be_given_is_in_the_example(self):
+    def test_the_required_variables_are_in_the_example(self):
         example = read("deploy/scale.env.example")
         asked = set(re.findall(r"\$\{(\w+):", read(self.FILE)))
-        told_of = set(re.findall(r"^(?:# )?([A-Z_]+)=", example, flags=re.M))
-        self.assertEqual(asked, told_of)
+        mentioned = set(re.findall(r"^(?:# )?([A-Z_]+)=", example, flags=re.M))
+        self.assertEqual(asked, mentioned)
         empty = set(re.findall(r"^([A-Z_]+)=$", example, flags=re.M))
         self.assertLessEqual(required(read(self.FILE)), empty)
         defaults = dict(re.findall(r"^# ([A-Z_]+)=(.+)$", example, flags=re.M))
@@ -136,7 +136,7 @@ class Scale(ComposeFile, unittest.TestCase):
         self.assertIn("/deploy/scale.env", read(".gitignore").splitlines())
         self.assertIn("deploy/scale.env", read(".dockerignore").splitlines())
 
-    def test_the_proxy_finds_the_servers_and_is_patient_enough(self):
+    def test_the_proxy_finds_the_servers_and_has_long_enough_timeouts(self):
         config, proxy = read(PROXY), self.services["proxy"]
         found = re.findall(r"server-template \w+ 1-(\d+) (\w+):(\d+)", config)
         self.assertEqual(len(found), 2)
@@ -155,7 +155,7 @@ class Scale(ComposeFile, unittest.TestCase):
             self.assertGreater(timeout(side), silence)
         for name in ("http-request", "http-keep-alive"):
             self.assertLessEqual(timeout(name), DEFAULTS["server"]["header_timeout_s"])
-        self.assertIn("retry-on conn-failure\n", config, "what a server has seen is sent again")
+        self.assertIn("retry-on conn-failure\n", config, "a request that a server has received must not be retried")
         [connections] = re.findall(r"maxconn (\d+)", config)
         self.assertGreater(proxy["ulimits"]["nofile"], 2 * int(connections))
         self.assertGreater(
@@ -166,7 +166,7 @@ class Scale(ComposeFile, unittest.TestCase):
                 ["haproxy", "-c", "-f", ROOT / PROXY], capture_output=True, text=True, check=False
             )
             self.assertEqual(ran.returncode, 0, ran.stdout + ran.stderr)
-            told(f"{PROXY}: taken by haproxy")
+            report(f"{PROXY}: accepted by haproxy")
 
     def test_prometheus_finds_each_server_and_each_worker(self):
         [config] = documents("deploy/prometheus/scale.yml")
@@ -177,7 +177,7 @@ class Scale(ComposeFile, unittest.TestCase):
         self.assertEqual([str(found["port"])], instructions()["EXPOSE"])
         self.assertEqual({one["target_label"] for one in job["relabel_configs"]}, {"deployment", "role"})
 
-    def test_the_image_is_built_by_one_of_them(self):
+    def test_the_image_is_built_by_one_service(self):
         built = [name for name, service in self.services.items() if "build" in service]
         self.assertEqual(built, ["server"])
         build = self.services["server"]["build"]

@@ -1,4 +1,4 @@
-"""The Dockerfile and compose.yaml: valid, closed, and of one mind."""
+"""The Dockerfile and compose.yaml: valid, hardened and consistent."""
 
 import re
 import unittest
@@ -13,14 +13,14 @@ from files import (
     documents,
     drain_times,
     read,
+    report,
     seconds,
     settings_in_force,
-    told,
 )
 
 
 class Image(unittest.TestCase):
-    def test_its_settings_exist_and_hold_together(self):
+    def test_its_settings_exist_and_are_consistent(self):
         of = instructions()
         check_settings(self, "Dockerfile")
         settings = settings_in_force(image_environment())
@@ -28,15 +28,15 @@ class Image(unittest.TestCase):
         self.assertEqual(of["EXPOSE"], [port])
         self.assertEqual(of["VOLUME"], [settings["data"]["dir"]])
         self.assertTrue(settings["model"]["assets"].startswith(settings["data"]["dir"] + "/"))
-        told(f"Dockerfile: {len(image_environment())} settings exist; volume and port are theirs")
+        report(f"Dockerfile: {len(image_environment())} settings exist and match the volume and the port")
 
-    def test_it_runs_as_nobody_in_particular_and_says_how_it_is(self):
+    def test_it_runs_as_an_unprivileged_user_and_has_a_health_check(self):
         of = instructions()
         self.assertRegex(of["USER"][0], r"^[1-9]\d+:[1-9]\d+$")
         self.assertIn('CMD ["whereabouts", "healthcheck"]', of["HEALTHCHECK"][0])
         self.assertEqual(of["STOPSIGNAL"], ["SIGTERM"])
 
-    def test_what_it_copies_is_there(self):
+    def test_the_files_it_copies_exist(self):
         stages = re.findall(r"^COPY (?!--from)(.*) \S+$", read("Dockerfile"), flags=re.M)
         for sources in stages:
             for source in sources.split():
@@ -51,7 +51,7 @@ class Compose(ComposeFile, unittest.TestCase):
         super().setUp()
         self.server = self.services["whereabouts"]
 
-    def test_it_is_of_one_mind_with_the_image(self):
+    def test_it_is_consistent_with_the_image(self):
         of, server = instructions(), self.server
         self.assertEqual(server["image"], f"whereabouts:{VERSION}")
         self.assertTrue((DEPLOY / server["build"]["context"] / server["build"]["dockerfile"]).is_file())
@@ -62,9 +62,9 @@ class Compose(ComposeFile, unittest.TestCase):
         self.assertGreater(seconds(server["stop_grace_period"]), drain_times())
         self.assertGreater(server["ulimits"]["nofile"], DEFAULTS["server"]["max_connections"])
 
-    def test_its_settings_hold_together(self):
+    def test_its_settings_are_consistent(self):
         settings_in_force(image_environment() | self.server["environment"])
-        told(f"{self.FILE}: `whereabouts config` takes its settings together with those of the image")
+        report(f"{self.FILE}: `whereabouts config` accepts its settings combined with those of the image")
 
     def test_prometheus_finds_the_server(self):
         [config] = documents("deploy/prometheus/prometheus.yml")

@@ -1,10 +1,10 @@
-"""The manifests of one server: valid by the schemas, within the profile `restricted`, and of one mind."""
+"""The manifests of one server: valid, within the profile `restricted`, and consistent."""
 
 import unittest
 
 import traffic
 from compose import image_environment, instructions
-from files import ROOT, VERSION, check_settings, documents, drain_times, read, settings_in_force, told
+from files import ROOT, VERSION, check_settings, documents, drain_times, read, report, settings_in_force
 from manifests import FOLDER, built, check_probes, check_resources, check_restricted, settings_of
 
 
@@ -20,13 +20,13 @@ class Kubernetes(unittest.TestCase):
     def test_every_resource_is_valid(self):
         check_resources(self, "embedded", [*self.resources, self.maintenance], self.tool)
 
-    def test_pods_keep_to_the_profile_restricted(self):
+    def test_pods_conform_to_the_profile_restricted(self):
         for pod in (self.pod, self.maintenance["spec"]):
             check_restricted(self, pod)
         labels = self.by_kind["Namespace"]["metadata"]["labels"]
         self.assertEqual(labels["pod-security.kubernetes.io/enforce"], "restricted")
 
-    def test_one_process_has_the_volume(self):
+    def test_only_one_process_has_the_volume(self):
         self.assertEqual(self.set["spec"]["replicas"], 1)
         self.assertGreater(self.pod["terminationGracePeriodSeconds"], drain_times())
         claim = self.by_kind["PersistentVolumeClaim"]
@@ -56,7 +56,7 @@ class Kubernetes(unittest.TestCase):
         maintenance = self.maintenance["metadata"]["labels"]
         self.assertFalse(
             set(service["selector"].items()) <= set(maintenance.items()),
-            "robots would ask the maintenance pod",
+            "requests would reach the maintenance pod",
         )
         self.assertEqual(self.set["spec"]["serviceName"], self.by_kind["Service"]["metadata"]["name"])
         self.assertEqual(self.pod["serviceAccountName"], self.by_kind["ServiceAccount"]["metadata"]["name"])
@@ -81,17 +81,17 @@ class Kubernetes(unittest.TestCase):
         given = {variable["name"]: variable.get("value", "a-secret") for variable in self.server["env"]}
         found = settings_in_force(image_environment() | settings | given)
         mounts = {mount["name"]: mount["mountPath"] for mount in self.server["volumeMounts"]}
-        self.assertTrue(found["data"]["dir"].startswith(mounts["data"] + "/"), "not the root of the volume")
+        self.assertTrue(found["data"]["dir"].startswith(mounts["data"] + "/"), "must be a subfolder of the volume")
         self.assertEqual(found["server"]["listen"].split(":")[1], str(self.server["ports"][0]["containerPort"]))
-        told(f"deploy/kubernetes: `whereabouts config` takes its {len(settings) + len(given)} settings")
+        report(f"deploy/kubernetes: `whereabouts config` accepts its {len(settings) + len(given)} settings")
 
-    def test_probes_ask_what_the_server_answers_without_a_key(self):
+    def test_probes_use_paths_that_need_no_key(self):
         check_probes(self, self.server)
         for path in ("/livez", "/readyz"):
             traffic.expect(traffic.ask("GET", path, role=None), 200)
-        told("deploy/kubernetes: /livez and /readyz answer the probes without a key")
+        report("deploy/kubernetes: /livez and /readyz answer the probes without a key")
 
-    def test_secrets_are_only_referred_to(self):
+    def test_secrets_are_referenced_not_inlined(self):
         self.assertNotIn("Secret", self.by_kind)
         self.assertNotIn("kind: Secret", read("deploy/kubernetes/maintenance.yaml"))
 

@@ -1,10 +1,10 @@
-"""The manifests of many servers and workers: valid, within the profile `restricted`, and of one mind."""
+"""The manifests of many servers and workers: valid, within the profile `restricted`, and consistent."""
 
 import re
 import unittest
 
 from compose import image_environment, instructions
-from files import DEFAULTS, VERSION, documents, drain_times, read, settings_in_force, told
+from files import DEFAULTS, VERSION, documents, drain_times, read, report, settings_in_force
 from manifests import built, check_probes, check_resources, check_restricted, settings_of
 
 
@@ -39,13 +39,13 @@ class Scale(unittest.TestCase):
             with self.subTest(name):
                 check_restricted(self, pod)
                 self.assertEqual(pod["serviceAccountName"], "whereabouts")
-                self.assertFalse([one for one in pod["volumes"] if "emptyDir" not in one], "something is kept")
+                self.assertFalse([one for one in pod["volumes"] if "emptyDir" not in one], "pods must be stateless")
                 mounts = [one["mountPath"] for one in pod["containers"][0]["volumeMounts"]]
                 self.assertEqual(mounts, [*instructions()["VOLUME"], "/tmp"])
         self.assertIs(self.only("ServiceAccount")["automountServiceAccountToken"], False)
         self.assertFalse([one for one in self.resources if one["kind"] == "Secret"])
 
-    def test_a_server_goes_when_its_successor_is_there_and_ends_in_order(self):
+    def test_servers_roll_without_downtime_and_shut_down_in_order(self):
         server = self.deployments["server"]["spec"]
         self.assertGreaterEqual(server["replicas"], 2)
         self.assertEqual(server["strategy"]["rollingUpdate"]["maxUnavailable"], 0)
@@ -65,16 +65,16 @@ class Scale(unittest.TestCase):
             for spread in pod["topologySpreadConstraints"]:
                 self.assertTrue(matches(spread["labelSelector"]["matchLabels"], self.labels[name]))
 
-    def test_workers_are_scaled_by_a_metric_that_is_there(self):
+    def test_workers_are_scaled_by_a_metric_that_exists(self):
         scaler = self.only("HorizontalPodAutoscaler")["spec"]
         self.assertEqual(scaler["scaleTargetRef"]["name"], self.deployments["worker"]["metadata"]["name"])
-        self.assertNotIn("replicas", self.deployments["worker"]["spec"], "it would undo the scaling")
+        self.assertNotIn("replicas", self.deployments["worker"]["spec"], "it would override the autoscaler")
         [metric] = [one["external"]["metric"] for one in scaler["metrics"]]
         [rule] = documents("deploy/prometheus/adapter.yaml")[0]["rules"]["external"]
         self.assertEqual(rule["name"]["as"], metric["name"])
         self.assertTrue(rule["seriesQuery"].startswith(metric["name"] + "{"))
         self.assertIs(rule["resources"]["namespaced"], False)
-        self.assertTrue(rule["metricsQuery"].startswith("max by (deployment) "), "the queue would be added up")
+        self.assertTrue(rule["metricsQuery"].startswith("max by (deployment) "), "the queue would be summed")
         [config] = documents("deploy/prometheus/kubernetes.yml")
         [job] = config["scrape_configs"]
         found = {one.get("target_label"): one["source_labels"] for one in job["relabel_configs"]}
@@ -87,9 +87,9 @@ class Scale(unittest.TestCase):
         for name, pod in self.pods.items():
             ports = [port["name"] for port in pod["containers"][0]["ports"]]
             self.assertEqual(kept, [self.labels[name]["app.kubernetes.io/name"], *ports])
-        told(f"kubernetes/scale: workers are scaled by {metric['name']}, as the adapter and the scrape have it")
+        report(f"kubernetes/scale: workers are scaled by {metric['name']}, as in the adapter and the scrape config")
 
-    def test_only_servers_are_asked_and_all_may_reach_their_stores(self):
+    def test_only_servers_receive_requests_and_all_pods_can_reach_their_stores(self):
         service = self.only("Service")["spec"]["selector"]
         self.assertTrue(matches(service, self.labels["server"]))
         self.assertFalse(matches(service, self.labels["worker"]))
@@ -119,9 +119,9 @@ class Scale(unittest.TestCase):
             for container in pod["containers"] + pod.get("initContainers", [])
             for variable in container["env"]
         }
-        self.assertLessEqual(referred, secrets, "a secret that docs/deploy.md does not make")
+        self.assertLessEqual(referred, secrets, "a secret that docs/deploy.md does not create")
 
-    def test_settings_exist_and_hold_together(self):
+    def test_settings_exist_and_are_consistent(self):
         _, settings = settings_of("scale")
         for name, pod in self.pods.items():
             [container] = pod["containers"]
@@ -131,7 +131,7 @@ class Scale(unittest.TestCase):
             self.assertEqual(
                 found["server"]["listen"].split(":")[1], str(container["ports"][0]["containerPort"])
             )
-            told(f"kubernetes/scale: `whereabouts config` takes the settings of a {name}")
+            report(f"kubernetes/scale: `whereabouts config` accepts the settings of a {name}")
         self.assertLessEqual(found["database"]["max_connections"], DEFAULTS["database"]["max_connections"])
 
 

@@ -1,4 +1,4 @@
-"""The rules and the dashboard against what a server tells at /metrics."""
+"""Checks the alert rules and the dashboard against /metrics of a server."""
 
 import json
 import re
@@ -18,8 +18,8 @@ from files import (
     dashboard,
     documents,
     read,
+    report,
     seconds,
-    told,
 )
 from queries import OF_TARGET, Query, Wrong
 
@@ -29,11 +29,11 @@ METRICS = {}
 
 def setUpModule():
     METRICS.update(traffic.make())
-    told(f"/metrics: {len(METRICS)} names, all of which the traffic made appear")
+    report(f"/metrics: {len(METRICS)} names after the generated traffic")
 
 
 def words(name, label):
-    """Values that need not have been seen: those that the help of a metric or the reference tells."""
+    """Label values that need not have been seen: those in the help of a metric or in the reference."""
     known = set(re.findall(r"\w+", METRICS[name].help))
     if (name, label) == ("whereabouts_refused_total", "reason"):
         [row] = [line for line in read("docs/operations.md").splitlines() if f"{name}{{{label}}}" in line]
@@ -48,7 +48,7 @@ def words(name, label):
 
 
 def families():
-    """The names of metrics without what tells the parts of a histogram."""
+    """The names of metrics without histogram suffixes."""
     return {re.sub(r"_(bucket|sum|count)$", "", name) for name in METRICS}
 
 
@@ -56,7 +56,7 @@ def query(text):
     return Query(text, METRICS, words)
 
 
-# What is in the database, and the same whichever process tells it.
+# Metrics from the shared database, which every process reports with the same value.
 SHARED = {
     "whereabouts_db_bytes",
     "whereabouts_description_cache_bytes",
@@ -72,7 +72,7 @@ SHARED = {
 
 
 def check_shared(case, text):
-    """Fails if what all processes of a deployment tell alike is added up, or told by each of them."""
+    """Fails if a metric that every process of a deployment reports alike is summed or shown per process."""
     bare = re.sub(r"\{[^{}]*\}|\[\w+\]", "", text)
     for name in SHARED & set(METRIC.findall(bare)):
         once = rf"max by \((job, )?deployment(, map)?\) \((predict_linear\()?{name}\b"
@@ -85,7 +85,7 @@ class Rules(unittest.TestCase):
         self.assertEqual(list(file), ["groups"])
         self.rules = [rule for group in file["groups"] for rule in group["rules"]]
 
-    def test_every_rule_has_what_a_rule_needs(self):
+    def test_every_rule_is_complete(self):
         for rule in self.rules:
             with self.subTest(rule.get("alert")):
                 self.assertLessEqual(set(rule), {"alert", "expr", "for", "labels", "annotations"})
@@ -94,9 +94,9 @@ class Rules(unittest.TestCase):
                 self.assertIn(rule["labels"]["severity"], ("critical", "warning"))
                 self.assertLessEqual({"summary", "action"}, set(rule["annotations"]))
         names = [rule["alert"] for rule in self.rules]
-        self.assertEqual(len(names), len(set(names)), "two rules of one name")
+        self.assertEqual(len(names), len(set(names)), "two rules with the same name")
         named = re.findall(r"Whereabouts[A-Z]\w+", json.dumps(self.rules) + read("docs/deploy.md"))
-        self.assertEqual(set(named) - set(names), set(), "rules that are named and are not there")
+        self.assertEqual(set(named) - set(names), set(), "rules that are mentioned and do not exist")
 
     def test_every_query_finds_its_metrics_and_labels(self):
         asked = set()
@@ -108,11 +108,11 @@ class Rules(unittest.TestCase):
                     self.fail(f"{RULES}: {rule['alert']}: {wrong}")
                 asked |= found.asked
                 check_shared(self, rule["expr"])
-                told_of = set(re.findall(r"\$labels\.(\w+)", json.dumps(rule["annotations"])))
-                self.assertEqual(told_of - found.labels, set(), "labels that the alert does not have")
-        told(f"{RULES}: {len(self.rules)} rules ask for {len(asked)} metrics, all there")
+                mentioned = set(re.findall(r"\$labels\.(\w+)", json.dumps(rule["annotations"])))
+                self.assertEqual(mentioned - found.labels, set(), "labels that the alert lacks")
+        report(f"{RULES}: {len(self.rules)} rules use {len(asked)} metrics, all of which exist")
 
-    def test_numbers_that_repeat_a_setting_are_its_default(self):
+    def test_numbers_that_repeat_a_setting_equal_its_default(self):
         for rule in self.rules:
             if "setting" not in rule["annotations"]:
                 continue
@@ -123,20 +123,20 @@ class Rules(unittest.TestCase):
                     DEFAULTS[section][key], query(rule["expr"]).numbers, f"default of {section}.{key}"
                 )
 
-    def test_what_it_says_names_settings_and_metrics_that_exist(self):
+    def test_the_settings_and_metrics_it_mentions_exist(self):
         text = read(RULES)
         check_settings(self, RULES, "docs/deploy.md")
         named = set(METRIC.findall(text + read("docs/deploy.md")))
-        self.assertEqual(named - set(METRICS) - families(), set(), "metrics that are named and are not there")
+        self.assertEqual(named - set(METRICS) - families(), set(), "metrics that are mentioned and do not exist")
 
-    def test_the_program_has_the_settings_of_this_tree(self):
-        self.assertEqual(tomllib.loads((SCRATCH / "defaults.toml").read_text()), DEFAULTS, "another program")
+    def test_the_binary_has_the_settings_of_this_tree(self):
+        self.assertEqual(tomllib.loads((SCRATCH / "defaults.toml").read_text()), DEFAULTS, "the binary is outdated")
 
     @unittest.skipUnless(shutil.which("promtool"), "promtool is not installed")
-    def test_promtool_takes_the_rules_and_they_fire_when_they_should(self):
+    def test_promtool_accepts_the_rules_and_they_fire_as_expected(self):
         shutil.copy(ROOT / RULES, SCRATCH)
         for name in ("prometheus.yml", "scale.yml"):
-            # The key's file is there only in the container.
+            # The key file exists only in the container.
             config = read(f"deploy/prometheus/{name}").replace(
                 "/run/secrets/metrics_key", str(SCRATCH / "operator.key")
             )
@@ -148,7 +148,7 @@ class Rules(unittest.TestCase):
         ):
             ran = subprocess.run(["promtool", *what], capture_output=True, text=True, check=False)
             self.assertEqual(ran.returncode, 0, ran.stdout + ran.stderr)
-        told("promtool: takes both configurations and the rules, which fire in alerts_test.yaml as expected")
+        report("promtool: accepts both configurations and the rules, which fire in alerts_test.yaml as expected")
 
 
 class Dashboard(unittest.TestCase):
@@ -156,24 +156,24 @@ class Dashboard(unittest.TestCase):
         self.board = dashboard()
         self.panels = [panel for panel in self.board["panels"] if panel["type"] != "row"]
 
-    def test_it_is_laid_out_well(self):
+    def test_panels_do_not_overlap(self):
         self.assertGreaterEqual(self.board["schemaVersion"], 41)
         ids = [panel["id"] for panel in self.board["panels"]]
-        self.assertEqual(len(ids), len(set(ids)), "two panels of one id")
+        self.assertEqual(len(ids), len(set(ids)), "two panels with the same id")
         taken = {}
         for panel in self.board["panels"]:
             place = panel["gridPos"]
             self.assertLessEqual(place["x"] + place["w"], 24, panel["title"])
             for x in range(place["x"], place["x"] + place["w"]):
                 for y in range(place["y"], place["y"] + place["h"]):
-                    self.assertNotIn((x, y), taken, f"{panel['title']} lies over {taken.get((x, y))}")
+                    self.assertNotIn((x, y), taken, f"{panel['title']} overlaps {taken.get((x, y))}")
                     taken[x, y] = panel["title"]
 
     def test_every_query_of_every_panel_finds_its_metrics_and_labels(self):
         asked, queries = set(), 0
         for panel in self.panels:
             with self.subTest(panel["title"]):
-                self.assertTrue(panel["targets"], "it asks for nothing")
+                self.assertTrue(panel["targets"], "the panel has no query")
                 self.assertEqual(panel["datasource"]["uid"], "${datasource}")
                 for target in panel["targets"]:
                     try:
@@ -181,7 +181,7 @@ class Dashboard(unittest.TestCase):
                     except Wrong as wrong:
                         self.fail(f"whereabouts.json: {panel['title']}: {wrong}")
                     legend = set(re.findall(r"{{\s*(\w+)\s*}}", target["legendFormat"]))
-                    self.assertEqual(legend - found.labels, set(), "labels of the legend that the query lacks")
+                    self.assertEqual(legend - found.labels, set(), "labels in the legend that the query lacks")
                     check_shared(self, target["expr"])
                     asked |= found.asked
                     queries += 1
@@ -191,7 +191,7 @@ class Dashboard(unittest.TestCase):
             if variable["type"] == "query":
                 series, label = re.fullmatch(r"label_values\((.*), (\w+)\)", variable["definition"]).groups()
                 self.assertIn(label, query(series).labels | OF_TARGET)
-        told(f"whereabouts.json: {len(self.panels)} panels, {queries} queries, {len(asked)} metrics, all there")
+        report(f"whereabouts.json: {len(self.panels)} panels, {queries} queries, {len(asked)} metrics, all existing")
         missing = families() - {re.sub(r"_(bucket|sum|count)$", "", name) for name in asked}
         self.assertEqual(missing, set(), "metrics that no panel shows")
 
@@ -203,19 +203,19 @@ class Dashboard(unittest.TestCase):
             there[re.sub(r"_(bucket|sum|count)$", "", name)] |= set(metric.labels) - {"le"}
         self.assertEqual(listed, there, "docs/operations.md, Metrics")
 
-    def test_what_it_says_names_settings_that_exist(self):
+    def test_the_settings_it_mentions_exist(self):
         check_settings(self, "deploy/grafana/whereabouts.json")
 
 
 class Scraping(unittest.TestCase):
-    def test_metrics_take_the_key_of_an_operator(self):
+    def test_metrics_need_an_operator_key(self):
         for role, status in ((None, 401), ("robot", 403), ("operator", 200)):
             self.assertEqual(traffic.ask("GET", "/metrics", role=role)[0], status, role)
         [job] = documents("deploy/prometheus/prometheus.yml")[0]["scrape_configs"]
         self.assertEqual(job["authorization"]["type"], "Bearer")
-        told("/metrics: 401 without a key, 403 with a robot's, 200 with an operator's")
+        report("/metrics: 401 without a key, 403 with a robot key, 200 with an operator key")
 
-    def test_the_job_of_the_rules_is_the_job_that_is_scraped(self):
+    def test_the_job_in_the_rules_is_the_scraped_job(self):
         named = set(re.findall(r'job="(\w+)"', read(RULES) + json.dumps(dashboard()).replace('\\"', '"')))
         for name in ("prometheus.yml", "scale.yml", "kubernetes.yml"):
             with self.subTest(name):
@@ -229,7 +229,7 @@ class Scraping(unittest.TestCase):
                 if times := config.get("global"):
                     self.assertLess(seconds(times["scrape_timeout"]), seconds(times["scrape_interval"]))
 
-    def test_the_metric_of_the_autoscaler_is_there(self):
+    def test_the_metric_of_the_autoscaler_exists(self):
         [rule] = documents("deploy/prometheus/adapter.yaml")[0]["rules"]["external"]
         series = query(rule["seriesQuery"])
         asked = rule["metricsQuery"].replace("<<.Series>>", rule["name"]["as"])

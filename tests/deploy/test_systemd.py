@@ -1,4 +1,4 @@
-"""The unit of systemd: taken by systemd, as closed as it can be, and with settings that exist."""
+"""The systemd units: accepted by systemd, hardened, and with settings that exist."""
 
 import re
 import shutil
@@ -13,14 +13,14 @@ from files import (
     check_settings,
     drain_times,
     read,
+    report,
     seconds,
     settings_in_force,
-    told,
 )
 
 UNIT = "deploy/systemd/whereabouts.service"
 WORKER = "deploy/systemd/whereabouts-worker.service"
-# On the scale of systemd-analyze, from 0.0 (closed) to 10.0. A server on the network cannot have less than 1.
+# Maximum exposure on the scale of systemd-analyze, from 0.0 (safe) to 10.0. A network server cannot have less than 1.
 EXPOSURE = 2.0
 
 
@@ -44,15 +44,15 @@ class Unit(unittest.TestCase):
         settings = settings_in_force(given | file)
         self.assertEqual(settings["data"]["dir"], state)
         self.assertTrue(settings["model"]["assets"].startswith(state))
-        told(f"{self.UNIT}: `whereabouts config` takes its settings together with whereabouts.env")
+        report(f"{self.UNIT}: `whereabouts config` accepts its settings combined with whereabouts.env")
 
-    def test_it_waits_for_the_end_and_leaves_room_for_connections(self):
+    def test_it_allows_enough_time_to_drain_and_enough_connections(self):
         self.assertGreater(seconds(self.of["TimeoutStopSec"]), drain_times())
         self.assertGreater(int(self.of["LimitNOFILE"]), DEFAULTS["server"]["max_connections"])
         self.assertIn(f"u {self.of['User']} ", read("deploy/systemd/whereabouts.sysusers"))
 
     @unittest.skipUnless(shutil.which("systemd-analyze"), "systemd-analyze is not installed")
-    def test_systemd_takes_it_and_finds_it_closed(self):
+    def test_systemd_accepts_it_and_rates_it_hardened(self):
         unit = SCRATCH / self.UNIT.rsplit("/", 1)[1]
         unit.write_text(read(self.UNIT).replace("/usr/bin/whereabouts", BINARY))
         ran = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, check=False)
@@ -67,16 +67,16 @@ class Unit(unittest.TestCase):
         ]
         ran = subprocess.run(rate, capture_output=True, text=True, check=False)
         if "unrecognized option" in ran.stderr or "Unknown" in ran.stderr:
-            self.skipTest("this systemd-analyze rates no file")
+            self.skipTest("this systemd-analyze cannot rate a file")
         self.assertEqual(ran.returncode, 0, ran.stdout.strip().splitlines()[-1:] or ran.stderr)
         [level] = re.findall(r"exposure level .*: ([\d.]+)", ran.stdout)
-        told(f"{self.UNIT}: taken by systemd-analyze verify; exposure {level} of 10, at most {EXPOSURE}")
+        report(f"{self.UNIT}: accepted by systemd-analyze verify; exposure {level} of 10, at most {EXPOSURE}")
 
 
 class Worker(Unit):
     UNIT = WORKER
 
-    def test_it_is_as_closed_as_the_server_and_migrates_first(self):
+    def test_it_is_hardened_like_the_server_and_migrates_first(self):
         own = {
             "Description",
             "ExecStartPre",
@@ -89,7 +89,7 @@ class Worker(Unit):
         self.assertEqual([line for line in self.lines if line[0] not in own], of_server)
         self.assertEqual(self.of["ExecStartPre"], "/usr/bin/whereabouts migrate")
         self.assertRegex(self.of["ExecStart"], r"^/usr/bin/whereabouts worker --listen 127\.0\.0\.1:\d+$")
-        self.assertNotIn(DEFAULTS["server"]["listen"], self.of["ExecStart"], "the port of a server beside it")
+        self.assertNotIn(DEFAULTS["server"]["listen"], self.of["ExecStart"], "the port of a server on the same machine")
 
 
 if __name__ == "__main__":

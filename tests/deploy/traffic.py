@@ -1,4 +1,4 @@
-"""Traffic until every family of metrics has a member, and what it all looks like then."""
+"""Generates traffic until every metric family has a sample, and returns the metrics."""
 
 import json
 import os
@@ -11,7 +11,7 @@ import exposition
 from files import SCRATCH
 
 URL, OUTSIDE = os.environ["URL"], os.environ["OUTSIDE"]
-# What takes its time to appear: a message to a webhook is given up, and a search of the index is checked.
+# The samples that take longest to appear: a dead webhook delivery, and a checked search of the index.
 LAST = (
     ("whereabouts_webhook_attempts_total", "outcome", "dead"),
     ("whereabouts_neighbours_checked_total", "found", "yes"),
@@ -23,7 +23,7 @@ def key(role):
 
 
 def ask(method, path, body=None, role="admin", **headers):
-    """Status and body of an answer."""
+    """Sends a request; returns the status and the body of the response."""
     if role:
         headers["Authorization"] = f"Bearer {key(role)}"
     headers = {name.replace("_", "-"): value for name, value in headers.items()}
@@ -46,7 +46,7 @@ def localize(frame, path="/localize?map=town&refine=wait", **headers):
 
 
 def call_grpc():
-    """A call of gRPC without a frame, so that its route is there; what it answers does not matter."""
+    """Makes a gRPC call without a frame, so that its route has a sample; the response does not matter."""
     path = f"{URL}/whereabouts.v1.LocalizationService/Localize"
     (SCRATCH / "empty").write_bytes(bytes(5))
     command = ["curl", "--silent", "--http2-prior-knowledge", "--output", os.devnull, "--data-binary"]
@@ -55,7 +55,7 @@ def call_grpc():
 
 
 def make():
-    """Makes all that there is to count, and gives the metrics."""
+    """Generates everything that is counted, and returns the metrics."""
     for path in ("/takes", "/refuses"):
         hook = json.dumps({"url": OUTSIDE + path}).encode()
         expect(ask("POST", "/webhooks", hook, Content_Type="application/json"), 201)
@@ -65,7 +65,7 @@ def make():
     expect(localize("frame-0002.jpg", path="/localize?map=nowhere"), 404)
     call_grpc()
     for _ in range(150):
-        # Searches are checked once there is an index.
+        # Searches are checked only once an index exists.
         expect(localize("frame-0003.jpg", path="/localize?map=town&refine=off"), 200)
         status, text = ask("GET", "/metrics", role="operator")
         expect((status, text), 200)
@@ -74,7 +74,7 @@ def make():
         if not missing:
             return metrics
         time.sleep(0.2)
-    raise AssertionError(f"not there within 30 seconds: {missing}")
+    raise AssertionError(f"missing after 30 seconds: {missing}")
 
 
 def seen(metrics, name, label, value):

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Holds the server against the contract in proto/, with a client of gRPC that others wrote, which knows no more
-# of it than reflection tells; and the contract against the rules of buf.
+# Checks the server against the contract in proto/ with an independent gRPC client, which learns the contract only
+# through reflection; and lints the contract with buf.
 #
 #     check.sh BINARY VENV
 #
-# VENV is a folder for a Python environment with grpcio (requirements.txt); it is made if it is not there.
-# Takes about half a minute once it is. Ends with 1 if anything fails.
+# VENV is the folder of a Python virtual environment with grpcio (requirements.txt); it is created if missing. After
+# that, a run takes about half a minute. Exits with 1 if anything fails.
 set -euo pipefail
 
 if [ $# -ne 2 ]; then
@@ -28,7 +28,7 @@ export WHEREABOUTS_SERVER__BODY_PAUSE_S=2 WHEREABOUTS_SERVER__STREAM_IDLE_S=4
 export WHEREABOUTS_AUTH__KEYS=required
 "$binary" keys create --data "$scratch/data" --name test --role admin --json > "$scratch/key.json"
 serve "$binary"
-# HTTP over version 2, without TLS.
+# HTTP/2 without TLS.
 version=$(curl --silent --fail --http2-prior-knowledge --output /dev/null --write-out '%{http_version}' "$url/livez")
 if [ "$version" != 2 ]; then
     echo "GET /livez was answered over HTTP/$version" >&2

@@ -1,4 +1,4 @@
-"""The server as a client of gRPC sees it that knows the contract by reflection alone."""
+"""Tests the server with a gRPC client that learns the contract only through reflection."""
 
 import contextlib
 import json
@@ -33,7 +33,7 @@ PACKAGE = "whereabouts.v1"
 
 
 class Services:
-    """The services of a server, by reflection."""
+    """The services of a server, discovered through reflection."""
 
     def __init__(self, key: str | None) -> None:
         self.channel = grpc.insecure_channel(ADDRESS)
@@ -46,7 +46,7 @@ class Services:
         return GetMessageClass(self.pool.FindMessageTypeByName(f"{PACKAGE}.{name}"))(**fields)
 
     def call(self, service: str, method: str, request: Any, **options: Any) -> Any:
-        """Calls a method; `request` is a message, or an iterator of them where those stream."""
+        """Calls a method; `request` is a message, or an iterator of messages for a client stream."""
         about = self.pool.FindServiceByName(f"{PACKAGE}.{service}").FindMethodByName(method)
         shapes = {
             (False, False): self.channel.unary_unary,
@@ -65,7 +65,7 @@ class Services:
 
 
 class WithKey(grpc.StreamStreamClientInterceptor):
-    """Sends a key with the calls of reflection."""
+    """Adds an API key to the calls of reflection."""
 
     def __init__(self, key: str) -> None:
         self.key = key
@@ -98,7 +98,7 @@ def over_http(method: str, path: str, body: bytes | None = None, kind: str = "im
 
 
 def make_key(**wanted: Any) -> tuple[str, str]:
-    """A key's id and the key."""
+    """Creates an API key; returns its id and token."""
     made = over_http("POST", "/keys", json.dumps(wanted).encode(), "application/json")
     return made["key"]["id"], made["token"]
 
@@ -131,7 +131,7 @@ class Contract(unittest.TestCase):
         cls.added = call("MapService", "AddImages", images()).results
         deadline = time.monotonic() + 30
         while over_http("GET", "/maps/town")["calibration"] is None:
-            assert time.monotonic() < deadline, "the map was not measured"
+            assert time.monotonic() < deadline, "the map was not calibrated"
             time.sleep(0.2)
 
     def call(self, service: str, method: str, request: Any, **options: Any) -> Any:
@@ -153,7 +153,7 @@ class Contract(unittest.TestCase):
         expected = {f"{PACKAGE}.{name}Service" for name in ("Localization", "Map", "Job")}
         self.assertLessEqual(expected | {"grpc.health.v1.Health"}, names)
 
-    def test_images_of_a_stream_are_answered_one_by_one(self) -> None:
+    def test_every_image_of_a_stream_gets_its_own_result(self) -> None:
         outcomes = [(result.id, result.WhichOneof("outcome")) for result in self.added]
         names = [name for name, _ in pictures("map")]
         expected = [(name, "stored") for name in names]
@@ -166,7 +166,7 @@ class Contract(unittest.TestCase):
         self.assertIn("lat is 91", by_place[7].problem.detail)
         self.assertEqual(over_http("GET", "/maps/town")["images"], len(names))
 
-    def test_a_frame_is_answered_as_over_http(self) -> None:
+    def test_a_frame_gets_the_same_answer_as_over_http(self) -> None:
         frame = pictures("frames")[0][1]
         request = self.message("LocalizeRequest", map="town", image=frame, k=5, refine=3)
         answer = self.call("LocalizationService", "Localize", request)
@@ -181,14 +181,14 @@ class Contract(unittest.TestCase):
         self.assertFalse(answer.HasField("job") or answer.HasField("track"))
         self.assertGreater(answer.timing.total_ms, 0)
 
-    def test_a_track_is_followed(self) -> None:
+    def test_a_track_accumulates_frames(self) -> None:
         for number, (_, frame) in enumerate(pictures("frames")[:3], 1):
             track = self.message("Track", id="robot-7", moved_m=1.0)
             request = self.message("LocalizeRequest", map="town", image=frame, refine=3, track=track)
             answer = self.call("LocalizationService", "Localize", request)
             self.assertEqual((answer.track.id, answer.track.frames), ("robot-7", number))
 
-    def test_a_job_is_followed_to_its_end(self) -> None:
+    def test_a_job_can_be_watched_until_it_ends(self) -> None:
         frame = pictures("frames")[1][1]
         request = self.message("LocalizeRequest", map="town", image=frame)
         job = self.call("LocalizationService", "Localize", request).job
@@ -260,7 +260,7 @@ class Contract(unittest.TestCase):
             turn.release()
         self.assertEqual(outcomes, ["answer", "unprocessable", "malformed", "not-found", "answer"])
 
-    def test_errors_say_what_they_are(self) -> None:
+    def test_errors_have_the_documented_code_and_reason(self) -> None:
         frame = pictures("frames")[0][1]
         for code, reason, fields in [
             (grpc.StatusCode.NOT_FOUND, "NOT_FOUND", {"map": "nowhere", "image": frame}),
@@ -279,7 +279,7 @@ class Contract(unittest.TestCase):
             self.assertEqual((info.reason, info.domain), (reason, "whereabouts"))
             self.assertGreater(len(error.details()), 10)
 
-    def test_what_is_not_there_is_unimplemented(self) -> None:
+    def test_an_unknown_method_is_unimplemented(self) -> None:
         for path in [f"/{PACKAGE}.JobService/Nothing", "/some.Other/Thing"]:
             call = self.services.channel.unary_unary(path)
             self.refused(
@@ -287,13 +287,13 @@ class Contract(unittest.TestCase):
                 lambda c=call: c(b"", metadata=self.services.metadata, timeout=5),
             )
 
-    def test_a_call_is_no_post(self) -> None:
+    def test_a_plain_post_is_not_a_call(self) -> None:
         for path in [f"/{PACKAGE}.JobService/WatchJob", f"/{PACKAGE}.JobService/GetJob"]:
             with self.assertRaises(urllib.error.HTTPError) as raised:
                 over_http("POST", path, b"")
             self.assertEqual(raised.exception.code, 415)
 
-    def test_a_deadline_is_kept(self) -> None:
+    def test_deadlines_are_enforced(self) -> None:
         frame = pictures("frames")[0][1]
         request = self.message("LocalizeRequest", map="town", image=frame)
         begun = time.monotonic()
@@ -319,16 +319,16 @@ class Contract(unittest.TestCase):
         self.assertIn("server.stream_idle_s", error.details())
         silent.set()
 
-    def test_a_call_that_is_given_up_frees_its_place(self) -> None:
+    def test_a_cancelled_stream_frees_its_slot(self) -> None:
         def watch() -> Any:
-            # A connection of its own: one has at most server.max_concurrent calls.
+            # A separate connection, because one has at most server.max_concurrent calls.
             own = [("grpc.use_local_subchannel_pool", 1)]
             health = health_pb2_grpc.HealthStub(grpc.insecure_channel(ADDRESS, own))
             asked = health_pb2.HealthCheckRequest()
             return health.Watch(asked, metadata=self.services.metadata, timeout=30)
 
         streams = [watch() for _ in range(300)]
-        # 256 may be open (server.max_streams); the rest is refused, and told when to come again.
+        # 256 may be open (server.max_streams); the rest are refused.
         codes = []
         for stream in streams:
             try:
@@ -349,7 +349,7 @@ class Contract(unittest.TestCase):
                 stream.cancel()
                 break
             except grpc.RpcError:
-                self.assertLess(time.monotonic(), deadline, "the places were not given back")
+                self.assertLess(time.monotonic(), deadline, "the slots were not freed")
                 time.sleep(0.1)
 
     def metric(self, name: str) -> list[str]:
@@ -358,7 +358,7 @@ class Contract(unittest.TestCase):
             lines = response.read().decode().splitlines()
         return [line for line in lines if line.startswith(name)]
 
-    def test_calls_are_counted_by_what_they_were_answered(self) -> None:
+    def test_calls_are_counted_by_status(self) -> None:
         request = self.message("GetMapRequest", map="not-there")
         self.refused(grpc.StatusCode.NOT_FOUND, lambda: self.call("MapService", "GetMap", request))
         counted = self.metric("whereabouts_http_requests_total")
@@ -373,11 +373,11 @@ class Contract(unittest.TestCase):
         unknown = health_pb2.HealthCheckRequest(service="nothing")
         self.refused(grpc.StatusCode.NOT_FOUND, lambda: health.Check(unknown, timeout=5))
 
-    def test_a_key_opens_what_it_is_for(self) -> None:
+    def test_a_key_grants_only_its_role_and_maps(self) -> None:
         frame = pictures("frames")[0][1]
         here = self.message("LocalizeRequest", map="town", image=frame, refine=3)
-        nobody, stranger = Services(None), Services("wab_" + "0" * 77)
-        for services in (nobody, stranger):
+        anonymous, unknown = Services(None), Services("wab_" + "0" * 77)
+        for services in (anonymous, unknown):
             error = self.refused(
                 grpc.StatusCode.UNAUTHENTICATED,
                 lambda s=services: s.call("LocalizationService", "Localize", here),
@@ -410,7 +410,7 @@ class Contract(unittest.TestCase):
                 lambda m=method, r=asked: robot.call("JobService", m, r),
             )
 
-    def test_a_stream_ends_with_its_key(self) -> None:
+    def test_revoking_a_key_ends_its_stream(self) -> None:
         id, token = make_key(name="short", role="robot")
         requests = threading.Event()
 
@@ -426,7 +426,7 @@ class Contract(unittest.TestCase):
         self.assertLess(time.monotonic() - begun, 3)
         requests.set()
 
-    def test_an_upload_ends_with_its_key_and_tells_of_what_it_has_done(self) -> None:
+    def test_revoking_a_key_ends_its_upload_with_the_results_so_far(self) -> None:
         id, token = make_key(name="brief", role="operator")
         go_on = threading.Event()
 
@@ -446,8 +446,8 @@ class Contract(unittest.TestCase):
             grpc.StatusCode.NOT_FOUND, lambda: self.call("MapService", "AddImages", iter([nowhere]))
         )
 
-    def test_memory_is_given_back(self) -> None:
-        # A prefix that announces a megabyte, many times over, on calls that are then given up.
+    def test_body_memory_is_released(self) -> None:
+        # Many large frames that cannot be decoded, so that a leak would exhaust the body budget.
         for _ in range(3):
             streams = []
             for _ in range(30):
@@ -456,9 +456,9 @@ class Contract(unittest.TestCase):
                 streams.append(self.call("LocalizationService", "LocalizeStream", iter([request])))
             for stream in streams:
                 self.assertEqual(next(stream).problem.kind, "unprocessable")
-        self.test_a_frame_is_answered_as_over_http()
+        self.test_a_frame_gets_the_same_answer_as_over_http()
 
-    def test_each_frame_of_a_stream_counts(self) -> None:
+    def test_each_frame_of_a_stream_counts_as_a_request(self) -> None:
         _, token = make_key(name="few", role="robot", limits={"requests_per_minute": 3})
         frame = pictures("frames")[0][1]
         request = self.message("LocalizeRequest", map="town", image=frame, refine=3)
@@ -478,9 +478,9 @@ class Contract(unittest.TestCase):
 
 
 class Encrypted(unittest.TestCase):
-    """Over TLS, where the version of HTTP is agreed on before the first byte of it."""
+    """Over TLS, where the HTTP version is negotiated with ALPN."""
 
-    def test_calls_are_answered_over_tls(self) -> None:
+    def test_calls_work_over_tls(self) -> None:
         with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
             place = pathlib.Path(folder)
             certificate, key = place / "certificate.pem", place / "key.pem"
@@ -517,7 +517,7 @@ class Encrypted(unittest.TestCase):
 
 
 class ZDrain(unittest.TestCase):
-    """Ends the server; its name makes it the last."""
+    """Stops the server; its name makes it run last."""
 
     def test_streams_end_when_the_server_drains(self) -> None:
         services = Services(KEY)

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Localizes frames with refine=async, several at a time, then waits for their jobs, and says how fast both
-# went:
+# Localizes frames concurrently with refine=async, waits for their jobs, and reports the throughput and latency of
+# both:
 #
 #     jobs.sh URL MAP FOLDER [CLIENTS] [REQUESTS]
 #
-# WAIT_S is how long to wait for all jobs, in seconds; the default is 300. Ends with 1 if any answer is other
-# than 200 or 429, or any job does not succeed in that time.
+# WAIT_S is how long to wait for all jobs, in seconds (default 300). Exits with 1 if a response is neither 200 nor
+# 429, or if a job does not succeed within that time.
 set -euo pipefail
 # shellcheck source-path=SCRIPTDIR source=summary.sh
 . "$(dirname "$0")/summary.sh"
@@ -15,7 +15,7 @@ wait_s=${WAIT_S:-300}
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 
-# Asks for the jobs whose ids are in a file; each answer goes to job-ID.
+# Prints the curl configuration that gets the jobs whose ids are in a file; each response goes to job-ID.
 job_configuration() {
     local id separator=
     while read -r id; do
@@ -36,7 +36,7 @@ frames_configuration async "$scratch/answer-#" | in_parallel "$clients" > "$scra
 echo "POST /localize (refine=async), $requests frames by $clients clients"
 summary "$scratch/posts" "$(between "$start" "$(now)")"
 
-# Not every frame has a job: under load the service gives up jobs before frames.
+# Not every frame has a job: under load the service sheds jobs before frames.
 sed -nE 's/.*"job":\{"id":"([^"]*)".*/\1/p' "$scratch"/answer-* | awk 1 > "$scratch/ids"
 made=$(wc -l < "$scratch/ids")
 cp "$scratch/ids" "$scratch/open"
@@ -57,7 +57,7 @@ echo
 echo "GET /jobs/{id}?wait=10, $made jobs by $clients clients; $((requests - made)) frames without a job"
 summary "$scratch/gets" "$(between "$waiting" "$ended")"
 
-# Each job's state, and the seconds from when it was queued to its end.
+# Prints each job's state and the seconds from being queued to its end.
 while read -r id; do
     cat "$scratch/job-$id" 2> /dev/null || true
     echo
@@ -69,7 +69,7 @@ done < "$scratch/ids" | awk '
         sub(/"$/, "", found)
         return found
     }
-    # Seconds since a day long past; days by the Gregorian calendar.
+    # Seconds since a fixed day, by the Gregorian calendar.
     function seconds(moment,  p, y, m) {
         split(moment, p, /[-T:Z]/)
         y = p[1]; m = p[2]
@@ -79,19 +79,19 @@ done < "$scratch/ids" | awk '
     }
     {
         state = field("state")
-        if (state == "") state = "unanswered"
+        if (state == "") state = "no_response"
         if (field("finished_at") == "") print state, "-"
         else printf "%s %.4f\n", state, seconds(field("finished_at")) - seconds(field("created_at"))
     }' > "$scratch/ends"
 echo
-echo "jobs from being queued to their end"
+echo "jobs, from being queued to their end"
 awk '{ count[$1]++ } END { for (state in count) printf "%-13s %d\n", state, count[state] }' "$scratch/ends" | sort
 awk '$1 == "succeeded" { print 200, $2 }' "$scratch/ends" > "$scratch/lasted"
-summary "$scratch/lasted" "$(between "$start" "$ended")" | sed -e '/^status/d' -e 's/^200 a second /jobs a second/'
+summary "$scratch/lasted" "$(between "$start" "$ended")" | sed -e '/^status/d' -e 's/^200 per s /jobs per s/'
 
 acceptable "$scratch/posts"
 if [ "$made" -eq 0 ]; then
-    echo "no frame had a job; does the server refine (refine.refiner), and has the map images?" >&2
+    echo "no frame had a job; is refinement on (refine.refiner), and does the map have images?" >&2
     exit 1
 fi
 acceptable "$scratch/gets"

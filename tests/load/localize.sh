@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Localizes the frames of a folder again and again, several at a time, and says how fast that went:
+# Localizes the frames of a folder repeatedly and concurrently, and reports throughput and latency:
 #
 #     localize.sh URL MAP FOLDER [CLIENTS] [REQUESTS]
 #
-# REFINE=async has jobs made too; the default is off. Ends with 1 if any answer is other than 200 or 429.
+# REFINE=async creates jobs too (default: off). Exits with 1 if a response is neither 200 nor 429.
 set -euo pipefail
 # shellcheck source-path=SCRIPTDIR source=summary.sh
 . "$(dirname "$0")/summary.sh"

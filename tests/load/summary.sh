@@ -1,8 +1,8 @@
-# Shared by the scripts here; not run by itself.
+# Sourced by the scripts in this folder; not run by itself.
 # shellcheck shell=bash
 
-# Lines "STATUS SECONDS" as a table: answers by status, how many a second, and percentiles (nearest rank) of
-# those with the status 200.
+# Summarizes lines "STATUS SECONDS" as a table: responses by status, throughput, and latency percentiles (nearest
+# rank) of those with status 200.
 #     summary FILE WALL_SECONDS
 summary() {
     local file=$1 wall=$2
@@ -23,33 +23,34 @@ summary() {
         END {
             printf "seconds       %.2f\n", wall
             if (NR == 0) exit
-            printf "200 a second  %.1f\n", NR / wall
+            printf "200 per s     %.1f\n", NR / wall
             printf "ms            p50 %.1f  p90 %.1f  p95 %.1f  p99 %.1f  max %.1f\n",
                 percentile(50), percentile(90), percentile(95), percentile(99), ms[NR]
         }'
 }
 
-# Whether there was an answer with 200, and none but 200 and 429 (overloaded, as the service may say).
+# Succeeds if there was a 200 and every status is 200 or 429 (overloaded).
 acceptable() {
     awk '$1 == 200 { served++ } $1 != 200 && $1 != 429 { other++ } END { exit !(served && !other) }' "$1"
 }
 
-# arguments CLIENTS REQUESTS "$@": what a script was called with, as $url, $map, $folder, $clients and $requests
-# (the first two stand in where they are not given), and the key, if there is one, as the header $key.
+# arguments CLIENTS REQUESTS "$@": parses the arguments of a script into $url, $map, $folder, $clients and $requests
+# (the first two are the defaults of the last two), and the API key, if any, into the header $key.
 arguments() {
     if [ $# -lt 5 ]; then
         echo "usage: $0 URL MAP FOLDER [CLIENTS] [REQUESTS]" >&2
         exit 2
     fi
     url=${3%/} map=$4 folder=$5
-    # shellcheck disable=SC2034 # for whoever sources this
+    # shellcheck disable=SC2034 # used by the sourcing script
     clients=${6:-$1}
     requests=${7:-$2}
     key=${WHEREABOUTS_API_KEY:+Authorization: Bearer $WHEREABOUTS_API_KEY}
     read_frames "$folder"
 }
 
-# frames_configuration REFINE OUTPUT: posts so many frames; # in OUTPUT, where the answer goes, is its number.
+# frames_configuration REFINE OUTPUT: prints the curl configuration that posts $requests frames. OUTPUT is the file of
+# the response, where # stands for the request number.
 frames_configuration() {
     local number
     for ((number = 0; number < requests; number++)); do
@@ -68,28 +69,28 @@ END
     done
 }
 
-# The JPEGs of a folder, as the array `frames`.
+# Reads the JPEGs of a folder into the array `frames`.
 read_frames() {
     shopt -s nullglob
     frames=("$1"/*.jpg "$1"/*.jpeg)
     if [ ${#frames[@]} -eq 0 ]; then
-        echo "$1 has no JPEGs; \`whereabouts demo\` draws some in demo-out/frames" >&2
+        echo "$1 has no JPEGs; \`whereabouts demo\` renders some in demo-out/frames" >&2
         exit 1
     fi
 }
 
-# A moment in seconds, with a fraction.
+# Prints the current time in seconds, with a fraction.
 now() {
     echo "${EPOCHREALTIME/,/.}"
 }
 
-# in_parallel CLIENTS: runs the transfers that the configuration on stdin names, so many at a time.
-# Failed ones are counted by their status, so that curl's own exit code says nothing new.
+# in_parallel CLIENTS: runs the transfers of the configuration on stdin, up to CLIENTS at a time. Failed transfers are
+# counted by their status, so curl's exit code is ignored.
 in_parallel() {
     curl --parallel --parallel-immediate --parallel-max "$1" --no-progress-meter --config - || true
 }
 
-# Prints "SECONDS" between two values of `now`.
+# Prints the seconds between two values of `now`.
 between() {
     awk -v from="$1" -v to="$2" 'BEGIN { printf "%.3f\n", to - from }'
 }

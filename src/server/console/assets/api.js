@@ -1,7 +1,7 @@
-// The API: the key, errors in one shape, pictures with the key, and server-sent events over fetch.
+// The API client: authentication, uniform errors, authenticated pictures, and server-sent events over fetch.
 
 const KEY = "whereabouts-key";
-let memory = null; // Where the browser forbids storage, the key lives until the page is left.
+let memory = null; // Fallback if the browser forbids storage; lost when the page is left.
 
 export const key = {
   get() { try { return sessionStorage.getItem(KEY) ?? memory; } catch { return memory; } },
@@ -11,11 +11,11 @@ export const key = {
   },
 };
 
-/** Tells the shell: `unauthorized`, `unreachable`, `reachable`. */
+/** Events for the shell: `unauthorized`, `unreachable`, `reachable`. */
 export const signals = new EventTarget();
 const tell = (name) => signals.dispatchEvent(new Event(name));
 
-/** What went wrong (RFC 9457), or that there was no answer at all (`status` 0). */
+/** An RFC 9457 problem, or the absence of a response (`status` 0). */
 export class Problem extends Error {
   constructor({ status, title, detail, type, request_id: requestId }) {
     super(detail ?? title);
@@ -25,26 +25,26 @@ export class Problem extends Error {
 
 async function problemOf(answer) {
   let told = {};
-  try { told = await answer.json(); } catch { /* a proxy on the way need not speak JSON */ }
+  try { told = await answer.json(); } catch { /* a proxy may send something other than JSON */ }
   const problem = { title: `The server answered ${answer.status}`, detail: answer.statusText, ...told, status: answer.status };
-  if (answer.status === 403) problem.title = "This key may not do that";
+  if (answer.status === 403) problem.title = "This key has no permission for that";
   const wait = answer.headers.get("retry-after");
   if (answer.status === 429 && wait) problem.detail = `${problem.detail} Try again in ${wait} s.`;
   return new Problem(problem);
 }
 
-/** A request with the key. Throws `Problem`, or `AbortError` when `signal` says so. */
+/** An authenticated request. Throws `Problem`, or `AbortError` if `signal` aborts. */
 export async function request(path, { method = "GET", body, headers = {}, signal } = {}) {
   const held = key.get();
   if (held) headers = { ...headers, Authorization: `Bearer ${held}` };
   let answer;
   try {
-    // Relative, so that the console works behind a proxy that serves it under a path of its own.
+    // Relative, so that the console works behind a proxy that serves it under a subpath.
     answer = await fetch(path.replace(/^\//, ""), { method, body, headers, signal });
   } catch (error) {
     if (error.name === "AbortError") throw error;
     tell("unreachable");
-    throw new Problem({ status: 0, title: "The server does not answer", detail: "This page goes on trying. Is whereabouts running, and is the network up?" });
+    throw new Problem({ status: 0, title: "The server does not answer", detail: "This page keeps trying. Is whereabouts running, and is the network up?" });
   }
   tell("reachable");
   if (answer.status === 401) tell("unauthorized");
@@ -52,7 +52,7 @@ export async function request(path, { method = "GET", body, headers = {}, signal
   return answer;
 }
 
-/** A request whose answer is JSON; `json` is sent as the body. */
+/** A request with a JSON response; `json`, if given, is posted as the body. */
 export async function call(path, { json, ...options } = {}) {
   if (json !== undefined) {
     options = { method: "POST", ...options, body: JSON.stringify(json), headers: { "Content-Type": "application/json" } };
@@ -63,11 +63,11 @@ export async function call(path, { json, ...options } = {}) {
 
 export const isAbort = (error) => error?.name === "AbortError";
 
-/** An address of a path and a query; what has no value is left out. */
+/** A relative URL of path segments and a query; empty query values are skipped. */
 export function address(parts, query = {}) {
-  // Browsers resolve `..` in a path, in whatever form; a request about an image of that name would go elsewhere.
+  // Browsers resolve `..` in a path in any encoding, so a request for an image of that name would go elsewhere.
   if (parts.some((part) => part === "." || part === "..")) {
-    throw new Problem({ status: 400, title: "This name cannot be asked for from a browser", detail: "It is a dot or two. Use another client, such as curl --path-as-is." });
+    throw new Problem({ status: 400, title: "A browser cannot request this name", detail: "The name is one or two dots. Use another client, such as curl --path-as-is." });
   }
   const path = parts.map(encodeURIComponent).join("/");
   const given = new URLSearchParams(Object.entries(query).filter(([, value]) => value !== null && value !== undefined && value !== ""));
@@ -88,8 +88,8 @@ const nearby = new IntersectionObserver((entries) => {
 }, { rootMargin: "200px" });
 
 /**
- * A picture that takes the key: fetched when it comes near the screen, shown from memory, and let go of
- * once it is drawn. `gone` says what stands in its place if there is none.
+ * An authenticated picture: fetched when it scrolls near the viewport, shown from memory, and released once it is
+ * drawn. `gone` is the text to show if it does not exist.
  */
 export function picture(path, alt, { signal, gone = "No picture.", className = "", loaded } = {}) {
   const image = document.createElement("img");
@@ -129,13 +129,12 @@ const shown = () => new Promise((done) => {
 });
 
 /**
- * Follows server-sent events until `signal` aborts or `on` returns true. Opens the stream again when it breaks,
- * after pauses that double up to 15 s. A tab that nobody looks at holds no stream: browsers give a server six
- * connections in all over HTTP/1.1.
+ * Follows server-sent events until `signal` aborts or `on` returns true. Reconnects with exponential backoff up to
+ * 15 s. A hidden tab holds no stream, because browsers allow only six HTTP/1.1 connections per server.
  *
- *     on(event, data)   an event, its data parsed
+ *     on(event, data)   an event with its parsed data
  *     status(state)     "live" | "waiting"
- *     failed(problem)   the server refuses; nothing more will come
+ *     failed(problem)   the server rejects the stream; no reconnect
  */
 export async function follow(path, { signal, on, status = () => {}, failed = () => {} }) {
   let tries = 0;

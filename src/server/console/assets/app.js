@@ -1,7 +1,7 @@
-// The shell: which view the address names, signing in and out, and what is said while the server is away.
+// The shell: routing, signing in and out, and the outage banner.
 //
-// A view is a module with `show(context)`, which may return `update(query)`, called when only the query of its
-// address has changed. `context.signal` aborts when the view is left: requests, streams and listeners hang on it.
+// A view is a module with `show(context)`, which may return `update(query)`, called when only the query of the URL
+// has changed. `context.signal` aborts when the view is left: tie requests, streams and listeners to it.
 
 import { call, isAbort, key, request, signals } from "./api.js";
 import { fill, failure, h } from "./dom.js";
@@ -19,7 +19,7 @@ const views = {
 const main = document.getElementById("main");
 let current = { name: "", leave: new AbortController(), update: null, failed: false };
 
-/** "#/maps/town?query=…" as a view, its argument and its query. */
+/** Parses "#/maps/town?query=…" into a view, its argument and its query. */
 function route() {
   const [path, query = ""] = location.hash.replace(/^#\/?/, "").split("?");
   const [head, ...rest] = path.split("/");
@@ -30,7 +30,7 @@ function route() {
   return { name, argument, query: new URLSearchParams(query), path };
 }
 
-/** Changes the query of the address: in place, or as a step that the back button undoes. */
+/** Changes the query of the URL: in place, or as a history entry that the back button undoes. */
 function setQuery(changes, { step = false } = {}) {
   const { path, query } = route();
   for (const [name, value] of Object.entries(changes)) {
@@ -69,17 +69,17 @@ async function render({ again = false } = {}) {
   };
   fill(main, root);
   if (!views[name]) {
-    fill(root, h("h1", {}, "There is no such page"), h("p", {}, h("a", { href: "#/jobs" }, "To the jobs")));
+    fill(root, h("h1", {}, "Page not found"), h("p", {}, h("a", { href: "#/jobs" }, "Go to the jobs")));
     return;
   }
   let view;
   try {
     view = await views[name]();
   } catch (error) {
-    // The file did not come. Browsers may remember that of a module until the page is loaded again.
+    // The module did not load. Browsers may cache that failure until the page is reloaded.
     mine.reload = true;
     signals.dispatchEvent(new Event("unreachable"));
-    fail({ title: "This page did not load", detail: "The server did not answer. This page goes on trying.", cause: error });
+    fail({ title: "This page did not load", detail: "The server did not answer. This page keeps trying.", cause: error });
     return;
   }
   try {
@@ -102,7 +102,7 @@ function mark(name) {
   }
 }
 
-// Signing in. The form takes the place of the view; the address stays, so that signing in leads there.
+// Signing in. The form replaces the view; the URL stays, so that signing in leads back to the view.
 
 function signIn() {
   if (document.getElementById("sign-in")) return;
@@ -113,15 +113,15 @@ function signIn() {
   const said = h("p", { class: "form-error", role: "alert" });
   const form = h("form", { id: "sign-in", class: "card narrow" },
     h("h1", {}, "Sign in"),
-    h("p", {}, "This server asks for an API key. It is kept until you close this tab or sign out."),
+    h("p", {}, "This server requires an API key. It is kept until you close this tab or sign out."),
     h("label", { for: "key" }, "API key"), input, said,
     h("div", { class: "actions" }, h("button", { class: "primary", type: "submit" }, "Sign in")),
     h("h2", {}, "No key yet?"),
-    h("p", {}, "Whoever has the role admin makes one; the role operator is enough for most of this page:"),
+    h("p", {}, "Anyone with the role admin can create one; the role operator is enough for most of this console:"),
     h("pre", { class: "command", tabindex: "0" }, h("code", {}, "whereabouts keys create --role operator --name 'my name'")),
-    h("p", { class: "muted" }, "The very first key is made in the data folder, while the server does not run: add ",
+    h("p", { class: "muted" }, "The first key is created in the data folder while the server is stopped: add ",
       h("code", {}, "--data DIR --role admin"), "."));
-  if (refused) said.textContent = "The key is not valid, or not any more.";
+  if (refused) said.textContent = "The key is invalid, expired or revoked.";
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     key.set(input.value.trim());
@@ -130,7 +130,7 @@ function signIn() {
     } catch (problem) {
       if (problem.status === 401) {
         key.set(null);
-        said.textContent = "The server does not know this key, or it has ended. Check that all of it was copied.";
+        said.textContent = "The server does not know this key, or it has expired. Check that you copied all of it.";
         input.select();
         return;
       }
@@ -153,7 +153,7 @@ signOut.addEventListener("click", () => {
 });
 signals.addEventListener("unauthorized", signIn);
 
-// While the server is away, ask it ever less often; what failed meanwhile is loaded again.
+// While the server is down, probe it with backoff; then reload what failed in the meantime.
 
 const outage = document.getElementById("outage");
 let probing = false;
@@ -176,7 +176,7 @@ signals.addEventListener("reachable", () => {
   else if (current.failed) render({ again: true });
 });
 
-// Light and dark follow the system unless somebody chose.
+// Light and dark follow the system unless the user chose one.
 
 const theme = document.getElementById("theme");
 const themes = ["auto", "light", "dark"];
@@ -190,7 +190,7 @@ const stored = () => { try { return localStorage.getItem("whereabouts-theme"); }
 theme.addEventListener("click", () => {
   const next = themes[(themes.indexOf(document.documentElement.dataset.theme ?? "auto") + 1) % themes.length];
   setTheme(next);
-  try { localStorage.setItem("whereabouts-theme", next); } catch { /* for this page only, then */ }
+  try { localStorage.setItem("whereabouts-theme", next); } catch { /* then it lasts for this page only */ }
 });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => dispatchEvent(new Event("themechange")));
 setTheme(themes.includes(stored()) ? stored() : "auto");
@@ -198,7 +198,7 @@ setTheme(themes.includes(stored()) ? stored() : "auto");
 setInterval(() => refreshTimes(main), 5000);
 addEventListener("hashchange", () => render());
 document.querySelector(".skip").addEventListener("click", (event) => {
-  event.preventDefault(); // "#main" is no view
+  event.preventDefault(); // "#main" is not a view
   main.focus();
 });
 showSignOut();

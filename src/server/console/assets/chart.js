@@ -1,18 +1,18 @@
-// Small charts of the last hour. Each has its numbers as a table too, for those who do not see it.
+// Small charts of the last hour. Each also has its numbers as a table, for accessibility.
 
 import { h, svg } from "./dom.js";
 
 const [WIDTH, HEIGHT, LEFT, BOTTOM, TOP] = [560, 190, 50, 26, 10];
 const MINUTE = 60e3;
 
-/** A round number at or above `value`, for the top of a scale. */
+/** Rounds up to a round number, for the top of a scale. */
 function round(value) {
   const power = 10 ** Math.floor(Math.log10(Math.max(value, 1)));
   return [1, 2, 2.5, 5, 10].map((step) => step * power).find((top) => top >= value);
 }
 
 /**
- * `series`: `{name, of, kind: "line" | "bar", look}` over the minutes, where `of(minute)` is a number or null.
+ * `series`: `{name, of, kind: "line" | "bar", look}` per minute, where `of(minute)` is a number or null.
  */
 export function chart({ title, unit, minutes, now, series, summary }) {
   const from = now - 60 * MINUTE;

@@ -1,7 +1,7 @@
-// Elements without markup: whatever comes from the server, names, tags and model text among it, gets into
-// the page as text nodes and attributes only. Nothing in this folder sets innerHTML.
+// DOM helpers without markup: everything from the server, including names, tags and model text, enters the page
+// only as text nodes and attributes. Nothing in this folder sets innerHTML.
 
-/** Makes an element. `attributes`: `class`, `on…` handlers, booleans, or plain attributes; null is left out. */
+/** Creates an element. `attributes`: `class`, `on…` handlers, booleans or plain attributes; null is skipped. */
 export function h(name, attributes = {}, ...children) {
   const made = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) {
@@ -14,7 +14,7 @@ export function h(name, attributes = {}, ...children) {
   return made;
 }
 
-/** The same for SVG. */
+/** Creates an SVG element. */
 export function svg(name, attributes = {}, ...children) {
   const made = document.createElementNS("http://www.w3.org/2000/svg", name);
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -28,25 +28,25 @@ function add(parent, ...children) {
   }
 }
 
-/** Replaces what is in an element. */
+/** Replaces the children of an element. */
 export function fill(parent, ...children) {
   parent.replaceChildren();
   add(parent, ...children);
   return parent;
 }
 
-/** A list of names and values; those without a value are left out. */
+/** A definition list; entries without a value are skipped. */
 export function facts(...pairs) {
   const given = pairs.filter(([, value]) => value !== null && value !== undefined && value !== "");
   return h("dl", { class: "facts" }, given.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
 }
 
-/** A state as a coloured word. */
+/** A state as a coloured badge. */
 export function badge(state) {
   return h("span", { class: `badge ${/^[a-z]+$/.test(state) ? state : ""}` }, state);
 }
 
-/** An error in plain words. */
+/** An error message, with an optional retry button. */
 export function failure(problem, again) {
   return h("div", { class: "notice bad", role: "alert" },
     h("strong", {}, problem.title ?? "Something went wrong"),
@@ -55,7 +55,7 @@ export function failure(problem, again) {
     again && h("button", { type: "button", onclick: again }, "Try again"));
 }
 
-/** What to do where there is nothing yet. */
+/** An empty state, with advice on what to do. */
 export function empty(title, ...advice) {
   return h("div", { class: "empty" }, h("h2", {}, title), advice);
 }
@@ -69,7 +69,7 @@ export function loading(what) {
   return h("p", { class: "muted loading" }, `Loading ${what}…`);
 }
 
-/** A share of a limit. */
+/** A meter of a value against its limit. */
 export function meter(value, limit, label) {
   value ??= 0;
   const share = limit ? Math.min(1, value / limit) : 0;
@@ -80,13 +80,13 @@ export function meter(value, limit, label) {
 }
 
 let announcing;
-/** Tells a screen reader, but not more than twice a second: the last thing said wins. */
+/** Announces a text to screen readers, at most twice a second; the latest text wins. */
 export function announce(text) {
   clearTimeout(announcing);
   announcing = setTimeout(() => { document.getElementById("live").textContent = text; }, 500);
 }
 
-/** Asks before something that cannot be undone. `word` must be typed, if it is given. */
+/** Asks for confirmation of an irreversible action. If `word` is given, it must be typed. */
 export function confirm({ title, text, action, word }) {
   return new Promise((resolve) => {
     const typed = word && h("input", { type: "text", autocomplete: "off", spellcheck: "false" });

@@ -1,4 +1,4 @@
-// Numbers with their units, times, and names, as people read them.
+// Formats numbers with units, times and names for people.
 
 const number = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const compact = new Intl.NumberFormat("en", { notation: "compact", maximumFractionDigits: 1 });
@@ -8,7 +8,7 @@ export const short = (value) => (value < 10000 ? number.format(value) : compact.
 export const percent = (share) => `${Math.round(share * 100)} %`;
 export const plural = (value, one, many = `${one}s`) => `${count(value)} ${value === 1 ? one : many}`;
 
-/** A span of time: "216 ms", "3.2 s", "4 min 10 s". */
+/** Formats a duration: "216 ms", "3.2 s", "4 min 10 s". */
 export function duration(ms) {
   if (!Number.isFinite(ms)) return "–";
   if (ms < 1000) return `${ms < 10 ? Math.round(ms * 10) / 10 : Math.round(ms)} ms`;
@@ -18,7 +18,7 @@ export function duration(ms) {
   return `${Math.floor(s / 3600)} h ${Math.floor((s % 3600) / 60)} min`;
 }
 
-/** How long ago: "now", "40 s ago", "3 h ago", "12 days ago". */
+/** Formats the time since: "now", "40 s ago", "3 h ago", "12 days ago". */
 export function ago(at, now = Date.now()) {
   const s = (now - Date.parse(at)) / 1000;
   if (!Number.isFinite(s)) return "–";
@@ -33,7 +33,7 @@ export function ago(at, now = Date.now()) {
 
 export const moment = (at) => (at ? new Date(at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" }) : "–");
 
-/** An element that says how long ago, and when exactly on pointing; `refreshTimes` keeps it true. */
+/** A relative time with the exact time as a tooltip; `refreshTimes` keeps it up to date. */
 export function timeAgo(at) {
   if (!at) return "–";
   const made = document.createElement("time");
@@ -58,7 +58,7 @@ export function bytes(value) {
   return `${at === 0 || value >= 100 ? Math.round(value) : value.toFixed(1)} ${units[at]}`;
 }
 
-/** The end of an id of version 7 tells jobs apart; its head is the time. */
+/** The end of a UUIDv7 distinguishes jobs; its start is the time. */
 export const shortId = (id) => `…${id.slice(-8)}`;
 
 export function metres(value) {
@@ -75,7 +75,7 @@ export function pose(value) {
   return `x ${value.x.toFixed(2)} m, y ${value.y.toFixed(2)} m`;
 }
 
-/** What a job or a pair cost. */
+/** Formats the cost of a job or a pair. */
 export function cost(usage) {
   if (!usage || (!usage.calls && !usage.cached)) return "no calls";
   const parts = [];

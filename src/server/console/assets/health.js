@@ -1,4 +1,4 @@
-// How the server fares: the last hour, what waits, what is spent, what went wrong, what is configured.
+// The health of the server: the last hour, queues, spending, recent errors, and configuration.
 
 import { call, isAbort } from "./api.js";
 import { chart } from "./chart.js";
@@ -12,9 +12,9 @@ export async function show({ root, signal, title }) {
   const heading = h("div", { class: "heading" }, h("h1", {}, "Health"));
   const body = h("div", { class: "view" }, loading("the status"));
   fill(root, heading, body);
-  let opened = new Set(); // which details stay open when the numbers are new
+  let opened = new Set(); // the <details> that stay open across an update
   let printed = "";
-  // Only a problem of this very view is worth the whole page; the others have their places in it.
+  // Only connection and authentication problems replace the whole page; others are shown in their section.
   const optional = (path) => call(path, { signal }).catch((problem) => { if (isAbort(problem) || problem.status === 401 || problem.status === 0) throw problem; return problem; });
 
   async function load() {
@@ -30,7 +30,7 @@ export async function show({ root, signal, title }) {
     for (const one of body.querySelectorAll("details")) {
       if (opened.has(one.dataset.name ?? one.closest("section")?.querySelector("h2")?.textContent)) one.open = true;
     }
-    // A reader stays where they were: nothing is pulled from under them by new numbers.
+    // Restore scroll positions and focus after an update.
     stops().forEach((one, at) => { if (before[at]) one.scrollTop = before[at]; });
     if (focused >= 0) stops()[focused]?.focus({ preventScroll: true });
   }
@@ -48,7 +48,7 @@ export async function show({ root, signal, title }) {
 }
 
 function without(problem, usage) {
-  const told = problem.status === 404 ? h("div", { class: "notice warn" }, h("strong", {}, "This server tells no status"), h("p", {}, "It is older than this page. Its metrics are at ", h("a", { href: "metrics" }, "/metrics"), "."))
+  const told = problem.status === 404 ? h("div", { class: "notice warn" }, h("strong", {}, "This server has no status endpoint"), h("p", {}, "It is older than this page. Its metrics are at ", h("a", { href: "metrics" }, "/metrics"), "."))
     : failure(problem);
   return [told, spending(null, usage)];
 }
@@ -66,7 +66,7 @@ function drawn(status, usage) {
   const [requests, errors, failed, ended] = ["requests", "errors", "jobs_failed", "jobs_ended"].map(sum);
   const slow = minutes.filter((minute) => minute.p95_ms !== null);
   const worst = slow.reduce((most, minute) => Math.max(most, minute.p95_ms), 0);
-  // The median of the medians, each counted with its frames: near enough for one number.
+  // The median of the minute medians, weighted by frames: accurate enough for one number.
   const middle = () => {
     const sorted = [...slow].sort((a, b) => a.p50_ms - b.p50_ms);
     let left = frames / 2;
@@ -81,19 +81,19 @@ function drawn(status, usage) {
       stat("Jobs open", count(jobs.open), small(`of ${count(jobs.limit)}; ${count(ended)} ended in the last hour, ${count(failed)} failed`), meter(jobs.open, jobs.limit, "Jobs open")),
       stat("Pictures waiting", count(pictures.open), small(`of ${count(pictures.limit)}`), meter(pictures.open, pictures.limit, "Pictures waiting")),
       stat("On disk", bytes(status.db_bytes), small(status.free_bytes === null || status.free_bytes === undefined ? "" : `${bytes(status.free_bytes)} free`)),
-      stat("Up", ago(status.started_at, now).replace(" ago", ""), small(`version ${status.version}`))),
+      stat("Uptime", ago(status.started_at, now).replace(" ago", ""), small(`version ${status.version}`))),
     h("div", { class: "charts" },
       chart({ title: "Latency", unit: "ms", minutes, now, summary: slow.length ? `Median ${duration(middle())}, worst p95 of a minute ${duration(worst)}.` : quiet,
         series: [{ name: "p50", of: (minute) => minute.p50_ms, kind: "line", look: "a" }, { name: "p95", of: (minute) => minute.p95_ms, kind: "line", look: "b" }] }),
-      chart({ title: "Requests", unit: "a minute", minutes, now, summary: requests ? `${plural(requests, "request")}, ${plural(errors, "error")} in the last hour.` : quiet,
+      chart({ title: "Requests", unit: "per minute", minutes, now, summary: requests ? `${plural(requests, "request")}, ${plural(errors, "error")} in the last hour.` : quiet,
         series: [{ name: "requests", of: (minute) => minute.requests, kind: "bar", look: "" }, { name: "errors", of: (minute) => minute.errors, kind: "bar", look: "bad" }] }),
-      chart({ title: "Jobs", unit: "ended a minute", minutes, now, summary: ended ? `${plural(ended, "job")} ended, ${count(failed)} failed in the last hour.` : quiet,
+      chart({ title: "Jobs", unit: "ended per minute", minutes, now, summary: ended ? `${plural(ended, "job")} ended, ${count(failed)} failed in the last hour.` : quiet,
         series: [{ name: "ended", of: (minute) => minute.jobs_ended, kind: "bar", look: "" }, { name: "failed", of: (minute) => minute.jobs_failed, kind: "bar", look: "bad" }] }),
     ),
     troubles(status.errors),
     h("div", { class: "charts" }, spending(status.today, usage), h("section", { class: "card" }, h("h2", {}, "Configured"), facts(
-      ["Refiner", status.refiner ?? "off: answers are not refined"], ["API keys", status.keys_required ? "required" : "not asked for: whoever reaches the server may do everything"],
-      ["Models", status.models.map((model) => `${model.name} (${model.provider}, ${model.precision})`).join("; ") || "none loaded"], ["By default", status.default_model],
+      ["Refiner", status.refiner ?? "off: answers are not refined"], ["API keys", status.keys_required ? "required" : "not required: anyone who can reach the server has full access"],
+      ["Models", status.models.map((model) => `${model.name} (${model.provider}, ${model.precision})`).join("; ") || "none loaded"], ["Default model", status.default_model],
       ["Map background", status.tiles ? "configured" : "none"]),
       h("details", { "data-name": "settings" }, h("summary", {}, "All settings"), h("pre", { class: "settings", tabindex: "0", "aria-label": "Settings" }, h("code", {}, status.settings))))),
   ];
@@ -107,7 +107,7 @@ function spending(today, usage) {
   const pairs = total ? total.calls + total.cached : 0;
   return h("section", { class: "card" }, h("h2", {}, "Budget and cache"),
     today ? facts(["Tokens today", share(today.tokens, today.token_limit, short)], ["Money today", share(today.money, today.money_limit, (value) => value.toFixed(2))],
-      ["Calls", today.suspended ? "suspended, because the last ones failed" : "allowed"]) : h("p", { class: "muted" }, "No model outside is asked, so nothing is spent."),
+      ["Calls", today.suspended ? "suspended, because the latest calls failed" : "allowed"]) : h("p", { class: "muted" }, "No external model is used, so nothing is spent."),
     total && pairs > 0 && facts(["Last 30 days", cost(total)], ["From the cache", percent(total.cached / pairs)], ["Money", told.total.money.toFixed(2)]),
     usage instanceof Error && h("p", { class: "muted" }, usage.detail));
 }

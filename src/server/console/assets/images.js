@@ -1,4 +1,4 @@
-// One image of a map: its picture and what is known of it, removing it, and adding another.
+// One image of a map: its picture and metadata, deleting it, and adding another.
 
 import { address, call, contentOf, isAbort, picture } from "./api.js";
 import { announce, confirm, facts, failure, fill, h } from "./dom.js";
@@ -7,7 +7,7 @@ import { ago, moment, pose } from "./format.js";
 export function imageCard(map, image, { signal, removed, close }) {
   const said = h("div");
   const remove = async () => {
-    const sure = await confirm({ title: "Delete this image?", text: `${image.id} leaves the map ${map.name}. Jobs that compared it keep their texts.`, action: "Delete the image" });
+    const sure = await confirm({ title: "Delete this image?", text: `${image.id} will be removed from the map ${map.name}. Jobs that compared it keep their texts.`, action: "Delete the image" });
     if (!sure) return;
     try {
       await call(address(["maps", map.name, "images", image.id]), { method: "DELETE", signal });
@@ -44,9 +44,9 @@ export function uploadCard(map, { signal, added, centre }) {
     field("tags", "Tags, separated by commas"),
     h("div", { class: "actions" }, send, h("button", { type: "button", onclick: () => {
       const middle = centre();
-      if (!middle) { said.textContent = "The plan is empty, so it has no middle yet."; return; }
+      if (!middle) { said.textContent = "The plan is empty, so it has no centre yet."; return; }
       for (const [name, value] of Object.entries(middle)) form.elements[name].value = value.toFixed(geographic ? 7 : 3);
-    } }, "Pose from the middle of the plan")), said);
+    } }, "Use the centre of the plan as the pose")), said);
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     const [file] = form.elements["up-file"].files;
@@ -63,5 +63,5 @@ export function uploadCard(map, { signal, added, centre }) {
     send.disabled = false;
   });
   return h("section", { class: "card" }, h("h2", {}, "Add an image"), h("details", {}, h("summary", {}, "Upload a picture"), form,
-    h("p", { class: "muted small" }, "Without a pose, the image is found but says no place. For a whole folder: "), h("code", { class: "small" }, `whereabouts index FOLDER --map ${map.name}`)));
+    h("p", { class: "muted small" }, "An image without a pose can be found but gives no place. For a whole folder: "), h("code", { class: "small" }, `whereabouts index FOLDER --map ${map.name}`)));
 }

@@ -1,4 +1,4 @@
-// One job: what came of it, the frame beside each candidate, and what it cost. A job that goes on is followed.
+// One job: its result, the frame next to each candidate, and its cost. An open job is followed live.
 
 import { address, call, contentOf, follow, frameOf, isAbort, picture } from "./api.js";
 import { announce, badge, facts, failure, fill, h, loading } from "./dom.js";
@@ -24,7 +24,7 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
 
   const ended = () => !OPEN.includes(job.state);
   const describes = (image) => job.descriptions.find((description) => description.image_id === image);
-  // Without a ranking, the pairs that are described stand in their coarse order.
+  // Without a ranking, the described pairs are listed in coarse order.
   const candidates = () => job.ranking ?? job.descriptions.map(({ image_id: image }) => ({ image_id: image }));
 
   async function act(verb, button) {
@@ -55,14 +55,14 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
           ["failed", "degraded", "cancelled"].includes(job.state) && h("button", { type: "button", onclick: (event) => act("retry", event.target) }, "Retry"),
           !ended() && h("button", { type: "button", onclick: (event) => act("cancel", event.target) }, "Cancel"))),
       job.error && h("div", { class: job.state === "failed" ? "notice bad" : "notice warn" },
-        h("strong", {}, { failed: "The job failed", degraded: "Part of the ranking fell back to the coarse order", cancelled: "The job was cancelled" }[job.state] ?? "The job waits"),
+        h("strong", {}, { failed: "The job failed", degraded: "Part of the ranking fell back to the coarse order", cancelled: "The job was cancelled" }[job.state] ?? "The job is waiting"),
         h("p", {}, job.error)),
       h("div", { class: "summary" },
         h("div", { class: "card answer" },
-          picture(frameOf(id, 640), "The frame of this job", { signal, className: "small-picture", gone: "The frame is not kept any more, or this server does not show frames." }),
+          picture(frameOf(id, 640), "The frame of this job", { signal, className: "small-picture", gone: "The frame is no longer stored, or this server does not serve frames." }),
           h("div", {}, h("h2", {}, "Estimate"),
-            estimate ? h("p", { class: "big" }, percent(estimate.confidence), h("span", { class: "muted" }, " confidence")) : h("p", { class: "muted" }, ended() ? "There is none." : "Comes when the job has ended."),
-            estimate && h("p", {}, estimate.known ? "The place is known." : "Perhaps not in the map: the confidence is below the configured bound."),
+            estimate ? h("p", { class: "big" }, percent(estimate.confidence), h("span", { class: "muted" }, " confidence")) : h("p", { class: "muted" }, ended() ? "None." : "Available when the job has ended."),
+            estimate && h("p", {}, estimate.known ? "The place is known." : "May not be in the map: the confidence is below the configured threshold."),
             estimate && h("p", {}, h("code", {}, estimate.image_id), h("br"), h("span", { class: "muted" }, pose(estimate.pose))),
             job.reasoning && h("div", {}, h("h2", {}, "Reasoning"), job.reasoning.split(/\n+/).map((part) => h("p", { class: "told" }, part))))),
         h("div", { class: "card" }, facts(
@@ -79,10 +79,10 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
     const all = candidates();
     if (!all.some(({ image_id: image }) => image === chosen)) chosen = all[0]?.image_id ?? null;
     if (!all.length) {
-      fill(list, h("li", { class: "muted" }, ended() ? "No pair was compared." : "The first pair is on its way."));
-      return fill(stage, h("p", { class: "muted" }, ended() ? "There is nothing to compare." : "Pairs show here as they are described."));
+      fill(list, h("li", { class: "muted" }, ended() ? "No pair was compared." : "Waiting for the first pair."));
+      return fill(stage, h("p", { class: "muted" }, ended() ? "There is nothing to compare." : "Pairs appear here as they are described."));
     }
-    // Kept by image: a pair that arrives does not fetch the pictures of the others again.
+    // Cached by image, so that a new pair does not refetch the pictures of the others.
     fill(list, all.map((candidate) => {
       const image = candidate.image_id;
       if (!links.has(image)) {
@@ -128,7 +128,7 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
       h("h2", {}, candidate.rank ? `Rank ${candidate.rank}` : "Compared"),
       candidate.rank && h("span", {}, h("span", { class: "muted" }, `coarse rank ${candidate.coarse_rank} `), moved(candidate)),
       h("div", { class: "heading-end" }, step(-1, "Previous"), step(1, "Next")));
-    // While pairs arrive, the pictures of the chosen one stay; only words and ranks are new.
+    // While pairs arrive, keep the pictures of the chosen pair and update only texts and ranks.
     if (sameImage && stage.children.length === 4) {
       stage.children[0].replaceWith(heading);
       stage.children[2].replaceWith(words(describes(chosen)));
@@ -151,7 +151,7 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
     const rest = (field) => Math.max(0, job.usage[field] - job.descriptions.reduce((sum, one) => sum + one.usage[field], 0));
     fill(calls, h("section", { class: "card" }, h("h2", {}, "Calls"),
       h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Calls" }, h("table", { class: "calls" },
-        h("thead", {}, h("tr", {}, ["Call", "How", "Tokens sent", "received", "Took"].map((name) => h("th", { scope: "col" }, name)))),
+        h("thead", {}, h("tr", {}, ["Call", "Source", "Tokens sent", "received", "Took"].map((name) => h("th", { scope: "col" }, name)))),
         h("tbody", {}, job.descriptions.map((one) => row(one.image_id, bought(one), one.usage, one.took_ms)),
           job.usage.calls > described && row("Ranking and repeats", plural(job.usage.calls - described, "call"),
             { prompt_tokens: rest("prompt_tokens"), completion_tokens: rest("completion_tokens") }, job.reasoning_took_ms)))),

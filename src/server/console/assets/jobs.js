@@ -1,5 +1,5 @@
-// The list of jobs, live: one stream for all of them, the first page again when something has ended, and no
-// request per row. The server searches them.
+// The live list of jobs: one event stream for all of them, a reload of the first page when a job ends, and no
+// request per row. The search runs on the server.
 
 import { address, call, follow, isAbort } from "./api.js";
 import { announce, badge, command, empty, failure, fill, h, loading } from "./dom.js";
@@ -9,20 +9,20 @@ const PAGE = 50;
 const STATES = ["queued", "running", "succeeded", "degraded", "failed", "cancelled"];
 const ENDED = new Set(["succeeded", "degraded", "failed", "cancelled"]);
 
-const LONGEST_SEARCH = 200; // characters; the server takes no more
+const LONGEST_SEARCH = 200; // characters; the limit of the server
 const UUID = /^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$/i;
 
-/** A page of the jobs that fit a filter, without their descriptions. */
+/** Fetches a page of the jobs that match a filter, without their descriptions. */
 const page = ({ map, state, q }, cursor, signal) => call(address(["jobs"], { map, state, q, cursor, limit: PAGE, brief: "true" }), { signal });
 
 export async function show({ root, query, signal, setQuery, title }) {
   title("Jobs");
   let filter = read(query);
   let jobs = new Map(); // by id; ids sort by time
-  let cursor = null; // where older ones begin; null if there are none
-  let loaded = false; // whether `cursor` says so
-  let want = PAGE; // as many are looked for
-  let generation = 0; // a slow answer to an earlier filter is dropped
+  let cursor = null; // the next page of older jobs; null at the end
+  let loaded = false; // whether `cursor` is valid
+  let want = PAGE; // number of jobs to look for
+  let generation = 0; // a late response to an earlier filter is dropped
 
   const live = h("span", { class: "live waiting" }, "connecting");
   const maps = h("select", { id: "f-map", onchange: () => setQuery({ map: maps.value }, { step: true }) }, h("option", { value: "" }, "all maps"));
@@ -80,18 +80,18 @@ export async function show({ root, query, signal, setQuery, title }) {
     fill(before, direct, shown.length === 0 && (searching ? loading("older jobs") : nothing()));
     body.removeAttribute("aria-busy");
     const what = filter.q ? plural(shown.length, "job found", "jobs found") : `${plural(shown.length, "job")} loaded`;
-    fill(after, shown.length > 0 && h("span", { class: "muted" }, searching ? `${what}, looking through older ones…` : cursor ? what : `${what}; no older ones`),
-      cursor && !searching && h("button", { type: "button", onclick: (event) => more(event.target) }, filter.q ? "Look through older jobs" : "Load older jobs"));
+    fill(after, shown.length > 0 && h("span", { class: "muted" }, searching ? `${what}, searching older ones…` : cursor ? what : `${what}; no older ones`),
+      cursor && !searching && h("button", { type: "button", onclick: (event) => more(event.target) }, filter.q ? "Search older jobs" : "Load older jobs"));
   }
 
   function nothing() {
     if (filter.q) {
-      return empty("No match", h("p", {}, "No job that fits the filters contains this text. Search looks at the ids of jobs, queries and candidates, at maps, states, refiners, errors, reasons and descriptions."));
+      return empty("No match", h("p", {}, "No job that matches the filters contains this text. The search covers the ids of jobs, queries and candidates, maps, states, refiners, errors, reasoning and descriptions."));
     }
     if (filter.map || filter.state) {
-      return empty("No such jobs", h("p", {}, "No job fits these filters. ", h("a", { href: "#/jobs" }, "Show all jobs")));
+      return empty("No such jobs", h("p", {}, "No job matches these filters. ", h("a", { href: "#/jobs" }, "Show all jobs")));
     }
-    return empty("No jobs yet", h("p", {}, "A job starts with each frame that is localized. ", h("a", { href: "#/try" }, "Try it with a picture"), ", or:"),
+    return empty("No jobs yet", h("p", {}, "Each localized frame starts a job. ", h("a", { href: "#/try" }, "Try it with a picture"), ", or:"),
       command("whereabouts localize FRAME.jpg --map NAME"), h("p", {}, "No map yet?"), command("whereabouts index FOLDER --map NAME"));
   }
 
@@ -101,7 +101,7 @@ export async function show({ root, query, signal, setQuery, title }) {
       const answer = await page(filter, null, signal);
       if (mine !== generation) return;
       const end = answer.next_cursor;
-      // What was loaded below this page stays; what belongs into it and is not there is gone.
+      // Keep the jobs loaded below this page; jobs missing from the page itself are gone.
       const older = end && loaded && (cursor === null || cursor < end) ? [...jobs.values()].filter((job) => job.id < end) : null;
       if (!older) cursor = end;
       loaded = true;
@@ -122,7 +122,7 @@ export async function show({ root, query, signal, setQuery, title }) {
     draw();
   }
 
-  /** Goes on with a search until there are enough: the server looks at some thousand jobs for one page of it. */
+  /** Continues a search until there are enough jobs: the server examines a bounded number of jobs per page. */
   async function fillUp(mine) {
     try {
       while (mine === generation && filter.q && cursor && jobs.size < want) await further(mine);
@@ -153,18 +153,18 @@ export async function show({ root, query, signal, setQuery, title }) {
     cursor = null;
     loaded = false;
     want = PAGE;
-    body.setAttribute("aria-busy", "true"); // what is shown fits the filter before
+    body.setAttribute("aria-busy", "true"); // the list still shows the previous filter
     load();
   }
 
-  // How many pairs are described is told by events alone; it outlives the row that a reload replaces.
+  // Progress in pairs comes from events only; it is kept when a reload replaces the row.
   const progress = new Map();
   let reload = null;
   let frame = 0;
-  // A search costs the server more than a list does.
+  // A search is more expensive for the server than a list.
   const soon = () => { reload ??= setTimeout(() => { reload = null; load(); }, filter.q ? 5000 : 1500); };
   let ended = 0;
-  let said = 0; // a busy server is not read out job by job
+  let said = 0; // limits screen reader announcements on a busy server
   function changed(change) {
     if (filter.map && change.map !== filter.map) return;
     const { described, of, state, attempts, error } = change;
@@ -181,16 +181,16 @@ export async function show({ root, query, signal, setQuery, title }) {
     }
     const job = jobs.get(change.id);
     if (!job) return soon();
-    // It may be none of those any more.
+    // It may no longer match the filter.
     if ((filter.q || filter.state) && (job.state !== state || job.error !== error)) soon();
     Object.assign(job, { state, attempts, error, described, of });
-    frame ||= requestAnimationFrame(() => { frame = 0; draw(); }); // many changes, one drawing
+    frame ||= requestAnimationFrame(() => { frame = 0; draw(); }); // coalesce many changes into one redraw
   }
 
   controls();
   table.parentElement.hidden = true;
   fill(before, loading("the jobs"));
-  const first = load(); // before all else that asks: it is what the page is for
+  const first = load(); // before all other requests: it is the main content
 
   signal.addEventListener("abort", () => { clearTimeout(reload); clearTimeout(typing); cancelAnimationFrame(frame); });
   follow("events", {
@@ -199,7 +199,7 @@ export async function show({ root, query, signal, setQuery, title }) {
     status(state) {
       live.className = `live ${state}`;
       live.textContent = state === "live" ? "live" : "reconnecting";
-      if (state === "live" && loaded) load(); // what happened while nobody listened
+      if (state === "live" && loaded) load(); // catch up on events missed while disconnected
     },
     failed(problem) { live.className = "live off"; live.textContent = "not live"; live.title = problem.detail; },
   });

@@ -1,4 +1,4 @@
-// One map: its images on a plan, what they cover and how old they are, a query on top, and single images.
+// One map: its images on a plan, their coverage and age, a query overlay, and single images.
 
 import { address, call, isAbort } from "./api.js";
 import { announce, command, confirm, empty, facts, failure, fill, h, loading } from "./dom.js";
@@ -9,7 +9,7 @@ import { Plan } from "./plan.js";
 import { AGES } from "./points.js";
 
 const PAGE = 1000;
-const MOST = 100_000; // images that are loaded without being asked
+const MOST = 100_000; // maximum number of images loaded automatically
 const LISTED = 100;
 
 export async function show({ root, argument: name, query, signal, setQuery, title, fail }) {
@@ -44,7 +44,7 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
     map.description && h("p", {}, map.description),
     progress,
     h("div", { class: "map-body" },
-      h("div", {}, planCard, h("p", { id: "plan-keys", class: "muted small" }, "Drag or use the arrow keys to move, the wheel, two fingers or + and − to zoom, 0 to see everything. Click a point for its picture; the list holds the same images.")),
+      h("div", {}, planCard, h("p", { id: "plan-keys", class: "muted small" }, "Drag or use the arrow keys to move, the wheel, two fingers or + and − to zoom, 0 to see everything. Click a point for its picture; the list shows the same images.")),
       h("div", { class: "map-side" }, single, asked,
         h("section", { class: "card" }, h("h2", {}, "Images in view"), h("label", { for: "image-q" }, "Search all images", search), listed, list),
         h("section", { class: "card" }, h("h2", {}, "Coverage and age"), h("label", { class: "check", for: "coverage" }, overlay, "Mark 10 m around each image"), covered),
@@ -55,15 +55,15 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
 
   function settings() {
     return h("section", { class: "card" }, h("h2", {}, "This map"), facts(
-      ["Place", map.scene], ["Poses", map.frame], ["Model", `${map.model}, ${map.precision} precision`], ["Descriptor", `${map.descriptor}, ${count(map.dim)} numbers`],
+      ["Scene", map.scene], ["Poses", map.frame], ["Model", `${map.model}, ${map.precision} precision`], ["Descriptor", `${map.descriptor}, ${count(map.dim)} dimensions`],
       ["Search", searched(map)], ["Reindex", reindexed(map)],
-      ["Confidence", map.calibration ? `measured on ${plural(map.calibration.asked, "image")}` : "not measured yet"], ["Made", moment(map.created_at)]),
-      h("details", {}, h("summary", {}, "Delete this map"), h("p", {}, "Takes the role admin, and all images with it."),
+      ["Confidence", map.calibration ? `calibrated on ${plural(map.calibration.asked, "image")}` : "not calibrated yet"], ["Created", moment(map.created_at)]),
+      h("details", {}, h("summary", {}, "Delete this map"), h("p", {}, "Needs the role admin. Deletes all images of the map."),
         h("button", { type: "button", class: "danger", onclick: remove }, "Delete the map…")));
   }
 
   async function remove() {
-    const sure = await confirm({ title: `Delete the map ${name}?`, text: `Its ${plural(map.images, "image")} go with it. There is no way back but a backup.`, action: "Delete the map", word: name });
+    const sure = await confirm({ title: `Delete the map ${name}?`, text: `This deletes its ${plural(map.images, "image")}. Only a backup can restore them.`, action: "Delete the map", word: name });
     if (!sure) return;
     try {
       await call(address(["maps", name]), { method: "DELETE", signal });
@@ -91,7 +91,7 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
 
   let listing = 0;
   function listSoon() {
-    // Not with each frame of a drag: the list follows when the plan rests.
+    // Debounced: during a drag, the list is not redrawn with each frame.
     clearTimeout(listing);
     listing = setTimeout(drawList, 200);
   }
@@ -102,7 +102,7 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
     found.sort((a, b) => (a.id < b.id ? -1 : 1));
     const what = text ? `${plural(found.length, "image")} found` : `${plural(found.length, "image")} of ${count(images.length)}`;
     let told = found.length > LISTED ? `${what}; the first ${LISTED} are listed, zoom in or search for the others` : what;
-    if (!found.length && images.length) told += text ? "" : "; 0 on the plan, or ⤢, shows everything";
+    if (!found.length && images.length) told += text ? "" : "; press 0 on the plan, or ⤢, to show everything";
     if (listed.textContent !== told) listed.textContent = told;
     fill(list, found.slice(0, LISTED).map((image) => h("li", {}, h("button", { type: "button", "data-id": image.id, "aria-pressed": String(image.id === chosen?.id), onclick: () => choose(image, { focus: true }) },
       h("span", {}, image.id), h("span", { class: "muted" }, image.pose ? ago(image.captured_at ?? image.created_at) : "no pose")))));
@@ -122,9 +122,9 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
       ["Without pose", images.length - posed ? count(images.length - posed) : null],
       ["Extent", `${metres(cover.width)} × ${metres(cover.height)}`],
       ["Covered", `${plural(cover.cells, "square")} of 10 m`],
-      ["Spacing", cover.spacing === null ? null : `${metres(cover.spacing)} in the median`],
+      ["Spacing", cover.spacing === null ? null : `${metres(cover.spacing)} (median)`],
       ["Newest", ago(new Date(cover.newest).toISOString())], ["Oldest", ago(new Date(cover.oldest).toISOString())],
-    ) : h("p", { class: "muted" }, images.length ? "No image has a pose; the list holds them all." : "There is no image yet."));
+    ) : h("p", { class: "muted" }, images.length ? "No image has a pose; the list contains all of them." : "There is no image yet."));
     listSoon();
   }
 
@@ -134,13 +134,13 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
       const answer = await call(address(["maps", name, "images"], { limit: PAGE, cursor }), { signal });
       images.push(...answer.images);
       cursor = answer.next_cursor;
-      // Drawing again costs with all there is, so the pages are shown in ever larger steps.
+      // Redrawing costs time proportional to all images, so it is done after the first page and then every ten pages.
       if (!cursor || images.length === PAGE || images.length % (10 * PAGE) === 0) changed();
       progress.textContent = cursor ? `${count(images.length)} of ${plural(map.images, "image")} loaded…` : "";
     } while (cursor && images.length < MOST);
     if (cursor) progress.textContent = `The first ${count(images.length)} of ${plural(map.images, "image")} are shown.`;
     progress.hidden = !progress.textContent;
-    if (!images.length) fill(progress, empty("No images yet", h("p", {}, "Put pictures in, with the form on this page or from a folder:"), command(`whereabouts index FOLDER --map ${name}`)));
+    if (!images.length) fill(progress, empty("No images yet", h("p", {}, "Add pictures with the form on this page, or from a folder:"), command(`whereabouts index FOLDER --map ${name}`)));
     progress.hidden = images.length > 0 && !cursor;
     const wanted = images.find((image) => image.id === query.get("image"));
     if (wanted) choose(wanted);
@@ -158,12 +158,12 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
       plan.setMarkers(ranking.map((candidate) => ({ pose: candidate.pose, label: String(candidate.rank), kind: candidate.image_id === best ? "estimate" : "candidate" })));
       const known = (image) => images.find((one) => one.id === image);
       fill(asked, h("div", { class: "heading" }, h("h2", {}, "Query"), h("a", { class: "heading-end", href: `#/jobs/${encodeURIComponent(id)}` }, "Its job")),
-        job.estimate && h("p", {}, "Estimate ", h("code", {}, best), `, ${percent(job.estimate.confidence)} confidence, ${job.estimate.known ? "known" : "perhaps not in the map"}. It has a ring on the plan.`),
+        job.estimate && h("p", {}, "Estimate ", h("code", {}, best), `, ${percent(job.estimate.confidence)} confidence, ${job.estimate.known ? "known" : "may not be in the map"}. It is ringed on the plan.`),
         ranking.length ? h("ol", { class: "images" }, ranking.map((candidate) => h("li", {}, h("button", { type: "button", onclick: () => { const image = known(candidate.image_id); if (image) choose(image, { focus: true }); } },
           h("span", {}, `${candidate.rank}. ${candidate.image_id}`), h("span", { class: "muted" }, candidate.pose ? "" : "no pose"))))) : h("p", { class: "muted" }, "The job has no ranking, so there are no candidates to show."));
     } catch (problem) {
       if (isAbort(problem)) return;
-      fill(asked, h("p", {}, problem.status === 404 ? "This job is not kept any more." : problem.detail));
+      fill(asked, h("p", {}, problem.status === 404 ? "This job is no longer stored." : problem.detail));
     }
   }
 

@@ -1,4 +1,4 @@
-// All maps, and how to make the first.
+// The list of maps, and how to create the first one.
 
 import { call } from "./api.js";
 import { command, empty, facts, fill, h, loading } from "./dom.js";
@@ -10,16 +10,16 @@ export async function show({ root, signal, title }) {
   const { maps } = await call("maps", { signal });
   if (!maps.length) {
     fill(root, h("h1", {}, "Maps"), empty("No map yet",
-      h("p", {}, "A map is a folder of pictures whose places are known, by EXIF or a table of poses:"),
+      h("p", {}, "A map is built from a folder of pictures with known poses, from EXIF or a table:"),
       command("whereabouts index FOLDER --map NAME"),
-      h("p", {}, "To look around first, there is a small town to play with:"), command("whereabouts demo --offline")));
+      h("p", {}, "To try it first, create a small demo town:"), command("whereabouts demo --offline")));
     return;
   }
   fill(root, h("h1", {}, "Maps"), h("ul", { class: "cards" }, maps.map((map) => h("li", { class: "card" },
     h("h2", {}, h("a", { href: `#/maps/${encodeURIComponent(map.name)}` }, map.name)),
     map.description && h("p", {}, map.description),
-    facts(["Images", map.images ? count(map.images) : "none yet"], ["Place", map.scene], ["Poses", map.frame],
-      ["Model", `${map.model}, ${map.descriptor}`], ["Search", searched(map)], ["Reindex", reindexed(map)], ["Made", timeAgo(map.created_at)]),
+    facts(["Images", map.images ? count(map.images) : "none yet"], ["Scene", map.scene], ["Poses", map.frame],
+      ["Model", `${map.model}, ${map.descriptor}`], ["Search", searched(map)], ["Reindex", reindexed(map)], ["Created", timeAgo(map.created_at)]),
     h("p", { class: "actions" }, h("a", { href: `#/try?map=${encodeURIComponent(map.name)}` }, "Try a picture"),
       h("a", { href: `#/jobs?map=${encodeURIComponent(map.name)}` }, "Its jobs"))))));
 }

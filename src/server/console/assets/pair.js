@@ -1,4 +1,4 @@
-// A frame beside a candidate: both pictures, the lines between their matched regions, and the words.
+// A frame next to a candidate: both pictures, lines between their matched regions, and the description.
 
 import { address, call, contentOf, frameOf, isAbort, picture } from "./api.js";
 import { fill, h } from "./dom.js";
@@ -6,18 +6,18 @@ import { cost, count, duration, plural } from "./format.js";
 import { apart } from "./words.js";
 
 const EDGE = 1024;
-const FIRST = 150; // lines at first; all of them hide the pictures
+const FIRST = 150; // initial number of lines; all of them would hide the pictures
 
 /** The two pictures of a pair. */
 export function pictures(job, imageId, { signal }) {
   const lines = h("canvas", { class: "lines", "aria-hidden": "true" });
   const note = h("span", { class: "muted small" });
   const box = h("input", { type: "checkbox", id: "lines-on", checked: true });
-  const many = h("input", { type: "range", id: "lines-many", min: "1", "aria-label": "How many lines, the most telling first" });
+  const many = h("input", { type: "range", id: "lines-many", min: "1", "aria-label": "Number of lines, strongest matches first" });
   const bar = h("div", { class: "pair-bar", hidden: true }, h("label", { class: "check", for: "lines-on" }, box, "Lines between matched regions"), many, note);
   let redraw = () => {};
   const options = { signal, loaded: () => redraw() };
-  const frame = picture(frameOf(job.id, EDGE), "The frame", { ...options, gone: "The frame is not kept any more, or this server does not show frames." });
+  const frame = picture(frameOf(job.id, EDGE), "The frame", { ...options, gone: "The frame is no longer stored, or this server does not serve frames." });
   const image = picture(contentOf(job.map, imageId, EDGE), `Candidate ${imageId}`, { ...options, gone: "The image is no longer in the map." });
   const stage = h("div", { class: "pair" },
     h("figure", {}, frame, h("figcaption", {}, "Frame")),
@@ -36,7 +36,7 @@ export function pictures(job, imageId, { signal }) {
     let regions = all;
     redraw = () => {
       regions = all.slice(0, Number(many.value));
-      note.textContent = regions.length < all.length ? `${count(regions.length)} of ${plural(all.length, "region")}, the most telling` : plural(all.length, "region");
+      note.textContent = regions.length < all.length ? `${count(regions.length)} of ${plural(all.length, "region")}, the strongest` : plural(all.length, "region");
       draw(lines, stage, frame, image, regions, box.checked, near);
     };
     box.addEventListener("change", redraw);
@@ -54,12 +54,12 @@ export function pictures(job, imageId, { signal }) {
     if (isAbort(problem)) return;
     bar.hidden = false;
     box.parentElement.hidden = many.hidden = true;
-    note.textContent = problem.status === 404 ? "Matched regions cannot be shown: the frame or the image is gone, or this server does not tell them." : `Matched regions cannot be shown: ${problem.detail}`;
+    note.textContent = problem.status === 404 ? "Matched regions cannot be shown: the frame or the image is gone, or this server does not provide them." : `Matched regions cannot be shown: ${problem.detail}`;
   });
   return all;
 }
 
-// Before it has loaded, a picture has the size of its alternative text.
+// Until it has loaded, a picture has the size of its alternative text.
 const boxOf = (picture) => picture.classList.contains("here") && picture.querySelector("img").getBoundingClientRect();
 
 function draw(canvas, stage, frame, image, regions, on, near) {
@@ -76,7 +76,7 @@ function draw(canvas, stage, frame, image, regions, on, near) {
   const line = (region, at) => {
     const [x0, y0] = place(region.frame, a);
     const [x1, y1] = place(region.image, b);
-    // The hue goes with the place in the frame: what moved together has lines that run together.
+    // The hue depends on the place in the frame, so that regions that moved together have lines of similar colour.
     const hue = 20 + 300 * region.frame[1];
     ink.strokeStyle = ink.fillStyle = at === near ? "#fff" : `hsl(${hue} 90% 62% / ${many > 300 ? 0.3 : many > 100 ? 0.45 : 0.75})`;
     ink.lineWidth = at === near ? 3 : 1;
@@ -94,7 +94,7 @@ function draw(canvas, stage, frame, image, regions, on, near) {
   if (near >= 0 && near < many) line(regions[near], near);
 }
 
-// Regions are told in shares of the width and the height.
+// Region coordinates are fractions of the width and the height.
 const place = ([x, y], box) => [box.left + x * box.width, box.top + y * box.height];
 
 function nearest(event, frame, image, regions) {
@@ -111,32 +111,32 @@ function nearest(event, frame, image, regions) {
   return found;
 }
 
-/** The description of a pair, with what agrees and what differs set apart. */
+/** The description of a pair, with agreements and differences listed separately. */
 export function words(description) {
   if (!description) return h("p", { class: "muted" }, "This pair has no description.");
   const found = apart(description.text);
   const list = (name, title, items) => h("section", { class: name }, h("h4", {}, title),
-    items.length ? h("ul", {}, items.map((item) => h("li", {}, item))) : h("p", { class: "muted" }, "Nothing was named."));
+    items.length ? h("ul", {}, items.map((item) => h("li", {}, item))) : h("p", { class: "muted" }, "None listed."));
   const whole = (text) => text.split(/\n{2,}/).map((part) => h("p", { class: "told" }, part));
   return h("div", { class: "words" },
     found?.verdict && h("p", { class: "verdict" }, found.verdict),
     found && h("div", { class: "apart" }, list("agree", "Agrees", found.agree), list("differ", "Differs", found.differ)),
     found?.view && h("p", { class: "muted" }, found.view),
-    found ? h("details", {}, h("summary", {}, "The whole text"), whole(description.text)) : whole(description.text),
+    found ? h("details", {}, h("summary", {}, "Full text"), whole(description.text)) : whole(description.text),
     h("p", { class: "muted small" }, bought(description), description.took_ms !== null && ` · took ${duration(description.took_ms)}`));
 }
 
-/** Whether a description was bought, and for how much. */
+/** The source and cost of a description. */
 export function bought(description) {
-  if (description.stands_in) return `Stands in from the earlier frame of query ${description.stands_in.query_id}, whose similarity is ${description.stands_in.similarity.toFixed(3)}.`;
-  if (description.cached) return "Known from an earlier job; no call was made.";
+  if (description.stands_in) return `Reused from the similar frame of query ${description.stands_in.query_id} (similarity ${description.stands_in.similarity.toFixed(3)}).`;
+  if (description.cached) return "Cached from an earlier job; no call was made.";
   return description.usage.calls ? cost(description.usage) : "Compared on this server; no call was made.";
 }
 
-/** How a candidate moved, as text and as a sign. */
+/** The change of a candidate's rank, as text and symbol. */
 export function moved(candidate) {
   const by = candidate.coarse_rank - candidate.rank;
-  if (by === 0) return h("span", { class: "moved" }, "unmoved");
+  if (by === 0) return h("span", { class: "moved" }, "unchanged");
   return h("span", { class: by > 0 ? "moved up" : "moved down" }, by > 0 ? `▲ ${by}` : `▼ ${-by}`,
     h("span", { class: "unseen" }, by > 0 ? " places up" : " places down"));
 }

@@ -1,14 +1,14 @@
-// The plan: a canvas that draws the points of a map and is moved by mouse, fingers and keys. It draws when
-// something has changed, at most once a frame, whatever the number of events.
+// The plan: a canvas with the points of a map, panned and zoomed by mouse, touch and keyboard. It redraws only after
+// a change, at most once per animation frame.
 
 import { metres } from "./format.js";
 import { Points, plane } from "./points.js";
 
-const REACH = 14; // pixels from a point that still count as on it
-const PLACE_M = 10; // what an image is taken to cover, for the coverage overlay
+const REACH = 14; // hit radius of a point, in pixels
+const PLACE_M = 10; // radius covered by an image in the coverage overlay
 
 export class Plan {
-  /** `picked(image)` on a click, `moved()` when another part is shown; `tiles` is a template of addresses or null. */
+  /** Calls `picked(image)` on a click and `moved()` after a redraw; `tiles` is a URL template or null. */
   constructor(canvas, { signal, picked, moved, tiles = null }) {
     Object.assign(this, { canvas, picked, moved, tiles });
     this.ink = canvas.getContext("2d");
@@ -18,7 +18,7 @@ export class Plan {
     this.chosen = null;
     this.coverage = false;
     this.centre = [0, 0];
-    this.scale = 1; // pixels in a metre
+    this.scale = 1; // pixels per metre
     this.size = [1, 1];
     this.fitted = true;
     this.loaded = new Map();
@@ -27,7 +27,7 @@ export class Plan {
     this.paint();
   }
 
-  /** The first pose that is heard of says where the plane lies. */
+  /** The first pose determines the projection plane. */
   around(pose) { if (pose) this.plane ??= plane(pose); }
 
   setImages(images) {
@@ -37,7 +37,7 @@ export class Plan {
     this.touch();
   }
 
-  /** Numbered places: `{pose, label, kind}` with the kind "candidate" or "estimate". */
+  /** Sets numbered markers: `{pose, label, kind}` of kind "candidate" or "estimate". */
   setMarkers(markers) {
     this.around(markers.find((marker) => marker.pose)?.pose);
     this.markers = markers.filter((marker) => marker.pose).map((marker) => ({ ...marker, at: this.plane.project(marker.pose) }));
@@ -47,7 +47,7 @@ export class Plan {
 
   choose(image) { this.chosen = image; this.touch(); }
 
-  /** Shows all points, or all markers while there are some. */
+  /** Fits all points into view, or all markers if there are any. */
   fit(everything = false) {
     this.fitted = true;
     let box = this.points.length ? this.points.box : null;
@@ -62,7 +62,7 @@ export class Plan {
     this.touch();
   }
 
-  /** Without a place to zoom at, it is the chosen image, if that can be seen. */
+  /** Zooms around a point; by default around the chosen image, if visible, else the centre. */
   zoom(by, at = this.middle()) {
     const before = this.toWorld(...at);
     this.scale = Math.min(400, Math.max(1e-5, this.scale * by));
@@ -95,7 +95,7 @@ export class Plan {
 
   poseOfCentre() { return this.plane?.unproject(...this.centre) ?? null; }
 
-  /** The images that can be seen now. */
+  /** The images in view. */
   inView() {
     const seen = [];
     const [x0, y0, x1, y1] = this.bounds();
@@ -115,7 +115,7 @@ export class Plan {
     this.frame = requestAnimationFrame(() => { this.frame = 0; this.draw(); this.moved?.(); });
   }
 
-  // What moves it
+  // Input
 
   listen(signal) {
     const { canvas } = this;
@@ -139,7 +139,7 @@ export class Plan {
       } else if (dragged > 4) {
         this.pan(here[0] - last[0], here[1] - last[1]);
       } else {
-        // A shaky click is no drag.
+        // A shaky click is not a drag.
         dragged += Math.hypot(here[0] - last[0], here[1] - last[1]);
       }
       this.pointers.set(event.pointerId, here);
@@ -182,9 +182,9 @@ export class Plan {
     signal.addEventListener("abort", () => { observer.disconnect(); cancelAnimationFrame(this.frame); this.frame = 1; });
   }
 
-  // What is drawn
+  // Drawing
 
-  /** Takes the colours from the stylesheet; a canvas knows no `var()`. */
+  /** Reads the colours from the stylesheet, because a canvas cannot use `var()`. */
   paint() {
     const probe = document.createElement("span");
     this.canvas.parentElement.append(probe);
@@ -210,11 +210,11 @@ export class Plan {
     this.drawScale(colours);
   }
 
-  /** The points: copies of one dot, or squares from a distance. A path of thousands of arcs takes ten times as long. */
+  /** Draws points as copies of one dot, or as squares when zoomed out. A path of thousands of arcs is ten times slower. */
   drawPoints() {
     const { ink, points, scale, size: [w, h], centre: [cx, cy] } = this;
     const near = scale > 2.2;
-    // Few points are drawn larger; many would hide each other.
+    // Few points are drawn larger; many large ones would hide each other.
     const least = points.length < 500 ? 3.6 : points.length < 5000 ? 2.4 : 1.6;
     const radius = Math.min(6, Math.max(least, 2.2 + Math.log2(scale + 0.2)));
     const edge = Math.round(2 * radius);
@@ -235,7 +235,7 @@ export class Plan {
       for (let i = 0; i < list.length; i += 1) {
         const at = list[i];
         const turn = points.bearing[at];
-        if (turn !== turn) continue; // NaN: nobody said
+        if (turn !== turn) continue; // NaN: unknown
         const x = (points.x[at] - cx) * scale + w / 2;
         const y = h / 2 - (points.y[at] - cy) * scale;
         if (x < -20 || y < -20 || x > w + 20 || y > h + 20) continue;
@@ -246,7 +246,7 @@ export class Plan {
     });
   }
 
-  /** A dot, drawn once for each size and colour. */
+  /** A dot image, cached by size and colour. */
   dot(radius, age) {
     const ratio = this.canvas.width / this.size[0];
     const name = `${radius} ${ratio} ${this.colours[`age-${age + 1}`]}`;
@@ -275,7 +275,7 @@ export class Plan {
       ink.moveTo(x + radius, y);
       ink.arc(x, y, radius, 0, 6.2832);
     }
-    ink.fill(); // one path: where discs meet they do not add up
+    ink.fill(); // one path, so that overlapping discs do not accumulate opacity
     ink.globalAlpha = 1;
   }
 
@@ -305,7 +305,7 @@ export class Plan {
     ink.stroke();
   }
 
-  /** A round length of 60 to 150 pixels. */
+  /** A round length for the scale bar, 60 to 150 pixels long. */
   span() {
     const most = 150 / this.scale;
     const power = 10 ** Math.floor(Math.log10(most));
@@ -354,7 +354,7 @@ export class Plan {
     const [left, right] = [x0, x1].map((x) => Math.floor((x / span + mx) * many));
     const [top, bottom] = [y1, y0].map((y) => Math.max(0, Math.min(many - 1, Math.floor((my - y / span) * many))));
     if (right - left > 40 || bottom - top > 40) return;
-    ink.globalAlpha = this.dark ? 0.35 : 1; // tiles are made for the day
+    ink.globalAlpha = this.dark ? 0.35 : 1; // tiles are designed for a light background
     for (let column = left; column <= right; column += 1) {
       for (let line = top; line <= bottom; line += 1) {
         const tile = this.tile(zoom, ((column % many) + many) % many, line);

@@ -1,18 +1,18 @@
-// The images of a map as points on a plane, in metres: typed arrays, a grid over them for finding what is near,
-// and what the plan says of coverage and age. Nothing here draws.
+// The images of a map as points on a plane, in metres: typed arrays, a grid for neighbour search, and statistics of
+// coverage and age. Nothing here draws.
 
 const ROUND = 40075016.686; // metres around the equator
 const DAY = 86400e3;
 
 export const AGES = [["up to a week", 7], ["a month", 31], ["3 months", 92], ["a year", 366], ["older", Infinity]];
 
-/** Where a point of the globe is on the Web Mercator square, 0 to 1. */
+/** Projects a point to the Web Mercator square, 0 to 1. */
 export function mercator(lat, lon) {
   const sine = Math.min(0.9999, Math.max(-0.9999, Math.sin((lat * Math.PI) / 180)));
   return [lon / 360 + 0.5, 0.5 - Math.log((1 + sine) / (1 - sine)) / (4 * Math.PI)];
 }
 
-/** A plane around `first`: Mercator, scaled so that metres are right there; or the map's own metres. */
+/** A projection plane: Mercator scaled to true metres at `first`, or the map's own metres. */
 export function plane(first) {
   if (!first || !("lat" in first)) return { project: (pose) => [pose.x, pose.y], unproject: (x, y) => ({ x, y }), geographic: false };
   const [mx, my] = mercator(first.lat, first.lon);
@@ -21,7 +21,7 @@ export function plane(first) {
     geographic: true, mx, my, span,
     project(pose) {
       const [x, y] = mercator(pose.lat, pose.lon);
-      // A map that lies on the antimeridian stays in one piece.
+      // Keeps a map across the antimeridian in one piece.
       return [span * (((x - mx + 1.5) % 1) - 0.5), span * (my - y)];
     },
     unproject(x, y) {
@@ -31,7 +31,7 @@ export function plane(first) {
   };
 }
 
-/** Which way a camera looks on the plan, in radians clockwise from up; NaN if nobody said. */
+/** The viewing direction of a camera on the plan, in radians clockwise from up; NaN if unknown. */
 function bearing(pose) {
   if (pose.heading !== null && pose.heading !== undefined) return (pose.heading * Math.PI) / 180;
   const { qx, qy, qz, qw } = pose;
@@ -42,7 +42,7 @@ function bearing(pose) {
 
 export const takenAt = (image) => image.captured_at ?? image.created_at;
 
-/** The points of those images that have a pose. */
+/** The points of the images that have a pose. */
 export class Points {
   constructor(images, plane) {
     this.images = images.filter((image) => image.pose);
@@ -69,7 +69,7 @@ export class Points {
 
   get length() { return this.x.length; }
 
-  /** Sorts the points into cells, about four to each. */
+  /** Sorts the points into grid cells, about four per cell. */
   grid() {
     const [x0, y0, x1, y1] = this.length ? this.box : [0, 0, 0, 0];
     const [width, height] = [Math.max(x1 - x0, 1e-6), Math.max(y1 - y0, 1e-6)];
@@ -88,7 +88,7 @@ export class Points {
     for (let at = 0; at < this.length; at += 1) this.order[next[cells[at]]++] = at;
   }
 
-  /** Calls `visit` with each point in the cells that a box touches. */
+  /** Calls `visit` for each point in the cells that intersect a box. */
   within(x0, y0, x1, y1, visit) {
     if (!this.length) return;
     const clamp = (value, most) => Math.min(most, Math.max(0, Math.floor(value)));
@@ -101,7 +101,7 @@ export class Points {
     }
   }
 
-  /** The point nearest to a place, no farther than `reach`; −1 if there is none. */
+  /** The index of the nearest point within `reach`; −1 if there is none. */
   nearest(x, y, reach, except = -1) {
     let found = -1;
     let best = reach * reach;
@@ -112,13 +112,13 @@ export class Points {
     return found;
   }
 
-  /** Extent, spacing and age in numbers. */
+  /** Statistics of extent, spacing and age. */
   coverage() {
     if (!this.length) return null;
     const [x0, y0, x1, y1] = this.box;
     const cells = new Set();
     for (let at = 0; at < this.length; at += 1) cells.add(`${Math.floor(this.x[at] / 10)},${Math.floor(this.y[at] / 10)}`);
-    // The spacing of a sample is good enough, and does not make a large map wait.
+    // The spacing of a sample is accurate enough, and fast for a large map.
     const gaps = [];
     for (let at = 0; at < this.length; at += Math.max(1, Math.floor(this.length / 1000))) {
       let reach = this.cell;

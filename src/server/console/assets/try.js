@@ -1,4 +1,4 @@
-// A picture in, an answer out: where it was taken, what it is like, and then the refinement pair by pair.
+// Localizes a picture: shows the estimate, the similar images, and then the refinement pair by pair.
 
 import { address, call, contentOf, follow, isAbort, picture } from "./api.js";
 import { announce, badge, command, empty, facts, failure, fill, h } from "./dom.js";
@@ -12,7 +12,7 @@ export async function show({ root, query, signal, setQuery, title }) {
   title("Try it");
   const { maps } = await call("maps", { signal });
   if (!maps.length) {
-    fill(root, h("h1", {}, "Try it"), empty("No map yet", h("p", {}, "A picture is looked for in a map. Make one first:"), command("whereabouts index FOLDER --map NAME")));
+    fill(root, h("h1", {}, "Try it"), empty("No map yet", h("p", {}, "A picture is localized in a map. Create one first:"), command("whereabouts index FOLDER --map NAME")));
     return;
   }
   const map = h("select", { id: "try-map", onchange: () => setQuery({ map: map.value, job: "" }) }, maps.map(({ name, images }) => h("option", { value: name }, `${name} (${count(images)})`)));
@@ -25,16 +25,16 @@ export async function show({ root, query, signal, setQuery, title }) {
   const out = h("div", { class: "view" });
   const drop = h("div", { class: "drop" },
     h("div", { class: "actions" }, choose("try-file", "Choose a picture", "primary", {}), choose("try-camera", "Use the camera", "", { capture: "environment" })),
-    h("p", { class: "muted" }, "or drop one here, or paste it. It is sent as it is: JPEG, PNG or WebP."));
+    h("p", { class: "muted" }, "or drop one here, or paste it. It is sent unchanged: JPEG, PNG or WebP."));
   fill(root, h("h1", {}, "Try it"),
-    h("form", { class: "filters", "aria-label": "How to look", onsubmit: (event) => event.preventDefault() }, h("label", { for: "try-map" }, "Map", map), h("label", { class: "check", for: "try-refine" }, refine, "Refine the answer in a job")),
+    h("form", { class: "filters", "aria-label": "Options", onsubmit: (event) => event.preventDefault() }, h("label", { for: "try-map" }, "Map", map), h("label", { class: "check", for: "try-refine" }, refine, "Refine the answer in a job")),
     drop, out);
 
   const earlier = query.get("job");
   if (earlier) fill(out, h("p", {}, "The last picture: ", h("a", { href: `#/jobs/${encodeURIComponent(earlier)}` }, "its job"), "."));
 
   const over = (on) => (event) => { event.preventDefault(); drop.classList.toggle("over-it", on); };
-  // Anywhere on the page: a picture that misses the target must not replace the page.
+  // Anywhere on the page: a picture dropped next to the target must not replace the page.
   addEventListener("dragover", over(true), { signal });
   addEventListener("dragleave", (event) => { if (!event.relatedTarget) drop.classList.remove("over-it"); }, { signal });
   addEventListener("drop", (event) => { over(false)(event); const [file] = event.dataTransfer.files; if (file) ask(file); }, { signal });
@@ -51,7 +51,7 @@ export async function show({ root, query, signal, setQuery, title }) {
     const own = h("div", { class: "picture here" }, shown);
     shown.addEventListener("load", () => URL.revokeObjectURL(source));
     shown.addEventListener("error", () => { URL.revokeObjectURL(source); own.replaceChildren("The browser cannot show this picture."); });
-    const told = h("div", {}, h("p", { class: "muted" }, "Looking…"));
+    const told = h("div", {}, h("p", { class: "muted" }, "Localizing…"));
     const best = h("figure", {}, h("div", { class: "picture" }));
     const rest = h("div");
     fill(out, h("section", { class: "card", "aria-label": "Answer" }, h("div", { class: "guess" }, h("figure", {}, own, h("figcaption", {}, "Your picture")), best, told)), rest);
@@ -70,7 +70,7 @@ export async function show({ root, query, signal, setQuery, title }) {
     const round = performance.now() - start;
     setQuery({ map: answer.map, job: answer.job?.id });
     estimated(best, told, answer, answer.estimate, { round });
-    announce(answer.estimate ? `Answered: ${answer.estimate.image_id}, ${percent(answer.estimate.confidence)} confidence.` : "Answered: there is no candidate.");
+    announce(answer.estimate ? `Answered: ${answer.estimate.image_id}, ${percent(answer.estimate.confidence)} confidence.` : "Answered: no candidates.");
     if (!answer.candidates.length) {
       fill(rest, empty("Nothing to compare with", h("p", {}, "This map has no images yet:"), command(`whereabouts index FOLDER --map ${answer.map}`)));
       return;
@@ -85,16 +85,16 @@ export async function show({ root, query, signal, setQuery, title }) {
     if (print !== pictured) {
       pictured = print;
       fill(best, estimate && [picture(contentOf(answer.map, estimate.image_id, 800), `The image ${estimate.image_id}`, { signal, gone: "The image is no longer in the map." }),
-        h("figcaption", {}, "Most like it: ", h("code", {}, estimate.image_id))]);
+        h("figcaption", {}, "Most similar: ", h("code", {}, estimate.image_id))]);
     }
     fill(told, h("h2", {}, job ? "Refined estimate" : "Estimate"),
-      estimate ? h("p", { class: "big" }, percent(estimate.confidence), h("span", { class: "muted" }, " confidence")) : h("p", {}, "There is none: the map has no images."),
-      estimate && h("p", {}, estimate.known ? "The place is known." : "Perhaps not in the map: the confidence is below the configured bound."),
+      estimate ? h("p", { class: "big" }, percent(estimate.confidence), h("span", { class: "muted" }, " confidence")) : h("p", {}, "None: the map has no images."),
+      estimate && h("p", {}, estimate.known ? "The place is known." : "May not be in the map: the confidence is below the configured threshold."),
       facts(["Pose", estimate && pose(estimate.pose)], ["Answered in", `${duration(timing.total)} (decode ${duration(timing.decode)}, extract ${duration(timing.extract)}, search ${duration(timing.search)})`],
-        ["With the network", duration(round)], ["Model", answer.model]));
+        ["Round trip", duration(round)], ["Model", answer.model]));
   }
 
-  /** The candidates, each with the text of its pair once that has come. */
+  /** Shows the candidates, each with the description of its pair once it has arrived. */
   function candidates(rest, answer, stop, refined) {
     const status = h("p", { class: "muted", role: "status" });
     const list = h("ol", { class: "answers" });
@@ -113,14 +113,14 @@ export async function show({ root, query, signal, setQuery, title }) {
     }
     const { job } = answer;
     fill(rest, h("div", { class: "heading" }, h("h2", {}, "Candidates"), job && h("a", { class: "heading-end button", href: `#/jobs/${encodeURIComponent(job.id)}` }, "Open the job ", h("code", {}, shortId(job.id)))),
-      answer.no_job && h("div", { class: "notice warn" }, h("strong", {}, "There is no refinement"), h("p", {}, answer.no_job.detail)), status, list);
+      answer.no_job && h("div", { class: "notice warn" }, h("strong", {}, "No refinement"), h("p", {}, answer.no_job.detail)), status, list);
     if (!job) return;
-    status.textContent = "The refinement waits.";
+    status.textContent = "The refinement is queued.";
     const describe = ({ image_id: image, text }) => {
-      // A job may compare more candidates than were asked for.
+      // A job may compare more candidates than were requested.
       if (!cards.has(image)) list.append(card(image, null));
       const found = apart(text);
-      fill(cards.get(image).words, h("p", { class: "verdict" }, found?.verdict ?? `${text.slice(0, 160)}${text.length > 160 ? "…" : ""}`), h("details", {}, h("summary", {}, "What was compared"), h("p", { class: "told small" }, text)));
+      fill(cards.get(image).words, h("p", { class: "verdict" }, found?.verdict ?? `${text.slice(0, 160)}${text.length > 160 ? "…" : ""}`), h("details", {}, h("summary", {}, "Description"), h("p", { class: "told small" }, text)));
     };
     follow(address(["jobs", job.id, "events"]), {
       signal: stop,
@@ -144,7 +144,7 @@ export async function show({ root, query, signal, setQuery, title }) {
         list.append(item); // in the refined order
       }
       refined(ended);
-      announce(`The refinement has ended: ${ended.state}.${ended.ranking ? ` First is ${ended.ranking[0]?.image_id}.` : ""}`);
+      announce(`The refinement has ended: ${ended.state}.${ended.ranking ? ` First: ${ended.ranking[0]?.image_id}.` : ""}`);
     }
   }
 }

@@ -1,8 +1,8 @@
-// What agrees and what differs, out of the text of a description. `local` writes fixed sentences; `mllm` is asked
-// for OBJECTS, MATCHES and COMPARISON, but no model is bound to follow. Where the form is another, there are no
-// lists, and the text stands for itself. Nothing is left out: the whole text is shown too.
+// Extracts what agrees and what differs from the text of a description. `local` writes fixed sentences; `mllm` is
+// asked for OBJECTS, MATCHES and COMPARISON, but a model need not comply. If the format is not recognised, there are
+// no lists and only the text is shown. The full text is always available.
 
-/** `{agree, differ, view, verdict}` (lists of sentences, a sentence or null), or null if the text has no such form. */
+/** Returns `{agree, differ, view, verdict}` (lists of sentences; a sentence or null), or null for an unknown format. */
 export function apart(text) {
   return /^(\d+|None) of (the )?\d+ regions? of the query\b/.test(text) ? ofLocal(text) : ofModel(text);
 }
@@ -40,7 +40,7 @@ const YES = /\b(agree\w*|same|both|identical\w*|match\w*|alike|correspond\w*|sim
 function heading(line) {
   const bare = line.replace(/^[#*_\s\d.)]+/, "").replace(/[*_]+/g, "");
   for (const [pattern, section] of HEADINGS) {
-    // A heading stands alone, or ends with a stop or a colon, or is written in capitals.
+    // A heading stands alone on its line, or ends with a full stop or a colon.
     const [first, ...after] = bare.split(/(?<=^[\w ]{3,40})[.:]\s*/);
     if (pattern.test(first) && (after.length > 0 || bare.length < 40) && first.length < 40) return { section, after: after.join(" ").trim() };
   }
@@ -55,14 +55,14 @@ function ofModel(text) {
     const told = heading(raw.trim());
     let line = raw;
     if (told?.after && (told.section === "agree" || told.section === "differ")) {
-      // "Missing from the frame: a bench." says it all in its line.
+      // "Missing from the frame: a bench." is complete in one line.
       found[told.section].push(raw.trim().replace(/^[\s\-*•–]+/, "").replace(/\*\*/g, ""));
       continue;
     }
     if (told) { section = told.section; headed = true; line = told.after; }
     line = line.replace(/^[\s\-*•–]+/, "").replace(/^\d+[.)]\s+/, "").replace(/\*\*/g, "").trim();
     if (!line || section === "objects" || section === "rest") continue;
-    // One object to a line is kept whole; running text is taken sentence by sentence.
+    // A line about one object is kept whole; running text is split into sentences.
     const parts = section === "matches" ? [line] : sentences(line);
     for (const part of parts) {
       if (section === "agree" || section === "differ") found[section].push(part);
