@@ -1,10 +1,11 @@
 //! `whereabouts eval`: how often the service is right on two folders, without a server.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use parking_lot::Mutex;
 
 use super::progress::Progress;
 use whereabouts_core::{DescriptorKind, Digest, RefinerKind, Scene};
@@ -302,8 +303,8 @@ impl Args {
 struct Bars(Mutex<Option<Progress>>);
 
 impl Bars {
-    fn bar(&self) -> std::sync::MutexGuard<'_, Option<Progress>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    fn bar(&self) -> parking_lot::MutexGuard<'_, Option<Progress>> {
+        self.0.lock()
     }
 }
 

@@ -1,10 +1,10 @@
 //! How far a long command has come: a bar on a terminal, a line every few seconds in a pipe.
 
 use std::io::IsTerminal;
-use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use parking_lot::Mutex;
 
 pub struct Progress {
     bar: ProgressBar,
@@ -52,7 +52,7 @@ impl Progress {
 
     fn line(&self) {
         const PAUSE: Duration = Duration::from_secs(5);
-        let mut last_line = self.last_line.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut last_line = self.last_line.lock();
         if !self.on_terminal && last_line.elapsed() >= PAUSE {
             *last_line = Instant::now();
             let (done, total) = (self.bar.position(), self.bar.length().unwrap_or_default());

@@ -4,9 +4,9 @@ use std::collections::HashMap;
 use std::fs::File;
 use std::io::Write;
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context;
+use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 
 use super::Method;
@@ -112,7 +112,7 @@ impl Kept {
         }
         let mut line = serde_json::to_vec(outcome)?;
         line.push(b'\n');
-        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut file = self.file.lock();
         file.write_all(&line).and_then(|()| file.sync_data()).context("cannot keep an outcome")
     }
 }

@@ -14,8 +14,9 @@ mod graph;
 mod sealed;
 
 use std::ops::Range;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use std::sync::Arc;
 
+use parking_lot::{Mutex, MutexGuard, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use rayon::ThreadPool;
 use rayon::prelude::*;
 
@@ -320,23 +321,23 @@ impl MapIndex {
     }
 
     fn live_mut(&self) -> RwLockWriteGuard<'_, Live> {
-        self.live.write().unwrap_or_else(PoisonError::into_inner)
+        self.live.write()
     }
 
     fn live(&self) -> RwLockReadGuard<'_, Live> {
-        self.live.read().unwrap_or_else(PoisonError::into_inner)
+        self.live.read()
     }
 
     fn graphs(&self) -> RwLockReadGuard<'_, Graphs> {
-        self.graphs.read().unwrap_or_else(PoisonError::into_inner)
+        self.graphs.read()
     }
 
     fn graphs_mut(&self) -> RwLockWriteGuard<'_, Graphs> {
-        self.graphs.write().unwrap_or_else(PoisonError::into_inner)
+        self.graphs.write()
     }
 
     fn merging(&self) -> MutexGuard<'_, Option<Merging>> {
-        self.merging.lock().unwrap_or_else(PoisonError::into_inner)
+        self.merging.lock()
     }
 }
 

@@ -3,8 +3,9 @@
 //! They are derived: whoever misses one here extracts it again from the image's bytes.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
+use parking_lot::Mutex;
 use whereabouts_core::{DenseFeatures, Digest};
 
 /// Whose features they are.
@@ -44,7 +45,7 @@ impl DenseCache {
 
     /// The features of a picture, if they are still here.
     pub fn get(&self, key: &DenseKey) -> Option<Arc<DenseFeatures>> {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = self.state.lock();
         state.clock += 1;
         let now = state.clock;
         let entry = state.entries.get_mut(key)?;
@@ -58,7 +59,7 @@ impl DenseCache {
         if bytes > self.max_bytes {
             return;
         }
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = self.state.lock();
         state.clock += 1;
         let used = state.clock;
         if let Some(old) = state.entries.insert(key, Entry { features, used }) {
@@ -72,7 +73,7 @@ impl DenseCache {
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner).bytes
+        self.state.lock().bytes
     }
 }
 

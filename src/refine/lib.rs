@@ -13,10 +13,11 @@ pub mod mllm;
 mod patience;
 mod worker;
 
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use parking_lot::Mutex;
 
 pub use dense_cache::{DenseCache, DenseKey};
 pub use local_refiner::LocalRefiner;

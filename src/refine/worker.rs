@@ -1,6 +1,6 @@
 //! The worker: takes a job, has it refined, writes down how it ended.
 
-use std::sync::{Arc, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
@@ -181,7 +181,7 @@ impl Worker {
     }
 
     fn record(&self, took: Duration) {
-        let mut pace = self.pace.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut pace = self.pace.lock();
         pace.record(took, self.settings.side_by_side);
     }
 

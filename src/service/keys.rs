@@ -1,10 +1,11 @@
 //! API keys: making, listing and revoking them, and who a token belongs to.
 
 use std::collections::HashMap;
-use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard, Weak};
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
+use parking_lot::{RwLock, RwLockReadGuard};
 use ring::rand::{SecureRandom, SystemRandom};
 use tokio::sync::watch;
 
@@ -217,7 +218,7 @@ impl Keys {
         let (store, known) = (Arc::clone(&self.store), Arc::clone(&self.known));
         let keeping = tokio::spawn(async move {
             store.put_key(stored.clone()).await?;
-            let mut known = known.write().unwrap_or_else(PoisonError::into_inner);
+            let mut known = known.write();
             known.insert(stored.key.id.clone(), stored);
             Ok(())
         });
@@ -227,7 +228,7 @@ impl Keys {
     }
 
     fn read(&self) -> RwLockReadGuard<'_, HashMap<String, StoredKey>> {
-        self.known.read().unwrap_or_else(PoisonError::into_inner)
+        self.known.read()
     }
 }
 
@@ -250,7 +251,7 @@ async fn keep_up(
             let Some(known) = known.upgrade() else { return };
             match read_all(store.as_ref()).await {
                 Ok(now) => {
-                    *known.write().unwrap_or_else(PoisonError::into_inner) = now;
+                    *known.write() = now;
                     revoked.send_replace(());
                     break;
                 }
@@ -281,7 +282,7 @@ pub(super) fn random<const N: usize>(of: &str) -> Result<[u8; N], ServiceError> 
 mod tests {
     use super::*;
     use async_trait::async_trait;
-    use std::sync::Mutex;
+    use parking_lot::Mutex;
     use whereabouts_core::{KeyLimits, Role};
 
     #[derive(Default)]
@@ -290,14 +291,14 @@ mod tests {
     #[async_trait]
     impl KeyStore for Drawer {
         async fn put_key(&self, key: StoredKey) -> Result<(), StoreError> {
-            let mut kept = self.0.lock().unwrap();
+            let mut kept = self.0.lock();
             kept.retain(|other| other.key.id != key.key.id);
             kept.push(key);
             Ok(())
         }
 
         async fn keys(&self) -> Result<Vec<StoredKey>, StoreError> {
-            Ok(self.0.lock().unwrap().clone())
+            Ok(self.0.lock().clone())
         }
     }
 
@@ -313,7 +314,7 @@ mod tests {
         let made = keys.create(wanted(Role::Robot, KeyLimits::default())).await.unwrap();
         let token: Token = made.token.parse().unwrap();
         assert_eq!(keys.holder(&token).unwrap().id, made.key.id);
-        let kept = serde_json::to_string(&*store.0.lock().unwrap()).unwrap();
+        let kept = serde_json::to_string(&*store.0.lock()).unwrap();
         assert!(!kept.contains(&made.token[17..]), "the secret is stored");
 
         let mut other = made.token.clone();

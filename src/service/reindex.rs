@@ -1,10 +1,11 @@
 //! New descriptors for a whole map, by another model, while the old ones serve.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::Semaphore;
 use uuid::Uuid;
 
@@ -78,7 +79,7 @@ impl Reindexes {
     }
 
     fn known(&self) -> MutexGuard<'_, BTreeMap<Uuid, Reindex>> {
-        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+        self.known.lock()
     }
 }
 

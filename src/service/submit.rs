@@ -1,6 +1,6 @@
 //! The job of a frame, or why it has none: jobs are given up before frames are refused.
 
-use std::sync::{Arc, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -133,7 +133,7 @@ impl Service {
     pub(super) fn refuse_job(&self, why: &NoJob) -> ServiceError {
         let pause = match why.reason {
             NoJobReason::QueueFull => {
-                let pace = self.job_pace.lock().unwrap_or_else(PoisonError::into_inner);
+                let pace = self.job_pace.lock();
                 self.admission.within_bounds(pace.until_done(1))
             }
             _ => self.admission.retry_after(),

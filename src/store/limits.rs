@@ -2,10 +2,11 @@
 //! on a day.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use async_trait::async_trait;
 use jiff::civil::Date;
+use parking_lot::Mutex;
 use tokio::time::Instant;
 
 use super::StoreError;
@@ -90,7 +91,7 @@ impl Buckets {
         match self {
             Self::Shared(shared) => shared.draw(name, draws).await,
             Self::Here(levels) => {
-                let mut levels = levels.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut levels = levels.lock();
                 let now = Instant::now();
                 let full = Levels { left: draws.map(|draw| draw.per_minute), at: now };
                 let known = levels.entry(name.to_owned()).or_insert(full);

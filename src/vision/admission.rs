@@ -4,9 +4,10 @@
 //! busy; all others wait here, where their order is known and little memory is held, or are refused.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::oneshot;
 
 use whereabouts_core::ServiceTime;
@@ -216,7 +217,7 @@ impl Drop for Permit {
 
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, Line> {
-        self.line.lock().unwrap_or_else(PoisonError::into_inner)
+        self.line.lock()
     }
 
     fn permit(self: &Arc<Self>) -> Permit {

@@ -1,9 +1,10 @@
 //! The queue before inference, and the threads that empty it.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
+use parking_lot::{Condvar, Mutex, MutexGuard};
 use serde::{Deserialize, Serialize};
 use tokio::sync::oneshot;
 
@@ -108,7 +109,7 @@ impl Batcher {
     pub fn wait_until_complete(&self) {
         let mut state = self.queue.lock();
         while state.loading > 0 && !state.closed {
-            state = self.queue.room.wait(state).unwrap_or_else(PoisonError::into_inner);
+            self.queue.room.wait(&mut state);
         }
     }
 
@@ -117,7 +118,7 @@ impl Batcher {
         let (answer, inferring) = oneshot::channel();
         let mut state = self.queue.lock();
         while state.waiting.len() >= self.queue.layout.capacity() && !state.closed {
-            state = self.queue.room.wait(state).unwrap_or_else(PoisonError::into_inner);
+            self.queue.room.wait(&mut state);
         }
         if state.closed {
             return Err(InferenceError::Stopped);
@@ -201,7 +202,7 @@ impl State {
 
 impl Queue {
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock()
     }
 
     fn close(&self) {
@@ -249,7 +250,7 @@ impl Queue {
             if state.may_take(kind) {
                 break;
             }
-            state = self.work.wait(state).unwrap_or_else(PoisonError::into_inner);
+            self.work.wait(&mut state);
         }
         let fair = match kind {
             Kind::Wide => state.waiting.len(),

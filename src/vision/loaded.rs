@@ -1,7 +1,7 @@
 //! The models in memory: loaded when they are first needed, no more than so many at a time.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::decode::ImageLimits;
@@ -9,6 +9,7 @@ use super::extractor::{Extractor, ExtractorSettings};
 use super::manifest::{MANIFEST, Manifest};
 use super::provider::{Execution, Wanted};
 use super::runtime::{Assets, RuntimeError};
+use parking_lot::{Mutex, MutexGuard};
 use whereabouts_core::{Digest, Map, Precision};
 
 /// How models are kept in memory.
@@ -202,7 +203,7 @@ impl Shared {
     }
 
     fn loaded(&self) -> MutexGuard<'_, Vec<Loaded>> {
-        self.loaded.lock().unwrap_or_else(PoisonError::into_inner)
+        self.loaded.lock()
     }
 }
 

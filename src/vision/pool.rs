@@ -1,10 +1,11 @@
 //! A fixed number of threads for work that would block the async runtime, with a bounded queue.
 
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
+use parking_lot::{Condvar, Mutex};
 use tokio::sync::oneshot;
 
 type Work = Box<dyn FnOnce() + Send>;
@@ -29,7 +30,7 @@ struct Running {
 
 impl Running {
     fn change(&self, change: impl FnOnce(&mut usize)) {
-        change(&mut self.count.lock().unwrap_or_else(PoisonError::into_inner));
+        change(&mut self.count.lock());
         self.ended.notify_all();
     }
 }
@@ -87,14 +88,14 @@ impl CpuPool {
     /// Blocks until no work is being done, but no longer than `longest`. A process that ends while a
     /// library of another language works is ended by that library, and not with its own exit code.
     pub fn wait_until_idle(&self, longest: Duration) {
-        let count = self.running.count.lock().unwrap_or_else(PoisonError::into_inner);
-        let _ = self.running.ended.wait_timeout_while(count, longest, |count| *count > 0);
+        let mut count = self.running.count.lock();
+        let _ = self.running.ended.wait_while_for(&mut count, |count| *count > 0, longest);
     }
 }
 
 fn run_all(receiver: &Mutex<Receiver<Work>>, running: &Running) {
     loop {
-        let next = receiver.lock().unwrap_or_else(PoisonError::into_inner).recv();
+        let next = receiver.lock().recv();
         let Ok(work) = next else { return };
         running.change(|count| *count += 1);
         // A panic in one piece of work must not take the thread from all the others.
@@ -158,6 +159,6 @@ mod tests {
         assert!(!idle.is_finished());
         release.send(()).unwrap();
         idle.join().unwrap();
-        assert_eq!(*pool.running.count.lock().unwrap(), 0);
+        assert_eq!(*pool.running.count.lock(), 0);
     }
 }

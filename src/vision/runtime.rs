@@ -3,9 +3,10 @@
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use ort::environment::Environment;
+use parking_lot::Mutex;
 
 use super::manifest::MANIFEST;
 use super::provider::Provider;
@@ -175,7 +176,7 @@ impl Assets {
     ) -> Result<Arc<Environment>, RuntimeError> {
         // ONNX Runtime allows one environment in a process, whoever asks; once made, it stays.
         static LOADED: Mutex<Option<Arc<Environment>>> = Mutex::new(None);
-        let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut loaded = LOADED.lock();
         if let Some(environment) = loaded.as_ref() {
             return Ok(Arc::clone(environment));
         }

@@ -3,10 +3,11 @@
 //! A call is admitted with the longest answer it may get, and settled with what it was billed, so
 //! that calls in progress together cannot pass a limit.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 
 use jiff::Timestamp;
 use jiff::civil::Date;
+use parking_lot::{Mutex, MutexGuard};
 
 use whereabouts_core::{Spent, utc_day};
 
@@ -88,7 +89,7 @@ impl Budget {
     /// Today's account; a new day starts an empty one.
     fn today(&self, now: Timestamp) -> MutexGuard<'_, Today> {
         let date = utc_day(now);
-        let mut today = self.today.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut today = self.today.lock();
         if date > today.date {
             *today = Today { date, spent: Spent::default() };
         }
@@ -129,7 +130,7 @@ impl JobBudget {
     }
 
     fn spent(&self) -> MutexGuard<'_, Spent> {
-        self.spent.lock().unwrap_or_else(PoisonError::into_inner)
+        self.spent.lock()
     }
 }
 
@@ -152,7 +153,7 @@ impl Reservation<'_> {
     fn replace(&mut self, by: Spent) {
         let mut job = self.job.spent();
         *job = job.minus(self.held).plus(by);
-        let mut today = self.job.budget.today.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut today = self.job.budget.today.lock();
         // Since midnight the account is another one, and nothing is set aside there.
         let held = if today.date == self.date { self.held } else { Spent::default() };
         today.spent = today.spent.minus(held).plus(by);

@@ -1,11 +1,12 @@
 //! One description for each pair: known, on its way, or bought.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use futures_util::{StreamExt, stream};
 use jiff::Timestamp;
+use parking_lot::Mutex;
 use tokio::sync::OnceCell;
 
 use super::aside::Aside;
@@ -120,7 +121,7 @@ impl<'a> Work<'a> {
 
     /// What was bought so far.
     pub fn usage(&self) -> Usage {
-        *self.usage.lock().unwrap_or_else(PoisonError::into_inner)
+        *self.usage.lock()
     }
 
     /// Takes a description into the account; what was bought is charged when it is answered.
@@ -136,7 +137,7 @@ impl<'a> Work<'a> {
     }
 
     fn charge(&self, cost: Usage) {
-        *self.usage.lock().unwrap_or_else(PoisonError::into_inner) += cost;
+        *self.usage.lock() += cost;
     }
 }
 

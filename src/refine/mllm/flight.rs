@@ -1,8 +1,9 @@
 //! One call where several jobs want the same answer at once.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 
+use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::OnceCell;
 
 use whereabouts_core::Digest;
@@ -38,7 +39,7 @@ impl<T: Clone> Flights<T> {
     }
 
     fn cells(&self) -> MutexGuard<'_, HashMap<Digest, Cell<T>>> {
-        self.cells.lock().unwrap_or_else(PoisonError::into_inner)
+        self.cells.lock()
     }
 }
 

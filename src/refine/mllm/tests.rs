@@ -75,7 +75,7 @@ async fn each_step_is_told_with_its_cost() {
     for known in [0, 4] {
         let steps = Steps::default();
         let refinement = bench.refiner.refine(&bench.record(4), &steps).await.unwrap();
-        let steps = steps.0.into_inner().unwrap();
+        let steps = steps.0.into_inner();
         assert_eq!(steps.len(), 5);
         let told: Vec<_> = steps.iter().filter_map(|step| step.description.as_ref()).collect();
         assert_eq!(told.len(), 4);
@@ -83,7 +83,7 @@ async fn each_step_is_told_with_its_cost() {
         let sum = steps.iter().fold(Usage::default(), |sum, step| sum + step.usage);
         assert_eq!((sum, sum.cached), (refinement.usage, known));
     }
-    let accounted = bench.cache.spent.lock().unwrap();
+    let accounted = bench.cache.spent.lock();
     let sum = accounted.iter().fold(Usage::default(), |sum, spent| sum + spent.usage);
     assert_eq!((sum.calls, sum.cached), (6, 4));
 }

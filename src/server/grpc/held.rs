@@ -1,7 +1,8 @@
 //! The memory that the messages of a call, or a body, take.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 
+use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 /// What the messages, or a body, that have come hold of the memory for bodies, until somebody takes it over
@@ -57,6 +58,6 @@ impl Held {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.lock()
     }
 }

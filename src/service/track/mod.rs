@@ -7,10 +7,11 @@ mod belief;
 mod places;
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
+use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 use tokio::sync::Mutex as AsyncMutex;
 use uuid::Uuid;
@@ -185,7 +186,7 @@ impl Tracks {
 
     /// A track, which begins now unless it is remembered.
     fn track(&self, key: &Key) -> Arc<AsyncMutex<Track>> {
-        let mut tracks = self.tracks.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut tracks = self.tracks.lock();
         let now = Instant::now();
         let idle = Duration::from_secs(self.settings.idle_s);
         if let Some(known) = tracks.get_mut(key)
@@ -213,7 +214,7 @@ impl Tracks {
     }
 
     fn known(&self, map: &Map, version: (u32, u64)) -> Option<Arc<Places>> {
-        let maps = self.maps.lock().unwrap_or_else(PoisonError::into_inner);
+        let maps = self.maps.lock();
         let known = maps.get(&map.uid)?;
         let fresh = known.version == version || known.at.elapsed() < REFRESH;
         fresh.then(|| Arc::clone(&known.places))
@@ -222,10 +223,10 @@ impl Tracks {
     /// Remembers the images of a map, and forgets those of maps that no track is in.
     fn know(&self, map: &Map, version: (u32, u64), places: &Arc<Places>) {
         let used: Vec<Uuid> = {
-            let tracks = self.tracks.lock().unwrap_or_else(PoisonError::into_inner);
+            let tracks = self.tracks.lock();
             tracks.keys().map(|(uid, ..)| *uid).collect()
         };
-        let mut maps = self.maps.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut maps = self.maps.lock();
         maps.retain(|uid, _| used.contains(uid));
         let known = Known { version, at: Instant::now(), places: Arc::clone(places) };
         maps.insert(map.uid, known);

@@ -4,9 +4,10 @@ use std::collections::HashMap;
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use bytes::Bytes;
+use parking_lot::Mutex;
 
 use super::super::StoreError;
 use super::make_folder;
@@ -31,7 +32,7 @@ pub(super) struct Pin {
 
 impl Drop for Pin {
     fn drop(&mut self) {
-        let mut pinned = self.pinned.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut pinned = self.pinned.lock();
         if let Some(count) = pinned.get_mut(&self.digest) {
             *count -= 1;
             if *count == 0 {
@@ -66,7 +67,7 @@ impl Blobs {
 
     /// Stores bytes durably; the pin is taken first, so that nobody removes them in between.
     pub fn put(&self, digest: Digest, bytes: &Bytes) -> Result<Pin, StoreError> {
-        *self.pinned.lock().unwrap_or_else(PoisonError::into_inner).entry(digest).or_insert(0) += 1;
+        *self.pinned.lock().entry(digest).or_insert(0) += 1;
         let pin = Pin { digest, pinned: Arc::clone(&self.pinned) };
         let path = self.path(&digest);
         // Bytes of the right length under this name were whole when they were renamed to it.
@@ -91,7 +92,7 @@ impl Blobs {
     /// Removes bytes that nobody needs any more, and says how many. What cannot be removed stays as
     /// rubbish, which harms nobody.
     pub fn remove_unreferenced(&self, digest: &Digest, trees: &Trees) -> u64 {
-        let pinned = self.pinned.lock().unwrap_or_else(PoisonError::into_inner);
+        let pinned = self.pinned.lock();
         if pinned.contains_key(digest) || !trees.is_unreferenced(digest) {
             return 0;
         }

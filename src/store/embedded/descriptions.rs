@@ -5,10 +5,11 @@
 //! forgotten, the oldest.
 
 use std::collections::{BTreeMap, HashMap};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 
 use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
+use parking_lot::{Mutex, MutexGuard};
 use uuid::Uuid;
 
 use super::super::{DescriptionBounds, StoreError};
@@ -91,7 +92,7 @@ impl DescriptionUse {
     }
 
     fn order(&self) -> MutexGuard<'_, Order> {
-        self.order.lock().unwrap_or_else(PoisonError::into_inner)
+        self.order.lock()
     }
 
     /// Counts a new description; returns those that must go for it.

@@ -9,7 +9,7 @@ pub(super) mod tests;
 
 use std::fs::File;
 use std::path::PathBuf;
-use std::sync::{Arc, PoisonError};
+use std::sync::Arc;
 
 use async_trait::async_trait;
 
@@ -43,7 +43,7 @@ impl DraftStore for EmbeddedStore {
         let inner = Arc::clone(&self.inner);
         let draft = blocking(move || {
             let current = inner.live_revision(&old)?;
-            let mut drafts = inner.drafts.write().unwrap_or_else(PoisonError::into_inner);
+            let mut drafts = inner.drafts.write();
             if drafts.contains_key(&next.uid) {
                 return Err(being_reindexed(&next));
             }
@@ -141,7 +141,7 @@ impl Draft for EmbeddedDraft {
                     next.set_map(map.clone());
                     next.go_on_from(&current);
                     inner.indexer.look_at(&next);
-                    let mut maps = inner.maps.write().unwrap_or_else(PoisonError::into_inner);
+                    let mut maps = inner.maps.write();
                     maps.insert(map.name.clone(), next);
                     drop(maps);
                     inner.forget_draft(map);
@@ -186,7 +186,7 @@ impl EmbeddedDraft {
 
 impl Inner {
     fn forget_draft(&self, map: &Map) {
-        self.drafts.write().unwrap_or_else(PoisonError::into_inner).remove(&map.uid);
+        self.drafts.write().remove(&map.uid);
     }
 }
 

@@ -1,13 +1,14 @@
 //! One map in memory: which slot is which image, and its index.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, PoisonError, RwLock};
 
 use super::super::{LookAlikes, StoreError};
 use super::blobs::replace_durably;
 use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
+use parking_lot::RwLock;
 use whereabouts_core::{Calibration, CalibrationSettings, Candidate, ImageId, Map, Pose};
 use whereabouts_index::{Found, IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
 
@@ -111,11 +112,11 @@ impl LiveMap {
     }
 
     pub fn map(&self) -> Map {
-        self.map.read().unwrap_or_else(PoisonError::into_inner).clone()
+        self.map.read().clone()
     }
 
     pub fn set_map(&self, map: Map) {
-        *self.map.write().unwrap_or_else(PoisonError::into_inner) = map;
+        *self.map.write() = map;
     }
 
     /// The slot for a new image. Call on the writer thread.
@@ -136,7 +137,7 @@ impl LiveMap {
 
     /// Makes a stored image part of every later answer.
     pub fn publish(&self, stored: &StoredImage) {
-        let mut entries = self.entries.write().unwrap_or_else(PoisonError::into_inner);
+        let mut entries = self.entries.write();
         if entries.len() <= stored.slot {
             entries.resize_with(stored.slot + 1, || None);
         }
@@ -149,7 +150,7 @@ impl LiveMap {
     /// Keeps an image out of every later answer.
     pub fn withdraw(&self, slot: usize) {
         self.index.remove(slot);
-        let mut entries = self.entries.write().unwrap_or_else(PoisonError::into_inner);
+        let mut entries = self.entries.write();
         if let Some(entry) = entries.get_mut(slot) {
             *entry = None;
         }
@@ -168,7 +169,7 @@ impl LiveMap {
 
     /// The images that have a pose, in the order of their addition.
     pub fn positions(&self) -> Vec<(ImageId, Pose)> {
-        let entries = self.entries.read().unwrap_or_else(PoisonError::into_inner);
+        let entries = self.entries.read();
         entries.iter().flatten().filter_map(|entry| Some((entry.id.clone(), entry.pose?))).collect()
     }
 
@@ -177,7 +178,7 @@ impl LiveMap {
     }
 
     fn candidates(&self, found: &[Found]) -> Vec<Candidate> {
-        let entries = self.entries.read().unwrap_or_else(PoisonError::into_inner);
+        let entries = self.entries.read();
         found
             .iter()
             // An image that was removed since the search is left out.
@@ -196,7 +197,7 @@ impl LiveMap {
     /// Images spread over the map, each with the `k` most similar ones of other places.
     pub fn look_alikes(&self, settings: CalibrationSettings, k: usize) -> Vec<LookAlikes> {
         let places: Vec<Place> = {
-            let entries = self.entries.read().unwrap_or_else(PoisonError::into_inner);
+            let entries = self.entries.read();
             let known = entries.iter().enumerate();
             let known = known.filter_map(|(slot, entry)| Some((slot, entry.as_ref()?)));
             known.map(|(slot, entry)| Place { slot, pose: entry.pose }).collect()
@@ -235,7 +236,7 @@ impl LiveMap {
             }
             wanted *= 2;
         };
-        let image_id = self.entries.read().unwrap_or_else(PoisonError::into_inner);
+        let image_id = self.entries.read();
         let image_id = image_id.get(asked.slot)?.as_ref()?.id.clone();
         Some(LookAlikes { image_id, others: self.candidates(&others) })
     }
@@ -262,7 +263,7 @@ impl KeptCalibration {
     }
 
     pub fn get(&self) -> Option<Arc<Calibration>> {
-        self.known.read().unwrap_or_else(PoisonError::into_inner).clone()
+        self.known.read().clone()
     }
 
     pub fn put(&self, measured: Calibration) {
@@ -274,7 +275,7 @@ impl KeptCalibration {
             // The next start measures again.
             tracing::warn!(file = %self.file.display(), %error, "a calibration cannot be kept");
         }
-        *self.known.write().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(measured));
+        *self.known.write() = Some(Arc::new(measured));
     }
 }
 

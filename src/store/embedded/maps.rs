@@ -1,7 +1,7 @@
 //! Maps and images: every change goes through the writer, every read past it.
 
 use std::path::Path;
-use std::sync::{Arc, PoisonError};
+use std::sync::Arc;
 
 use async_trait::async_trait;
 use bytes::Bytes;
@@ -29,7 +29,7 @@ const SWEEP: usize = 256;
 impl Inner {
     /// The map as it is now, whatever its revision.
     pub(super) fn live(&self, map: &Map) -> Result<Arc<LiveMap>, StoreError> {
-        let maps = self.maps.read().unwrap_or_else(PoisonError::into_inner);
+        let maps = self.maps.read();
         match maps.get(&map.name) {
             Some(live) if live.map().uid == map.uid => Ok(Arc::clone(live)),
             _ => Err(removed(map)),
@@ -51,7 +51,7 @@ impl Inner {
             live.withdraw(slot);
             self.indexer.look_at(&live);
         }
-        let drafts = self.drafts.read().unwrap_or_else(PoisonError::into_inner);
+        let drafts = self.drafts.read();
         if let Some(draft) = drafts.get(&map.uid) {
             draft.withdraw(slot);
         }
@@ -73,7 +73,7 @@ impl Inner {
     }
 
     fn publish_map(&self, map: &Map) {
-        let mut maps = self.maps.write().unwrap_or_else(PoisonError::into_inner);
+        let mut maps = self.maps.write();
         match maps.get(&map.name) {
             Some(live) if live.map().uid == map.uid => live.set_map(map.clone()),
             _ => match LiveMap::load(map.clone(), &self.descriptors, self.index, &self.trees) {
@@ -100,12 +100,12 @@ impl MapStore for EmbeddedStore {
     }
 
     async fn map(&self, name: &MapName) -> Result<Option<Map>, StoreError> {
-        let maps = self.inner.maps.read().unwrap_or_else(PoisonError::into_inner);
+        let maps = self.inner.maps.read();
         Ok(maps.get(name).map(|live| live.map()))
     }
 
     async fn maps(&self) -> Result<Vec<Map>, StoreError> {
-        let maps = self.inner.maps.read().unwrap_or_else(PoisonError::into_inner);
+        let maps = self.inner.maps.read();
         Ok(maps.values().map(|live| live.map()).collect())
     }
 
@@ -121,7 +121,7 @@ impl MapStore for EmbeddedStore {
                 },
                 move |removed: &Option<Map>| {
                     if let Some(map) = removed {
-                        let mut maps = inner.maps.write().unwrap_or_else(PoisonError::into_inner);
+                        let mut maps = inner.maps.write();
                         maps.remove(&map.name);
                     }
                 },

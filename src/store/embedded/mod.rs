@@ -37,9 +37,10 @@ mod writer;
 use std::collections::BTreeMap;
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
-use std::sync::{Arc, PoisonError, RwLock};
 
+use parking_lot::RwLock;
 use tokio::sync::{broadcast, watch};
 use uuid::Uuid;
 
@@ -143,7 +144,7 @@ impl EmbeddedStore {
             deliveries: watch::Sender::new(()),
             _lock: lock,
         };
-        for live in inner.maps.read().unwrap_or_else(PoisonError::into_inner).values() {
+        for live in inner.maps.read().values() {
             inner.indexer.look_at(live);
         }
         Ok(Self { inner: Arc::new(inner) })

@@ -1,8 +1,8 @@
 //! Ended jobs go, with their queries and frames: the first to end first, a few in each change, so that
 //! no other change waits long.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, PoisonError};
 
 use async_trait::async_trait;
 use jiff::civil::Date;
@@ -59,7 +59,7 @@ impl Retention for EmbeddedStore {
     }
 
     async fn index_bytes(&self) -> Result<Vec<(MapName, u64)>, StoreError> {
-        let maps = self.inner.maps.read().unwrap_or_else(PoisonError::into_inner);
+        let maps = self.inner.maps.read();
         Ok(maps.iter().map(|(name, live)| (name.clone(), live.index_bytes())).collect())
     }
 

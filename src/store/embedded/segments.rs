@@ -13,10 +13,11 @@ use std::io;
 use std::ops::Range;
 use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, PoisonError, RwLock};
 
 use memmap2::Mmap;
+use parking_lot::RwLock;
 
 use super::super::StoreError;
 use whereabouts_core::Descriptor;
@@ -87,7 +88,7 @@ impl VectorFiles {
 
     /// Makes every descriptor written so far durable.
     pub fn sync(&self) -> Result<(), StoreError> {
-        let segments = self.segments.read().unwrap_or_else(PoisonError::into_inner).clone();
+        let segments = self.segments.read().clone();
         for segment in segments {
             if segment.dirty.swap(false, Ordering::AcqRel) {
                 segment.file.sync_data().map_err(|error| self.failed("sync", &error))?;
@@ -120,7 +121,7 @@ impl VectorFiles {
         let segment = self.open_segment(&path).map_err(|error| {
             StoreError::Failed(format!("cannot open the segment {}: {error}", path.display()))
         })?;
-        self.segments.write().unwrap_or_else(PoisonError::into_inner).push(Arc::new(segment));
+        self.segments.write().push(Arc::new(segment));
         Ok(())
     }
 
@@ -183,11 +184,11 @@ impl VectorFiles {
     }
 
     fn count(&self) -> usize {
-        self.segments.read().unwrap_or_else(PoisonError::into_inner).len()
+        self.segments.read().len()
     }
 
     fn segment(&self, index: usize) -> Option<Arc<Segment>> {
-        self.segments.read().unwrap_or_else(PoisonError::into_inner).get(index).cloned()
+        self.segments.read().get(index).cloned()
     }
 
     fn path(&self, index: usize) -> PathBuf {

@@ -3,10 +3,9 @@
 //! Bounded in bytes and in age. The least recently used go first; when one was used is noted now and then, not
 //! at every use.
 
-use std::sync::{Mutex, PoisonError};
-
 use async_trait::async_trait;
 use jiff::Timestamp;
+use parking_lot::Mutex;
 use uuid::Uuid;
 
 use super::super::StoreError;
@@ -31,11 +30,11 @@ pub(super) struct KnownLevels(Mutex<CacheLevels>);
 
 impl KnownLevels {
     fn get(&self) -> CacheLevels {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        *self.0.lock()
     }
 
     fn set(&self, levels: CacheLevels) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = levels;
+        *self.0.lock() = levels;
     }
 }
 

@@ -5,8 +5,8 @@
 //! wanted, and those are compared again with all their bits. `tests/store/search.rs` holds its recall.
 
 use std::collections::HashSet;
-use std::sync::{PoisonError, RwLock};
 
+use parking_lot::RwLock;
 use sqlx::types::Json;
 use sqlx::{AssertSqlSafe, PgConnection, Row};
 use uuid::Uuid;
@@ -50,18 +50,18 @@ pub(super) struct KnownGraphs(RwLock<HashSet<(Uuid, u32)>>);
 
 impl KnownGraphs {
     fn has(&self, map: &Map) -> bool {
-        let known = self.0.read().unwrap_or_else(PoisonError::into_inner);
+        let known = self.0.read();
         known.contains(&(map.uid, map.revision))
     }
 
     pub fn add(&self, map: &Map) {
-        let mut known = self.0.write().unwrap_or_else(PoisonError::into_inner);
+        let mut known = self.0.write();
         known.retain(|(uid, revision)| *uid != map.uid || *revision == map.revision);
         known.insert((map.uid, map.revision));
     }
 
     pub fn forget(&self, uid: Uuid) {
-        let mut known = self.0.write().unwrap_or_else(PoisonError::into_inner);
+        let mut known = self.0.write();
         known.retain(|(other, _)| *other != uid);
     }
 }

@@ -1,9 +1,9 @@
 //! What the workers of this process hold.
 
 use std::collections::HashMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use parking_lot::{Mutex, MutexGuard};
 use uuid::Uuid;
 
 use super::super::Claim;
@@ -15,7 +15,7 @@ pub(super) struct HeldJobs(Mutex<HashMap<Uuid, (Claim, Instant)>>);
 
 impl HeldJobs {
     fn jobs(&self) -> MutexGuard<'_, HashMap<Uuid, (Claim, Instant)>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.lock()
     }
 
     /// Those whose leases have not ended.

@@ -31,10 +31,11 @@ mod webhooks;
 
 use std::future::Future;
 use std::str::FromStr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::SignedDuration;
+use parking_lot::Mutex;
 use serde::Serialize;
 use sqlx::postgres::{PgConnectOptions, PgPool, PgPoolOptions};
 use sqlx::{Connection, Postgres, Transaction};
@@ -167,12 +168,12 @@ struct Doubts(Arc<Mutex<Option<Instant>>>);
 
 impl Doubts {
     fn arise(&self) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
+        *self.0.lock() = Some(Instant::now());
     }
 
     /// Whether a call ran out of time so short a while ago that its connection is still to come.
     fn are_fresh(&self, within: Duration) -> bool {
-        let arose = *self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let arose = *self.0.lock();
         arose.is_some_and(|arose| arose.elapsed() < within)
     }
 }

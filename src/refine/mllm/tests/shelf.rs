@@ -1,13 +1,14 @@
 //! A map of a few plain pictures in memory, and a refiner that looks at them through the mock.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 use async_trait::async_trait;
 use bytes::Bytes;
 use image::{Rgb, RgbImage};
 use jiff::Timestamp;
 use jiff::civil::Date;
+use parking_lot::Mutex;
 use uuid::Uuid;
 
 use super::super::settings::tests::defaults;
@@ -262,7 +263,7 @@ pub struct Steps(pub Mutex<Vec<Step>>);
 #[async_trait]
 impl Progress for Steps {
     async fn step(&self, step: Step) {
-        self.0.lock().unwrap().push(step);
+        self.0.lock().push(step);
     }
 }
 
@@ -277,7 +278,7 @@ pub struct MemoryCache {
 #[async_trait]
 impl UsageStore for MemoryCache {
     async fn add_usage(&self, spent: DayUsage) -> Result<(), StoreError> {
-        self.spent.lock().unwrap().push(spent);
+        self.spent.lock().push(spent);
         Ok(())
     }
 
@@ -289,7 +290,7 @@ impl UsageStore for MemoryCache {
 #[async_trait]
 impl DescriptionCache for MemoryCache {
     async fn description(&self, key: &Digest) -> Result<Option<CachedDescription>, StoreError> {
-        Ok(self.descriptions.lock().unwrap().get(key).cloned())
+        Ok(self.descriptions.lock().get(key).cloned())
     }
 
     async fn keep_description(
@@ -297,7 +298,7 @@ impl DescriptionCache for MemoryCache {
         key: Digest,
         value: CachedDescription,
     ) -> Result<(), StoreError> {
-        self.descriptions.lock().unwrap().insert(key, value);
+        self.descriptions.lock().insert(key, value);
         Ok(())
     }
 
@@ -307,7 +308,7 @@ impl DescriptionCache for MemoryCache {
         to: &Descriptor,
         at_least: f32,
     ) -> Result<Vec<SimilarFrame>, StoreError> {
-        let frames = self.frames.lock().unwrap();
+        let frames = self.frames.lock();
         let similar = frames.iter().map(|frame| SimilarFrame {
             digest: frame.digest,
             stand_in: StandIn {
@@ -319,7 +320,7 @@ impl DescriptionCache for MemoryCache {
     }
 
     async fn keep_frame(&self, _: Uuid, frame: DescribedFrame, _: usize) -> Result<(), StoreError> {
-        self.frames.lock().unwrap().push(frame);
+        self.frames.lock().push(frame);
         Ok(())
     }
 

@@ -1,8 +1,9 @@
 //! How many connections are open, and which of them makes room.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 
+use parking_lot::{Mutex, MutexGuard};
 use tokio_util::sync::CancellationToken;
 
 /// Places for connections. Clones share them.
@@ -45,7 +46,7 @@ struct State {
 
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock()
     }
 }
 
@@ -105,7 +106,7 @@ impl Slot {
     }
 
     fn use_of(&self) -> MutexGuard<'_, Use> {
-        self.use_of.lock().unwrap_or_else(PoisonError::into_inner)
+        self.use_of.lock()
     }
 }
 

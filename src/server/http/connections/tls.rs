@@ -1,9 +1,10 @@
 //! TLS from two files, which are read again when they change.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
+use parking_lot::RwLock;
 use rustls::ServerConfig;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
@@ -61,7 +62,7 @@ impl Tls {
 
     /// Takes connections with the certificate of the moment.
     pub(super) fn acceptor(&self) -> TlsAcceptor {
-        Arc::clone(&self.current.read().unwrap_or_else(PoisonError::into_inner)).into()
+        Arc::clone(&self.current.read()).into()
     }
 
     /// Reads the files again when they have changed, until `shutdown`. While they cannot be used, as when
@@ -75,7 +76,7 @@ impl Tls {
             }
             match read(&self.certificate, &self.key) {
                 Ok(read) => {
-                    *self.current.write().unwrap_or_else(PoisonError::into_inner) = read;
+                    *self.current.write() = read;
                     tracing::info!(certificate = %self.certificate.display(), "read the certificate again");
                     seen = now;
                 }
