@@ -19,8 +19,8 @@ use futures_util::{StreamExt, stream};
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
 use whereabouts_core::{
-    Candidate, Description, Descriptor, DescriptorKind, Digest, Frame, Image, Job, JobState, Map,
-    MediaType, Precision, RefinerKind, Scene, Usage,
+    Candidate, CoordinateFrame, Description, Descriptor, DescriptorKind, Digest, Image, Job,
+    JobState, Map, MediaType, Precision, RefinerKind, Scene, Usage,
 };
 use whereabouts_index::IndexSettings;
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore, Examination, compact, examine};
@@ -208,7 +208,7 @@ async fn map_of(images: usize) {
         name: "m".parse().unwrap(),
         scene: Scene::Outdoor,
         descriptor: DescriptorKind::Gem,
-        frame: Frame::Wgs84,
+        frame: CoordinateFrame::Wgs84,
         model: "m".into(),
         model_digest: Digest::of(b"m"),
         precision: Precision::Full,

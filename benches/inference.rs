@@ -10,7 +10,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use anyhow::Context;
-use whereabouts_vision::{Assets, Bench, BenchRow, BenchSettings, Layout, Wanted};
+use whereabouts_vision::{Assets, Bench, BenchRow, BenchSettings, Layout, ProviderPreference};
 
 const MODEL: &str = "dinov2-small";
 const SIZE: usize = 224;
@@ -33,12 +33,15 @@ fn main() -> anyhow::Result<()> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/bench-models");
     let file = export(&folder)?;
     let threads = std::thread::available_parallelism()?.get();
-    let bench = Bench::open(&Assets::locate(Some(&folder)), MODEL, Wanted::default())?;
+    let bench = Bench::open(&Assets::locate(Some(&folder)), MODEL, ProviderPreference::default())?;
     let flop = bench.flop().context("the model is no transformer")?;
     println!("{MODEL} at {SIZE}×{SIZE}, {:.2} GFLOP a picture, {threads} threads", flop / 1e9);
-    let execution = fastest(&run_ours(&bench, Wanted::default(), threads, 1)?)?.execution;
-    let wanted =
-        Wanted { provider: Some(execution.provider), precision: Some(execution.precision) };
+    let execution =
+        fastest(&run_ours(&bench, ProviderPreference::default(), threads, 1)?)?.execution;
+    let wanted = ProviderPreference {
+        provider: Some(execution.provider),
+        precision: Some(execution.precision),
+    };
     let asked: Vec<usize> = std::env::args().filter_map(|argument| argument.parse().ok()).collect();
     for batch in if asked.is_empty() { BATCHES.to_vec() } else { asked } {
         println!("\nbatch {batch}; whereabouts by {execution}");
@@ -86,7 +89,7 @@ fn median(mut numbers: Vec<f64>) -> f64 {
 /// is configured by `whereabouts model bench --write`.
 fn run_ours(
     bench: &Bench,
-    wanted: Wanted,
+    wanted: ProviderPreference,
     threads: usize,
     max_batch: usize,
 ) -> anyhow::Result<Vec<BenchRow>> {

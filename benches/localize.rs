@@ -20,7 +20,7 @@ use whereabouts_core::DescriptorKind;
 use whereabouts_server::config::{Config, Overrides};
 use whereabouts_town::{Town, TownSpec};
 use whereabouts_vision::decode::encode_jpeg;
-use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Wanted};
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, ProviderPreference};
 
 const PLACES: usize = 200;
 const FRAMES: usize = 50;
@@ -68,7 +68,7 @@ fn in_process(model: &str, frames: &[bytes::Bytes]) -> anyhow::Result<(Times, f6
     let threads = std::thread::available_parallelism()?.get();
     // By whoever is fastest on this machine, and as the server does.
     let settings = ExtractorSettings {
-        wanted: Wanted::default(),
+        wanted: ProviderPreference::default(),
         layout: config.model.layout(),
         exact_decode: config.image.exact,
         ..ExtractorSettings::plain(model, threads, ImageLimits { max_pixels: 50_000_000 })

@@ -17,8 +17,8 @@ use sqlx::postgres::{PgConnection, PgPoolCopyExt};
 use sqlx::{AssertSqlSafe, Connection, PgPool};
 use uuid::Uuid;
 use whereabouts_core::{
-    Description, Descriptor, DescriptorKind, Digest, Frame, Image, Job, JobState, Map, MediaType,
-    Precision, RefinerKind, Scene, Usage,
+    CoordinateFrame, Description, Descriptor, DescriptorKind, Digest, Image, Job, JobState, Map,
+    MediaType, Precision, RefinerKind, Scene, Usage,
 };
 use whereabouts_index::{IndexSettings, MapIndex, SearchMode};
 use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
@@ -305,7 +305,7 @@ fn map() -> anyhow::Result<Map> {
         name: "m".parse()?,
         scene: Scene::Outdoor,
         descriptor: DescriptorKind::Gem,
-        frame: Frame::Wgs84,
+        frame: CoordinateFrame::Wgs84,
         model: "made up".into(),
         model_digest: Digest::of(b"made up"),
         precision: Precision::Full,

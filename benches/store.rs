@@ -14,7 +14,7 @@ use jiff::Timestamp;
 use tempfile::TempDir;
 use uuid::Uuid;
 use whereabouts_core::{
-    Descriptor, DescriptorKind, Digest, Frame, Image, Map, MediaType, Precision, Scene,
+    CoordinateFrame, Descriptor, DescriptorKind, Digest, Image, Map, MediaType, Precision, Scene,
 };
 use whereabouts_index::IndexSettings;
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
@@ -98,7 +98,7 @@ async fn new_map(store: &EmbeddedStore) -> anyhow::Result<Map> {
         name: "bench".parse()?,
         scene: Scene::Outdoor,
         descriptor: DescriptorKind::Gem,
-        frame: Frame::Metric,
+        frame: CoordinateFrame::Metric,
         model: "none".into(),
         model_digest: Digest::of(b""),
         precision: Precision::Full,

@@ -2,8 +2,8 @@
 
 use jiff::Timestamp;
 use whereabouts_core::{
-    Candidate, Description, DescriptorKind, Estimate, Frame, Job, JobState, Pose, Priority,
-    RankedCandidate, RefinerKind, Scene, Usage,
+    Candidate, CoordinateFrame, Description, DescriptorKind, Estimate, Job, JobState, Pose,
+    Priority, RankedCandidate, RefinerKind, Scene, Usage,
 };
 
 use crate::{Answer, IndexKind, MapState, NoJob, NoJobReason, TimingMs, TrackEstimate, proto};
@@ -215,8 +215,8 @@ impl From<MapState> for proto::Map {
             DescriptorKind::Cls => proto::Descriptor::Cls,
         };
         let frame = match map.frame {
-            Frame::Wgs84 => proto::Frame::Wgs84,
-            Frame::Metric => proto::Frame::Metric,
+            CoordinateFrame::Wgs84 => proto::Frame::Wgs84,
+            CoordinateFrame::Metric => proto::Frame::Metric,
         };
         let index = match map.index {
             IndexKind::Exact => proto::Index::Exact,

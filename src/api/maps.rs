@@ -3,7 +3,9 @@
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
-use whereabouts_core::{Calibration, DescriptorKind, Digest, Frame, MapName, Precision, Scene};
+use whereabouts_core::{
+    Calibration, CoordinateFrame, DescriptorKind, Digest, MapName, Precision, Scene,
+};
 
 /// What to set on a map. What is left out keeps its value, or its default in a new map.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
@@ -17,7 +19,7 @@ pub struct MapChange {
     pub descriptor: Option<DescriptorKind>,
     /// `wgs84` (default) or `metric`; fixed once the map has images.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub frame: Option<Frame>,
+    pub frame: Option<CoordinateFrame>,
     /// The model, one that is installed; in a new map by default the one that the server was
     /// started with. Once the map has images, only a reindex changes it.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -37,7 +39,7 @@ pub struct MapState {
     /// Which descriptor it compares.
     pub descriptor: DescriptorKind,
     /// The frame of its poses.
-    pub frame: Frame,
+    pub frame: CoordinateFrame,
     /// The model that makes its descriptors.
     pub model: String,
     /// The digest of that model's weights and of how they are fed and pooled.

@@ -21,7 +21,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 pub use self::read::{Item, Reader};
-pub use self::write::{Mark, Resumed, Writer, growing};
+pub use self::write::{Checkpoint, Resumed, Writer, growing};
 use whereabouts_core::{Digest, ImageId, MapName, MediaType};
 
 /// What `manifest.json` calls the format.

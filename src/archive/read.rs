@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 use sha2::{Digest as _, Sha256};
 use tar::{EntryType, Header};
 
-use super::write::{Mark, disk};
+use super::write::{Checkpoint, disk};
 use super::{
     ArchiveError, ArchivedMap, BLOCK, END, End, FORMAT, LeftOut, MANIFEST, Manifest, VERSION,
     bytes_name, left_out_name, map_name, record_name,
@@ -99,8 +99,8 @@ impl<R: Read> Reader<R> {
     }
 
     /// Where the last item ended.
-    pub(super) fn mark(&self) -> Mark {
-        Mark::new(self.hash.clone(), self.bytes, self.entries)
+    pub(super) fn mark(&self) -> Checkpoint {
+        Checkpoint::new(self.hash.clone(), self.bytes, self.entries)
     }
 
     /// The next item; `None` after the end.
@@ -227,7 +227,7 @@ impl<R: Read> Reader<R> {
         Ok(Item::Image(image, bytes.bytes.into()))
     }
 
-    fn end(&mut self, entry: &Entry, before: Mark) -> Result<Item, ArchiveError> {
+    fn end(&mut self, entry: &Entry, before: Checkpoint) -> Result<Item, ArchiveError> {
         let end: End = self.json(entry)?;
         if (end.sha256, end.bytes, end.entries) != before.of_whole() {
             return Err(self.damaged("the checksum of the whole archive is wrong"));

@@ -9,7 +9,7 @@ use uuid::Uuid;
 
 use super::*;
 use whereabouts_core::ExportedImage;
-use whereabouts_core::{Descriptor, DescriptorKind, Frame, Image, Map, Precision, Scene};
+use whereabouts_core::{CoordinateFrame, Descriptor, DescriptorKind, Image, Map, Precision, Scene};
 
 fn map(name: &str) -> Map {
     Map {
@@ -17,7 +17,7 @@ fn map(name: &str) -> Map {
         name: name.parse().unwrap(),
         scene: Scene::Outdoor,
         descriptor: DescriptorKind::Gem,
-        frame: Frame::Wgs84,
+        frame: CoordinateFrame::Wgs84,
         model: "m".into(),
         model_digest: Digest::of(b"m"),
         precision: Precision::Full,

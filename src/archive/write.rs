@@ -21,14 +21,14 @@ use whereabouts_core::{Digest, ImageId, Map, MapName};
 pub struct Writer {
     file: BufWriter<File>,
     path: PathBuf,
-    mark: Mark,
+    mark: Checkpoint,
     /// What entries say about when they were changed, in seconds since 1970.
     made_at: u64,
 }
 
 /// A place in the archive to which the writer can go back.
 #[derive(Clone)]
-pub struct Mark {
+pub struct Checkpoint {
     hash: Sha256,
     bytes: u64,
     entries: u64,
@@ -44,7 +44,7 @@ pub struct Resumed {
     /// See `map`.
     pub last: Option<ImageId>,
     /// Where the last map begins.
-    pub begins: Option<Mark>,
+    pub begins: Option<Checkpoint>,
 }
 
 /// Where an archive grows until it is whole.
@@ -59,7 +59,7 @@ impl Writer {
     pub fn begin(path: &Path, manifest: &Manifest) -> Result<Self, ArchiveError> {
         let partial = growing(path);
         let file = File::create(&partial).map_err(disk("write", &partial))?;
-        let mark = Mark { hash: Sha256::new(), bytes: 0, entries: 0 };
+        let mark = Checkpoint { hash: Sha256::new(), bytes: 0, entries: 0 };
         let (file, made_at) = (BufWriter::new(file), seconds(manifest));
         let mut writer = Self { file, path: path.to_owned(), mark, made_at };
         writer.json(MANIFEST, manifest)?;
@@ -104,12 +104,12 @@ impl Writer {
     }
 
     /// The place that the archive has come to.
-    pub fn mark(&self) -> Mark {
+    pub fn mark(&self) -> Checkpoint {
         self.mark.clone()
     }
 
     /// Takes back what was written since.
-    pub fn go_back(&mut self, mark: &Mark) -> Result<(), ArchiveError> {
+    pub fn go_back(&mut self, mark: &Checkpoint) -> Result<(), ArchiveError> {
         let mut rewind = || {
             self.file.flush()?;
             self.file.get_ref().set_len(mark.bytes)?;
@@ -196,7 +196,7 @@ impl Writer {
     }
 }
 
-impl Mark {
+impl Checkpoint {
     pub(super) fn new(hash: Sha256, bytes: u64, entries: u64) -> Self {
         Self { hash, bytes, entries }
     }

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::client::{Client, ServerArg, explained, segment};
 use super::progress::Progress;
 use whereabouts_api::{ExportPage, MapState};
-use whereabouts_archive::{ArchivedMap, LeftOut, Manifest, Mark, Resumed, Writer, growing};
+use whereabouts_archive::{ArchivedMap, Checkpoint, LeftOut, Manifest, Resumed, Writer, growing};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, Image, ImageId, Map, MapName};
 
@@ -253,7 +253,7 @@ impl Backup {
 /// How far a map is saved.
 struct Saving {
     /// Where it begins in the archive.
-    begins: Mark,
+    begins: Checkpoint,
     map: Option<Map>,
     images: usize,
     last: Option<ImageId>,
@@ -261,7 +261,7 @@ struct Saving {
 }
 
 impl Saving {
-    fn new(begins: Mark) -> Self {
+    fn new(begins: Checkpoint) -> Self {
         Self { begins, map: None, images: 0, last: None, left_out: Vec::new() }
     }
 }

@@ -10,7 +10,7 @@ use parking_lot::Mutex;
 use super::progress::Progress;
 use whereabouts_core::{DescriptorKind, Digest, RefinerKind, Scene};
 use whereabouts_eval::{
-    Dataset, Evaluator, Folders, RunSettings, Sampling, Summary, Told, TruthSource, Watch,
+    Dataset, Evaluator, Folders, RunConditions, RunSettings, Sampling, Summary, TruthSource, Watch,
     predictions, report, table,
 };
 use whereabouts_index::SearchMode;
@@ -141,7 +141,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         found.extend(evaluator.run(&data, *descriptor).await?);
     }
 
-    let told = Told {
+    let told = RunConditions {
         database: args.database.display().to_string(),
         query_folder: args.queries.display().to_string(),
         truth: truth.said(),

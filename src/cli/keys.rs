@@ -90,7 +90,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
                 );
             }
             let opening =
-                tokio::task::spawn_blocking(move || startup::store(&config, Uuid::now_v7()));
+                tokio::task::spawn_blocking(move || startup::open_store(&config, Uuid::now_v7()));
             let opened = opening.await.context("the folder could not be opened")?.context(
                 "while its server runs, leave --data out, so that the server is asked over HTTP",
             )?;

@@ -5,8 +5,6 @@ use std::path::PathBuf;
 use anyhow::bail;
 
 use whereabouts_server::config::{Config, Overrides};
-use whereabouts_server::startup;
-use whereabouts_store::postgres::{SchemaState, migrate, schema_of};
 
 /// Makes the tables of the database (database.url, WHEREABOUTS_DATABASE__URL), or brings them up to date. Run it
 /// before a new version is started; it may run several times, and several times at once.
@@ -28,8 +26,21 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
              migration: a server brings its data folder up to date when it starts"
         );
     }
-    let settings = startup::postgres(&config);
-    if args.check {
+    migrate_database(&config, args.check).await
+}
+
+#[cfg(not(feature = "postgres"))]
+async fn migrate_database(_: &Config, _: bool) -> anyhow::Result<()> {
+    bail!("this build cannot use PostgreSQL: build with the Cargo feature `postgres`")
+}
+
+#[cfg(feature = "postgres")]
+async fn migrate_database(config: &Config, check_only: bool) -> anyhow::Result<()> {
+    use whereabouts_server::startup;
+    use whereabouts_store::postgres::{SchemaState, migrate, schema_of};
+
+    let settings = startup::postgres_settings(config);
+    if check_only {
         match schema_of(&settings).await? {
             SchemaState::UpToDate => println!("the tables are up to date"),
             SchemaState::Behind { steps } => {

@@ -65,22 +65,22 @@ fn median(mut values: Vec<f32>) -> Option<f32> {
 /// Evidence that chance gave to wrong answers, in ascending order.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(from = "Vec<f32>", into = "Vec<f32>")]
-pub struct Chance(Vec<f32>);
+pub struct NullDistribution(Vec<f32>);
 
-impl From<Vec<f32>> for Chance {
+impl From<Vec<f32>> for NullDistribution {
     fn from(mut values: Vec<f32>) -> Self {
         values.sort_by(f32::total_cmp);
         Self(values)
     }
 }
 
-impl From<Chance> for Vec<f32> {
-    fn from(chance: Chance) -> Self {
+impl From<NullDistribution> for Vec<f32> {
+    fn from(chance: NullDistribution) -> Self {
         chance.0
     }
 }
 
-impl Chance {
+impl NullDistribution {
     /// How many wrong answers it was measured with.
     pub fn len(&self) -> usize {
         self.0.len()
@@ -114,9 +114,9 @@ pub struct Calibration {
     /// Whether all of it was measured; else that was broken off, or goes on.
     pub complete: bool,
     /// Of [`Evidence::Similarity`].
-    pub similarity: Chance,
+    pub similarity: NullDistribution,
     /// Of [`Evidence::Agreement`]; empty until it is measured, and where there is no refiner.
-    pub agreement: Chance,
+    pub agreement: NullDistribution,
 }
 
 /// How a map is measured.
@@ -246,7 +246,7 @@ mod tests {
 
     #[test]
     fn of_chance_values_at_most_their_share_is_as_sure() {
-        let chance = Chance::from(vec![0.3, 0.1, 0.2, 0.2]);
+        let chance = NullDistribution::from(vec![0.3, 0.1, 0.2, 0.2]);
         let of = |evidence| chance.confidence(evidence);
         assert_eq!([of(0.05), of(0.2), of(0.25), of(9.0)], [0.0, 0.2, 0.6, 0.8]);
         // Each of 99 values, held against the other 98.
@@ -254,10 +254,10 @@ mod tests {
         let sure = (0..99).filter(|&left_out| {
             let mut others = values.clone();
             let one = others.remove(left_out);
-            Chance::from(others).confidence(one) >= 0.9
+            NullDistribution::from(others).confidence(one) >= 0.9
         });
         assert!(sure.count() <= 10);
-        assert_eq!(Chance::default().confidence(1.0), 0.0);
+        assert_eq!(NullDistribution::default().confidence(1.0), 0.0);
     }
 
     #[test]

@@ -30,7 +30,7 @@ pub use job::{
     DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage, utc_day,
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
-pub use map::{DescriptorKind, Frame, Map, MapName, Precision, Scene};
+pub use map::{CoordinateFrame, DescriptorKind, Map, MapName, Precision, Scene};
 pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError};
 pub use secret::Secret;
 pub use service_time::ServiceTime;

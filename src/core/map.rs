@@ -84,7 +84,8 @@ pub enum DescriptorKind {
 /// The frame of reference of a map's poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
-pub enum Frame {
+#[schema(as = Frame)]
+pub enum CoordinateFrame {
     /// Latitude and longitude in degrees.
     #[default]
     Wgs84,
@@ -137,7 +138,7 @@ pub(super) use display_as_written;
 display_as_written!(Scene { Outdoor => "outdoor", Indoor => "indoor" });
 display_as_written!(Precision { Full => "full", Bf16 => "bf16" });
 display_as_written!(DescriptorKind { Gem => "gem", Cls => "cls" });
-display_as_written!(Frame { Wgs84 => "wgs84", Metric => "metric" });
+display_as_written!(CoordinateFrame { Wgs84 => "wgs84", Metric => "metric" });
 
 /// A map as it is stored.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -151,7 +152,7 @@ pub struct Map {
     /// Which descriptor it compares.
     pub descriptor: DescriptorKind,
     /// The frame of its poses.
-    pub frame: Frame,
+    pub frame: CoordinateFrame,
     /// The name of the model that makes its descriptors.
     pub model: String,
     /// The digest of that model's weights and of how they are fed and pooled: descriptors of another

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use utoipa::ToSchema;
 
-use super::Frame;
+use super::CoordinateFrame;
 
 /// Where a camera stood, in the frame of its map.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -93,10 +93,10 @@ const FARTHEST_METRES: f64 = 1e8;
 
 impl Pose {
     /// Reads a pose written in JSON for a map of the given frame.
-    pub fn from_json(frame: Frame, value: Value) -> Result<Self, PoseError> {
+    pub fn from_json(frame: CoordinateFrame, value: Value) -> Result<Self, PoseError> {
         let (name, expected) = match frame {
-            Frame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading"),
-            Frame::Metric => ("metric", "x, y and, if known, z, qx, qy, qz, qw"),
+            CoordinateFrame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading"),
+            CoordinateFrame::Metric => ("metric", "x, y and, if known, z, qx, qy, qz, qw"),
         };
         let fields = |error: serde_json::Error| PoseError::Fields {
             frame: name,
@@ -104,18 +104,20 @@ impl Pose {
             detail: error.to_string(),
         };
         match frame {
-            Frame::Wgs84 => {
+            CoordinateFrame::Wgs84 => {
                 serde_json::from_value::<GeographicPose>(value).map_err(fields)?.checked()
             }
-            Frame::Metric => serde_json::from_value::<MetricPose>(value).map_err(fields)?.checked(),
+            CoordinateFrame::Metric => {
+                serde_json::from_value::<MetricPose>(value).map_err(fields)?.checked()
+            }
         }
     }
 
     /// The frame it belongs to.
-    pub fn frame(&self) -> Frame {
+    pub fn frame(&self) -> CoordinateFrame {
         match self {
-            Self::Geographic(_) => Frame::Wgs84,
-            Self::Metric(_) => Frame::Metric,
+            Self::Geographic(_) => CoordinateFrame::Wgs84,
+            Self::Metric(_) => CoordinateFrame::Metric,
         }
     }
 
@@ -209,16 +211,19 @@ mod tests {
 
     #[test]
     fn a_pose_out_of_range_names_the_field_and_the_range() {
-        let error = Pose::from_json(Frame::Wgs84, json!({"lat": 91.0, "lon": 0.0})).unwrap_err();
+        let error =
+            Pose::from_json(CoordinateFrame::Wgs84, json!({"lat": 91.0, "lon": 0.0})).unwrap_err();
         assert_eq!(error.to_string(), "lat is 91; it must be between -90 and 90 degrees");
-        assert!(Pose::from_json(Frame::Metric, json!({"x": 1e9, "y": 0.0})).is_err());
+        assert!(Pose::from_json(CoordinateFrame::Metric, json!({"x": 1e9, "y": 0.0})).is_err());
     }
 
     #[test]
     fn a_pose_of_the_other_frame_says_what_this_map_takes() {
-        let error = Pose::from_json(Frame::Wgs84, json!({"x": 1.0, "y": 2.0})).unwrap_err();
+        let error =
+            Pose::from_json(CoordinateFrame::Wgs84, json!({"x": 1.0, "y": 2.0})).unwrap_err();
         assert!(error.to_string().contains("takes lat, lon"), "{error}");
-        let error = Pose::from_json(Frame::Metric, json!({"lat": 1.0, "lon": 2.0})).unwrap_err();
+        let error =
+            Pose::from_json(CoordinateFrame::Metric, json!({"lat": 1.0, "lon": 2.0})).unwrap_err();
         assert!(error.to_string().contains("takes x, y"), "{error}");
     }
 
@@ -226,9 +231,11 @@ mod tests {
     fn an_orientation_is_whole_and_of_unit_norm() {
         let with =
             |q: [f64; 4]| json!({"x": 0, "y": 0, "qx": q[0], "qy": q[1], "qz": q[2], "qw": q[3]});
-        assert!(Pose::from_json(Frame::Metric, with([0.0, 0.0, 0.6, 0.8])).is_ok());
-        assert!(Pose::from_json(Frame::Metric, with([0.0, 0.0, 0.6, 0.6])).is_err());
-        assert!(Pose::from_json(Frame::Metric, json!({"x": 0, "y": 0, "qw": 1})).is_err());
+        assert!(Pose::from_json(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.8])).is_ok());
+        assert!(Pose::from_json(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.6])).is_err());
+        assert!(
+            Pose::from_json(CoordinateFrame::Metric, json!({"x": 0, "y": 0, "qw": 1})).is_err()
+        );
     }
 
     #[test]
@@ -241,9 +248,10 @@ mod tests {
 
     #[test]
     fn poses_of_different_frames_have_no_distance() {
-        let metric = Pose::from_json(Frame::Metric, json!({"x": 3.0, "y": 4.0})).unwrap();
-        let origin = Pose::from_json(Frame::Metric, json!({"x": 0.0, "y": 0.0})).unwrap();
-        let globe = Pose::from_json(Frame::Wgs84, json!({"lat": 0.0, "lon": 0.0})).unwrap();
+        let metric = Pose::from_json(CoordinateFrame::Metric, json!({"x": 3.0, "y": 4.0})).unwrap();
+        let origin = Pose::from_json(CoordinateFrame::Metric, json!({"x": 0.0, "y": 0.0})).unwrap();
+        let globe =
+            Pose::from_json(CoordinateFrame::Wgs84, json!({"lat": 0.0, "lon": 0.0})).unwrap();
         assert_eq!(metric.distance_m(&origin), Some(5.0));
         assert_eq!(metric.distance_m(&globe), None);
     }

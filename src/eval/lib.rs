@@ -31,9 +31,9 @@ mod tests;
 
 pub use dataset::{Dataset, EvaluatedQuery, Folders, QueryKind, Sampling};
 pub use folder::{PictureFile, pictures};
-pub use outcome::{Answered, MethodOutcomes, Outcome, Times};
+pub use outcome::{MethodOutcomes, Outcome, Prediction, Times};
 pub use poses::PoseSource;
 pub use run::{Evaluator, Method, RunSettings, Watch};
-pub use summary::{MethodSummary, Summary, Told};
+pub use summary::{MethodSummary, RunConditions, Summary};
 pub use table::table;
 pub use truth::TruthSource;

@@ -11,7 +11,7 @@ use super::{Evaluator, PictureFile};
 use whereabouts_api::{ImageMeta, IndexKind, MapChange};
 use whereabouts_core::{DescriptorKind, Digest, ImageId, Map, MapName};
 use whereabouts_service::{NewImage, Service};
-use whereabouts_vision::Demand;
+use whereabouts_vision::AdmissionRequest;
 
 /// The map of the references.
 pub(super) struct ReferenceMap {
@@ -85,7 +85,7 @@ impl Evaluator<'_> {
         }
         let meta = ImageMeta { id: Some(picture.id.to_string()), ..ImageMeta::default() };
         self.service
-            .add_image(map, NewImage { bytes, meta, demand: Demand::BACKGROUND })
+            .add_image(map, NewImage { bytes, meta, demand: AdmissionRequest::BACKGROUND })
             .await
             .with_context(|| {
                 format!("{} cannot be a reference; repair it or take it out of the folder", named())

@@ -143,7 +143,7 @@ impl Called {
 
 /// What the first answers of a method say about `known`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Knowing {
+pub struct OpenSetMetrics {
     /// What the service calls known.
     pub called: Called,
     /// The threshold with the best F1 of taking true answers.
@@ -160,7 +160,7 @@ pub struct Knowing {
     pub auc: Option<f64>,
 }
 
-impl Knowing {
+impl OpenSetMetrics {
     /// Works it out.
     pub fn of(first: &[First], Bounds { service, given }: Bounds) -> Self {
         let curve = precision_recall(first);

@@ -20,7 +20,7 @@ pub struct Outcome {
     /// Its bytes.
     pub digest: Digest,
     /// The references, best first.
-    pub answers: Vec<Answered>,
+    pub answers: Vec<Prediction>,
     /// How sure the first of them is, 0 to 1.
     pub confidence: f32,
     /// What a refiner said of the pairs.
@@ -37,7 +37,7 @@ pub struct Outcome {
 
 /// One reference in an answer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Answered {
+pub struct Prediction {
     /// The reference.
     pub image_id: ImageId,
     /// Cosine similarity of its descriptor to the query's, −1 to 1.
@@ -73,12 +73,12 @@ pub struct MethodOutcomes {
 /// The outcomes of one method in a file of JSON lines.
 ///
 /// Its name covers all that decides an outcome, so that a changed setting begins a new file.
-pub(super) struct Kept {
+pub(super) struct OutcomeCache {
     known: HashMap<(ImageId, Digest), Outcome>,
     file: Mutex<File>,
 }
 
-impl Kept {
+impl OutcomeCache {
     /// Reads what an earlier run left. A line that a kill cut short is passed over.
     pub fn open(path: &Path) -> anyhow::Result<Self> {
         let cannot = || format!("cannot use {}; choose another folder with --work", path.display());
@@ -139,15 +139,15 @@ mod tests {
     fn what_was_kept_is_known_after_a_kill_in_the_middle_of_a_line() {
         let dir = tempfile::TempDir::new().unwrap();
         let file = dir.path().join("kept.jsonl");
-        let kept = Kept::open(&file).unwrap();
+        let kept = OutcomeCache::open(&file).unwrap();
         kept.keep(&outcome("a")).unwrap();
         kept.keep(&Outcome { degraded: Some("why".into()), ..outcome("b") }).unwrap();
         kept.keep(&outcome("c")).unwrap();
         let bytes = std::fs::read(&file).unwrap();
         std::fs::write(&file, &bytes[..bytes.len() - 9]).unwrap();
-        let kept = Kept::open(&file).unwrap();
+        let kept = OutcomeCache::open(&file).unwrap();
         kept.keep(&outcome("d")).unwrap();
-        let kept = Kept::open(&file).unwrap();
+        let kept = OutcomeCache::open(&file).unwrap();
         let known =
             |name: &str| kept.get(&name.parse().unwrap(), Digest::of(name.as_bytes())).is_some();
         assert_eq!(["a", "b", "c", "d"].map(known), [true, false, false, true]);
@@ -158,7 +158,7 @@ mod tests {
     fn what_is_read_again_is_what_was_measured_to_the_last_bit() {
         let dir = tempfile::TempDir::new().unwrap();
         let file = dir.path().join("kept.jsonl");
-        let kept = Kept::open(&file).unwrap();
+        let kept = OutcomeCache::open(&file).unwrap();
         let measured = |i: u32| {
             let ms = f64::from(i) * 1e-6;
             let times =
@@ -167,7 +167,7 @@ mod tests {
         };
         let all: Vec<Outcome> = (0..200).map(|i| measured(i * 7919 + 1)).collect();
         all.iter().for_each(|outcome| kept.keep(outcome).unwrap());
-        let kept = Kept::open(&file).unwrap();
+        let kept = OutcomeCache::open(&file).unwrap();
         assert!(
             all.iter().all(|known| kept.get(&known.query, known.digest).as_ref() == Some(known))
         );

@@ -9,7 +9,7 @@ use exif::{In, Rational, Tag, Value};
 use serde::Deserialize;
 
 use super::PictureFile;
-use whereabouts_core::{Frame, GeographicPose, MetricPose, Pose};
+use whereabouts_core::{CoordinateFrame, GeographicPose, MetricPose, Pose};
 
 /// Where poses come from; one source for a whole folder.
 #[derive(Debug)]
@@ -17,7 +17,7 @@ pub enum PoseSource {
     /// A CSV file.
     Csv {
         /// The frame of all of them.
-        frame: Frame,
+        frame: CoordinateFrame,
         /// By path below the folder, or by file name.
         poses: HashMap<String, Pose>,
     },
@@ -73,10 +73,10 @@ impl PoseSource {
     }
 
     /// The frame of the poses, as far as the source decides it.
-    pub fn frame(&self) -> Option<Frame> {
+    pub fn frame(&self) -> Option<CoordinateFrame> {
         match self {
             Self::Csv { frame, .. } => Some(*frame),
-            Self::Names => Some(Frame::Metric),
+            Self::Names => Some(CoordinateFrame::Metric),
             Self::Exif => None,
         }
     }
@@ -199,7 +199,7 @@ mod tests {
     fn a_csv_names_files_by_path_or_by_name() {
         let source =
             csv("file, lat, lon, heading\na/1.jpg, 35.5, 139.5, 90\n2.jpg,1,2,\n").unwrap();
-        assert_eq!(source.frame(), Some(Frame::Wgs84));
+        assert_eq!(source.frame(), Some(CoordinateFrame::Wgs84));
         assert!(source.pose("a/1.jpg", b"").unwrap().is_some());
         assert!(source.pose("b/2.jpg", b"").unwrap().is_some());
         assert!(source.pose("3.jpg", b"").unwrap().is_none());

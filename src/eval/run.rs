@@ -12,14 +12,14 @@ use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::map::ReferenceMap;
-use super::outcome::Kept;
-use super::{Answered, Dataset, EvaluatedQuery, MethodOutcomes, Outcome, Times};
+use super::outcome::OutcomeCache;
+use super::{Dataset, EvaluatedQuery, MethodOutcomes, Outcome, Prediction, Times};
 use whereabouts_core::{Calibration, DescriptorKind, Digest, Job, Map, RefinerKind, Scene, Usage};
 use whereabouts_index::SearchMode;
 use whereabouts_refine::{DenseKey, Progress, RefineError, Refinement, Refiner};
 use whereabouts_service::{Retrieved, Service};
 use whereabouts_store::{JobRecord, Query, Step};
-use whereabouts_vision::Demand;
+use whereabouts_vision::AdmissionRequest;
 
 /// A way to answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -101,7 +101,7 @@ impl Evaluator<'_> {
         let kept = methods
             .iter()
             .map(|method| self.kept(*method, &references))
-            .collect::<anyhow::Result<Vec<Kept>>>()?;
+            .collect::<anyhow::Result<Vec<OutcomeCache>>>()?;
 
         self.watch.begin("queries", data.queries.len());
         let mut outcomes: Vec<Vec<Outcome>> = methods.iter().map(|_| Vec::new()).collect();
@@ -118,7 +118,7 @@ impl Evaluator<'_> {
     }
 
     /// The file of a method's outcomes.
-    fn kept(&self, method: Method, references: &ReferenceMap) -> anyhow::Result<Kept> {
+    fn kept(&self, method: Method, references: &ReferenceMap) -> anyhow::Result<OutcomeCache> {
         let RunSettings { k, search, scene, refiner_settings, work, .. } = &self.settings;
         let refined = method.refiner.map(|_| (scene, refiner_settings));
         let decides = format!(
@@ -133,7 +133,7 @@ impl Evaluator<'_> {
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot make the folder {}", folder.display()))?;
         let digest = Digest::of(decides.as_bytes()).hex();
-        Kept::open(&folder.join(format!("{}-{}.jsonl", method.name(), &digest[..16])))
+        OutcomeCache::open(&folder.join(format!("{}-{}.jsonl", method.name(), &digest[..16])))
     }
 
     /// What chance resemblance is like in the map. Measured anew each time: what an earlier run kept may
@@ -150,7 +150,7 @@ impl Evaluator<'_> {
         map: &Map,
         calibration: &Calibration,
         query: &EvaluatedQuery,
-        kept: &[Kept],
+        kept: &[OutcomeCache],
     ) -> anyhow::Result<Vec<Outcome>> {
         let named = || query.picture.file.display().to_string();
         let frame: Bytes = tokio::fs::read(&query.picture.file).await.with_context(named)?.into();
@@ -163,7 +163,7 @@ impl Evaluator<'_> {
         let wanted = self.settings.k.max(LEAST_ANSWERS);
         let retrieved = self
             .service
-            .retrieve(&map.name, &frame, wanted, self.settings.search, Demand::BACKGROUND)
+            .retrieve(&map.name, &frame, wanted, self.settings.search, AdmissionRequest::BACKGROUND)
             .await
             .with_context(named)?;
         let coarse = coarse(query, digest, &retrieved, calibration);
@@ -227,7 +227,7 @@ impl Evaluator<'_> {
         let mut tries = 1;
         loop {
             let start = Instant::now();
-            match refiner.refine(&record, &Unheard).await {
+            match refiner.refine(&record, &NoProgress).await {
                 Ok(refinement) => {
                     let took = start.elapsed();
                     let confidence = refinement.ranking.first().map_or(0.0, |first| {
@@ -239,16 +239,16 @@ impl Evaluator<'_> {
                     });
                     return Ok(refined(coarse, refinement, confidence, took));
                 }
-                Err(RefineError::Later { why, after }) => bail!(
+                Err(RefineError::Deferred { why, after }) => bail!(
                     "{why}; what was found so far is kept: run the same command again in {} s",
                     after.as_secs()
                 ),
-                Err(RefineError::Passing(_)) if tries < self.settings.attempts => {
+                Err(RefineError::Transient(_)) if tries < self.settings.attempts => {
                     let pause = self.settings.retry_pause * 2_u32.saturating_pow(tries - 1);
                     tokio::time::sleep(pause).await;
                     tries += 1;
                 }
-                Err(RefineError::Passing(why) | RefineError::Hopeless(why)) => {
+                Err(RefineError::Transient(why) | RefineError::Permanent(why)) => {
                     return Ok(Outcome { degraded: Some(why), ..coarse.clone() });
                 }
             }
@@ -265,7 +265,7 @@ fn coarse(
     let times = retrieved.extraction.times;
     let candidates = &retrieved.candidates;
     let first = candidates.first();
-    let answers = retrieved.candidates.iter().map(|candidate| Answered {
+    let answers = retrieved.candidates.iter().map(|candidate| Prediction {
         image_id: candidate.image_id.clone(),
         similarity: candidate.similarity,
         coarse_rank: candidate.rank,
@@ -312,9 +312,9 @@ fn ms(duration: Duration) -> f64 {
 }
 
 /// Nobody watches a single job of an evaluation.
-struct Unheard;
+struct NoProgress;
 
 #[async_trait]
-impl Progress for Unheard {
+impl Progress for NoProgress {
     async fn step(&self, _: Step) {}
 }

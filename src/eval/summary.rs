@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::open_set::{Bounds, First, Knowing};
+use super::open_set::{Bounds, First, OpenSetMetrics};
 use super::recall::{AtK, Change, FirstTrue, change, first_true, recall};
 use super::{Dataset, EvaluatedQuery, MethodOutcomes, Outcome, QueryKind};
 use whereabouts_core::Usage;
@@ -20,14 +20,14 @@ pub struct Summary {
     pub references: usize,
     /// The conditions.
     #[serde(flatten)]
-    pub told: Told,
+    pub told: RunConditions,
     /// One for each method, a coarse one before those that refine it.
     pub methods: Vec<MethodSummary>,
 }
 
 /// The conditions of an evaluation.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Told {
+pub struct RunConditions {
     /// The folder of references.
     pub database: String,
     /// The folder of queries.
@@ -68,27 +68,27 @@ pub struct MethodSummary {
     /// Why the first of them is.
     pub degraded_why: Option<String>,
     /// Telling known places from unknown ones by the confidence in the first answer.
-    pub known: Knowing,
+    pub known: OpenSetMetrics,
 }
 
 /// How long the stages of a query took, in milliseconds.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Timing {
     /// Decoding and resizing.
-    pub decode: Spread,
+    pub decode: Quantiles,
     /// Inference and pooling, the wait for a session included.
-    pub extract: Spread,
+    pub extract: Quantiles,
     /// Search.
-    pub search: Spread,
+    pub search: Quantiles,
     /// Refinement of all pairs of a query; null for a coarse method.
-    pub refine: Option<Spread>,
+    pub refine: Option<Quantiles>,
     /// The same for one pair.
-    pub refine_pair: Option<Spread>,
+    pub refine_pair: Option<Quantiles>,
 }
 
 /// Of a number that differs from query to query.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Spread {
+pub struct Quantiles {
     /// The median.
     pub median: f64,
     /// The 95th percentile.
@@ -97,7 +97,7 @@ pub struct Spread {
 
 impl Summary {
     /// Sums up what was found. Methods come as coarse ones each followed by its refined ones.
-    pub fn new(told: Told, data: &Dataset, found: &[MethodOutcomes]) -> Self {
+    pub fn new(told: RunConditions, data: &Dataset, found: &[MethodOutcomes]) -> Self {
         let bounds = Bounds { service: told.known_confidence, given: told.known_threshold };
         let mut methods = Vec::with_capacity(found.len());
         let mut coarse = Vec::new();
@@ -162,7 +162,7 @@ fn summed_up(
 ) -> MethodSummary {
     let recall = recall(first);
     let outcomes = &found.outcomes;
-    let spread = |of: fn(&Outcome) -> f64| Spread::of(outcomes.iter().map(of).collect());
+    let spread = |of: fn(&Outcome) -> f64| Quantiles::of(outcomes.iter().map(of).collect());
     let is_refined = found.method.refiner.is_some();
     MethodSummary {
         name: found.method.name(),
@@ -181,11 +181,11 @@ fn summed_up(
         usage: outcomes.iter().fold(Usage::default(), |sum, outcome| sum + outcome.usage),
         degraded: outcomes.iter().filter(|outcome| outcome.degraded.is_some()).count(),
         degraded_why: outcomes.iter().find_map(|outcome| outcome.degraded.clone()),
-        known: Knowing::of(&firsts(data, found), bounds),
+        known: OpenSetMetrics::of(&firsts(data, found), bounds),
     }
 }
 
-impl Spread {
+impl Quantiles {
     fn of(mut values: Vec<f64>) -> Self {
         values.sort_unstable_by(f64::total_cmp);
         let at = |share: f64| {

@@ -63,7 +63,7 @@ async fn map_of(store: &EmbeddedStore, descriptors: &[Descriptor]) -> Map {
         name: "random".parse().unwrap(),
         scene: Scene::Outdoor,
         descriptor: DescriptorKind::Gem,
-        frame: whereabouts_core::Frame::Metric,
+        frame: whereabouts_core::CoordinateFrame::Metric,
         model: "none".into(),
         model_digest: Digest::of(b""),
         precision: Precision::Full,
@@ -113,7 +113,7 @@ async fn answered(
     mode: SearchMode,
 ) -> Outcome {
     let candidates = store.search(map, query.clone(), 10, mode).await.unwrap();
-    let answers = candidates.into_iter().map(|candidate| Answered {
+    let answers = candidates.into_iter().map(|candidate| Prediction {
         image_id: candidate.image_id,
         similarity: candidate.similarity,
         coarse_rank: candidate.rank,
@@ -137,7 +137,7 @@ async fn summary(store: &EmbeddedStore, map: &Map, mode: SearchMode) -> Summary 
         outcomes.push(answered(store, map, query, mode).await);
     }
     let method = Method { descriptor: DescriptorKind::Gem, refiner: None };
-    let told = Told {
+    let told = RunConditions {
         database: String::new(),
         query_folder: String::new(),
         truth: String::new(),

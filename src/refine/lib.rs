@@ -27,10 +27,10 @@ pub use worker::{Worker, WorkerSettings};
 use whereabouts_core::PairRegion;
 use whereabouts_core::ServiceTime;
 use whereabouts_core::{Description, Evidence, ImageId, Map, Ranking, RefinerKind, Usage};
-use whereabouts_store::{JobRecord, LookAlikes, Step, StoreError};
+use whereabouts_store::{HardNegatives, JobRecord, Step, StoreError};
 
 /// How fast jobs are done.
-pub type JobPace = Arc<Mutex<ServiceTime>>;
+pub type JobServiceTime = Arc<Mutex<ServiceTime>>;
 
 /// Compares and orders the candidates of one job.
 #[async_trait]
@@ -53,7 +53,11 @@ pub trait Refiner: Send + Sync {
     ) -> Result<Refinement, RefineError>;
     /// What speaks for the first of candidates that are all wrong; `None` from a refiner that measures
     /// nothing of the kind, and for an image that is gone.
-    async fn chance(&self, map: &Map, asked: &LookAlikes) -> Result<Option<Evidence>, RefineError> {
+    async fn chance(
+        &self,
+        map: &Map,
+        asked: &HardNegatives,
+    ) -> Result<Option<Evidence>, RefineError> {
         let _ = (map, asked);
         Ok(None)
     }
@@ -105,13 +109,13 @@ fn milliseconds(took: Duration) -> u64 {
 pub enum RefineError {
     /// Trying again would change nothing.
     #[error("{0}")]
-    Hopeless(String),
+    Permanent(String),
     /// It may work the next time.
     #[error("{0}")]
-    Passing(String),
+    Transient(String),
     /// Nothing is wrong with the job, but now is not the time.
     #[error("{why}")]
-    Later {
+    Deferred {
         /// What it waits for.
         why: String,
         /// How long to wait.
@@ -123,13 +127,13 @@ impl From<StoreError> for RefineError {
     fn from(error: StoreError) -> Self {
         match error {
             StoreError::NotFound(_) | StoreError::Conflict(_) | StoreError::Damaged(_) => {
-                Self::Hopeless(error.to_string())
+                Self::Permanent(error.to_string())
             }
             StoreError::QueueFull { .. }
             | StoreError::Full { .. }
             | StoreError::Unavailable(_)
             | StoreError::Failed(_)
-            | StoreError::Superseded(_) => Self::Passing(error.to_string()),
+            | StoreError::Superseded(_) => Self::Transient(error.to_string()),
         }
     }
 }

@@ -13,7 +13,7 @@ use whereabouts_core::{
     Candidate, DenseFeatures, Description, DescriptorKind, Digest, Evidence, ImageId, Map, Ranking,
     RefinerKind, Usage,
 };
-use whereabouts_store::{BlobStore, JobRecord, LookAlikes, MapStore};
+use whereabouts_store::{BlobStore, HardNegatives, JobRecord, MapStore};
 use whereabouts_vision::{CpuPool, ExtractError, Extractor, LoadedModels, ModelError};
 
 /// Geometric matching of dense features, on this machine.
@@ -70,7 +70,11 @@ impl Refiner for LocalRefiner {
         Ok(matches.map(|matches| matches.into_iter().map(region).collect()))
     }
 
-    async fn chance(&self, map: &Map, asked: &LookAlikes) -> Result<Option<Evidence>, RefineError> {
+    async fn chance(
+        &self,
+        map: &Map,
+        asked: &HardNegatives,
+    ) -> Result<Option<Evidence>, RefineError> {
         let extractor = self.models.of(map).await.map_err(no_model)?;
         let query = match self.maps.image(map, &asked.image_id).await? {
             Some(image) => {
@@ -99,14 +103,14 @@ impl LocalRefiner {
     async fn compared_of(&self, record: &JobRecord) -> Result<Compared, RefineError> {
         let map = match self.maps.map(&record.job.map).await? {
             Some(map) if map.uid == record.map_uid => map,
-            _ => return Err(RefineError::Hopeless("the map was removed".into())),
+            _ => return Err(RefineError::Permanent("the map was removed".into())),
         };
         let extractor = self.models.of(&map).await.map_err(no_model)?;
         let model = extractor.identity();
         let query = self
             .source(DenseKey { model, picture: record.query.digest })
             .await?
-            .ok_or_else(|| RefineError::Hopeless("the frame is missing from the store".into()))?;
+            .ok_or_else(|| RefineError::Permanent("the frame is missing from the store".into()))?;
         self.compared(&map, extractor, query, &record.candidates).await
     }
 
@@ -131,7 +135,7 @@ impl LocalRefiner {
             .pool
             .run(move || compare(&extractor, &dense, &matcher, query, sources))
             .await
-            .map_err(|error| RefineError::Passing(error.to_string()))??;
+            .map_err(|error| RefineError::Transient(error.to_string()))??;
         Ok(Compared { present, pairs, took })
     }
 
@@ -160,9 +164,9 @@ impl LocalRefiner {
 fn no_model(error: ModelError) -> RefineError {
     match error {
         ModelError::NotInstalled(_) | ModelError::Broken { .. } => {
-            RefineError::Hopeless(error.to_string())
+            RefineError::Permanent(error.to_string())
         }
-        ModelError::AllInUse(_) => RefineError::Passing(error.to_string()),
+        ModelError::AllInUse(_) => RefineError::Transient(error.to_string()),
     }
 }
 
@@ -179,7 +183,7 @@ fn compare(
         Source::Bytes(key, bytes) => {
             let extraction = extractor
                 .extract(&bytes, DescriptorKind::Gem)
-                .map_err(|error: ExtractError| RefineError::Passing(error.to_string()))?;
+                .map_err(|error: ExtractError| RefineError::Transient(error.to_string()))?;
             let features = Arc::new(extraction.dense);
             dense.insert(key, Arc::clone(&features));
             Ok(features)
@@ -192,7 +196,7 @@ fn compare(
     let began = Instant::now();
     let pairs = matcher
         .compare_all(&query, &candidates)
-        .map_err(|error| RefineError::Hopeless(error.to_string()))?;
+        .map_err(|error| RefineError::Permanent(error.to_string()))?;
     Ok((pairs, began.elapsed()))
 }
 
@@ -205,7 +209,7 @@ fn conclude(candidates: &[Candidate], compared: &Compared) -> Result<Refinement,
     let gone = (0..candidates.len()).filter(|index| !present.contains(index));
     let order: Vec<usize> = ordered.iter().copied().chain(gone).collect();
     let ranking = Ranking::new(candidates, &order)
-        .map_err(|error| RefineError::Hopeless(error.to_string()))?;
+        .map_err(|error| RefineError::Permanent(error.to_string()))?;
     let missing = candidates.len() - present.len();
     Ok(Refinement {
         descriptions: present

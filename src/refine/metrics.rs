@@ -8,13 +8,13 @@ use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::histogram::Histogram;
 use whereabouts_core::{Job, JobState};
-use whereabouts_telemetry::LastHour;
+use whereabouts_telemetry::HourlyStats;
 use whereabouts_telemetry::metrics::{Registry, latency, register};
 
 /// Metric families of refinement jobs and of the description cache.
 #[derive(Debug)]
 pub struct RefineMetrics {
-    hourly: Arc<LastHour>,
+    hourly: Arc<HourlyStats>,
     jobs: Family<JobLabels, Counter>,
     job_seconds: Family<RefinerLabels, Histogram, fn() -> Histogram>,
     model_calls: Family<RefinerLabels, Counter>,
@@ -58,7 +58,7 @@ struct LookupLabels {
 
 impl RefineMetrics {
     /// Registers the families; all counts are zero.
-    pub fn register(registry: &mut Registry, hourly: Arc<LastHour>) -> Self {
+    pub fn register(registry: &mut Registry, hourly: Arc<HourlyStats>) -> Self {
         Self {
             hourly,
             jobs: register(registry, "jobs_ended", "Jobs that ended", Family::default()),

@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::patience::until;
-use super::{JobPace, Progress, RefineError, RefineMetrics, Refinement, Refiner};
+use super::{JobServiceTime, Progress, RefineError, RefineMetrics, Refinement, Refiner};
 use whereabouts_core::{Estimate, Job, JobState};
 use whereabouts_store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
 use whereabouts_telemetry::traces;
@@ -43,7 +43,7 @@ pub struct Worker {
     /// What is counted.
     pub metrics: Arc<RefineMetrics>,
     /// Learns how long jobs take.
-    pub pace: JobPace,
+    pub pace: JobServiceTime,
     /// Its patience.
     pub settings: WorkerSettings,
 }
@@ -96,12 +96,12 @@ impl Worker {
                 let release = Release { why, not_before: None, counts: false };
                 self.release(claim, release).await?;
             }
-            Err(Stopped::Failed(RefineError::Later { why, after: pause })) => {
+            Err(Stopped::Failed(RefineError::Deferred { why, after: pause })) => {
                 tracing::info!(job = %job.id, why, seconds = pause.as_secs(), "a job waits");
                 let release = Release { why, not_before: Some(after(pause)), counts: false };
                 self.release(claim, release).await?;
             }
-            Err(Stopped::Failed(RefineError::Passing(why)))
+            Err(Stopped::Failed(RefineError::Transient(why)))
                 if job.attempts < self.settings.attempts =>
             {
                 tracing::warn!(job = %job.id, attempt = job.attempts, why, "a job is tried again");
@@ -136,7 +136,7 @@ impl Worker {
             () = self.taken_away(record.claim()) => Err(Stopped::NoLongerOurs),
             outcome = tokio::time::timeout(timeout, self.refiner.refine(record, &progress)) => match outcome {
                 Ok(refined) => refined.map_err(Stopped::Failed),
-                Err(_) => Err(Stopped::Failed(RefineError::Passing(format!(
+                Err(_) => Err(Stopped::Failed(RefineError::Transient(format!(
                     "it took longer than {} s (jobs.timeout_s)",
                     timeout.as_secs()
                 )))),

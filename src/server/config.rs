@@ -150,7 +150,7 @@ impl Console {
         (!url.is_empty()).then_some(Tiles { url, attribution })
     }
 
-    fn contradiction(&self) -> Option<String> {
+    fn validate(&self) -> Option<String> {
         let url = &self.tiles_url;
         if url.is_empty() {
             return None;
@@ -197,7 +197,7 @@ impl Config {
             .merge(Serialized::defaults(flags))
             .extract()
             .map_err(|error| ConfigError::Malformed(Box::new(error)))?;
-        match config.contradiction() {
+        match config.validate() {
             Some(why) => Err(ConfigError::Contradiction(why)),
             None => Ok(config),
         }
@@ -213,7 +213,7 @@ impl Config {
     }
 
     fn contradiction_of_a_section(&self) -> Option<String> {
-        let track = || self.track.contradiction();
+        let track = || self.track.validate();
         if self.bulk.memory_bytes < self.server.body_limit_bytes {
             return Some("bulk.memory_bytes must not be less than server.body_limit_bytes".into());
         }
@@ -225,17 +225,17 @@ impl Config {
             );
         }
         let timeout = self.server.request_timeout().as_secs();
-        let console = || self.console.contradiction();
-        let objects = || self.objects.contradiction(timeout);
+        let console = || self.console.validate();
+        let objects = || self.objects.validate(timeout);
         let scale = || match self.database.is_set() {
-            true => self.database.contradiction().or_else(objects),
+            true => self.database.validate().or_else(objects),
             false => None,
         };
-        let traces = || self.traces.contradiction();
-        self.server.contradiction().or_else(track).or_else(console).or_else(scale).or_else(traces)
+        let traces = || self.traces.validate();
+        self.server.validate().or_else(track).or_else(console).or_else(scale).or_else(traces)
     }
 
-    fn contradiction(&self) -> Option<String> {
+    fn validate(&self) -> Option<String> {
         let at_least_one = [
             ("server.body_limit_bytes", self.server.body_limit_bytes),
             ("server.max_requests", self.server.max_requests),
@@ -294,14 +294,14 @@ impl Config {
             return Some("index.m must not exceed 256".into());
         }
         if self.refine.refiner == Refiner::Mllm
-            && let Some(why) = self.mllm.contradiction(self.jobs.timeout_s)
+            && let Some(why) = self.mllm.validate(self.jobs.timeout_s)
         {
             return Some(why);
         }
         if let Some(why) = self.contradiction_of_a_section() {
             return Some(why);
         }
-        if let Some(why) = self.webhooks.contradiction() {
+        if let Some(why) = self.webhooks.validate() {
             return Some(why);
         }
         if !(0.0..=1.0).contains(&self.jobs.shed_at) {

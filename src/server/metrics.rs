@@ -11,8 +11,8 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use whereabouts_refine::RefineMetrics;
-use whereabouts_service::{Refusals, RefusedFor, ServiceMetrics};
-use whereabouts_telemetry::LastHour;
+use whereabouts_service::{Rejection, Rejections, ServiceMetrics};
+use whereabouts_telemetry::HourlyStats;
 use whereabouts_telemetry::metrics::{self, Registry, latency, register};
 
 use super::levels::{Gauges, Levels};
@@ -24,7 +24,7 @@ const FRAME_ROUTES: [&str; 2] = ["/localize", "/whereabouts.v1.LocalizationServi
 #[derive(Debug)]
 pub struct Metrics {
     /// Statistics of the last hour.
-    pub last_hour: Arc<LastHour>,
+    pub last_hour: Arc<HourlyStats>,
     /// Of refinement.
     pub refine: Arc<RefineMetrics>,
     /// Of the use cases.
@@ -59,13 +59,9 @@ impl Metrics {
     pub fn new() -> Self {
         let mut all = metrics::registry();
         let registry = &mut all;
-        let last_hour = Arc::new(LastHour::default());
-        let refusals = Arc::new(Refusals::register(registry));
-        let service = ServiceMetrics::register(registry, refusals);
+        let last_hour = Arc::new(HourlyStats::default());
+        let rejections = Arc::new(Rejections::register(registry));
         Self {
-            refine: Arc::new(RefineMetrics::register(registry, Arc::clone(&last_hour))),
-            service: Arc::new(service),
-            last_hour,
             requests: register(registry, "http_requests", "Requests answered", Family::default()),
             request_seconds: register(
                 registry,
@@ -79,6 +75,9 @@ impl Metrics {
                 "Connections that are open",
                 Gauge::default(),
             ),
+            service: Arc::new(ServiceMetrics::register(registry, rejections)),
+            refine: Arc::new(RefineMetrics::register(registry, Arc::clone(&last_hour))),
+            last_hour,
             levels: Gauges::new(registry),
             registry: all,
         }
@@ -101,7 +100,7 @@ impl Metrics {
     }
 
     /// Counts a rejection.
-    pub fn refused(&self, reason: RefusedFor) {
+    pub fn refused(&self, reason: Rejection) {
         self.service.refusals.count(reason);
     }
 

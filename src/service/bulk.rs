@@ -9,11 +9,11 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
 
-use super::{Caller, NewImage, Service, ServiceError};
+use super::{NewImage, Principal, Service, ServiceError};
 use whereabouts_api::{ErrorKind, ImageMeta};
 use whereabouts_core::{ImageId, MapName};
 use whereabouts_store::Added;
-use whereabouts_vision::{Class, Demand};
+use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 /// Bounds of bulk uploads.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
@@ -50,7 +50,7 @@ impl Service {
     pub async fn add_images<E, O>(
         &self,
         map: &MapName,
-        caller: &Caller,
+        caller: &Principal,
         images: impl Stream<Item = Result<Result<BulkImage, ServiceError>, E>> + Send,
         until: impl Future<Output = O> + Send,
     ) -> Result<Vec<BulkResult>, E> {
@@ -112,7 +112,7 @@ impl Service {
     /// Stores an image when there is room for it.
     async fn add_patiently(&self, map: &MapName, image: BulkImage) -> Result<Added, ServiceError> {
         const LONGEST: Duration = Duration::from_secs(1);
-        let demand = Demand { class: Class::Index, deadline: None };
+        let demand = AdmissionRequest { class: WorkClass::Index, deadline: None };
         let until = Instant::now() + Duration::from_secs(self.settings.bulk.patience_s);
         loop {
             let new = NewImage { bytes: image.bytes.clone(), meta: image.meta.clone(), demand };

@@ -7,10 +7,10 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::{Service, ServiceError};
-use whereabouts_core::confidence::{COMPARED, Chance};
+use whereabouts_core::confidence::{COMPARED, NullDistribution};
 use whereabouts_core::{Calibration, Evidence, Map};
 use whereabouts_refine::{RefineError, Refiner};
-use whereabouts_store::{IndexState, LookAlikes};
+use whereabouts_store::{HardNegatives, IndexState};
 
 /// How often it is looked for maps that have changed.
 const LOOK: Duration = Duration::from_millis(500);
@@ -85,7 +85,7 @@ impl Service {
         let settings = self.settings.calibration;
         let IndexState { images, .. } = self.maps.index_state(map).await?;
         let asked = self.maps.look_alikes(map, settings, COMPARED.max(settings.candidates)).await?;
-        let similarity = Chance::from(values(asked.iter().filter_map(|asked| {
+        let similarity = NullDistribution::from(values(asked.iter().filter_map(|asked| {
             Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
         })));
         let mut measured = Calibration { images, settings, similarity, ..Calibration::default() };
@@ -97,7 +97,7 @@ impl Service {
                 asked.others.truncate(settings.candidates);
                 found.extend(chance(refiner, map, &asked).await);
             }
-            measured.agreement = Chance::from(values(found.into_iter()));
+            measured.agreement = NullDistribution::from(values(found.into_iter()));
         }
         measured.complete = true;
         tracing::info!(
@@ -117,14 +117,14 @@ fn values(evidence: impl Iterator<Item = Evidence>) -> Vec<f32> {
 }
 
 /// What speaks for the first of these, which are all wrong. Jobs go first.
-async fn chance(refiner: &dyn Refiner, map: &Map, asked: &LookAlikes) -> Option<Evidence> {
+async fn chance(refiner: &dyn Refiner, map: &Map, asked: &HardNegatives) -> Option<Evidence> {
     for _ in 0..PAUSES {
         match refiner.chance(map, asked).await {
             Ok(evidence) => return evidence,
-            Err(RefineError::Passing(_) | RefineError::Later { .. }) => {
+            Err(RefineError::Transient(_) | RefineError::Deferred { .. }) => {
                 tokio::time::sleep(PAUSE).await;
             }
-            Err(RefineError::Hopeless(_)) => return None,
+            Err(RefineError::Permanent(_)) => return None,
         }
     }
     None

@@ -6,11 +6,11 @@ use whereabouts_api::ErrorKind;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use super::{Caller, Deadline, Service, ServiceError};
+use super::{Deadline, Principal, Service, ServiceError};
 
 /// Whether requests are answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Phase {
+pub enum ReadinessPhase {
     /// Not yet.
     Starting,
     /// They are.
@@ -21,18 +21,18 @@ pub enum Phase {
 
 /// What stands between the callers and a service; clones share it.
 #[derive(Clone)]
-pub struct Door {
+pub struct Readiness {
     service: Arc<OnceLock<Arc<Service>>>,
-    phase: watch::Sender<Phase>,
+    phase: watch::Sender<ReadinessPhase>,
     draining: CancellationToken,
 }
 
-impl Default for Door {
+impl Default for Readiness {
     /// A door without a service behind it.
     fn default() -> Self {
         Self {
             service: Arc::default(),
-            phase: watch::Sender::new(Phase::Starting),
+            phase: watch::Sender::new(ReadinessPhase::Starting),
             draining: CancellationToken::new(),
         }
     }
@@ -43,8 +43,8 @@ impl Service {
     /// wants no more. Says why.
     pub fn over(
         self: &Arc<Self>,
-        door: &Door,
-        caller: Caller,
+        door: &Readiness,
+        caller: Principal,
         deadline: Deadline,
     ) -> impl Future<Output = ServiceError> + Send + use<> {
         let (service, draining) = (Arc::clone(self), door.draining());
@@ -69,17 +69,17 @@ impl Service {
     }
 }
 
-impl Door {
+impl Readiness {
     /// Lets callers in.
     pub fn open(&self, service: Arc<Service>) {
         if self.service.set(service).is_ok() {
-            self.phase.send_replace(Phase::Open);
+            self.phase.send_replace(ReadinessPhase::Open);
         }
     }
 
     /// Says from now on that the service is not ready, while it answers what it has begun. Streams end.
     pub fn drain(&self) {
-        self.phase.send_replace(Phase::Draining);
+        self.phase.send_replace(ReadinessPhase::Draining);
         self.draining.cancel();
     }
 
@@ -89,7 +89,7 @@ impl Door {
     }
 
     /// The phase, and every change of it.
-    pub fn phases(&self) -> watch::Receiver<Phase> {
+    pub fn phases(&self) -> watch::Receiver<ReadinessPhase> {
         self.phase.subscribe()
     }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 use whereabouts_api::ErrorKind;
 use whereabouts_core::{InvalidName, PoseError};
 use whereabouts_store::StoreError;
-use whereabouts_vision::{ExtractError, Overloaded, Refusal, Refused};
+use whereabouts_vision::{ExtractError, Overloaded, RejectReason, Rejected};
 
 /// What went wrong, in a sentence for the caller.
 #[derive(Debug, thiserror::Error)]
@@ -66,11 +66,11 @@ impl From<Overloaded> for ServiceError {
     }
 }
 
-impl From<Refused> for ServiceError {
-    fn from(refused: Refused) -> Self {
+impl From<Rejected> for ServiceError {
+    fn from(refused: Rejected) -> Self {
         let advice = match refused.reason {
-            Refusal::DeadlineTooSoon => "allow more time, or try again after Retry-After",
-            Refusal::QueueFull | Refusal::WaitTooLong => "try again after Retry-After",
+            RejectReason::DeadlineTooSoon => "allow more time, or try again after Retry-After",
+            RejectReason::QueueFull | RejectReason::WaitTooLong => "try again after Retry-After",
         };
         Self::new(ErrorKind::Overloaded, format!("{refused}; {advice}"))
             .retry_after(refused.retry_after)

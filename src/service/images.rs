@@ -11,7 +11,7 @@ use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
 use whereabouts_core::{DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose};
 use whereabouts_store::{Added, StoreError};
 use whereabouts_vision::{
-    Class, Demand, ExtractError, Extraction, Extractor, PoolError, decode, preprocess,
+    AdmissionRequest, ExtractError, Extraction, Extractor, PoolError, WorkClass, decode, preprocess,
 };
 
 /// An image to add.
@@ -22,7 +22,7 @@ pub struct NewImage {
     /// What the caller says about it.
     pub meta: ImageMeta,
     /// How urgent it is.
-    pub demand: Demand,
+    pub demand: AdmissionRequest,
 }
 
 impl Service {
@@ -113,7 +113,8 @@ impl Service {
             return Err(ServiceError::unprocessable("max_edge must be between 16 and 4096 pixels"));
         }
         let limits = self.models.limits();
-        let permit = self.admit(Demand { class: Class::Index, deadline: None }).await?;
+        let permit =
+            self.admit(AdmissionRequest { class: WorkClass::Index, deadline: None }).await?;
         let jpeg = self
             .on_pool(move || {
                 let _permit = permit;
@@ -142,7 +143,7 @@ impl Service {
         extractor: &Arc<Extractor>,
         bytes: Bytes,
         kind: DescriptorKind,
-        demand: Demand,
+        demand: AdmissionRequest,
     ) -> Result<Extraction, ServiceError> {
         let permit = Arc::new(self.admit(demand).await?);
         let gone = CancellationToken::new();

@@ -95,8 +95,8 @@ impl Service {
         let regions = match refiner {
             Some(refiner) => {
                 refiner.regions(&record, image).await.map_err(|error| match error {
-                    RefineError::Hopeless(why) => ServiceError::not_found(why),
-                    RefineError::Passing(why) | RefineError::Later { why, .. } => {
+                    RefineError::Permanent(why) => ServiceError::not_found(why),
+                    RefineError::Transient(why) | RefineError::Deferred { why, .. } => {
                         ServiceError::new(ErrorKind::Unavailable, why)
                     }
                 })?

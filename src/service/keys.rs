@@ -32,35 +32,35 @@ const MOST_NAME_BYTES: usize = 100;
 
 /// Who asks.
 #[derive(Debug, Clone)]
-pub enum Caller {
+pub enum Principal {
     /// Keys are off: everybody may do everything.
-    Anybody,
+    Anonymous,
     /// The holder of a key.
-    Holder(Arc<ApiKey>),
+    ApiKey(Arc<ApiKey>),
 }
 
-impl Caller {
+impl Principal {
     /// A name for the caller, under which what is kept for one is not seen by another.
     pub fn scope(&self) -> &str {
         match self {
-            Self::Anybody => "-",
-            Self::Holder(key) => &key.id,
+            Self::Anonymous => "-",
+            Self::ApiKey(key) => &key.id,
         }
     }
 
     /// Whether the caller may use that map.
     pub fn may_use(&self, map: &MapName) -> bool {
         match self {
-            Self::Anybody => true,
-            Self::Holder(key) => key.may_use(map),
+            Self::Anonymous => true,
+            Self::ApiKey(key) => key.may_use(map),
         }
     }
 
     /// Whether the caller may use all maps.
     pub fn may_use_all(&self) -> bool {
         match self {
-            Self::Anybody => true,
-            Self::Holder(key) => key.maps.is_empty(),
+            Self::Anonymous => true,
+            Self::ApiKey(key) => key.maps.is_empty(),
         }
     }
 
@@ -178,8 +178,8 @@ impl Keys {
     }
 
     /// Returns when a caller may ask no more: the key was revoked, or has expired.
-    pub async fn ended(&self, caller: Caller) {
-        let Caller::Holder(key) = caller else { return std::future::pending().await };
+    pub async fn ended(&self, caller: Principal) {
+        let Principal::ApiKey(key) = caller else { return std::future::pending().await };
         let mut revoked = self.revoked.subscribe();
         loop {
             let now = Timestamp::now();

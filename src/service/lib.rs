@@ -33,26 +33,26 @@ use std::sync::Arc;
 use uuid::Uuid;
 
 pub use self::bulk::{BulkImage, BulkResult, BulkSettings};
-pub use self::door::{Door, Phase};
+pub use self::door::{Readiness, ReadinessPhase};
 pub use self::error::ServiceError;
 pub use self::events::{AnyJobEvent, JobEvent};
 pub use self::images::NewImage;
 pub use self::jobs::{search_text, uuid};
-pub use self::keys::{Caller, Keys};
+pub use self::keys::{Keys, Principal};
 pub use self::limits::{Allowance, Allowances, Limits};
 pub use self::localize::{Deadline, LocalizeRequest, Retrieved};
 pub use self::metrics::{AttemptOutcome, ServiceMetrics};
-pub use self::once::{Once, OnceSettings};
+pub use self::once::{IdempotencySettings, Once};
 pub use self::recall::RecallCheck;
-pub use self::refused::{Refusals, RefusedFor};
+pub use self::refused::{Rejection, Rejections};
 pub use self::reindex::Reindexes;
 pub use self::retention::{Janitor, RetentionSettings};
 pub use self::track::{TrackSettings, TrackStep, Tracks};
 pub use self::webhooks::{Dispatcher, WebhookSettings, Webhooks};
 use whereabouts_core::CalibrationSettings;
-use whereabouts_refine::{DenseCache, JobPace, Refiner};
+use whereabouts_refine::{DenseCache, JobServiceTime, Refiner};
 use whereabouts_store::{
-    AnswerStore, BlobStore, DraftStore, ExportStore, JobStore, MapStore, Retention, UsageStore,
+    BlobStore, DraftStore, ExportStore, IdempotencyStore, JobStore, MapStore, Retention, UsageStore,
 };
 use whereabouts_vision::{Admission, CpuPool, LoadedModels};
 
@@ -78,7 +78,7 @@ pub struct ServiceSettings {
     /// For how many days it is known what was spent.
     pub usage_days: u32,
     /// What is kept of requests that may be sent again.
-    pub once: OnceSettings,
+    pub once: IdempotencySettings,
     /// Bounds of bulk uploads.
     pub bulk: BulkSettings,
 }
@@ -104,7 +104,7 @@ pub struct Service {
     /// Jobs.
     pub jobs: Arc<dyn JobStore>,
     /// First answers to requests that may be sent again.
-    pub answers: Arc<dyn AnswerStore>,
+    pub answers: Arc<dyn IdempotencyStore>,
     /// Tells this process from those before it.
     pub process: Uuid,
     /// What calls to models outside have cost.
@@ -122,7 +122,7 @@ pub struct Service {
     /// Where pictures are decoded.
     pub pool: CpuPool,
     /// How fast jobs are done.
-    pub job_pace: JobPace,
+    pub job_pace: JobServiceTime,
     /// Who refines, if anybody.
     pub refiner: Option<Arc<dyn Refiner>>,
     /// Dense features that a job will need soon.

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use super::{Caller, ServiceError};
+use super::{Principal, ServiceError};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::ApiKey;
-use whereabouts_store::{Buckets, Draw, Drawn};
+use whereabouts_store::{Buckets, TokenGrant, TokenRequest};
 
 /// A bucket of a key fills up in this time.
 const WINDOW: Duration = Duration::from_secs(60);
@@ -49,7 +49,7 @@ impl Limits {
         if draws.iter().all(|draw| draw.per_minute == 0.0) {
             return (Allowances::default(), Ok(()));
         }
-        let Drawn { taken, left } = match self.0.draw(&key.id, draws).await {
+        let TokenGrant { taken, left } = match self.0.draw(&key.id, draws).await {
             Ok(drawn) => drawn,
             Err(error) => return (Allowances::default(), Err(error.into())),
         };
@@ -83,10 +83,10 @@ impl Limits {
     }
 
     /// Takes one of several things that came in one request from the requests left to a key.
-    pub async fn take_one_more(&self, caller: &Caller) -> Result<(), ServiceError> {
+    pub async fn take_one_more(&self, caller: &Principal) -> Result<(), ServiceError> {
         match caller {
-            Caller::Anybody => Ok(()),
-            Caller::Holder(key) => self.take_request(key).await.1,
+            Principal::Anonymous => Ok(()),
+            Principal::ApiKey(key) => self.take_request(key).await.1,
         }
     }
 
@@ -95,7 +95,7 @@ impl Limits {
         if key.limits.bytes_per_minute.is_none() || count == 0 {
             return;
         }
-        let requests = Draw { needed: f64::MIN, taken: 0.0, ..requests(key) };
+        let requests = TokenRequest { needed: f64::MIN, taken: 0.0, ..requests(key) };
         if let Err(error) =
             self.0.draw(&key.id, [requests, bytes(key, f64::MIN, count as f64)]).await
         {
@@ -104,8 +104,8 @@ impl Limits {
     }
 }
 
-fn requests(key: &ApiKey) -> Draw {
-    key.limits.requests_per_minute.map_or(Draw::UNLIMITED, |limit| Draw {
+fn requests(key: &ApiKey) -> TokenRequest {
+    key.limits.requests_per_minute.map_or(TokenRequest::UNLIMITED, |limit| TokenRequest {
         per_minute: f64::from(limit),
         needed: 1.0,
         taken: 1.0,
@@ -113,9 +113,9 @@ fn requests(key: &ApiKey) -> Draw {
 }
 
 /// A body may be larger than what is left: then there is less than nothing for a while.
-fn bytes(key: &ApiKey, needed: f64, taken: f64) -> Draw {
-    let bytes = |limit| Draw { per_minute: limit as f64, needed, taken };
-    key.limits.bytes_per_minute.map_or(Draw::UNLIMITED, bytes)
+fn bytes(key: &ApiKey, needed: f64, taken: f64) -> TokenRequest {
+    let bytes = |limit| TokenRequest { per_minute: limit as f64, needed, taken };
+    key.limits.bytes_per_minute.map_or(TokenRequest::UNLIMITED, bytes)
 }
 
 fn allowance(limit: f64, left: f64) -> Allowance {

@@ -15,7 +15,7 @@ use whereabouts_core::{Calibration, Candidate, Digest, Estimate, Map, MapName, P
 use whereabouts_index::SearchMode;
 use whereabouts_store::StoreError;
 use whereabouts_telemetry::traces;
-use whereabouts_vision::{Class, Demand, Extraction};
+use whereabouts_vision::{AdmissionRequest, Extraction, WorkClass};
 
 /// When a caller no longer wants the answer, if it said so.
 #[derive(Debug, Clone, Copy, Default)]
@@ -70,7 +70,7 @@ impl Service {
             // Before any work is done.
             self.check_submission().await?;
         }
-        let demand = Demand { class: Class::Localize, deadline: request.deadline };
+        let demand = AdmissionRequest { class: WorkClass::Localize, deadline: request.deadline };
         let compared = if refined { self.settings.candidates } else { 0 };
         let followed = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
         let wanted = k.max(compared).max(COMPARED).max(followed);
@@ -145,7 +145,7 @@ impl Service {
         frame: &Bytes,
         k: usize,
         mode: SearchMode,
-        demand: Demand,
+        demand: AdmissionRequest,
     ) -> Result<Retrieved, ServiceError> {
         let mut left = SUPERSEDED;
         loop {

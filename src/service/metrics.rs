@@ -11,13 +11,13 @@ use whereabouts_store::RemovedJobs;
 use whereabouts_telemetry::metrics::{Registry, latency, register};
 use whereabouts_vision::Extraction;
 
-use crate::refused::Refusals;
+use crate::refused::Rejections;
 
 /// Metric families of the use cases.
 #[derive(Debug)]
 pub struct ServiceMetrics {
     /// Rejections, by reason.
-    pub refusals: Arc<Refusals>,
+    pub refusals: Arc<Rejections>,
     stage_seconds: Family<StageLabels, Histogram, fn() -> Histogram>,
     batch_pictures: Histogram,
     neighbours_checked: Family<CheckLabels, Counter>,
@@ -61,7 +61,7 @@ struct OutcomeLabels {
 
 impl ServiceMetrics {
     /// Registers the families; all counts are zero.
-    pub fn register(registry: &mut Registry, refusals: Arc<Refusals>) -> Self {
+    pub fn register(registry: &mut Registry, refusals: Arc<Rejections>) -> Self {
         Self {
             refusals,
             stage_seconds: register(

@@ -27,7 +27,7 @@ impl Service {
             ),
             error => unusable(&map.model, error),
         })?;
-        match contradiction(&map, &extractor) {
+        match validate(&map, &extractor) {
             Some(detail) => Err(ServiceError::new(ErrorKind::Conflict, detail)),
             None => Ok((map, extractor)),
         }
@@ -67,7 +67,7 @@ pub(super) fn dimension(manifest: &Manifest, kind: DescriptorKind) -> Result<usi
 }
 
 /// Why the model in memory cannot serve the map, if it cannot.
-fn contradiction(map: &Map, extractor: &Extractor) -> Option<String> {
+fn validate(map: &Map, extractor: &Extractor) -> Option<String> {
     if extractor.is_of(map) {
         return None;
     }

@@ -7,18 +7,18 @@ use jiff::Timestamp;
 use super::retention::before;
 use super::{Service, ServiceError};
 use whereabouts_core::Digest;
-use whereabouts_store::{FirstAnswer, KeptAnswer, Progress};
+use whereabouts_store::{IdempotencyRecord, Progress, StoredResponse};
 
 /// What answers to requests with a key are kept for.
 #[derive(Debug, Clone, Copy)]
-pub struct OnceSettings {
+pub struct IdempotencySettings {
     /// How long.
     pub keep: Duration,
     /// How many.
     pub most: usize,
 }
 
-impl OnceSettings {
+impl IdempotencySettings {
     /// Answers from before this moment count no more.
     pub fn since(&self, now: Timestamp) -> Timestamp {
         before(now, self.keep)
@@ -31,7 +31,7 @@ pub enum Once {
     /// It is the first: do it, and then say so with [`Service::end_once`].
     First,
     /// It was done: this was the answer.
-    Again(KeptAnswer),
+    Again(StoredResponse),
     /// It is being done.
     Running,
     /// The key was another request's.
@@ -44,12 +44,12 @@ impl Service {
         let now = Timestamp::now();
         let settings = self.settings.once;
         let progress = Progress::Running { process: self.process, job: None };
-        let reserved = FirstAnswer { fingerprint, at: now, progress };
+        let reserved = IdempotencyRecord { fingerprint, at: now, progress };
         Ok(match self.answers.reserve_answer(id, reserved, settings.since(now)).await? {
             None => Once::First,
             Some(known) if known.fingerprint != fingerprint => Once::Other,
-            Some(FirstAnswer { progress: Progress::Answered(kept), .. }) => Once::Again(kept),
-            Some(FirstAnswer { progress: Progress::Running { .. }, .. }) => Once::Running,
+            Some(IdempotencyRecord { progress: Progress::Answered(kept), .. }) => Once::Again(kept),
+            Some(IdempotencyRecord { progress: Progress::Running { .. }, .. }) => Once::Running,
         })
     }
 
@@ -59,13 +59,13 @@ impl Service {
         &self,
         id: &str,
         fingerprint: Digest,
-        kept: Option<KeptAnswer>,
+        kept: Option<StoredResponse>,
     ) -> Result<(), ServiceError> {
         match kept {
             None => self.answers.forget_answer(id).await?,
             Some(kept) => {
                 let progress = Progress::Answered(kept);
-                let answer = FirstAnswer { fingerprint, at: Timestamp::now(), progress };
+                let answer = IdempotencyRecord { fingerprint, at: Timestamp::now(), progress };
                 self.answers.keep_answer(id, answer).await?;
             }
         }

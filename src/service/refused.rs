@@ -4,11 +4,11 @@ use prometheus_client::encoding::EncodeLabelSet;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use whereabouts_telemetry::metrics::{Registry, register};
-use whereabouts_vision::Refusal;
+use whereabouts_vision::RejectReason;
 
 /// Why a request, a part of one or a connection was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum RefusedFor {
+pub enum Rejection {
     /// As many pictures wait for a permit as may.
     Queue,
     /// A picture would have waited for too long, or has.
@@ -27,7 +27,7 @@ pub enum RefusedFor {
     Connections,
 }
 
-impl RefusedFor {
+impl Rejection {
     /// Its label.
     fn as_str(self) -> &'static str {
         match self {
@@ -43,12 +43,12 @@ impl RefusedFor {
     }
 }
 
-impl From<Refusal> for RefusedFor {
-    fn from(refusal: Refusal) -> Self {
+impl From<RejectReason> for Rejection {
+    fn from(refusal: RejectReason) -> Self {
         match refusal {
-            Refusal::QueueFull => Self::Queue,
-            Refusal::WaitTooLong => Self::Wait,
-            Refusal::DeadlineTooSoon => Self::Deadline,
+            RejectReason::QueueFull => Self::Queue,
+            RejectReason::WaitTooLong => Self::Wait,
+            RejectReason::DeadlineTooSoon => Self::Deadline,
         }
     }
 }
@@ -60,9 +60,9 @@ struct RefusedLabels {
 
 /// The metric family of rejections, shared by the service and the server.
 #[derive(Debug)]
-pub struct Refusals(Family<RefusedLabels, Counter>);
+pub struct Rejections(Family<RefusedLabels, Counter>);
 
-impl Refusals {
+impl Rejections {
     /// Registers the family.
     pub fn register(registry: &mut Registry) -> Self {
         Self(register(
@@ -74,7 +74,7 @@ impl Refusals {
     }
 
     /// Counts one rejection.
-    pub fn count(&self, reason: RefusedFor) {
+    pub fn count(&self, reason: Rejection) {
         self.0.get_or_create(&RefusedLabels { reason: reason.as_str() }).inc();
     }
 }

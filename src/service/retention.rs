@@ -6,10 +6,10 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use tokio_util::sync::CancellationToken;
 
-use super::OnceSettings;
+use super::IdempotencySettings;
 use crate::ServiceMetrics;
 use whereabouts_core::utc_day;
-use whereabouts_store::{AnswerStore, KeepJobs, RemovedJobs, Retention, StoreError};
+use whereabouts_store::{IdempotencyStore, KeepJobs, RemovedJobs, Retention, StoreError};
 
 /// How long what is kept, and how it is removed.
 #[derive(Debug, Clone, Copy)]
@@ -27,7 +27,7 @@ pub struct RetentionSettings {
     /// For how many days it is known what was spent.
     pub usage_days: u32,
     /// Which answers to requests that may be sent again are kept.
-    pub once: OnceSettings,
+    pub once: IdempotencySettings,
 }
 
 /// Removes jobs that have ended, with their queries and frames, and old accounts.
@@ -35,7 +35,7 @@ pub struct Janitor {
     /// Where they are.
     pub store: Arc<dyn Retention>,
     /// Where answers are that may be given again.
-    pub answers: Arc<dyn AnswerStore>,
+    pub answers: Arc<dyn IdempotencyStore>,
     /// What is counted.
     pub metrics: Arc<ServiceMetrics>,
     /// What is kept.

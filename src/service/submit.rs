@@ -8,7 +8,7 @@ use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::{Service, ServiceError};
-use crate::RefusedFor;
+use crate::Rejection;
 use whereabouts_api::{ErrorKind, NoJob, NoJobReason};
 use whereabouts_core::{
     Candidate, DenseFeatures, Descriptor, Digest, Job, Map, MediaType, Priority,
@@ -125,7 +125,7 @@ impl Service {
     }
 
     fn counted_job(&self, why: NoJob) -> NoJob {
-        self.metrics.refusals.count(RefusedFor::Jobs);
+        self.metrics.refusals.count(Rejection::Jobs);
         why
     }
 

@@ -9,7 +9,7 @@ use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, Image, ImageId, Map, MapName, MediaType};
 use whereabouts_store::{Added, StoreError};
-use whereabouts_vision::Demand;
+use whereabouts_vision::AdmissionRequest;
 
 /// The most numbers in a descriptor that comes from elsewhere.
 const MAX_DIM: usize = 1 << 16;
@@ -78,7 +78,7 @@ impl Service {
         name: &MapName,
         from: ImportedImage,
         bytes: Bytes,
-        demand: Demand,
+        demand: AdmissionRequest,
     ) -> Result<Added, ServiceError> {
         let ImportedImage { map: source, image: ExportedImage { image, descriptor } } = from;
         let map = self.known_map(name).await?;

@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 use uuid::Uuid;
 
-use super::{FirstAnswer, JobRecord, Progress, Release, Step, StoreError, StoredDelivery};
+use super::{IdempotencyRecord, JobRecord, Progress, Release, Step, StoreError, StoredDelivery};
 use whereabouts_core::{
     Attempt, Delivery, DeliveryState, Descriptor, Image, Job, JobState, Map, Message, Priority,
     StoredWebhook, Then, Usage, WebhookEvent,
@@ -68,7 +68,7 @@ impl JobRecord {
     }
 }
 
-impl FirstAnswer {
+impl IdempotencyRecord {
     /// What takes the place of `known`, which counts no more: what was queued for the same request is queued.
     pub(super) fn in_place_of(mut self, known: &Self) -> Self {
         if let (Progress::Running { job, .. }, Progress::Running { job: Some(queued), .. }) =

@@ -10,7 +10,9 @@ pub mod embedded;
 mod jobs;
 mod limits;
 mod listing;
+#[cfg(feature = "postgres")]
 mod objects;
+#[cfg(feature = "postgres")]
 pub mod postgres;
 mod webhooks;
 
@@ -27,8 +29,9 @@ use uuid::Uuid;
 
 pub use self::descriptions::DescriptionCache;
 pub use self::jobs::{Claim, JobRecord, JobStore, Query, Release, Step};
-pub use self::limits::{Buckets, Draw, Drawn, SharedLimits};
+pub use self::limits::{Buckets, SharedLimits, TokenGrant, TokenRequest};
 pub use self::listing::{JobFilter, JobList};
+#[cfg(feature = "postgres")]
 pub use self::objects::{ObjectSettings, Objects};
 pub use self::webhooks::{ForgottenDeliveries, KeepDeliveries, StoredDelivery, WebhookStore};
 use whereabouts_core::ExportedImage;
@@ -87,7 +90,7 @@ pub trait Store:
     + JobStore
     + UsageStore
     + KeyStore
-    + AnswerStore
+    + IdempotencyStore
     + WebhookStore
     + DescriptionCache
     + Retention
@@ -102,7 +105,7 @@ impl<T> Store for T where
         + JobStore
         + UsageStore
         + KeyStore
-        + AnswerStore
+        + IdempotencyStore
         + WebhookStore
         + DescriptionCache
         + Retention
@@ -183,7 +186,7 @@ pub trait MapStore: Send + Sync {
         map: &Map,
         settings: CalibrationSettings,
         k: usize,
-    ) -> Result<Vec<LookAlikes>, StoreError>;
+    ) -> Result<Vec<HardNegatives>, StoreError>;
     /// What was last measured in this revision of the map, while it is the one that serves. It is
     /// derived: it may be lost.
     async fn calibration(&self, map: &Map) -> Result<Option<Arc<Calibration>>, StoreError>;
@@ -193,7 +196,7 @@ pub trait MapStore: Send + Sync {
 
 /// An image as if it were a frame of another place.
 #[derive(Debug, Clone, PartialEq)]
-pub struct LookAlikes {
+pub struct HardNegatives {
     /// The image.
     pub image_id: ImageId,
     /// Images of other places, the most similar first.
@@ -287,7 +290,7 @@ pub trait KeyStore: Send + Sync {
 
 /// What became of a request that may be sent again.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct FirstAnswer {
+pub struct IdempotencyRecord {
     /// Tells it from another request.
     pub fingerprint: Digest,
     /// When it was begun, or answered.
@@ -309,12 +312,12 @@ pub enum Progress {
         job: Option<Uuid>,
     },
     /// It was done.
-    Answered(KeptAnswer),
+    Answered(StoredResponse),
 }
 
 /// An answer that is given again.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct KeptAnswer {
+pub struct StoredResponse {
     /// The HTTP status.
     pub status: u16,
     /// The media type of the body.
@@ -325,18 +328,18 @@ pub struct KeptAnswer {
 
 /// First answers to requests that may be sent again.
 #[async_trait]
-pub trait AnswerStore: Send + Sync {
+pub trait IdempotencyStore: Send + Sync {
     /// What is known of the request with this id; or, if that is nothing, is older than `since`, or is of a
     /// process that has ended, `None`, and from now on it is `reserved`, together with the job that that
     /// process queued for it.
     async fn reserve_answer(
         &self,
         id: &str,
-        reserved: FirstAnswer,
+        reserved: IdempotencyRecord,
         since: Timestamp,
-    ) -> Result<Option<FirstAnswer>, StoreError>;
+    ) -> Result<Option<IdempotencyRecord>, StoreError>;
     /// Keeps the answer.
-    async fn keep_answer(&self, id: &str, answer: FirstAnswer) -> Result<(), StoreError>;
+    async fn keep_answer(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError>;
     /// Forgets that there was such a request.
     async fn forget_answer(&self, id: &str) -> Result<(), StoreError>;
     /// Forgets those from before that moment, and the oldest of those that are more than `most`. Returns

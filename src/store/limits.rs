@@ -14,7 +14,7 @@ use whereabouts_core::Spent;
 
 /// What is wanted of a bucket, which fills steadily up to a minute's worth. What it holds may go below zero.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Draw {
+pub struct TokenRequest {
     /// A minute's worth; 0: there is no limit.
     pub per_minute: f64,
     /// So much must be in it.
@@ -23,14 +23,14 @@ pub struct Draw {
     pub taken: f64,
 }
 
-impl Draw {
+impl TokenRequest {
     /// Of a bucket without a limit.
     pub const UNLIMITED: Self = Self { per_minute: 0.0, needed: f64::MIN, taken: 0.0 };
 }
 
 /// What two buckets hold after a draw.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Drawn {
+pub struct TokenGrant {
     /// Whether both held enough, so that something was taken from both; else from neither.
     pub taken: bool,
     /// What is left in each.
@@ -41,7 +41,7 @@ pub struct Drawn {
 #[async_trait]
 pub trait SharedLimits: Send + Sync {
     /// Draws from the two buckets of that name; full ones, if there are none yet.
-    async fn draw(&self, name: &str, draws: [Draw; 2]) -> Result<Drawn, StoreError>;
+    async fn draw(&self, name: &str, draws: [TokenRequest; 2]) -> Result<TokenGrant, StoreError>;
     /// Sets aside what a call may cost at the most on that day; `false` if what was spent and set aside would
     /// then pass the limit, of which 0 is none. What is spent is taken from it by
     /// [`UsageStore::add_usage`](super::UsageStore::add_usage).
@@ -87,7 +87,11 @@ impl Buckets {
     }
 
     /// See [`SharedLimits::draw`].
-    pub async fn draw(&self, name: &str, draws: [Draw; 2]) -> Result<Drawn, StoreError> {
+    pub async fn draw(
+        &self,
+        name: &str,
+        draws: [TokenRequest; 2],
+    ) -> Result<TokenGrant, StoreError> {
         match self {
             Self::Shared(shared) => shared.draw(name, draws).await,
             Self::Here(levels) => {
@@ -102,10 +106,10 @@ impl Buckets {
 }
 
 impl Levels {
-    fn draw(&mut self, draws: [Draw; 2], now: Instant) -> Drawn {
+    fn draw(&mut self, draws: [TokenRequest; 2], now: Instant) -> TokenGrant {
         let minutes = (now - self.at).as_secs_f64() / 60.0;
         let filled = |index: usize| {
-            let Draw { per_minute, .. } = draws[index];
+            let TokenRequest { per_minute, .. } = draws[index];
             (self.left[index] + minutes * per_minute).min(per_minute)
         };
         let filled = [filled(0), filled(1)];
@@ -117,6 +121,6 @@ impl Levels {
             false => filled,
         };
         *self = Self { left, at: now };
-        Drawn { taken, left }
+        TokenGrant { taken, left }
     }
 }

@@ -15,7 +15,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, fmt};
 
 use self::recent::Listener;
-pub use self::recent::{LastHour, Minute, Trouble, Troubles};
+pub use self::recent::{HourlyStats, LogIssue, LogIssues, Minute};
 pub use self::traces::{TraceSettings, Traces};
 
 /// `[log]`
@@ -42,7 +42,7 @@ pub enum LogFormat {
 
 /// Starts logging to standard error and tracing, and gives the last warnings and errors, and what sends the
 /// traces. A second call changes nothing.
-pub fn init(log: &LogSettings, traces: &TraceSettings) -> Result<(Arc<Troubles>, Traces), String> {
+pub fn init(log: &LogSettings, traces: &TraceSettings) -> Result<(Arc<LogIssues>, Traces), String> {
     let filter = EnvFilter::try_new(&log.filter)
         .map_err(|error| format!("log.filter cannot be read: {error}"))?;
     let pretty = match log.format {
@@ -55,7 +55,7 @@ pub fn init(log: &LogSettings, traces: &TraceSettings) -> Result<(Arc<Troubles>,
         true => lines.with_target(false).boxed(),
         false => lines.json().flatten_event(true).boxed(),
     };
-    let troubles = Arc::new(Troubles::default());
+    let troubles = Arc::new(LogIssues::default());
     let listener = Listener(Arc::clone(&troubles)).with_filter(LevelFilter::WARN);
     let traces = Traces::start(traces)?;
     let no_span_of_a_trace = filter_fn(|about| !(about.is_span() && traces::is_ours(about)));

@@ -52,7 +52,8 @@ pub struct Minute {
 
 /// Something that the log warned of, or an error in it.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
-pub struct Trouble {
+#[schema(as = Trouble)]
+pub struct LogIssue {
     /// When it last happened.
     pub at: Timestamp,
     /// Which part of the server said so.
@@ -66,7 +67,7 @@ pub struct Trouble {
 
 /// The last hour. Minutes in which nothing was done are left out.
 #[derive(Debug, Default)]
-pub struct LastHour(Mutex<VecDeque<Counts>>);
+pub struct HourlyStats(Mutex<VecDeque<Counts>>);
 
 #[derive(Debug)]
 struct Counts {
@@ -121,7 +122,7 @@ impl Counts {
     }
 }
 
-impl LastHour {
+impl HourlyStats {
     /// Counts an answer; of a frame that was localized, with the time it took.
     pub fn answered(&self, now: Timestamp, status: u16, frame: Option<Duration>) {
         self.count(now, |counts| {
@@ -172,11 +173,11 @@ impl LastHour {
 
 /// The last warnings and errors of the log, the newest first; the same one again is counted.
 #[derive(Debug, Default)]
-pub struct Troubles(Mutex<VecDeque<Trouble>>);
+pub struct LogIssues(Mutex<VecDeque<LogIssue>>);
 
-impl Troubles {
+impl LogIssues {
     /// What there is.
-    pub fn last(&self) -> Vec<Trouble> {
+    pub fn last(&self) -> Vec<LogIssue> {
         self.lock().iter().cloned().collect()
     }
 
@@ -185,21 +186,21 @@ impl Troubles {
         let known = troubles.iter().position(|of| of.place == place && of.detail == detail);
         let count = known.and_then(|at| troubles.remove(at)).map_or(0, |before| before.count);
         let at = Timestamp::now();
-        troubles.push_front(Trouble { at, place: place.to_owned(), detail, count: count + 1 });
+        troubles.push_front(LogIssue { at, place: place.to_owned(), detail, count: count + 1 });
         troubles.truncate(TROUBLES);
     }
 
-    fn lock(&self) -> MutexGuard<'_, VecDeque<Trouble>> {
+    fn lock(&self) -> MutexGuard<'_, VecDeque<LogIssue>> {
         self.0.lock()
     }
 }
 
-/// Listens to the log for [`Troubles`].
-pub(super) struct Listener(pub std::sync::Arc<Troubles>);
+/// Listens to the log for [`LogIssues`].
+pub(super) struct Listener(pub std::sync::Arc<LogIssues>);
 
 impl<S: Subscriber> Layer<S> for Listener {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
-        let mut words = Words::default();
+        let mut words = MessageVisitor::default();
         event.record(&mut words);
         let mut detail = words.message;
         detail.push_str(&words.fields);
@@ -213,12 +214,12 @@ impl<S: Subscriber> Layer<S> for Listener {
 
 /// An event in words.
 #[derive(Default)]
-struct Words {
+struct MessageVisitor {
     message: String,
     fields: String,
 }
 
-impl Visit for Words {
+impl Visit for MessageVisitor {
     fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
         // Writing to a string does not fail. What tells one request from another would make each trouble
         // another one.
@@ -240,7 +241,7 @@ mod tests {
 
     #[test]
     fn a_minute_knows_its_quantiles_and_an_hour_forgets() {
-        let hour = LastHour::default();
+        let hour = HourlyStats::default();
         for ms in 1..=100 {
             hour.answered(at(120 + ms % 60), 200, Some(Duration::from_millis(ms as u64)));
         }
@@ -268,7 +269,7 @@ mod tests {
 
     #[test]
     fn the_same_trouble_again_is_counted() {
-        let troubles = Troubles::default();
+        let troubles = LogIssues::default();
         for index in 0..60 {
             troubles.add("a", format!("{index}"));
         }

@@ -36,7 +36,7 @@ pub struct TraceSettings {
 
 impl TraceSettings {
     /// Why these settings cannot be used, if so.
-    pub fn contradiction(&self) -> Option<String> {
+    pub fn validate(&self) -> Option<String> {
         if !(0.0..=1.0).contains(&self.share) {
             return Some("traces.share must be from 0 to 1".into());
         }

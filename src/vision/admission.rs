@@ -27,7 +27,7 @@ pub struct AdmissionSettings {
 
 /// What a permit is for, the most urgent first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Class {
+pub enum WorkClass {
     /// A robot wants to know where it is.
     Localize,
     /// A map grows, or a person looks at it.
@@ -38,21 +38,21 @@ pub enum Class {
 
 /// What a permit is for, and until when it is of use.
 #[derive(Debug, Clone, Copy)]
-pub struct Demand {
+pub struct AdmissionRequest {
     /// What it is for.
-    pub class: Class,
+    pub class: WorkClass,
     /// When the caller no longer wants the answer.
     pub deadline: Option<Instant>,
 }
 
-impl Demand {
+impl AdmissionRequest {
     /// Of work that nobody waits for.
-    pub const BACKGROUND: Self = Self { class: Class::Background, deadline: None };
+    pub const BACKGROUND: Self = Self { class: WorkClass::Background, deadline: None };
 }
 
 /// Why there is no permit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Refusal {
+pub enum RejectReason {
     /// As many wait as may wait.
     QueueFull,
     /// It would wait longer than is allowed, or has.
@@ -64,27 +64,27 @@ pub enum Refusal {
 /// There is no permit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{}", self.sentence())]
-pub struct Refused {
+pub struct Rejected {
     /// Why not.
-    pub reason: Refusal,
+    pub reason: RejectReason,
     /// When what is in work and waits now should be done, at the pace of late, within bounds.
     pub retry_after: Duration,
     /// Pictures that wait.
     pub waiting: usize,
 }
 
-impl Refused {
+impl Rejected {
     fn sentence(&self) -> String {
         let Self { waiting, .. } = self;
         match self.reason {
-            Refusal::QueueFull => {
+            RejectReason::QueueFull => {
                 format!("{waiting} pictures wait already, the bound (image.queue)")
             }
-            Refusal::WaitTooLong => format!(
+            RejectReason::WaitTooLong => format!(
                 "{waiting} pictures wait already, and another would wait for longer than \
                  image.max_wait_ms allows"
             ),
-            Refusal::DeadlineTooSoon => format!(
+            RejectReason::DeadlineTooSoon => format!(
                 "{waiting} pictures wait already, so that the answer would come after the \
                  X-Deadline-Ms of the request"
             ),
@@ -123,13 +123,13 @@ pub struct Permit {
 #[derive(Debug)]
 struct Shared {
     settings: AdmissionSettings,
-    line: Mutex<Line>,
+    line: Mutex<WaitQueue>,
 }
 
 type Waiter = oneshot::Sender<Permit>;
 
 #[derive(Debug, Default)]
-struct Line {
+struct WaitQueue {
     in_use: usize,
     /// By class. Who has gone is still here until somebody looks.
     waiting: [VecDeque<Waiter>; 3],
@@ -149,27 +149,27 @@ impl Admission {
     }
 
     /// Whether a permit is to be had; who would be refused hears so before it sends its picture.
-    pub fn check(&self, demand: Demand) -> Result<(), Refused> {
+    pub fn check(&self, demand: AdmissionRequest) -> Result<(), Rejected> {
         self.shared.check(&mut self.shared.lock(), demand)
     }
 
     /// Waits for a permit. A future that is dropped waits no longer.
-    pub async fn enter(&self, demand: Demand) -> Result<Permit, Refused> {
+    pub async fn enter(&self, demand: AdmissionRequest) -> Result<Permit, Rejected> {
         let waiting = match self.shared.join(demand)? {
             Place::Inside(permit) => return Ok(permit),
             Place::Waiting(waiting) => waiting,
         };
         let refused = |reason| self.shared.refused(&self.shared.lock(), reason);
-        let admitted = if demand.class == Class::Background {
+        let admitted = if demand.class == WorkClass::Background {
             waiting.await
         } else {
             match tokio::time::timeout(self.shared.settings.max_wait, waiting).await {
                 Ok(admitted) => admitted,
-                Err(_) => return Err(refused(Refusal::WaitTooLong)),
+                Err(_) => return Err(refused(RejectReason::WaitTooLong)),
             }
         };
         // Nobody else drops the other end but to make room.
-        admitted.map_err(|_| refused(Refusal::QueueFull))
+        admitted.map_err(|_| refused(RejectReason::QueueFull))
     }
 
     /// The share of the queue that is taken, from 0 to 1.
@@ -216,7 +216,7 @@ impl Drop for Permit {
 }
 
 impl Shared {
-    fn lock(&self) -> MutexGuard<'_, Line> {
+    fn lock(&self) -> MutexGuard<'_, WaitQueue> {
         self.line.lock()
     }
 
@@ -224,52 +224,52 @@ impl Shared {
         Permit { shared: Arc::clone(self), since: Instant::now() }
     }
 
-    fn join(self: &Arc<Self>, demand: Demand) -> Result<Place, Refused> {
+    fn join(self: &Arc<Self>, demand: AdmissionRequest) -> Result<Place, Rejected> {
         let mut line = self.lock();
         self.check(&mut line, demand)?;
         if line.in_use < self.settings.permits {
             line.in_use += 1;
             return Ok(Place::Inside(self.permit()));
         }
-        if demand.class == Class::Localize && line.bounded() >= self.settings.queue {
+        if demand.class == WorkClass::Localize && line.bounded() >= self.settings.queue {
             // What is to be indexed makes room: the last of it, which has waited least.
-            line.waiting[Class::Index as usize].pop_back();
+            line.waiting[WorkClass::Index as usize].pop_back();
         }
         let (waiter, waiting) = oneshot::channel();
         line.waiting[demand.class as usize].push_back(waiter);
         Ok(Place::Waiting(waiting))
     }
 
-    fn check(&self, line: &mut Line, demand: Demand) -> Result<(), Refused> {
+    fn check(&self, line: &mut WaitQueue, demand: AdmissionRequest) -> Result<(), Rejected> {
         line.prune();
         // Whoever is alone is served, whatever took long before.
-        if demand.class == Class::Background || line.in_use < self.settings.permits {
+        if demand.class == WorkClass::Background || line.in_use < self.settings.permits {
             return Ok(());
         }
         let gives_way = match demand.class {
-            Class::Localize => line.waiting[Class::Index as usize].len(),
-            Class::Index | Class::Background => 0,
+            WorkClass::Localize => line.waiting[WorkClass::Index as usize].len(),
+            WorkClass::Index | WorkClass::Background => 0,
         };
         if line.bounded() - gives_way >= self.settings.queue {
-            return Err(self.refused(line, Refusal::QueueFull));
+            return Err(self.refused(line, RejectReason::QueueFull));
         }
         let first = line.waiting.iter().take(demand.class as usize + 1);
         let wait = line.pace.until_done(first.map(VecDeque::len).sum::<usize>() + 1);
         if wait > self.settings.max_wait {
-            return Err(self.refused(line, Refusal::WaitTooLong));
+            return Err(self.refused(line, RejectReason::WaitTooLong));
         }
         let answered = Instant::now() + wait + line.pace.one();
         if demand.deadline.is_some_and(|deadline| deadline < answered) {
-            return Err(self.refused(line, Refusal::DeadlineTooSoon));
+            return Err(self.refused(line, RejectReason::DeadlineTooSoon));
         }
         Ok(())
     }
 
-    fn refused(&self, line: &Line, reason: Refusal) -> Refused {
-        Refused { reason, retry_after: self.retry_after(line), waiting: line.bounded() }
+    fn refused(&self, line: &WaitQueue, reason: RejectReason) -> Rejected {
+        Rejected { reason, retry_after: self.retry_after(line), waiting: line.bounded() }
     }
 
-    fn retry_after(&self, line: &Line) -> Duration {
+    fn retry_after(&self, line: &WaitQueue) -> Duration {
         self.within_bounds(line.pace.until_done(line.bounded() + line.in_use))
     }
 
@@ -294,7 +294,7 @@ impl Shared {
     }
 }
 
-impl Line {
+impl WaitQueue {
     fn prune(&mut self) {
         for class in &mut self.waiting {
             class.retain(|waiter| !waiter.is_closed());
@@ -303,7 +303,7 @@ impl Line {
 
     /// Those whose number is bounded.
     fn bounded(&self) -> usize {
-        self.waiting[..Class::Background as usize].iter().map(VecDeque::len).sum()
+        self.waiting[..WorkClass::Background as usize].iter().map(VecDeque::len).sum()
     }
 }
 

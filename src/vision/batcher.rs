@@ -42,9 +42,9 @@ pub(super) struct Batcher {
 
 /// An answer that is to come. Dropping it takes the picture out of the queue.
 #[derive(Debug)]
-pub(super) struct Inferring(oneshot::Receiver<Result<RawOutput, InferenceError>>);
+pub(super) struct PendingInference(oneshot::Receiver<Result<RawOutput, InferenceError>>);
 
-impl Inferring {
+impl PendingInference {
     /// Blocks until the answer is there.
     pub fn wait(self) -> Result<RawOutput, InferenceError> {
         self.0.blocking_recv().map_err(|_| InferenceError::Stopped)?
@@ -114,7 +114,7 @@ impl Batcher {
     }
 
     /// Hands in one picture; blocks while the queue is full.
-    pub fn submit(&self, tensor: Tensor) -> Result<Inferring, InferenceError> {
+    pub fn submit(&self, tensor: Tensor) -> Result<PendingInference, InferenceError> {
         let (answer, inferring) = oneshot::channel();
         let mut state = self.queue.lock();
         while state.waiting.len() >= self.queue.layout.capacity() && !state.closed {
@@ -127,7 +127,7 @@ impl Batcher {
         state.waiting.push_back(Request { tensor, answer });
         drop(state);
         self.queue.work.notify_all();
-        Ok(Inferring(inferring))
+        Ok(PendingInference(inferring))
     }
 }
 

@@ -9,7 +9,7 @@ use super::batcher::{Batcher, Layout};
 use super::extractor::{ExtractError, Opened, sample};
 use super::manifest;
 use super::preprocess::Tensor;
-use super::provider::{self, Execution, LEAST_SIMILARITY, Wanted};
+use super::provider::{self, Execution, LEAST_SIMILARITY, ProviderPreference};
 use super::runtime::Assets;
 use super::session::{InferenceError, Model};
 
@@ -22,7 +22,7 @@ const GEMM_FLOP: f64 = 8.0 * 2.0 * 1024.0 * 1024.0 * 1024.0;
 #[derive(Debug, Clone)]
 pub struct BenchSettings {
     /// By whom and at which precision.
-    pub wanted: Wanted,
+    pub wanted: ProviderPreference,
     /// How threads are shared.
     pub layouts: Vec<Layout>,
     /// How long each figure is measured.
@@ -70,7 +70,11 @@ pub struct Bench {
 
 impl Bench {
     /// Finds and reads a model. Only the executions that `wanted` allows can be tried.
-    pub fn open(assets: &Assets, model: &str, wanted: Wanted) -> Result<Self, ExtractError> {
+    pub fn open(
+        assets: &Assets,
+        model: &str,
+        wanted: ProviderPreference,
+    ) -> Result<Self, ExtractError> {
         let opened = Opened::open(assets, model, wanted.provider)?;
         let sample = sample(&opened.model.manifest.input)?;
         Ok(Self { opened, sample })

@@ -4,12 +4,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::batcher::{Batcher, Inferring, Layout};
+use super::batcher::{Batcher, Layout, PendingInference};
 use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jpeg};
 use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest};
 use super::pooling::PoolingError;
 use super::preprocess::{self, PreprocessError, Tensor, preprocess};
-use super::provider::{self, Execution, Provider, Wanted};
+use super::provider::{self, Execution, Provider, ProviderPreference};
 use super::runtime::{Assets, RuntimeError};
 use super::session::{InferenceError, Model, RawOutput};
 use whereabouts_core::{DenseFeatures, Descriptor, DescriptorKind, Digest, MediaType};
@@ -22,7 +22,7 @@ pub struct ExtractorSettings {
     /// How inference shares its threads among pictures.
     pub layout: Layout,
     /// By whom and at which precision it may be run.
-    pub wanted: Wanted,
+    pub wanted: ProviderPreference,
     /// Where the choice among these is remembered; measured at each start if nowhere.
     pub remember: Option<PathBuf>,
     /// Bounds on a picture.
@@ -38,7 +38,7 @@ impl ExtractorSettings {
         Self {
             model: model.into(),
             layout: Layout { threads, sessions: 1, max_batch: 1 },
-            wanted: Wanted {
+            wanted: ProviderPreference {
                 provider: Some(reference.provider),
                 precision: Some(reference.precision),
             },
@@ -62,20 +62,20 @@ pub struct Extractor {
 
 /// A picture that was handed to inference. Dropping it gives that up.
 #[derive(Debug)]
-pub struct Extracting {
-    shown: Shown,
-    inferring: Inferring,
+pub struct PendingExtraction {
+    shown: DecodedMeta,
+    inferring: PendingInference,
 }
 
 /// What inference gave for one picture.
 #[derive(Debug)]
-pub struct Inferred {
-    shown: Shown,
+pub struct Inference {
+    shown: DecodedMeta,
     raw: RawOutput,
 }
 
 #[derive(Debug)]
-struct Shown {
+struct DecodedMeta {
     width: u32,
     height: u32,
     media_type: MediaType,
@@ -84,10 +84,10 @@ struct Shown {
     decoded: Instant,
 }
 
-impl Extracting {
+impl PendingExtraction {
     /// Waits for inference.
-    pub async fn inferred(self) -> Result<Inferred, ExtractError> {
-        Ok(Inferred { raw: self.inferring.answer().await?, shown: self.shown })
+    pub async fn inferred(self) -> Result<Inference, ExtractError> {
+        Ok(Inference { raw: self.inferring.answer().await?, shown: self.shown })
     }
 }
 
@@ -190,8 +190,8 @@ impl Extractor {
 
     /// Decodes a picture, runs it through the model and makes its descriptor; blocks.
     pub fn extract(&self, bytes: &[u8], kind: DescriptorKind) -> Result<Extraction, ExtractError> {
-        let Extracting { shown, inferring } = self.begin(bytes, || true)?;
-        self.finish(Inferred { shown, raw: inferring.wait()? }, kind)
+        let PendingExtraction { shown, inferring } = self.begin(bytes, || true)?;
+        self.finish(Inference { shown, raw: inferring.wait()? }, kind)
     }
 
     /// Decodes a picture and hands it to inference; blocks for the one, and while the queue before
@@ -200,7 +200,7 @@ impl Extractor {
         &self,
         bytes: &[u8],
         wanted: impl Fn() -> bool,
-    ) -> Result<Extracting, ExtractError> {
+    ) -> Result<PendingExtraction, ExtractError> {
         let start = Instant::now();
         let input = &self.manifest.input;
         let needed = if self.exact_decode { Needed::All } else { preprocess::needed(input) };
@@ -214,8 +214,8 @@ impl Extractor {
         let decoded = Instant::now();
         let inferring = self.batcher.submit(tensor)?;
         let decode = decoded - start;
-        Ok(Extracting {
-            shown: Shown { width, height, media_type, cells, decode, decoded },
+        Ok(PendingExtraction {
+            shown: DecodedMeta { width, height, media_type, cells, decode, decoded },
             inferring,
         })
     }
@@ -223,14 +223,14 @@ impl Extractor {
     /// Makes the descriptor of what inference gave; blocks for less than a millisecond.
     pub fn finish(
         &self,
-        inferred: Inferred,
+        inferred: Inference,
         kind: DescriptorKind,
     ) -> Result<Extraction, ExtractError> {
-        let Inferred { shown, raw } = inferred;
+        let Inference { shown, raw } = inferred;
         let local = raw.local_features(&self.manifest.output, shown.cells)?;
         let descriptor = local.descriptor(kind, &self.manifest.pooling)?;
         let dense = local.into_dense()?;
-        let Shown { width, height, media_type, decode, decoded, .. } = shown;
+        let DecodedMeta { width, height, media_type, decode, decoded, .. } = shown;
         let times = StageTimes { decode, extract: decoded.elapsed() };
         Ok(Extraction { descriptor, dense, media_type, width, height, times, batch: raw.batch })
     }

@@ -22,16 +22,18 @@ mod runtime;
 mod session;
 
 pub use admission::{
-    Admission, AdmissionLevels, AdmissionSettings, Class, Demand, Permit, Refusal, Refused,
+    Admission, AdmissionLevels, AdmissionRequest, AdmissionSettings, Permit, RejectReason,
+    Rejected, WorkClass,
 };
 pub use batcher::Layout;
 pub use bench::{Bench, BenchRow, BenchSettings, Figures};
 pub use decode::{DecodeError, ImageLimits, Needed, Picture};
 pub use extractor::{
-    ExtractError, Extracting, Extraction, Extractor, ExtractorSettings, Inferred, StageTimes,
+    ExtractError, Extraction, Extractor, ExtractorSettings, Inference, PendingExtraction,
+    StageTimes,
 };
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
-pub use provider::{Execution, LEAST_SIMILARITY, Measured, Provider, Trial, Wanted};
+pub use provider::{Execution, LEAST_SIMILARITY, Measured, Provider, ProviderPreference, Trial};
 pub use runtime::{AUTO, Assets, BUILT_IN_MODEL, CHOSEN, PREFERRED_MODELS, RuntimeError, WhyModel};

@@ -7,7 +7,7 @@ use std::time::SystemTime;
 use super::decode::ImageLimits;
 use super::extractor::{Extractor, ExtractorSettings};
 use super::manifest::{MANIFEST, Manifest};
-use super::provider::{Execution, Wanted};
+use super::provider::{Execution, ProviderPreference};
 use super::runtime::{Assets, RuntimeError};
 use parking_lot::{Mutex, MutexGuard};
 use whereabouts_core::{Digest, Map, Precision};
@@ -150,7 +150,7 @@ impl Shared {
         let LoadedSettings { remember, each, .. } = &self.settings;
         let settings = ExtractorSettings {
             model: name.to_owned(),
-            wanted: Wanted { precision, ..each.wanted },
+            wanted: ProviderPreference { precision, ..each.wanted },
             remember: Some(remember.join(format!("inference-{name}.toml"))),
             ..each.clone()
         };

@@ -243,7 +243,7 @@ impl Manifest {
 
     /// Checks that the numbers fit each other; `path` is for messages.
     pub fn check(&self, path: &Path) -> Result<(), ManifestError> {
-        match self.contradiction() {
+        match self.validate() {
             Some(detail) => Err(ManifestError::Inconsistent { path: path.to_owned(), detail }),
             None => Ok(()),
         }
@@ -265,7 +265,7 @@ impl Manifest {
         }
     }
 
-    fn contradiction(&self) -> Option<String> {
+    fn validate(&self) -> Option<String> {
         const LARGEST_EDGE: u32 = 4096;
         const MOST_CHANNELS: usize = 1 << 14;
         let (input, output, pooling) = (&self.input, &self.output, &self.pooling);

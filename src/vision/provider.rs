@@ -47,7 +47,7 @@ pub struct Execution {
 
 /// What may be chosen from; `None` for anything.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Wanted {
+pub struct ProviderPreference {
     /// The provider.
     pub provider: Option<Provider>,
     /// The precision.
@@ -95,7 +95,7 @@ impl Execution {
     pub const REFERENCE: Self = Self { provider: Provider::Cpu, precision: Precision::Full };
 
     /// What can be tried for a wish, given what the library was built with.
-    pub(super) fn candidates(wanted: Wanted) -> Vec<Self> {
+    pub(super) fn candidates(wanted: ProviderPreference) -> Vec<Self> {
         const ALL: [Execution; 6] = [
             Execution::REFERENCE,
             Execution { provider: Provider::OpenVino, precision: Precision::Full },
@@ -159,7 +159,7 @@ impl Provider {
 /// with all trials.
 pub(super) fn choose(
     model: &Model,
-    wanted: Wanted,
+    wanted: ProviderPreference,
     threads: usize,
     sample: &[Tensor],
 ) -> Result<(Execution, Vec<Trial>), InferenceError> {
@@ -200,7 +200,7 @@ pub(super) fn choose(
     }
 }
 
-impl std::fmt::Display for Wanted {
+impl std::fmt::Display for ProviderPreference {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self.provider {
             Some(provider) => provider.fmt(f)?,
@@ -213,7 +213,7 @@ impl std::fmt::Display for Wanted {
     }
 }
 
-struct Tried {
+struct ProviderTrial {
     latency: Duration,
     descriptors: Vec<Descriptor>,
 }
@@ -223,7 +223,7 @@ fn try_one(
     execution: Execution,
     threads: usize,
     sample: &[Tensor],
-) -> Result<Tried, InferenceError> {
+) -> Result<ProviderTrial, InferenceError> {
     /// A large model on a small machine shows what it does in fewer.
     const RUNS: std::ops::RangeInclusive<usize> = 3..=11;
     const LONG_ENOUGH: Duration = Duration::from_millis(500);
@@ -239,7 +239,10 @@ fn try_one(
         times.push(start.elapsed());
     }
     times.sort();
-    Ok(Tried { latency: times.get(times.len() / 2).copied().unwrap_or_default(), descriptors })
+    Ok(ProviderTrial {
+        latency: times.get(times.len() / 2).copied().unwrap_or_default(),
+        descriptors,
+    })
 }
 
 /// The descriptors of `sample` by one execution on so many threads.

@@ -14,7 +14,7 @@ use uuid::Uuid;
 use whereabouts_archive::{ArchivedMap, LeftOut, Manifest, Writer};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{
-    Descriptor, DescriptorKind, Digest, Frame, Image, Map, MediaType, Precision, Scene,
+    CoordinateFrame, Descriptor, DescriptorKind, Digest, Image, Map, MediaType, Precision, Scene,
 };
 use whereabouts_index::{IndexSettings, MapIndex, Vectors};
 use whereabouts_town::{Town, TownSpec};
@@ -110,7 +110,7 @@ pub fn archives() -> Vec<Vec<u8>> {
         name: "a".parse().unwrap(),
         scene: Scene::Outdoor,
         descriptor: DescriptorKind::Gem,
-        frame: Frame::Wgs84,
+        frame: CoordinateFrame::Wgs84,
         model: "m".into(),
         model_digest: Digest::of(b"m"),
         precision: Precision::Full,

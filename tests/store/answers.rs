@@ -6,7 +6,7 @@ use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
 use whereabouts_core::Digest;
-use whereabouts_store::{FirstAnswer, KeptAnswer, Progress, Store};
+use whereabouts_store::{IdempotencyRecord, Progress, Store, StoredResponse};
 
 use crate::support::{Fixture, eventually, odd_texts};
 
@@ -19,19 +19,19 @@ contract!(
     a_request_of_a_process_that_ended_may_be_done_again,
 );
 
-fn running(process: Uuid) -> FirstAnswer {
+fn running(process: Uuid) -> IdempotencyRecord {
     let progress = Progress::Running { process, job: None };
-    FirstAnswer { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
+    IdempotencyRecord { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
 }
 
-fn answered(at: Timestamp, body: &str) -> FirstAnswer {
+fn answered(at: Timestamp, body: &str) -> IdempotencyRecord {
     let (status, content_type) = (201, Some("application/json".into()));
-    let progress = Progress::Answered(KeptAnswer { status, content_type, body: body.into() });
-    FirstAnswer { fingerprint: Digest::of(b"request"), at, progress }
+    let progress = Progress::Answered(StoredResponse { status, content_type, body: body.into() });
+    IdempotencyRecord { fingerprint: Digest::of(b"request"), at, progress }
 }
 
 /// What is known of a request, whatever its age; if that is nothing, it is reserved.
-async fn reserve(store: &dyn Store, id: &str, process: Uuid) -> Option<FirstAnswer> {
+async fn reserve(store: &dyn Store, id: &str, process: Uuid) -> Option<IdempotencyRecord> {
     store.reserve_answer(id, running(process), Timestamp::UNIX_EPOCH).await.unwrap()
 }
 

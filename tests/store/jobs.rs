@@ -9,7 +9,7 @@ use tokio::sync::broadcast;
 use uuid::Uuid;
 use whereabouts_core::{Candidate, Description, Digest, Job, JobState, Priority, StandIn, Usage};
 use whereabouts_store::{
-    Claim, FirstAnswer, JobFilter, JobRecord, Progress, Release, Step, Store, StoreError,
+    Claim, IdempotencyRecord, JobFilter, JobRecord, Progress, Release, Step, Store, StoreError,
 };
 
 use crate::support::{
@@ -460,7 +460,7 @@ async fn a_request_that_is_done_again_finds_its_job(fixture: &Fixture) {
     let store = fixture.open().await;
     let running = || {
         let progress = Progress::Running { process: Uuid::now_v7(), job: None };
-        FirstAnswer { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
+        IdempotencyRecord { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
     };
     let reserve = async || {
         store.reserve_answer("r", running(), Timestamp::UNIX_EPOCH).await.unwrap();

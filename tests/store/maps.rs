@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use futures_util::future::join_all;
 use whereabouts_core::{
-    Calibration, CalibrationSettings, DescriptorKind, Digest, Frame, Map, Precision, Scene,
+    Calibration, CalibrationSettings, CoordinateFrame, DescriptorKind, Digest, Map, Precision,
+    Scene,
 };
 use whereabouts_index::SearchMode;
 use whereabouts_store::{IndexState, Store, StoreError};
@@ -49,7 +50,7 @@ async fn what_shapes_the_descriptors_changes_only_while_there_are_no_images(fixt
         |map| Map { model: "other".into(), model_digest: Digest::of(b"other"), ..map },
         |map| Map { precision: Precision::Bf16, ..map },
         |map| Map { descriptor: DescriptorKind::Cls, ..map },
-        |map| Map { frame: Frame::Metric, ..map },
+        |map| Map { frame: CoordinateFrame::Metric, ..map },
         |map| Map { dim: 5, ..map },
     ];
     for other in others {

@@ -18,8 +18,8 @@ use whereabouts_index::SearchMode;
 use whereabouts_store::DescriptionCache;
 use whereabouts_store::postgres::{PostgresStore, SchemaState, migrate, schema_of};
 use whereabouts_store::{
-    AnswerStore, DraftStore, Draw, FirstAnswer, JobStore, KeyStore, MapStore, Progress, Retention,
-    SharedLimits, StoreError, StoredDelivery, UsageStore, WebhookStore,
+    DraftStore, IdempotencyRecord, IdempotencyStore, JobStore, KeyStore, MapStore, Progress,
+    Retention, SharedLimits, StoreError, StoredDelivery, TokenRequest, UsageStore, WebhookStore,
 };
 
 use crate::support::{
@@ -208,9 +208,9 @@ async fn what_one_process_replaces_the_others_are_told_of_when_they_ask() {
     assert!(matches!(late, StoreError::NotFound(_)), "{late}");
 }
 
-fn running(process: Uuid) -> FirstAnswer {
+fn running(process: Uuid) -> IdempotencyRecord {
     let progress = Progress::Running { process, job: None };
-    FirstAnswer { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
+    IdempotencyRecord { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
 }
 
 #[tokio::test]
@@ -442,18 +442,19 @@ async fn a_limit_by_the_minute_is_that_of_all_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
     // As good as nothing comes back while this runs.
-    let draw = Draw { per_minute: 0.01, needed: 0.001, taken: 0.001 };
+    let draw = TokenRequest { per_minute: 0.01, needed: 0.001, taken: 0.001 };
     let mut taken = 0;
     for number in 0..30 {
-        let drawn = processes[number % 2].draw("key", [draw, Draw::UNLIMITED]).await.unwrap();
+        let drawn =
+            processes[number % 2].draw("key", [draw, TokenRequest::UNLIMITED]).await.unwrap();
         taken += usize::from(drawn.taken);
         assert!(drawn.taken || drawn.left[0] < 0.002);
     }
     assert!((9..=12).contains(&taken), "{taken}");
     // What is given back is there for others, and no more than a minute's worth.
-    let back = Draw { needed: f64::MIN, taken: -1.0, ..draw };
-    processes[0].draw("key", [back, Draw::UNLIMITED]).await.unwrap();
-    let drawn = processes[1].draw("key", [draw, Draw::UNLIMITED]).await.unwrap();
+    let back = TokenRequest { needed: f64::MIN, taken: -1.0, ..draw };
+    processes[0].draw("key", [back, TokenRequest::UNLIMITED]).await.unwrap();
+    let drawn = processes[1].draw("key", [draw, TokenRequest::UNLIMITED]).await.unwrap();
     assert!(drawn.taken && drawn.left[0] < 0.01, "{drawn:?}");
 }
 

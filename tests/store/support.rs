@@ -12,8 +12,8 @@ use sqlx::{AssertSqlSafe, ConnectOptions};
 use tempfile::TempDir;
 use uuid::Uuid;
 use whereabouts_core::{
-    Descriptor, DescriptorKind, Digest, Frame, Image, Job, Map, MediaType, Precision, RefinerKind,
-    Scene,
+    CoordinateFrame, Descriptor, DescriptorKind, Digest, Image, Job, Map, MediaType, Precision,
+    RefinerKind, Scene,
 };
 use whereabouts_index::IndexSettings;
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
@@ -276,7 +276,7 @@ pub fn map(name: &str, dim: usize) -> Map {
         name: name.parse().unwrap(),
         scene: Scene::Outdoor,
         descriptor: DescriptorKind::Gem,
-        frame: Frame::Wgs84,
+        frame: CoordinateFrame::Wgs84,
         model: "old".into(),
         model_digest: Digest::of(b"old"),
         precision: Precision::Full,

@@ -15,7 +15,7 @@ use super::client::{Client, LONGEST_PAUSE, PATIENCE, ServerArg, segment};
 use super::progress::Progress;
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 use whereabouts_api::{ErrorKind, ImageMeta, MapChange};
-use whereabouts_core::{DescriptorKind, Frame, MapName, MediaType, Scene};
+use whereabouts_core::{CoordinateFrame, DescriptorKind, MapName, MediaType, Scene};
 use whereabouts_eval::{PictureFile, PoseSource, pictures};
 
 /// Poses come from a CSV file (--poses, or poses.csv in the folder), from file names of the form
@@ -49,7 +49,7 @@ pub struct Args {
     pub descriptor: Option<DescriptorKind>,
     /// The frame of a new map; otherwise it follows from the poses
     #[arg(long)]
-    pub frame: Option<Frame>,
+    pub frame: Option<CoordinateFrame>,
     /// Requests side by side, each with up to 16 images
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..=64))]
     pub concurrency: u16,

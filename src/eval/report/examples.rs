@@ -7,7 +7,7 @@ use anyhow::Context;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use super::super::{Answered, Dataset, EvaluatedQuery, MethodOutcomes, Outcome, QueryKind};
+use super::super::{Dataset, EvaluatedQuery, MethodOutcomes, Outcome, Prediction, QueryKind};
 use whereabouts_core::ImageId;
 use whereabouts_vision::{ImageLimits, decode, preprocess};
 
@@ -50,9 +50,9 @@ pub struct Group<'a> {
 /// One query with what was answered.
 pub struct Example<'a> {
     pub query: &'a EvaluatedQuery,
-    pub before: &'a Answered,
+    pub before: &'a Prediction,
     /// After refinement, with what the refiner said.
-    pub after: Option<(&'a Answered, &'a Outcome)>,
+    pub after: Option<(&'a Prediction, &'a Outcome)>,
 }
 
 /// Examples that are shown of each kind and method.
@@ -87,7 +87,7 @@ fn group<'a>(method: &str, kind: Kind, all: Vec<Example<'a>>) -> Group<'a> {
     Group { method: method.to_owned(), kind, count, shown: spread.map(|(_, one)| one).collect() }
 }
 
-fn is_right(query: &EvaluatedQuery, answer: &Answered) -> bool {
+fn is_right(query: &EvaluatedQuery, answer: &Prediction) -> bool {
     query.truth.contains(&answer.image_id)
 }
 

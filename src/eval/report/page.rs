@@ -4,7 +4,9 @@ use std::fmt::{self, Write};
 
 use super::super::open_set::precision_recall;
 use super::super::summary::firsts;
-use super::super::{Answered, Dataset, MethodOutcomes, MethodSummary, Outcome, QueryKind, Summary};
+use super::super::{
+    Dataset, MethodOutcomes, MethodSummary, Outcome, Prediction, QueryKind, Summary,
+};
 use super::Escaped;
 use super::charts;
 use super::examples::{Example, Group, Pictures};
@@ -254,7 +256,7 @@ fn write_example(
             Escaped(name)
         )
     };
-    let answer = |label: &str, answer: &Answered| -> anyhow::Result<String> {
+    let answer = |label: &str, answer: &Prediction| -> anyhow::Result<String> {
         let class = if query.truth.contains(&answer.image_id) { "right" } else { "wrong" };
         let picture = pictures.reference(&answer.image_id)?;
         let note = format!(", similarity {:.3}", answer.similarity);
@@ -285,8 +287,8 @@ fn write_example(
 
 /// What the refiner said of the first after refinement, and folded up what it said besides.
 fn write_said(
-    before: &Answered,
-    after: &Answered,
+    before: &Prediction,
+    after: &Prediction,
     outcome: &Outcome,
     out: &mut String,
 ) -> fmt::Result {

@@ -9,13 +9,13 @@ use whereabouts_core::Spent;
 use whereabouts_store::{SharedLimits, StoreError};
 
 /// What is set aside for one call. Dropped unsettled, it goes back: the call was not answered.
-pub(super) struct Aside {
+pub(super) struct SpendReservation {
     shared: Arc<dyn SharedLimits>,
     day: Date,
     unneeded: Spent,
 }
 
-impl Aside {
+impl SpendReservation {
     /// Sets aside what a call may cost at the most; `None` if the limit of the day would be passed.
     pub async fn set(
         shared: Arc<dyn SharedLimits>,
@@ -37,7 +37,7 @@ impl Aside {
     }
 }
 
-impl Drop for Aside {
+impl Drop for SpendReservation {
     fn drop(&mut self) {
         let (shared, day, unneeded) = (Arc::clone(&self.shared), self.day, self.unneeded);
         tokio::spawn(async move {

@@ -23,7 +23,7 @@ pub(super) fn conclude(
     let behind: Vec<usize> = (0..candidates.len()).filter(|index| !order.contains(index)).collect();
     order.extend(behind);
     let ranking = Ranking::new(candidates, &order)
-        .map_err(|error| RefineError::Hopeless(error.to_string()))?;
+        .map_err(|error| RefineError::Permanent(error.to_string()))?;
     Ok(Refinement {
         descriptions: findings.described.iter().map(|pair| pair.of(candidates)).collect(),
         ranking,
@@ -65,8 +65,8 @@ fn shortfalls(
 /// one that may pass, else any.
 pub(super) fn gravest(failed: &[CallError]) -> Option<CallError> {
     let weight = |error: &&CallError| match error {
-        CallError::Hopeless(_) => 0,
-        CallError::Passing(_) => 1,
+        CallError::Permanent(_) => 0,
+        CallError::Transient(_) => 1,
         CallError::JobSpent => 2,
         CallError::Suspended { .. } => 3,
         CallError::DaySpent => 4,
@@ -83,9 +83,9 @@ pub(super) fn is_unavailable(error: &CallError) -> bool {
 /// The end of a job without a ranking.
 pub(super) fn given_up(error: &CallError) -> RefineError {
     match error {
-        CallError::Hopeless(_) | CallError::JobSpent => RefineError::Hopeless(error.to_string()),
-        CallError::Passing(_) | CallError::Suspended { .. } | CallError::DaySpent => {
-            RefineError::Passing(error.to_string())
+        CallError::Permanent(_) | CallError::JobSpent => RefineError::Permanent(error.to_string()),
+        CallError::Transient(_) | CallError::Suspended { .. } | CallError::DaySpent => {
+            RefineError::Transient(error.to_string())
         }
     }
 }

@@ -9,12 +9,12 @@ use jiff::Timestamp;
 use parking_lot::Mutex;
 use tokio::sync::OnceCell;
 
-use super::aside::Aside;
+use super::aside::SpendReservation;
 use super::budget::{Exceeded, JobBudget};
 use super::client::{Answer, Call, estimate_tokens};
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Switches, clean};
-use super::purchase::Purchase;
+use super::purchase::DescriptionLease;
 use super::retry::CallError;
 use super::wire::{Content, ImageUrl, Message, Part, Role};
 use super::{MllmRefiner, Progress, RefineError};
@@ -262,13 +262,14 @@ impl MllmRefiner {
                 return Ok(Found { description, stands_in, took: None });
             }
         }
-        let _purchase = match Purchase::begin(&self.cache, &pair.key).await.map_err(passing)? {
-            Ok(purchase) => purchase,
-            Err(description) => {
-                self.metrics.description_lookup(CacheLookup::Hit);
-                return Ok(Found { description, stands_in: None, took: None });
-            }
-        };
+        let _purchase =
+            match DescriptionLease::begin(&self.cache, &pair.key).await.map_err(passing)? {
+                Ok(purchase) => purchase,
+                Err(description) => {
+                    self.metrics.description_lookup(CacheLookup::Hit);
+                    return Ok(Found { description, stands_in: None, took: None });
+                }
+            };
         self.metrics.description_lookup(CacheLookup::Miss);
         let (description, took) = self.buy(work, pair).await?;
         bought.store(true, Ordering::Relaxed);
@@ -297,7 +298,7 @@ impl MllmRefiner {
             self.keep(work, usage, None).await;
             work.progress.step(Step { usage, description: None }).await;
             let why = answer.cut.as_deref().unwrap_or("the model said nothing");
-            return Err(CallError::Hopeless(format!("the description is empty: {why}")));
+            return Err(CallError::Permanent(format!("the description is empty: {why}")));
         }
         let description = CachedDescription { text, usage, created_at: Timestamp::now() };
         self.keep(work, usage, Some((pair.key, description.clone()))).await;
@@ -349,14 +350,14 @@ impl MllmRefiner {
     }
 
     /// Sets aside what a call may cost, where other processes spend too and a day has a limit.
-    async fn set_aside(&self, prompt_tokens: u64) -> Result<Option<Aside>, CallError> {
+    async fn set_aside(&self, prompt_tokens: u64) -> Result<Option<SpendReservation>, CallError> {
         let limit =
             Spent { tokens: self.settings.tokens_per_day, money: self.settings.money_per_day };
         let Some(shared) = self.shared.clone().filter(|_| limit != Spent::default()) else {
             return Ok(None);
         };
         let most = self.budget.cost(prompt_tokens, self.client.max_tokens());
-        let aside = Aside::set(shared, utc_day(Timestamp::now()), most, limit).await;
+        let aside = SpendReservation::set(shared, utc_day(Timestamp::now()), most, limit).await;
         aside.map_err(passing)?.map(Some).ok_or(CallError::DaySpent)
     }
 
@@ -400,14 +401,14 @@ fn question(prompt: String, frame: &SentPicture, candidate: &SentPicture) -> Mes
 }
 
 fn passing(error: StoreError) -> CallError {
-    CallError::Passing(error.to_string())
+    CallError::Transient(error.to_string())
 }
 
 impl From<PictureError> for CallError {
     fn from(error: PictureError) -> Self {
         match error {
-            PictureError::Missing | PictureError::Unfit(_) => Self::Hopeless(error.to_string()),
-            PictureError::Store(_) | PictureError::Undone(_) => Self::Passing(error.to_string()),
+            PictureError::Missing | PictureError::Unfit(_) => Self::Permanent(error.to_string()),
+            PictureError::Store(_) | PictureError::Undone(_) => Self::Transient(error.to_string()),
         }
     }
 }

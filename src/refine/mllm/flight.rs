@@ -12,17 +12,17 @@ type Cell<T> = Arc<OnceCell<T>>;
 
 /// Answers that are on their way, by key.
 #[derive(Debug)]
-pub struct Flights<T> {
+pub struct SingleFlight<T> {
     cells: Mutex<HashMap<Digest, Cell<T>>>,
 }
 
-impl<T> Default for Flights<T> {
+impl<T> Default for SingleFlight<T> {
     fn default() -> Self {
         Self { cells: Mutex::default() }
     }
 }
 
-impl<T: Clone> Flights<T> {
+impl<T: Clone> SingleFlight<T> {
     /// What `make` gives, or what another caller of the same key is making at the moment. If that
     /// one fails or leaves, the next takes its place.
     pub async fn join<F, E>(&self, key: Digest, make: impl FnOnce() -> F) -> Result<T, E>
@@ -33,9 +33,9 @@ impl<T: Clone> Flights<T> {
         seat.cell.get_or_try_init(make).await.cloned()
     }
 
-    fn board(&self, key: Digest) -> Seat<'_, T> {
+    fn board(&self, key: Digest) -> Follower<'_, T> {
         let cell = Arc::clone(self.cells().entry(key).or_default());
-        Seat { flights: self, key, cell }
+        Follower { flights: self, key, cell }
     }
 
     fn cells(&self) -> MutexGuard<'_, HashMap<Digest, Cell<T>>> {
@@ -44,13 +44,13 @@ impl<T: Clone> Flights<T> {
 }
 
 /// One caller's share in a flight; the last one to leave ends it.
-struct Seat<'a, T: Clone> {
-    flights: &'a Flights<T>,
+struct Follower<'a, T: Clone> {
+    flights: &'a SingleFlight<T>,
     key: Digest,
     cell: Cell<T>,
 }
 
-impl<T: Clone> Drop for Seat<'_, T> {
+impl<T: Clone> Drop for Follower<'_, T> {
     fn drop(&mut self) {
         let mut cells = self.flights.cells();
         // The map's own and this one: cells are only cloned under the lock.
@@ -74,7 +74,7 @@ mod tests {
 
     #[tokio::test]
     async fn two_at_once_share_one_answer() {
-        let flights = Flights::<u8>::default();
+        let flights = SingleFlight::<u8>::default();
         let (answer, wait) = oneshot::channel();
         let mut first =
             pin!(flights.join(key(), || async { Ok::<_, Infallible>(wait.await.unwrap()) }));
@@ -88,7 +88,7 @@ mod tests {
 
     #[tokio::test]
     async fn when_the_first_leaves_the_second_takes_its_place() {
-        let flights = Flights::<u8>::default();
+        let flights = SingleFlight::<u8>::default();
         let mut second = pin!(flights.join(key(), || async { Ok::<_, Infallible>(8) }));
         {
             let waiting = std::future::pending::<Result<u8, Infallible>>();
@@ -101,7 +101,7 @@ mod tests {
 
     #[tokio::test]
     async fn nothing_is_kept_after_the_last_has_left() {
-        let flights = Flights::<u8>::default();
+        let flights = SingleFlight::<u8>::default();
         let failed = flights.join(key(), || async { Err("down") }).await;
         assert_eq!(failed, Err("down"));
         let again = flights.join(key(), || async { Ok::<_, &str>(9) }).await;

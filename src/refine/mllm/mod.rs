@@ -47,14 +47,15 @@ pub use settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError, O
 use self::budget::Budget;
 use self::client::MllmClient;
 use self::describe::{Found, Work};
-use self::flight::Flights;
+use self::flight::SingleFlight;
 use self::pictures::Pictures;
 use self::retry::CallError;
 use super::{Progress, RefineError, Refinement, Refiner};
 use crate::RefineMetrics;
 use whereabouts_core::{CacheLevels, DayUsage, Evidence, Map, RefinerKind, Spent, Usage, utc_day};
 use whereabouts_store::{
-    BlobStore, Buckets, DescriptionCache, JobRecord, LookAlikes, MapStore, SharedLimits, UsageStore,
+    BlobStore, Buckets, DescriptionCache, HardNegatives, JobRecord, MapStore, SharedLimits,
+    UsageStore,
 };
 use whereabouts_vision::ImageLimits;
 
@@ -91,7 +92,7 @@ pub struct MllmRefiner {
     pictures: Pictures,
     client: MllmClient,
     budget: Arc<Budget>,
-    flights: Flights<Found>,
+    flights: SingleFlight<Found>,
     settings: MllmSettings,
 }
 
@@ -124,7 +125,7 @@ impl MllmRefiner {
             pictures,
             client,
             budget: Arc::new(Budget::new(settings.limits())),
-            flights: Flights::default(),
+            flights: SingleFlight::default(),
             settings,
         })
     }
@@ -151,7 +152,7 @@ impl MllmRefiner {
     async fn map(&self, record: &JobRecord) -> Result<Map, RefineError> {
         match self.maps.map(&record.job.map).await? {
             Some(map) if map.uid == record.map_uid => Ok(map),
-            _ => Err(RefineError::Hopeless("the map was removed".into())),
+            _ => Err(RefineError::Permanent("the map was removed".into())),
         }
     }
 
@@ -198,7 +199,11 @@ impl Refiner for MllmRefiner {
     }
 
     /// Of the jobs that fall back.
-    async fn chance(&self, map: &Map, asked: &LookAlikes) -> Result<Option<Evidence>, RefineError> {
+    async fn chance(
+        &self,
+        map: &Map,
+        asked: &HardNegatives,
+    ) -> Result<Option<Evidence>, RefineError> {
         match &self.fallback {
             Some(fallback) => fallback.chance(map, asked).await,
             None => Ok(None),
@@ -228,7 +233,7 @@ impl Refiner for MllmRefiner {
                 if self.waits()
                     && let Some(after) = pause(&why) =>
             {
-                Err(RefineError::Later { why: why.to_string(), after })
+                Err(RefineError::Deferred { why: why.to_string(), after })
             }
             (Some(Err(why)), Some(fallback)) if conclude::is_unavailable(&why) => {
                 self.fall_back(fallback.as_ref(), &work, &why).await
@@ -249,6 +254,6 @@ fn pause(why: &CallError) -> Option<Duration> {
             let midnight = utc_day(now).tomorrow().ok()?.to_zoned(TimeZone::UTC).ok()?;
             now.duration_until(midnight.timestamp()).try_into().ok()
         }
-        CallError::Hopeless(_) | CallError::Passing(_) | CallError::JobSpent => None,
+        CallError::Permanent(_) | CallError::Transient(_) | CallError::JobSpent => None,
     }
 }

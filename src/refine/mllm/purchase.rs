@@ -18,12 +18,12 @@ const PURCHASE_LOOK: Duration = Duration::from_millis(250);
 const LONGEST_PURCHASE: SignedDuration = SignedDuration::from_mins(10);
 
 /// The right of this process to buy a description. It ends when this is dropped.
-pub(super) struct Purchase {
+pub(super) struct DescriptionLease {
     cache: Arc<dyn DescriptionCache>,
     key: Option<Digest>,
 }
 
-impl Purchase {
+impl DescriptionLease {
     /// The right to buy the description of that key; or the description, if another process was buying it.
     pub async fn begin(
         cache: &Arc<dyn DescriptionCache>,
@@ -52,7 +52,7 @@ impl Purchase {
     }
 }
 
-impl Drop for Purchase {
+impl Drop for DescriptionLease {
     fn drop(&mut self) {
         let Some(key) = self.key else { return };
         let cache = Arc::clone(&self.cache);

@@ -39,7 +39,9 @@ impl MllmRefiner {
                 talk.push(Message::user(prompts::repair(&why, &names)));
                 let second = self.ask(work, &labels, &talk).await?;
                 let verdict = read(&labels, &second).map_err(|why| {
-                    CallError::Hopeless(format!("the reasoning model gave no ranking twice: {why}"))
+                    CallError::Permanent(format!(
+                        "the reasoning model gave no ranking twice: {why}"
+                    ))
                 })?;
                 (verdict, second.took)
             }

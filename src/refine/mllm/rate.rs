@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use whereabouts_store::{Buckets, Draw, Drawn};
+use whereabouts_store::{Buckets, TokenGrant, TokenRequest};
 
 /// Two buckets that fill steadily up to a minute's worth. Callers are served in order.
 #[derive(Debug)]
@@ -29,8 +29,8 @@ impl RateLimiter {
         let draws = [self.draw(0, 1.0), self.draw(1, tokens as f64)];
         loop {
             match self.buckets.draw(NAME, draws).await {
-                Ok(Drawn { taken: true, .. }) => return,
-                Ok(Drawn { left, .. }) => {
+                Ok(TokenGrant { taken: true, .. }) => return,
+                Ok(TokenGrant { left, .. }) => {
                     let wait = [0, 1].map(|index| missing(draws[index], left[index]));
                     tokio::time::sleep(wait[0].max(wait[1]).max(FINEST)).await;
                 }
@@ -48,26 +48,27 @@ impl RateLimiter {
             return;
         }
         let taken = (taken as f64).min(self.per_minute[1]);
-        let nothing = Draw { needed: f64::MIN, taken: 0.0, ..self.draw(0, 0.0) };
-        let corrected = Draw { needed: f64::MIN, taken: used as f64 - taken, ..self.draw(1, 0.0) };
+        let nothing = TokenRequest { needed: f64::MIN, taken: 0.0, ..self.draw(0, 0.0) };
+        let corrected =
+            TokenRequest { needed: f64::MIN, taken: used as f64 - taken, ..self.draw(1, 0.0) };
         if let Err(error) = self.buckets.draw(NAME, [nothing, corrected]).await {
             tracing::warn!(%error, "tokens that were not needed are not given back");
         }
     }
 
     /// A cost above a minute's worth is one minute's worth, or it would wait for ever.
-    fn draw(&self, index: usize, cost: f64) -> Draw {
+    fn draw(&self, index: usize, cost: f64) -> TokenRequest {
         let per_minute = self.per_minute[index];
         if per_minute == 0.0 {
-            return Draw::UNLIMITED;
+            return TokenRequest::UNLIMITED;
         }
         let cost = cost.min(per_minute);
-        Draw { per_minute, needed: cost, taken: cost }
+        TokenRequest { per_minute, needed: cost, taken: cost }
     }
 }
 
 /// How long it is until a bucket holds what is needed.
-fn missing(draw: Draw, left: f64) -> Duration {
+fn missing(draw: TokenRequest, left: f64) -> Duration {
     if draw.per_minute == 0.0 {
         return Duration::ZERO;
     }

@@ -13,10 +13,10 @@ use super::breaker::Open;
 pub enum CallError {
     /// Trying again would change nothing.
     #[error("{0}")]
-    Hopeless(String),
+    Permanent(String),
     /// It may work another time.
     #[error("{0}")]
-    Passing(String),
+    Transient(String),
     /// Too many calls have failed lately; none is made for a while.
     #[error(
         "calls to the MLLM are suspended for another {} s, because the last ones failed",
@@ -92,7 +92,7 @@ impl RetryPolicy {
                 Ok(answer) => return Ok(answer),
                 Err(Failure::Open(Open { wait })) => return Err(CallError::Suspended { wait }),
                 Err(Failure::Refused(why) | Failure::Unstructured(why)) => {
-                    return Err(CallError::Hopeless(why));
+                    return Err(CallError::Permanent(why));
                 }
                 Err(Failure::Busy { why, retry_after } | Failure::Broken { why, retry_after }) => {
                     (why, retry_after)
@@ -100,7 +100,7 @@ impl RetryPolicy {
             };
             tried += 1;
             if tried >= self.attempts {
-                return Err(CallError::Passing(format!("{why} (tried {tried} times)")));
+                return Err(CallError::Transient(format!("{why} (tried {tried} times)")));
             }
             tokio::time::sleep(self.pause(tried, retry_after, &why)?).await;
         }
@@ -115,7 +115,7 @@ impl RetryPolicy {
         let doubled = self.backoff.saturating_mul(2_u32.saturating_pow(tried - 1));
         let backoff = doubled.min(LONGEST_BACKOFF).mul_f64(0.5 + 0.5 * random_fraction());
         match retry_after {
-            Some(wanted) if wanted > self.longest_wait => Err(CallError::Passing(format!(
+            Some(wanted) if wanted > self.longest_wait => Err(CallError::Transient(format!(
                 "{why}; it wants to be asked again in {} s, later than mllm.retry_after_max_s",
                 wanted.as_secs()
             ))),
@@ -187,21 +187,21 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn tries_are_bounded() {
         let (outcome, tries, _) = run(vec![busy(None); 9]).await;
-        assert_eq!(outcome, Err(CallError::Passing("429 (tried 4 times)".into())));
+        assert_eq!(outcome, Err(CallError::Transient("429 (tried 4 times)".into())));
         assert_eq!(tries, 4);
     }
 
     #[tokio::test(start_paused = true)]
     async fn a_server_that_asks_for_an_hour_is_not_waited_for() {
         let (outcome, tries, took) = run(vec![busy(Some(3600))]).await;
-        assert!(matches!(outcome, Err(CallError::Passing(_))));
+        assert!(matches!(outcome, Err(CallError::Transient(_))));
         assert_eq!((tries, took), (1, Duration::ZERO));
     }
 
     #[tokio::test(start_paused = true)]
     async fn what_is_refused_is_not_tried_again() {
         let (outcome, tries, _) = run(vec![Failure::Refused("401".into())]).await;
-        assert_eq!((outcome, tries), (Err(CallError::Hopeless("401".into())), 1));
+        assert_eq!((outcome, tries), (Err(CallError::Permanent("401".into())), 1));
     }
 
     #[test]

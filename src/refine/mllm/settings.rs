@@ -146,7 +146,7 @@ pub enum MllmSettingsError {
 impl MllmSettings {
     /// What contradicts itself in these settings, if anything does. `job_timeout_s` is the longest
     /// a job may take, in seconds.
-    pub fn contradiction(&self, job_timeout_s: u64) -> Option<String> {
+    pub fn validate(&self, job_timeout_s: u64) -> Option<String> {
         let at_least_one = [
             ("concurrency", self.concurrency as u64),
             ("image_max_edge", self.image_max_edge.into()),
@@ -236,19 +236,19 @@ pub(super) mod tests {
 
     #[test]
     fn the_defaults_are_whole_and_consistent() {
-        assert_eq!(defaults().contradiction(300), None);
+        assert_eq!(defaults().validate(300), None);
     }
 
     #[test]
     fn a_call_longer_than_its_job_is_refused() {
-        assert!(defaults().contradiction(60).unwrap().contains("outlast"));
+        assert!(defaults().validate(60).unwrap().contains("outlast"));
     }
 
     #[test]
     fn a_bound_on_money_needs_prices() {
         let settings = MllmSettings { money_per_day: 5.0, ..defaults() };
-        assert!(settings.contradiction(300).unwrap().contains("price"));
-        assert_eq!(MllmSettings { price_prompt: 2.5, ..settings }.contradiction(300), None);
+        assert!(settings.validate(300).unwrap().contains("price"));
+        assert_eq!(MllmSettings { price_prompt: 2.5, ..settings }.validate(300), None);
     }
 
     #[test]

@@ -248,7 +248,7 @@ async fn a_job_whose_map_is_gone_ends_at_once() {
     let bench = Bench::new(Script::default()).await;
     let record = JobRecord { map_uid: uuid::Uuid::from_u128(99), ..bench.record(2) };
     let error = bench.refiner.refine(&record, &Steps::default()).await.unwrap_err();
-    assert!(matches!(error, RefineError::Hopeless(_)));
+    assert!(matches!(error, RefineError::Permanent(_)));
     assert_eq!(bench.mock.describe_calls(), 0);
 }
 

@@ -54,7 +54,7 @@ impl Database {
         Duration::from_millis(self.timeout_ms)
     }
 
-    pub(super) fn contradiction(&self) -> Option<String> {
+    pub(super) fn validate(&self) -> Option<String> {
         if self.max_connections < FEWEST_CONNECTIONS {
             return Some(format!("database.max_connections must be at least {FEWEST_CONNECTIONS}"));
         }
@@ -78,7 +78,7 @@ impl ObjectStore {
         Duration::from_millis(self.timeout_ms)
     }
 
-    pub(super) fn contradiction(&self, request_timeout_s: u64) -> Option<String> {
+    pub(super) fn validate(&self, request_timeout_s: u64) -> Option<String> {
         if self.timeout_ms == 0 {
             return Some("objects.timeout_ms must be at least 1".into());
         }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use whereabouts_core::Precision;
 use whereabouts_models::DownloadSettings;
-use whereabouts_vision::{AdmissionSettings, Layout, Provider, Wanted};
+use whereabouts_vision::{AdmissionSettings, Layout, Provider, ProviderPreference};
 
 /// `[model]`
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -52,8 +52,8 @@ impl Model {
     }
 
     /// What may be chosen from.
-    pub fn wanted(&self) -> Wanted {
-        Wanted {
+    pub fn wanted(&self) -> ProviderPreference {
+        ProviderPreference {
             provider: match self.provider {
                 ProviderWish::Auto => None,
                 ProviderWish::Cpu => Some(Provider::Cpu),

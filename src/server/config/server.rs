@@ -51,7 +51,7 @@ pub struct Server {
 }
 
 impl Server {
-    pub(super) fn contradiction(&self) -> Option<String> {
+    pub(super) fn validate(&self) -> Option<String> {
         if self.tls_certificate.as_os_str().is_empty() != self.tls_key.as_os_str().is_empty() {
             return Some("server.tls_certificate and server.tls_key go together".into());
         }

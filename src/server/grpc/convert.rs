@@ -5,7 +5,7 @@ use serde_json::{Map as JsonObject, Value};
 
 use super::proto;
 use whereabouts_api::RefineMode;
-use whereabouts_core::{DescriptorKind, Frame, JobState, Priority, Scene};
+use whereabouts_core::{CoordinateFrame, DescriptorKind, JobState, Priority, Scene};
 use whereabouts_service::ServiceError;
 
 /// The value of an enum by its number.
@@ -63,11 +63,11 @@ pub(super) fn descriptor(number: i32) -> Result<Option<DescriptorKind>, ServiceE
 }
 
 /// `None` for as it is.
-pub(super) fn frame(number: i32) -> Result<Option<Frame>, ServiceError> {
+pub(super) fn frame(number: i32) -> Result<Option<CoordinateFrame>, ServiceError> {
     Ok(match known("frame", number)? {
         proto::Frame::Unspecified => None,
-        proto::Frame::Wgs84 => Some(Frame::Wgs84),
-        proto::Frame::Metric => Some(Frame::Metric),
+        proto::Frame::Wgs84 => Some(CoordinateFrame::Wgs84),
+        proto::Frame::Metric => Some(CoordinateFrame::Metric),
     })
 }
 
@@ -128,11 +128,12 @@ mod tests {
                 orientation: Some(proto::Quaternion { x: 0.0, y: 0.0, z: 0.6, w: 0.8 }),
             })),
         };
-        let read = Pose::from_json(Frame::Metric, pose(sent).unwrap()).unwrap();
+        let read = Pose::from_json(CoordinateFrame::Metric, pose(sent).unwrap()).unwrap();
         assert_eq!(proto::Pose::from(read), sent);
-        assert!(Pose::from_json(Frame::Wgs84, pose(sent).unwrap()).is_err());
+        assert!(Pose::from_json(CoordinateFrame::Wgs84, pose(sent).unwrap()).is_err());
         assert!(
-            Pose::from_json(Frame::Metric, pose(proto::Pose { frame: None }).unwrap()).is_err()
+            Pose::from_json(CoordinateFrame::Metric, pose(proto::Pose { frame: None }).unwrap())
+                .is_err()
         );
         let nowhere = proto::MetricPose { x: 0.0, y: 0.0, z: Some(f64::NAN), orientation: None };
         let nowhere = proto::Pose { frame: Some(proto::pose::Frame::Metric(nowhere)) };

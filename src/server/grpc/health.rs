@@ -9,7 +9,7 @@ use tonic_reflection::server::{Builder, Error};
 
 use super::streams::{Answers, until_over};
 use super::{Api, CONTRACT, status};
-use whereabouts_service::Phase;
+use whereabouts_service::ReadinessPhase;
 
 /// The services that the contract names; the empty name is the server as a whole.
 const SERVICES: [&str; 4] = [
@@ -19,10 +19,10 @@ const SERVICES: [&str; 4] = [
     "whereabouts.v1.JobService",
 ];
 
-fn answer(phase: Phase) -> HealthCheckResponse {
+fn answer(phase: ReadinessPhase) -> HealthCheckResponse {
     let status = match phase {
-        Phase::Open => ServingStatus::Serving,
-        Phase::Starting | Phase::Draining => ServingStatus::NotServing,
+        ReadinessPhase::Open => ServingStatus::Serving,
+        ReadinessPhase::Starting | ReadinessPhase::Draining => ServingStatus::NotServing,
     };
     HealthCheckResponse { status: status.into() }
 }

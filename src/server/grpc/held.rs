@@ -8,7 +8,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 /// What the messages, or a body, that have come hold of the memory for bodies, until somebody takes it over
 /// together with a message, or the request has been answered. Clones share it.
 #[derive(Debug, Clone, Default)]
-pub struct Held(Arc<Mutex<State>>);
+pub struct BodyBudget(Arc<Mutex<State>>);
 
 #[derive(Debug, Default)]
 struct State {
@@ -16,7 +16,7 @@ struct State {
     answered: bool,
 }
 
-impl Held {
+impl BodyBudget {
     /// Takes so much of the memory, if there is as much.
     pub fn try_add(&self, memory: &Arc<Semaphore>, bytes: usize) -> bool {
         if self.is_answered() {

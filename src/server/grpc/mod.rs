@@ -21,14 +21,14 @@ use axum::http::{HeaderMap, HeaderValue};
 use tonic::Extensions;
 
 pub use self::calls::{CALLS, Call, HEALTH_CHECK, call};
-pub use self::held::Held;
+pub use self::held::BodyBudget;
 use self::proto::job_service_server::JobServiceServer;
 use self::proto::localization_service_server::LocalizationServiceServer;
 use self::proto::map_service_server::MapServiceServer;
 use crate::Metrics;
 use whereabouts_api::ErrorKind;
 use whereabouts_core::MapName;
-use whereabouts_service::{Caller, Deadline, Door, Service, ServiceError};
+use whereabouts_service::{Deadline, Principal, Readiness, Service, ServiceError};
 
 use whereabouts_api::{DESCRIPTOR_SET as CONTRACT, proto};
 
@@ -41,13 +41,13 @@ pub fn is_call(headers: &HeaderMap) -> bool {
 /// What answers the calls of the contract, and those of health and reflection.
 #[derive(Clone)]
 struct Api {
-    door: Door,
+    door: Readiness,
     metrics: Arc<Metrics>,
 }
 
 /// All calls as routes. A message may have so many bytes; who sends more has been refused before.
 pub fn routes<S: Clone + Send + Sync + 'static>(
-    door: &Door,
+    door: &Readiness,
     metrics: &Arc<Metrics>,
     largest: usize,
 ) -> Router<S> {
@@ -86,19 +86,19 @@ pub fn routes<S: Clone + Send + Sync + 'static>(
 struct Asked {
     service: Arc<Service>,
     metrics: Arc<Metrics>,
-    caller: Caller,
+    caller: Principal,
     deadline: Deadline,
-    held: Held,
+    held: BodyBudget,
 }
 
 impl Api {
     fn asked(&self, extensions: &Extensions) -> Result<Asked, ServiceError> {
         let deadline = extensions.get::<Deadline>().copied().unwrap_or_default();
         // Who has not been let in has no business here.
-        let caller = extensions.get::<Caller>().cloned().ok_or_else(|| {
+        let caller = extensions.get::<Principal>().cloned().ok_or_else(|| {
             ServiceError::new(ErrorKind::Internal, "a call was not checked; see the server's log")
         })?;
-        let held = extensions.get::<Held>().cloned().unwrap_or_default();
+        let held = extensions.get::<BodyBudget>().cloned().unwrap_or_default();
         let metrics = Arc::clone(&self.metrics);
         Ok(Asked { service: self.door.service()?, metrics, caller, deadline, held })
     }

@@ -6,7 +6,7 @@ use futures_util::{FutureExt, Stream, StreamExt, future, stream};
 use tonic::Status;
 
 use super::{Asked, status};
-use whereabouts_service::Door;
+use whereabouts_service::Readiness;
 
 /// Answers, one after another.
 pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
@@ -14,7 +14,7 @@ pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send
 /// Answers until they end, the server drains, the caller may ask no more, or wants no more.
 pub(super) fn until_over<T: Send + 'static>(
     answers: impl Stream<Item = Result<T, Status>> + Send + 'static,
-    door: &Door,
+    door: &Readiness,
     asked: Asked,
 ) -> Answers<T> {
     let Asked { service, caller, deadline, .. } = asked;

@@ -19,7 +19,7 @@ use super::state::AppState;
 use crate::grpc;
 use whereabouts_api::ErrorKind;
 use whereabouts_core::{ApiKey, MapName, Role, Token};
-use whereabouts_service::{Allowances, Caller, Service, ServiceError};
+use whereabouts_service::{Allowances, Principal, Service, ServiceError};
 
 const RATE_LIMIT: HeaderName = HeaderName::from_static("ratelimit");
 const RATE_LIMIT_POLICY: HeaderName = HeaderName::from_static("ratelimit-policy");
@@ -85,7 +85,7 @@ pub(super) async fn admit(
     };
     let Access::Role(role) = needed else { return next.run(request).await };
     if !state.settings.keys_required {
-        request.extensions_mut().insert(Caller::Anybody);
+        request.extensions_mut().insert(Principal::Anonymous);
         return next.run(request).await;
     }
     let service = match state.door.service() {
@@ -96,7 +96,7 @@ pub(super) async fn admit(
         Ok(key) => key,
         Err(error) => return refuse(request, error),
     };
-    let caller = Caller::Holder(Arc::clone(&key));
+    let caller = Principal::ApiKey(Arc::clone(&key));
     let audited = match call {
         Some(call) => call.changes,
         None => {
@@ -163,12 +163,12 @@ fn holder(service: &Service, headers: &HeaderMap) -> Result<Arc<ApiKey>, Service
 /// Whether the caller has the role that a call takes, and may use the maps that it is about.
 async fn may_make(
     service: &Service,
-    caller: &Caller,
+    caller: &Principal,
     role: Role,
     request: &mut Request,
     route: Option<&str>,
 ) -> Result<(), ServiceError> {
-    let Caller::Holder(key) = caller else { return Ok(()) };
+    let Principal::ApiKey(key) = caller else { return Ok(()) };
     if key.role < role {
         return Err(ServiceError::new(
             ErrorKind::Forbidden,

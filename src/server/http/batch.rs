@@ -25,7 +25,7 @@ use super::problem::Problem;
 use super::state::{AppState, HttpSettings, Ready};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 use whereabouts_api::{ErrorKind, ImageMeta};
-use whereabouts_service::{BulkImage, BulkResult, Caller, Deadline, ServiceError};
+use whereabouts_service::{BulkImage, BulkResult, Deadline, Principal, ServiceError};
 use whereabouts_store::Added;
 
 /// The route.
@@ -131,7 +131,7 @@ struct BatchForm {
 pub(super) async fn add_images(
     State(state): State<AppState>,
     Ready(service): Ready,
-    Extension(caller): Extension<Caller>,
+    Extension(caller): Extension<Principal>,
     Segments(map): Segments<String>,
     deadline: Deadline,
     request: Request,

@@ -13,7 +13,7 @@ use super::problem::Problem;
 use super::state::AppState;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::Service;
-use whereabouts_vision::Demand;
+use whereabouts_vision::AdmissionRequest;
 
 /// The query string.
 pub(super) struct Params<T>(pub T);
@@ -73,7 +73,7 @@ impl PictureBody {
         request: Request,
         state: &AppState,
         service: &Service,
-        demand: Demand,
+        demand: AdmissionRequest,
     ) -> Result<Self, Problem> {
         if let Err(refused) = service.check_admission(demand) {
             throw_away(request);

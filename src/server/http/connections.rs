@@ -32,7 +32,7 @@ use self::slots::{Slot, Slots};
 pub use self::tls::{Tls, TlsError};
 use self::writes::TimedWrites;
 use crate::Metrics;
-use whereabouts_service::RefusedFor;
+use whereabouts_service::Rejection;
 
 /// What a client of HTTP/2 may send of one request before it is read, in bytes.
 const STREAM_WINDOW: u32 = 512 << 10;
@@ -80,7 +80,7 @@ impl Connections {
         }
         while let Some(stream) = shutdown.run_until_cancelled(accept(&listener)).await {
             let Some(slot) = slots.take() else {
-                this.metrics.refused(RefusedFor::Connections);
+                this.metrics.refused(Rejection::Connections);
                 // Who expects TLS would not understand a sentence.
                 if this.tls.is_none() {
                     refuse(stream);
@@ -93,7 +93,7 @@ impl Connections {
                 let slot = Arc::new(slot);
                 tokio::select! {
                     () = this.serve_one(stream, &slot, shutdown) => {}
-                    () = slot.taken_away() => this.metrics.refused(RefusedFor::Connections),
+                    () = slot.taken_away() => this.metrics.refused(Rejection::Connections),
                 }
                 this.metrics.connection_closed();
             });
@@ -114,7 +114,7 @@ impl Connections {
         match shutdown.run_until_cancelled(shaken).await {
             Some(Ok(Ok(encrypted))) => self.talk(encrypted, slot, shutdown.clone()).await,
             Some(Ok(Err(error))) => tracing::debug!(%error, "a connection was not encrypted"),
-            Some(Err(_)) => self.metrics.refused(RefusedFor::Slow),
+            Some(Err(_)) => self.metrics.refused(Rejection::Slow),
             None => {}
         }
     }
@@ -237,7 +237,7 @@ impl Connections {
                     connection.as_mut().graceful_shutdown();
                 }
                 _ = looking.tick() => if answers.are_stalled(patience) {
-                    self.metrics.refused(RefusedFor::Slow);
+                    self.metrics.refused(Rejection::Slow);
                     return tracing::debug!("a client takes nothing of an answer");
                 },
             }
@@ -263,7 +263,7 @@ impl Connections {
 
     /// Says that the head of a request did not come in time.
     async fn give_up(&self, mut stream: impl AsyncWrite + Unpin) {
-        self.metrics.refused(RefusedFor::Slow);
+        self.metrics.refused(Rejection::Slow);
         let _ = stream.write_all(self.too_slow().as_bytes()).await;
         let _ = stream.shutdown().await;
     }

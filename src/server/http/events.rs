@@ -14,7 +14,7 @@ use super::jobs::job_id;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
-use whereabouts_service::{AnyJobEvent, Caller, Deadline, JobEvent, ServiceError};
+use whereabouts_service::{AnyJobEvent, Deadline, JobEvent, Principal, ServiceError};
 
 /// A comment is sent after so long without an event, so that nothing on the way hangs up.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -33,7 +33,7 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
 pub(super) async fn follow_job(
     State(state): State<AppState>,
     Ready(service): Ready,
-    Extension(caller): Extension<Caller>,
+    Extension(caller): Extension<Principal>,
     Segments(id): Segments<String>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let permit = state.stream()?;
@@ -71,7 +71,7 @@ pub(super) struct FollowParams {
 pub(super) async fn follow_jobs(
     State(state): State<AppState>,
     Ready(service): Ready,
-    Extension(caller): Extension<Caller>,
+    Extension(caller): Extension<Principal>,
     Params(params): Params<FollowParams>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let map = params.map.as_deref().map(map_name).transpose()?;

@@ -20,10 +20,10 @@ use super::incoming::Watch;
 use super::messages;
 use super::problem::Problem;
 use super::state::AppState;
-use crate::grpc::{self, Call, HEALTH_CHECK, Held};
+use crate::grpc::{self, BodyBudget, Call, HEALTH_CHECK};
 use whereabouts_api::ErrorKind;
 use whereabouts_service::Deadline;
-use whereabouts_service::RefusedFor;
+use whereabouts_service::Rejection;
 use whereabouts_telemetry::traces;
 
 /// The id of a request: the caller's `x-request-id`, or a fresh one.
@@ -92,7 +92,7 @@ pub(super) async fn bound(
     match (request.uri().path(), call) {
         ("/livez" | "/readyz" | "/metrics", _) => return next.run(request).await,
         (HEALTH_CHECK, Some(call)) => {
-            let bounded = |body| messages::bounded(body, call, &state, Held::default());
+            let bounded = |body| messages::bounded(body, call, &state, BodyBudget::default());
             return next.run(request.map(bounded)).await;
         }
         _ => {}
@@ -102,7 +102,7 @@ pub(super) async fn bound(
         return bound_stream(state, request, next, arrival, call).await;
     }
     let Ok(_permit) = Arc::clone(&state.permits).try_acquire_owned() else {
-        state.metrics.refused(RefusedFor::Requests);
+        state.metrics.refused(Rejection::Requests);
         let detail = format!(
             "{} requests are in progress, the bound (server.max_requests); try again in a moment",
             state.settings.max_requests
@@ -135,7 +135,7 @@ pub(super) async fn bound(
     match (answered, wanted_for) {
         (Ok(response), _) => response,
         (Err(_), Some(wait)) if wait <= longest => {
-            state.metrics.refused(RefusedFor::Deadline);
+            state.metrics.refused(Rejection::Deadline);
             deadline::passed(wait).into_response()
         }
         (Err(_), _) => Problem::new(
@@ -161,7 +161,7 @@ async fn bound_stream(
             return hanging_up(problem);
         }
     };
-    let held = Held::default();
+    let held = BodyBudget::default();
     request.extensions_mut().insert(Deadline(wait.map(|wait| arrival + wait)));
     request.extensions_mut().insert(held.clone());
     let request = request.map(|body| match call {

@@ -19,8 +19,8 @@ use super::state::AppState;
 use crate::grpc;
 use whereabouts_api::ErrorKind;
 use whereabouts_core::Digest;
-use whereabouts_service::{Caller, Once, Service};
-use whereabouts_store::KeptAnswer;
+use whereabouts_service::{Once, Principal, Service};
+use whereabouts_store::StoredResponse;
 
 pub(super) const IDEMPOTENCY_KEY: &str = "idempotency-key";
 const REPLAYED: HeaderName = HeaderName::from_static("idempotent-replayed");
@@ -33,7 +33,7 @@ const LARGEST_ANSWER: usize = 4 << 20;
 
 /// The id of a request that has a key, for those who note what they have done for it.
 #[derive(Debug, Clone)]
-pub(super) struct OnceId(pub String);
+pub(super) struct IdempotencyId(pub String);
 
 /// Whether a call can be sent again with a key. The answers of those that make an API key and a webhook are
 /// not kept, because a secret is in them; a call of gRPC is no single text; many images can be sent again
@@ -61,7 +61,7 @@ async fn answer(state: AppState, request: Request, next: Next) -> Result<Respons
         ));
     }
     let service = state.door.service()?;
-    let scope = request.extensions().get::<Caller>().map_or("-", Caller::scope);
+    let scope = request.extensions().get::<Principal>().map_or("-", Principal::scope);
     let id = format!("{scope} {key}");
     let (parts, body) = request.into_parts();
     let bytes = whole(Request::new(body), &state).await?;
@@ -83,7 +83,7 @@ async fn answer(state: AppState, request: Request, next: Next) -> Result<Respons
         }
         Once::First => {
             let mut request = Request::from_parts(parts, Body::from(bytes));
-            request.extensions_mut().insert(OnceId(id.clone()));
+            request.extensions_mut().insert(IdempotencyId(id.clone()));
             // Goes on when the sender has gone: it will ask again.
             let doing = do_and_keep(service, id, fingerprint, request, next);
             let doing = tokio::spawn(doing.in_current_span());
@@ -126,7 +126,7 @@ async fn do_and_keep(
         }
     };
     let kept = std::str::from_utf8(&text).ok().filter(|_| parts.status.is_success());
-    let kept = kept.map(|body| KeptAnswer {
+    let kept = kept.map(|body| StoredResponse {
         status: parts.status.as_u16(),
         content_type: parts
             .headers
@@ -141,8 +141,8 @@ async fn do_and_keep(
     Response::from_parts(parts, Body::from(text))
 }
 
-fn replay(kept: KeptAnswer) -> Response {
-    let KeptAnswer { status, content_type, body } = kept;
+fn replay(kept: StoredResponse) -> Response {
+    let StoredResponse { status, content_type, body } = kept;
     let status = StatusCode::from_u16(status).unwrap_or(StatusCode::OK);
     let mut response = (status, body).into_response();
     let headers = response.headers_mut();

@@ -19,7 +19,7 @@ use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
 use whereabouts_core::{Image, ImageId, MediaType};
 use whereabouts_service::{Deadline, NewImage, ServiceError};
 use whereabouts_store::Added;
-use whereabouts_vision::{Class, Demand};
+use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 /// What can be said about a raw image in the query string; a form says it in its part `meta`.
 #[derive(Debug, Deserialize, IntoParams)]
@@ -133,7 +133,7 @@ pub(super) async fn add_image(
     Deadline(deadline): Deadline,
     request: Request,
 ) -> Result<(StatusCode, Json<Image>), Problem> {
-    let demand = Demand { class: Class::Index, deadline };
+    let demand = AdmissionRequest { class: WorkClass::Index, deadline };
     let body = PictureBody::read(request, &state, &service, demand).await?;
     let meta = match body.meta {
         Some(_) if !params.is_empty() => {

@@ -11,16 +11,16 @@ use tokio::time::{Instant, timeout_at};
 
 use super::problem::Problem;
 use super::state::HttpSettings;
-use crate::grpc::Held;
+use crate::grpc::BodyBudget;
 use whereabouts_api::ErrorKind;
-use whereabouts_service::RefusedFor;
+use whereabouts_service::Rejection;
 
 /// Watches one body. What it takes of the common memory is given back when the request is answered.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Watch {
     fault: Arc<OnceLock<Fault>>,
     /// What it holds of the memory of all.
-    pub held: Held,
+    pub held: BodyBudget,
 }
 
 /// Why a body was not read to its end.
@@ -91,11 +91,11 @@ impl Watch {
     }
 
     /// What is to be answered in the place of any other answer, and what it counts as.
-    pub fn problem(&self) -> Option<(Problem, RefusedFor)> {
+    pub fn problem(&self) -> Option<(Problem, Rejection)> {
         let fault = self.fault.get()?;
         let (kind, reason) = match fault {
-            Fault::TookTooLong(_) | Fault::Paused(_) => (ErrorKind::TooSlow, RefusedFor::Slow),
-            Fault::NoMemory(_) => (ErrorKind::Overloaded, RefusedFor::Bodies),
+            Fault::TookTooLong(_) | Fault::Paused(_) => (ErrorKind::TooSlow, Rejection::Slow),
+            Fault::NoMemory(_) => (ErrorKind::Overloaded, Rejection::Bodies),
         };
         Some((Problem::new(kind, fault.to_string()), reason))
     }

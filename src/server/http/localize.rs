@@ -7,14 +7,14 @@ use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody};
-use super::idempotency::OnceId;
+use super::idempotency::IdempotencyId;
 use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
 use whereabouts_api::{Answer, RefineMode};
 use whereabouts_core::Priority;
-use whereabouts_service::{Caller, Deadline, LocalizeRequest, ServiceError, TrackStep};
-use whereabouts_vision::{Class, Demand};
+use whereabouts_service::{Deadline, LocalizeRequest, Principal, ServiceError, TrackStep};
+use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
@@ -44,7 +44,7 @@ pub(super) struct LocalizeParams {
 }
 
 impl LocalizeParams {
-    fn step(&mut self, caller: &Caller) -> Result<Option<TrackStep>, ServiceError> {
+    fn step(&mut self, caller: &Principal) -> Result<Option<TrackStep>, ServiceError> {
         match self.track.take() {
             Some(id) => TrackStep::new(caller, id, self.captured_at, self.moved_m).map(Some),
             None if self.captured_at.is_some() || self.moved_m.is_some() => {
@@ -96,15 +96,15 @@ struct FrameForm {
 pub(super) async fn localize(
     State(state): State<AppState>,
     Ready(service): Ready,
-    Extension(caller): Extension<Caller>,
+    Extension(caller): Extension<Principal>,
     Params(mut params): Params<LocalizeParams>,
     Deadline(deadline): Deadline,
     request: Request,
 ) -> Result<Json<Answer>, Problem> {
-    let once = request.extensions().get().map(|OnceId(id): &OnceId| id.clone());
+    let once = request.extensions().get().map(|IdempotencyId(id): &IdempotencyId| id.clone());
     let map = map_name(&params.map)?;
     let track = params.step(&caller)?;
-    let demand = Demand { class: Class::Localize, deadline };
+    let demand = AdmissionRequest { class: WorkClass::Localize, deadline };
     let body = PictureBody::read(request, &state, &service, demand).await?;
     let request = LocalizeRequest {
         map,

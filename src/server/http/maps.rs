@@ -10,7 +10,7 @@ use super::problem::Problem;
 use super::state::Ready;
 use whereabouts_api::{MapChange, MapState, ReindexRequest};
 use whereabouts_core::MapName;
-use whereabouts_service::Caller;
+use whereabouts_service::Principal;
 
 /// All maps.
 #[derive(Debug, Serialize, ToSchema)]
@@ -32,7 +32,7 @@ pub(super) fn map_name(text: &str) -> Result<MapName, Problem> {
 ))]
 pub(super) async fn list_maps(
     Ready(service): Ready,
-    Extension(caller): Extension<Caller>,
+    Extension(caller): Extension<Principal>,
 ) -> Result<Json<MapList>, Problem> {
     let mut maps = service.list_maps().await?;
     maps.retain(|map| caller.may_use(&map.name));

@@ -15,9 +15,9 @@ use super::incoming::no_memory;
 use super::problem::Problem;
 use super::state::{AppState, HttpSettings};
 use crate::Metrics;
-use crate::grpc::{Call, Held};
+use crate::grpc::{BodyBudget, Call};
 use whereabouts_api::ErrorKind;
-use whereabouts_service::RefusedFor;
+use whereabouts_service::Rejection;
 
 /// The bytes before a message: whether it is compressed, and its length.
 const PREFIX: usize = 5;
@@ -33,7 +33,7 @@ struct Messages {
     metrics: Arc<Metrics>,
     /// Of all bodies, or of those of bulk uploads.
     memory: Arc<Semaphore>,
-    held: Held,
+    held: BodyBudget,
     prefix: [u8; PREFIX],
     /// Bytes of the prefix that have come.
     prefix_bytes: usize,
@@ -44,7 +44,7 @@ struct Messages {
 
 /// Bounds the messages of a call. Its reader hears of what is wrong as a status. What they take of the memory
 /// is in `held`, until the reader takes it from there or the call has been answered.
-pub(super) fn bounded(body: Body, call: Call, state: &AppState, held: Held) -> Body {
+pub(super) fn bounded(body: Body, call: Call, state: &AppState, held: BodyBudget) -> Body {
     let memory = if call.many { &state.bulk_memory } else { &state.bodies_memory };
     let messages = Messages {
         body: body.into_data_stream(),
@@ -138,8 +138,8 @@ impl Messages {
     fn fail(&mut self, problem: Problem) -> axum::Error {
         self.failed = true;
         match problem.kind() {
-            ErrorKind::TooSlow => self.metrics.refused(RefusedFor::Slow),
-            ErrorKind::Overloaded => self.metrics.refused(RefusedFor::Bodies),
+            ErrorKind::TooSlow => self.metrics.refused(Rejection::Slow),
+            ErrorKind::Overloaded => self.metrics.refused(Rejection::Bodies),
             _ => {}
         }
         // Who reads the body passes a status on as it is.
@@ -208,7 +208,7 @@ mod tests {
     ) -> Result<usize, String> {
         let chunks = stream::iter(chunks).map(|chunk| Ok::<_, axum::Error>(Bytes::from(chunk)));
         let body = Body::from_stream(chunks.chain(stream::pending()));
-        let held = Held::default();
+        let held = BodyBudget::default();
         let call = grpc::call(path).unwrap();
         let mut body = bounded(body, call, state, held.clone()).into_data_stream();
         let mut bytes = 0;

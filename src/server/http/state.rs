@@ -11,8 +11,8 @@ use super::problem::Problem;
 use super::status::About;
 use crate::Metrics;
 use whereabouts_api::ErrorKind;
-use whereabouts_service::RefusedFor;
-use whereabouts_service::{Door, Service};
+use whereabouts_service::Rejection;
+use whereabouts_service::{Readiness, Service};
 
 /// Bounds of the HTTP layer.
 #[derive(Debug, Clone)]
@@ -51,7 +51,7 @@ pub struct AppState {
     pub(super) streams: Arc<Semaphore>,
     pub(super) bodies_memory: Arc<Semaphore>,
     pub(super) bulk_memory: Arc<Semaphore>,
-    pub(super) door: Door,
+    pub(super) door: Readiness,
 }
 
 impl AppState {
@@ -65,7 +65,7 @@ impl AppState {
             settings: Arc::new(settings),
             about: Arc::new(about),
             metrics,
-            door: Door::default(),
+            door: Readiness::default(),
         }
     }
 
@@ -82,14 +82,14 @@ impl AppState {
     }
 
     /// What stands between the callers and the service.
-    pub fn door(&self) -> &Door {
+    pub fn door(&self) -> &Readiness {
         &self.door
     }
 
     /// The right to one of the streams that may be open.
     pub(super) fn stream(&self) -> Result<OwnedSemaphorePermit, Problem> {
         Arc::clone(&self.streams).try_acquire_owned().map_err(|_| {
-            self.metrics.refused(RefusedFor::Requests);
+            self.metrics.refused(Rejection::Requests);
             let detail = format!(
                 "{} streams are open, the bound (server.max_streams); ask with GET /jobs or \
                  GET /jobs/{{id}}?wait= instead",

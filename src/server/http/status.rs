@@ -13,7 +13,7 @@ use super::state::{AppState, Ready};
 use whereabouts_api::Today;
 use whereabouts_core::RefinerKind;
 use whereabouts_service::ServiceError;
-use whereabouts_telemetry::{Minute, Trouble, Troubles};
+use whereabouts_telemetry::{LogIssue, LogIssues, Minute};
 
 /// What is known of the server from its start on.
 #[derive(Debug)]
@@ -27,7 +27,7 @@ pub struct About {
     /// The pictures behind the plan of a map, if there are any.
     pub tiles: Option<Tiles>,
     /// The last warnings and errors.
-    pub troubles: Arc<Troubles>,
+    pub troubles: Arc<LogIssues>,
 }
 
 /// A server of map tiles.
@@ -75,7 +75,7 @@ pub(super) struct Status {
     /// The last hour, the oldest minute first; minutes in which nothing was done are left out.
     minutes: Vec<Minute>,
     /// The last warnings and errors of the log, the newest first.
-    errors: Vec<Trouble>,
+    errors: Vec<LogIssue>,
     /// The settings in force in TOML, without secrets.
     settings: String,
 }

@@ -13,7 +13,7 @@ use super::state::{AppState, Ready};
 use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
 use whereabouts_core::{Image, Map};
 use whereabouts_store::Added;
-use whereabouts_vision::{Class, Demand};
+use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 /// The images of a map with their descriptors, by id
 ///
@@ -90,7 +90,7 @@ pub(super) async fn import_image(
     Segments(map): Segments<String>,
     request: Request,
 ) -> Result<(StatusCode, Json<Image>), Problem> {
-    let demand = Demand { class: Class::Index, deadline: None };
+    let demand = AdmissionRequest { class: WorkClass::Index, deadline: None };
     let body = PictureBody::read(request, &state, &service, demand).await?;
     let meta = body.meta.unwrap_or_default();
     let from: ImportedImage = serde_json::from_slice(&meta).map_err(|error| {

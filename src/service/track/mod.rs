@@ -18,7 +18,7 @@ use uuid::Uuid;
 
 use self::belief::{Belief, Motion};
 use self::places::Places;
-use super::{Caller, Service, ServiceError};
+use super::{Principal, Service, ServiceError};
 use whereabouts_api::{ErrorKind, TrackEstimate};
 use whereabouts_core::{Calibration, Candidate, ImageId, Map};
 
@@ -66,7 +66,7 @@ pub struct TrackSettings {
 
 impl TrackSettings {
     /// What is wrong with them, if anything.
-    pub fn contradiction(&self) -> Option<String> {
+    pub fn validate(&self) -> Option<String> {
         let share = |name: &str, value: f64| {
             let wrong = !(value > 0.0 && value < 1.0);
             wrong.then(|| format!("track.{name} = {value} must be above 0 and below 1"))
@@ -108,7 +108,7 @@ impl TrackStep {
     /// # Errors
     /// [`ErrorKind::Unprocessable`](super::ErrorKind) for an id that is none, and for a way that cannot be.
     pub fn new(
-        caller: &Caller,
+        caller: &Principal,
         id: String,
         captured_at: Option<Timestamp>,
         moved_m: Option<f64>,

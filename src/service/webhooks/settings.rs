@@ -46,7 +46,7 @@ pub struct WebhookSettings {
 
 impl WebhookSettings {
     /// What is wrong with them, if anything.
-    pub fn contradiction(&self) -> Option<String> {
+    pub fn validate(&self) -> Option<String> {
         let at_least_one = [
             ("max", self.max),
             ("concurrency", self.concurrency),
@@ -146,9 +146,9 @@ pub(super) mod tests {
         let wrong = |change: fn(&mut WebhookSettings)| {
             let mut settings = defaults();
             change(&mut settings);
-            settings.contradiction().unwrap()
+            settings.validate().unwrap()
         };
-        assert_eq!(defaults().contradiction(), None);
+        assert_eq!(defaults().validate(), None);
         assert!(wrong(|settings| settings.max = 0).contains("webhooks.max "));
         assert!(wrong(|settings| settings.timeout_s = 0).contains("timeout_s"));
         assert!(wrong(|settings| settings.concurrency_each = 999).contains("concurrency_each"));

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use jiff::Timestamp;
 
-use super::super::{AnswerStore, FirstAnswer, Progress, StoreError};
+use super::super::{IdempotencyRecord, IdempotencyStore, Progress, StoreError};
 use super::trees::{Trees, decode, failed, get, put};
 use super::{EmbeddedStore, blocking};
 
@@ -15,7 +15,11 @@ fn age_key(at: Timestamp, id: &[u8]) -> Vec<u8> {
     [&at.as_millisecond().to_be_bytes(), id].concat()
 }
 
-pub(super) fn write(trees: &Trees, id: &[u8], answer: &FirstAnswer) -> Result<(), StoreError> {
+pub(super) fn write(
+    trees: &Trees,
+    id: &[u8],
+    answer: &IdempotencyRecord,
+) -> Result<(), StoreError> {
     remove(trees, id)?;
     put(&trees.answers, id, answer)?;
     put(&trees.answers_by_age, &age_key(answer.at, id), &())
@@ -23,24 +27,24 @@ pub(super) fn write(trees: &Trees, id: &[u8], answer: &FirstAnswer) -> Result<()
 
 fn remove(trees: &Trees, id: &[u8]) -> Result<(), StoreError> {
     if let Some(old) = trees.answers.remove(id).map_err(failed)? {
-        let old: FirstAnswer = decode(&old)?;
+        let old: IdempotencyRecord = decode(&old)?;
         trees.answers_by_age.remove(age_key(old.at, id)).map_err(failed)?;
     }
     Ok(())
 }
 
 #[async_trait]
-impl AnswerStore for EmbeddedStore {
+impl IdempotencyStore for EmbeddedStore {
     async fn reserve_answer(
         &self,
         id: &str,
-        reserved: FirstAnswer,
+        reserved: IdempotencyRecord,
         since: Timestamp,
-    ) -> Result<Option<FirstAnswer>, StoreError> {
+    ) -> Result<Option<IdempotencyRecord>, StoreError> {
         let id = id.to_owned();
         let reserve = move |trees: &Trees, _: &mut _| {
-            let known: Option<FirstAnswer> = get(&trees.answers, id.as_bytes())?;
-            let counts = |known: &FirstAnswer| match (&known.progress, &reserved.progress) {
+            let known: Option<IdempotencyRecord> = get(&trees.answers, id.as_bytes())?;
+            let counts = |known: &IdempotencyRecord| match (&known.progress, &reserved.progress) {
                 // Of a process that has ended nothing more will come.
                 (Progress::Running { process, .. }, Progress::Running { process: own, .. }) => {
                     process == own
@@ -58,7 +62,7 @@ impl AnswerStore for EmbeddedStore {
         self.inner.writer.commit(reserve, |_| {}).await
     }
 
-    async fn keep_answer(&self, id: &str, answer: FirstAnswer) -> Result<(), StoreError> {
+    async fn keep_answer(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError> {
         let id = id.to_owned();
         let keep = move |trees: &Trees, _: &mut _| write(trees, id.as_bytes(), &answer);
         self.inner.writer.commit(keep, |()| {}).await

@@ -15,7 +15,7 @@ use uuid::Uuid;
 use super::super::changes::{ended_at, no_job, place, submitted_at};
 use super::super::listing::SEARCHED;
 use super::super::{
-    Claim, FirstAnswer, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
+    Claim, IdempotencyRecord, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
 };
 use super::trees::{
     BlobOwner, Lease, Trees, blob_ref_key, decode, encode, ended_key, failed, get, put, queue_key,
@@ -104,14 +104,14 @@ impl EmbeddedStore {
 
 /// The job that was queued for a request.
 fn queued_for(trees: &Trees, request: &str) -> Result<Option<Job>, StoreError> {
-    let known: Option<FirstAnswer> = get(&trees.answers, request.as_bytes())?;
+    let known: Option<IdempotencyRecord> = get(&trees.answers, request.as_bytes())?;
     let job = known.and_then(|known| known.job()).map(|id| trees.job(id)).transpose()?;
     Ok(job.flatten().map(|record| record.job))
 }
 
 /// Notes that a job is queued for a request. It is there only if the job is: whoever reads it looks.
 fn note(trees: &Trees, request: &str, job: Uuid) -> Result<(), StoreError> {
-    let known: Option<FirstAnswer> = get(&trees.answers, request.as_bytes())?;
+    let known: Option<IdempotencyRecord> = get(&trees.answers, request.as_bytes())?;
     let Some(mut known) = known else { return Ok(()) };
     known.queued(job);
     answers::write(trees, request.as_bytes(), &known)

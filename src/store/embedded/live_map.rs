@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
-use super::super::{LookAlikes, StoreError};
+use super::super::{HardNegatives, StoreError};
 use super::blobs::replace_durably;
 use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
@@ -195,7 +195,7 @@ impl LiveMap {
     }
 
     /// Images spread over the map, each with the `k` most similar ones of other places.
-    pub fn look_alikes(&self, settings: CalibrationSettings, k: usize) -> Vec<LookAlikes> {
+    pub fn look_alikes(&self, settings: CalibrationSettings, k: usize) -> Vec<HardNegatives> {
         let places: Vec<Place> = {
             let entries = self.entries.read();
             let known = entries.iter().enumerate();
@@ -213,7 +213,7 @@ impl LiveMap {
         at: usize,
         settings: CalibrationSettings,
         k: usize,
-    ) -> Option<LookAlikes> {
+    ) -> Option<HardNegatives> {
         let asked = &places[at];
         let of_another_place = |found: &Found| {
             // Where it stands in the order of addition.
@@ -238,7 +238,7 @@ impl LiveMap {
         };
         let image_id = self.entries.read();
         let image_id = image_id.get(asked.slot)?.as_ref()?.id.clone();
-        Some(LookAlikes { image_id, others: self.candidates(&others) })
+        Some(HardNegatives { image_id, others: self.candidates(&others) })
     }
 }
 

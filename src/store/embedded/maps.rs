@@ -9,7 +9,7 @@ use sled::Transactional;
 use uuid::Uuid;
 
 use super::super::changes::{changed_map, check_dim, removed, same_bytes};
-use super::super::{Added, BlobPin, BlobStore, IndexState, LookAlikes, MapStore, StoreError};
+use super::super::{Added, BlobPin, BlobStore, HardNegatives, IndexState, MapStore, StoreError};
 use super::blobs::Blobs;
 use super::live_map::{LiveMap, folder_of};
 use super::trees::{
@@ -253,7 +253,7 @@ impl MapStore for EmbeddedStore {
         map: &Map,
         settings: CalibrationSettings,
         k: usize,
-    ) -> Result<Vec<LookAlikes>, StoreError> {
+    ) -> Result<Vec<HardNegatives>, StoreError> {
         let live = self.inner.live_revision(map)?;
         blocking(move || Ok(live.look_alikes(settings, k))).await
     }

@@ -13,13 +13,13 @@ use super::super::StoreError;
 use super::trees::Trees;
 
 /// The number of the last commit.
-pub(super) struct CommitMark {
+pub(super) struct CommitWatermark {
     path: PathBuf,
     file: File,
     number: u64,
 }
 
-impl CommitMark {
+impl CommitWatermark {
     /// Holds the database against the file.
     ///
     /// # Errors

@@ -50,7 +50,7 @@ use self::descriptions::DescriptionUse;
 pub use self::doctor::{Examination, Finding, MapReport, Report, Sizes, examine};
 use self::indexer::Indexer;
 use self::live_map::LiveMap;
-use self::mark::CommitMark;
+use self::mark::CommitWatermark;
 use self::trees::Trees;
 use self::writer::Writer;
 use super::{DescriptionBounds, StoreError};
@@ -115,7 +115,7 @@ impl EmbeddedStore {
         schema::bring_up_to_date(dir)?;
         compact::settle(dir)?;
         let trees = Trees::open(&dir.join("db"), settings.db_cache_bytes)?;
-        let mark = CommitMark::open(dir, &trees)?;
+        let mark = CommitWatermark::open(dir, &trees)?;
         let descriptors = dir.join("descriptors");
         make_folder(&descriptors)?;
         let blobs = Blobs::open(dir.join("images"), settings.min_free_bytes)?;

@@ -5,7 +5,7 @@ use std::thread;
 use tokio::sync::{mpsc, oneshot};
 
 use super::super::StoreError;
-use super::mark::CommitMark;
+use super::mark::CommitWatermark;
 use super::segments::VectorFiles;
 use super::trees::Trees;
 use std::sync::Arc;
@@ -28,7 +28,7 @@ pub(super) struct Touched {
 
 impl Writer {
     /// Starts the thread; it ends when the writer is dropped and the queue is empty.
-    pub fn start(trees: Trees, mark: CommitMark, batch: usize) -> Result<Self, StoreError> {
+    pub fn start(trees: Trees, mark: CommitWatermark, batch: usize) -> Result<Self, StoreError> {
         let (queue, changes) = mpsc::channel(batch.max(1));
         thread::Builder::new()
             .name("store-writer".into())
@@ -62,7 +62,12 @@ impl Writer {
     }
 }
 
-fn run(trees: &Trees, mut mark: CommitMark, mut changes: mpsc::Receiver<Change>, batch: usize) {
+fn run(
+    trees: &Trees,
+    mut mark: CommitWatermark,
+    mut changes: mpsc::Receiver<Change>,
+    batch: usize,
+) {
     while let Some(first) = changes.blocking_recv() {
         let mut touched = Touched::default();
         let mut waiting = vec![first(trees, &mut touched)];
@@ -84,7 +89,7 @@ fn run(trees: &Trees, mut mark: CommitMark, mut changes: mpsc::Receiver<Change>,
     }
 }
 
-fn sync(trees: &Trees, touched: &Touched, mark: &mut CommitMark) -> Result<(), StoreError> {
+fn sync(trees: &Trees, touched: &Touched, mark: &mut CommitWatermark) -> Result<(), StoreError> {
     touched.vectors.iter().try_for_each(|vectors| vectors.sync())?;
     mark.next(trees)?;
     trees.flush()?;

@@ -5,17 +5,17 @@ use jiff::Timestamp;
 use jiff_sqlx::ToSqlx;
 use sqlx::types::Json;
 
-use super::super::{AnswerStore, FirstAnswer, Progress, StoreError};
+use super::super::{IdempotencyRecord, IdempotencyStore, Progress, StoreError};
 use super::{PostgresStore, count, record, unavailable};
 
 #[async_trait]
-impl AnswerStore for PostgresStore {
+impl IdempotencyStore for PostgresStore {
     async fn reserve_answer(
         &self,
         id: &str,
-        reserved: FirstAnswer,
+        reserved: IdempotencyRecord,
         since: Timestamp,
-    ) -> Result<Option<FirstAnswer>, StoreError> {
+    ) -> Result<Option<IdempotencyRecord>, StoreError> {
         let inner = &self.inner;
         inner
             .call(async {
@@ -40,7 +40,7 @@ impl AnswerStore for PostgresStore {
                          ELSE holder = $4 OR is_alive(holder, make_interval(secs => $3)) END
                      FROM answers WHERE id = $1 FOR UPDATE",
                 );
-                let known: Option<(Json<FirstAnswer>, bool)> = known
+                let known: Option<(Json<IdempotencyRecord>, bool)> = known
                     .bind(id)
                     .bind(since.to_sqlx())
                     .bind(inner.lifetime())
@@ -70,7 +70,7 @@ impl AnswerStore for PostgresStore {
             .await
     }
 
-    async fn keep_answer(&self, id: &str, answer: FirstAnswer) -> Result<(), StoreError> {
+    async fn keep_answer(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError> {
         let inner = &self.inner;
         let holder = matches!(answer.progress, Progress::Running { .. }).then_some(inner.process);
         let query = sqlx::query(

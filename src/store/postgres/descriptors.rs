@@ -12,7 +12,7 @@ use sqlx::{AssertSqlSafe, PgConnection, Row};
 use uuid::Uuid;
 
 use super::super::changes::removed;
-use super::super::{LookAlikes, StoreError};
+use super::super::{HardNegatives, StoreError};
 use super::{Inner, count, is_locked, is_missing_table};
 use whereabouts_core::{CalibrationSettings, Candidate, Descriptor, ImageId, Map, Pose};
 use whereabouts_index::SearchMode;
@@ -307,7 +307,7 @@ impl Inner {
         map: &Map,
         settings: CalibrationSettings,
         k: usize,
-    ) -> Result<Vec<LookAlikes>, StoreError> {
+    ) -> Result<Vec<HardNegatives>, StoreError> {
         let places: Vec<(i64, String, Option<Json<Pose>>)> =
             sqlx::query_as("SELECT slot, id, pose FROM images WHERE map_uid = $1 ORDER BY slot")
                 .bind(map.uid)
@@ -335,7 +335,7 @@ impl Inner {
                 wanted *= 2;
             };
             let image_id = image_id(id.clone())?;
-            asked.push(LookAlikes { image_id, others: candidates(others) });
+            asked.push(HardNegatives { image_id, others: candidates(others) });
         }
         Ok(asked)
     }

@@ -15,7 +15,7 @@ use uuid::Uuid;
 use super::super::changes::{ended_at, news_of, no_job, place, submitted_at};
 use super::super::listing::SEARCHED;
 use super::super::{
-    Claim, FirstAnswer, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
+    Claim, IdempotencyRecord, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
 };
 use super::listener::{DELIVERIES, JOBS};
 use super::statements::alone;
@@ -233,7 +233,7 @@ impl JobStore for PostgresStore {
                 let mut tx = inner.begin().await?;
                 let known =
                     sqlx::query_scalar("SELECT record FROM answers WHERE id = $1 FOR UPDATE");
-                let known: Option<Json<FirstAnswer>> =
+                let known: Option<Json<IdempotencyRecord>> =
                     known.bind(request).fetch_optional(&mut *tx).await?;
                 if let Some(Json(mut known)) = known {
                     let job = sqlx::query_scalar("SELECT record FROM jobs WHERE id = $1");

@@ -7,7 +7,7 @@ use async_trait::async_trait;
 use jiff::civil::Date;
 use jiff_sqlx::ToSqlx;
 
-use super::super::{Draw, Drawn, SharedLimits, StoreError};
+use super::super::{SharedLimits, StoreError, TokenGrant, TokenRequest};
 use super::PostgresStore;
 use super::statements::alone;
 use whereabouts_core::Spent;
@@ -17,7 +17,7 @@ const BUDGET_LOCK: i64 = 0x7768_6572_6561_0003;
 
 #[async_trait]
 impl SharedLimits for PostgresStore {
-    async fn draw(&self, name: &str, draws: [Draw; 2]) -> Result<Drawn, StoreError> {
+    async fn draw(&self, name: &str, draws: [TokenRequest; 2]) -> Result<TokenGrant, StoreError> {
         let inner = &self.inner;
         let [first, second] = draws;
         let query = sqlx::query_as(
@@ -44,7 +44,7 @@ impl SharedLimits for PostgresStore {
         inner
             .call(async {
                 let (taken, first, second): (bool, f64, f64) = query.fetch_one(&inner.pool).await?;
-                Ok(Drawn { taken, left: [first, second] })
+                Ok(TokenGrant { taken, left: [first, second] })
             })
             .await
     }

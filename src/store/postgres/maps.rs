@@ -8,7 +8,7 @@ use sqlx::{PgConnection, Row};
 use uuid::Uuid;
 
 use super::super::changes::{changed_map, check_dim, removed};
-use super::super::{Added, IndexState, LookAlikes, MapStore, StoreError};
+use super::super::{Added, HardNegatives, IndexState, MapStore, StoreError};
 use super::descriptors::make_table;
 use super::{Inner, PostgresStore, counted, record};
 use whereabouts_core::{
@@ -111,7 +111,7 @@ impl MapStore for PostgresStore {
         map: &Map,
         settings: CalibrationSettings,
         k: usize,
-    ) -> Result<Vec<LookAlikes>, StoreError> {
+    ) -> Result<Vec<HardNegatives>, StoreError> {
         let inner = &self.inner;
         inner.call(inner.measure(map)).await?;
         // Many searches, and nobody waits for them.

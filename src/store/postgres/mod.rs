@@ -78,7 +78,7 @@ pub struct PostgresStore {
 
 struct Inner {
     pool: PgPool,
-    doubts: Doubts,
+    doubts: RecentTimeout,
     objects: Objects,
     settings: PostgresSettings,
     /// This process among all.
@@ -106,7 +106,7 @@ impl PostgresStore {
         objects: Objects,
         process: Uuid,
     ) -> Result<Self, StoreError> {
-        let doubts = Doubts::default();
+        let doubts = RecentTimeout::default();
         let pool = connect(&settings, &doubts)?;
         check_schema(&pool, &settings).await?;
         let background = CancellationToken::new();
@@ -164,9 +164,9 @@ impl Inner {
 /// When a call last ran out of time. The pool asks every connection that it is given back whether it is alive,
 /// and would wait for the answer of a dead one for ever; after such a call it does not.
 #[derive(Clone, Default)]
-struct Doubts(Arc<Mutex<Option<Instant>>>);
+struct RecentTimeout(Arc<Mutex<Option<Instant>>>);
 
-impl Doubts {
+impl RecentTimeout {
     fn arise(&self) {
         *self.0.lock() = Some(Instant::now());
     }
@@ -179,7 +179,7 @@ impl Doubts {
 }
 
 /// No connection yet: they are made when they are needed.
-fn connect(settings: &PostgresSettings, doubts: &Doubts) -> Result<PgPool, StoreError> {
+fn connect(settings: &PostgresSettings, doubts: &RecentTimeout) -> Result<PgPool, StoreError> {
     let options = PgConnectOptions::from_str(&settings.url).map_err(|error| {
         // The error may show the address, and that may hold a password.
         let what = match error {

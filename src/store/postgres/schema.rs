@@ -6,7 +6,7 @@ use sqlx::migrate::{AppliedMigration, Migrate, MigrateError, Migration, Migratio
 use sqlx::{PgPool, SqlSafeStr};
 
 use super::super::StoreError;
-use super::{Doubts, PostgresSettings, connect};
+use super::{PostgresSettings, RecentTimeout, connect};
 
 /// How far the schema of a database is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,7 +36,7 @@ fn steps() -> Vec<Migration> {
 /// Applies the missing steps; returns how many there were. Processes that do so at once wait for each other.
 pub async fn migrate(settings: &PostgresSettings) -> Result<usize, StoreError> {
     let unhurried = PostgresSettings { max_connections: 1, ..settings.clone() };
-    let pool = connect(&unhurried, &Doubts::default())?;
+    let pool = connect(&unhurried, &RecentTimeout::default())?;
     let missing = match schema_state(&pool).await? {
         SchemaState::UpToDate => 0,
         SchemaState::Behind { steps } => steps,
@@ -54,7 +54,7 @@ pub async fn migrate(settings: &PostgresSettings) -> Result<usize, StoreError> {
 
 /// How far the schema of the database of these settings is.
 pub async fn schema_of(settings: &PostgresSettings) -> Result<SchemaState, StoreError> {
-    schema_state(&connect(settings, &Doubts::default())?).await
+    schema_state(&connect(settings, &RecentTimeout::default())?).await
 }
 
 /// How far the schema is.

@@ -6,7 +6,7 @@ use futures_util::poll;
 
 use super::*;
 
-type Entering = Pin<Box<dyn Future<Output = Result<Permit, Refused>>>>;
+type Entering = Pin<Box<dyn Future<Output = Result<Permit, Rejected>>>>;
 
 fn admission(permits: usize, queue: usize) -> Admission {
     Admission::new(AdmissionSettings {
@@ -17,41 +17,41 @@ fn admission(permits: usize, queue: usize) -> Admission {
     })
 }
 
-fn demand(class: Class) -> Demand {
-    Demand { class, deadline: None }
+fn demand(class: WorkClass) -> AdmissionRequest {
+    AdmissionRequest { class, deadline: None }
 }
 
 /// Joins the line; whoever is refused at once fails the test.
-async fn waiting(admission: &Admission, class: Class) -> Entering {
+async fn waiting(admission: &Admission, class: WorkClass) -> Entering {
     let admission = admission.clone();
     let mut entering: Entering = Box::pin(async move { admission.enter(demand(class)).await });
     assert!(poll!(&mut entering).is_pending());
     entering
 }
 
-async fn reason(admission: &Admission, demand: Demand) -> Refusal {
+async fn reason(admission: &Admission, demand: AdmissionRequest) -> RejectReason {
     admission.enter(demand).await.unwrap_err().reason
 }
 
 #[tokio::test]
 async fn one_more_than_may_wait_is_refused_at_once() {
     let admission = admission(1, 2);
-    let _inside = admission.enter(demand(Class::Localize)).await.unwrap();
-    let _a = waiting(&admission, Class::Localize).await;
-    let _b = waiting(&admission, Class::Localize).await;
-    assert_eq!(reason(&admission, demand(Class::Localize)).await, Refusal::QueueFull);
-    assert_eq!(reason(&admission, demand(Class::Index)).await, Refusal::QueueFull);
-    assert!(admission.check(demand(Class::Localize)).is_err());
+    let _inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
+    let _a = waiting(&admission, WorkClass::Localize).await;
+    let _b = waiting(&admission, WorkClass::Localize).await;
+    assert_eq!(reason(&admission, demand(WorkClass::Localize)).await, RejectReason::QueueFull);
+    assert_eq!(reason(&admission, demand(WorkClass::Index)).await, RejectReason::QueueFull);
+    assert!(admission.check(demand(WorkClass::Localize)).is_err());
     assert_eq!(admission.pressure(), 1.0);
 }
 
 #[tokio::test]
 async fn frames_go_first_then_images_then_what_nobody_waits_for() {
     let admission = admission(1, 9);
-    let inside = admission.enter(demand(Class::Index)).await.unwrap();
-    let mut background = waiting(&admission, Class::Background).await;
-    let mut index = waiting(&admission, Class::Index).await;
-    let mut localize = waiting(&admission, Class::Localize).await;
+    let inside = admission.enter(demand(WorkClass::Index)).await.unwrap();
+    let mut background = waiting(&admission, WorkClass::Background).await;
+    let mut index = waiting(&admission, WorkClass::Index).await;
+    let mut localize = waiting(&admission, WorkClass::Localize).await;
     drop(inside);
     assert!(poll!(&mut index).is_pending() && poll!(&mut background).is_pending());
     drop(localize.as_mut().await.unwrap());
@@ -64,20 +64,20 @@ async fn frames_go_first_then_images_then_what_nobody_waits_for() {
 #[tokio::test]
 async fn the_last_image_makes_room_for_a_frame() {
     let admission = admission(1, 2);
-    let _inside = admission.enter(demand(Class::Localize)).await.unwrap();
-    let mut first = waiting(&admission, Class::Index).await;
-    let last = waiting(&admission, Class::Index).await;
-    let _frame = waiting(&admission, Class::Localize).await;
-    assert_eq!(last.await.unwrap_err().reason, Refusal::QueueFull);
+    let _inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
+    let mut first = waiting(&admission, WorkClass::Index).await;
+    let last = waiting(&admission, WorkClass::Index).await;
+    let _frame = waiting(&admission, WorkClass::Localize).await;
+    assert_eq!(last.await.unwrap_err().reason, RejectReason::QueueFull);
     assert!(poll!(&mut first).is_pending());
 }
 
 #[tokio::test]
 async fn the_place_of_who_has_gone_is_free() {
     let admission = admission(1, 1);
-    let inside = admission.enter(demand(Class::Localize)).await.unwrap();
-    drop(waiting(&admission, Class::Localize).await);
-    let mut next = waiting(&admission, Class::Localize).await;
+    let inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
+    drop(waiting(&admission, WorkClass::Localize).await);
+    let mut next = waiting(&admission, WorkClass::Localize).await;
     drop(inside);
     drop(next.as_mut().await.unwrap());
     assert_eq!(admission.levels().in_use, 0);
@@ -86,10 +86,10 @@ async fn the_place_of_who_has_gone_is_free() {
 #[tokio::test(start_paused = true)]
 async fn nobody_waits_longer_than_the_bound_but_in_the_background() {
     let admission = admission(1, 2);
-    let inside = admission.enter(demand(Class::Localize)).await.unwrap();
-    let mut background = waiting(&admission, Class::Background).await;
-    let frame = waiting(&admission, Class::Localize).await;
-    assert_eq!(frame.await.unwrap_err().reason, Refusal::WaitTooLong);
+    let inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
+    let mut background = waiting(&admission, WorkClass::Background).await;
+    let frame = waiting(&admission, WorkClass::Localize).await;
+    assert_eq!(frame.await.unwrap_err().reason, RejectReason::WaitTooLong);
     assert!(poll!(&mut background).is_pending());
     drop(inside);
     assert!(background.await.is_ok());
@@ -98,20 +98,22 @@ async fn nobody_waits_longer_than_the_bound_but_in_the_background() {
 #[tokio::test]
 async fn what_cannot_be_in_time_is_refused_at_once_and_told_when_to_come_back() {
     let admission = admission(1, 100);
-    let mut inside = admission.enter(demand(Class::Localize)).await.unwrap();
+    let mut inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
     inside.since = Instant::now() - Duration::from_secs(4);
     inside.served();
-    let soon =
-        Demand { class: Class::Localize, deadline: Some(Instant::now() + Duration::from_secs(5)) };
+    let soon = AdmissionRequest {
+        class: WorkClass::Localize,
+        deadline: Some(Instant::now() + Duration::from_secs(5)),
+    };
     let refused = admission.enter(soon).await.unwrap_err();
-    assert_eq!(refused.reason, Refusal::DeadlineTooSoon);
+    assert_eq!(refused.reason, RejectReason::DeadlineTooSoon);
     assert_eq!(refused.retry_after.as_secs(), 4);
     let mut in_line = Vec::new();
     for _ in 0..14 {
-        in_line.push(waiting(&admission, Class::Localize).await);
+        in_line.push(waiting(&admission, WorkClass::Localize).await);
     }
-    let refused = admission.enter(demand(Class::Localize)).await.unwrap_err();
-    assert_eq!(refused.reason, Refusal::WaitTooLong);
+    let refused = admission.enter(demand(WorkClass::Localize)).await.unwrap_err();
+    assert_eq!(refused.reason, RejectReason::WaitTooLong);
     assert_eq!(refused.retry_after.as_secs(), 30);
     // Who is alone is tried, whatever took long before.
     in_line.clear();

@@ -8,12 +8,12 @@ fn queue(narrow_sessions: usize, max_batch: usize) -> Queue {
     Queue { state: state.into(), work: Condvar::new(), room: Condvar::new(), layout }
 }
 
-fn submit(queue: &Queue) -> Inferring {
+fn submit(queue: &Queue) -> PendingInference {
     let (answer, inferring) = oneshot::channel();
     let mut state = queue.lock();
     state.overlapped |= state.in_progress();
     state.waiting.push_back(Request { tensor: Tensor::grey(1, 1), answer });
-    Inferring(inferring)
+    PendingInference(inferring)
 }
 
 fn may_take(queue: &Queue) -> (bool, bool) {

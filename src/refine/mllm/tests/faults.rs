@@ -64,7 +64,7 @@ async fn dropping_a_job_hangs_up() {
 async fn an_answer_of_ten_megabytes_is_refused() {
     let bench = Bench::new(after(vec![Reply::Huge(10_000_000)])).await;
     let error = bench.refine(1).await.unwrap_err();
-    assert!(matches!(&error, RefineError::Hopeless(why) if why.contains("answer_max_bytes")));
+    assert!(matches!(&error, RefineError::Permanent(why) if why.contains("answer_max_bytes")));
     assert_eq!(bench.mock.describe_calls(), 1);
 }
 
@@ -92,10 +92,10 @@ async fn when_no_pair_can_be_described_the_job_has_no_ranking() {
     let always =
         |reply: Reply| Script { describe: Box::new(move |_| reply.clone()), ..Script::default() };
     let bench = Bench::new(always(status(404))).await;
-    assert!(matches!(bench.refine(2).await.unwrap_err(), RefineError::Hopeless(_)));
+    assert!(matches!(bench.refine(2).await.unwrap_err(), RefineError::Permanent(_)));
     assert_eq!(bench.mock.describe_calls(), 2);
     let bench = Bench::with(always(status(500)), |settings| settings.breaker_failures = 100).await;
-    assert!(matches!(bench.refine(2).await.unwrap_err(), RefineError::Passing(_)));
+    assert!(matches!(bench.refine(2).await.unwrap_err(), RefineError::Transient(_)));
     assert_eq!(bench.mock.describe_calls(), 8);
     let bench = Bench::new(always(Reply::Text(" \u{200b}\n".into()))).await;
     let error = bench.refine(1).await.unwrap_err();
@@ -141,5 +141,5 @@ async fn a_server_that_is_not_there_may_come_back() {
     let mut bench = Bench::new(Script::default()).await;
     bench.rebuild(|settings| settings.base_url = "http://127.0.0.1:1/v1".into());
     let error = bench.refine(1).await.unwrap_err();
-    assert!(matches!(&error, RefineError::Passing(why) if why.contains("cannot be talked to")));
+    assert!(matches!(&error, RefineError::Transient(why) if why.contains("cannot be talked to")));
 }

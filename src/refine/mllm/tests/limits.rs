@@ -69,7 +69,7 @@ async fn an_open_breaker_hands_the_job_to_the_other_refiner() {
 async fn without_another_refiner_the_job_is_tried_again_later() {
     let bench = Bench::with(failing(1000), brittle).await;
     let error = bench.refine(5).await.unwrap_err();
-    assert!(matches!(error, RefineError::Passing(_)), "{error}");
+    assert!(matches!(error, RefineError::Transient(_)), "{error}");
 }
 
 #[tokio::test]
@@ -95,7 +95,7 @@ async fn a_job_that_waits_says_for_how_long() {
     })
     .await;
     let error = bench.refine(5).await.unwrap_err();
-    let RefineError::Later { why, after } = error else { panic!("{error}") };
+    let RefineError::Deferred { why, after } = error else { panic!("{error}") };
     assert!(why.contains("suspended"), "{why}");
     assert!((3590..=3600).contains(&after.as_secs()), "{after:?}");
 }
@@ -106,7 +106,7 @@ async fn what_earlier_attempts_spent_counts_against_the_budget_of_the_job() {
     let mut record = bench.record(2);
     record.job.usage.prompt_tokens = 19_990;
     let error = bench.refiner.refine(&record, &Steps::default()).await.unwrap_err();
-    assert!(matches!(&error, RefineError::Hopeless(why) if why.contains("tokens_per_job")));
+    assert!(matches!(&error, RefineError::Permanent(why) if why.contains("tokens_per_job")));
     assert_eq!(bench.mock.describe_calls(), 0);
 }
 
@@ -143,7 +143,7 @@ async fn a_day_never_passes_its_budget() {
     };
     bench.refiner.seed_spent_today(&spent(0.999));
     let error = bench.refine(2).await.unwrap_err();
-    assert!(matches!(&error, RefineError::Passing(why) if why.contains("money_per_day")));
+    assert!(matches!(&error, RefineError::Transient(why) if why.contains("money_per_day")));
     assert_eq!(bench.mock.describe_calls(), 0);
     bench.refiner.seed_spent_today(&spent(0.5));
     assert_eq!(bench.refine(2).await.unwrap().degraded, None);

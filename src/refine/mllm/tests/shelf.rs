@@ -15,11 +15,12 @@ use super::super::settings::tests::defaults;
 use super::*;
 use whereabouts_core::{CachedDescription, DescribedFrame, Secret, SimilarFrame};
 use whereabouts_core::{
-    Calibration, CalibrationSettings, Candidate, DayUsage, Descriptor, DescriptorKind, Digest,
-    Frame, Image, ImageId, Job, Map, MapName, MediaType, Pose, Precision, RefinerKind, StandIn,
+    Calibration, CalibrationSettings, Candidate, CoordinateFrame, DayUsage, Descriptor,
+    DescriptorKind, Digest, Image, ImageId, Job, Map, MapName, MediaType, Pose, Precision,
+    RefinerKind, StandIn,
 };
 use whereabouts_index::SearchMode;
-use whereabouts_store::{Added, BlobPin, IndexState, LookAlikes, Query, Step, StoreError};
+use whereabouts_store::{Added, BlobPin, HardNegatives, IndexState, Query, Step, StoreError};
 use whereabouts_telemetry::metrics::registry;
 use whereabouts_testkit::mock_mllm::{MockMllm, Script};
 use whereabouts_vision::decode::encode_jpeg;
@@ -111,7 +112,7 @@ impl Shelf {
             name: "m".parse().unwrap(),
             scene: Scene::Outdoor,
             descriptor: DescriptorKind::Gem,
-            frame: Frame::Metric,
+            frame: CoordinateFrame::Metric,
             model: "none".into(),
             model_digest: Digest::of(b"none"),
             precision: Precision::Full,
@@ -232,7 +233,7 @@ impl MapStore for Shelf {
         _: &Map,
         _: CalibrationSettings,
         _: usize,
-    ) -> Result<Vec<LookAlikes>, StoreError> {
+    ) -> Result<Vec<HardNegatives>, StoreError> {
         not_here()
     }
 

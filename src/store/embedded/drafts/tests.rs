@@ -9,7 +9,7 @@ use uuid::Uuid;
 use super::super::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
 use crate::{Draft, DraftStore, MapStore};
 use whereabouts_core::{
-    Descriptor, DescriptorKind, Digest, Frame, Image, Map, MediaType, Precision, Scene,
+    CoordinateFrame, Descriptor, DescriptorKind, Digest, Image, Map, MediaType, Precision, Scene,
 };
 use whereabouts_index::IndexSettings;
 
@@ -38,7 +38,7 @@ fn map() -> Map {
         name: "m".parse().unwrap(),
         scene: Scene::Outdoor,
         descriptor: DescriptorKind::Gem,
-        frame: Frame::Wgs84,
+        frame: CoordinateFrame::Wgs84,
         model: "old".into(),
         model_digest: Digest::of(b"old"),
         precision: Precision::Full,

@@ -1,5 +1,7 @@
 //! The only place where everything is wired: build, serve, drain.
 
+mod store;
+
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,22 +19,23 @@ use crate::Metrics;
 use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
 use crate::http::{About, AppState, Connections, HttpSettings, router, worker_router};
 use whereabouts_core::{CalibrationSettings, utc_day};
-use whereabouts_index::IndexSettings;
 use whereabouts_refine::local::{LocalMatcher, LocalSettings};
 use whereabouts_refine::mllm::{MllmParts, MllmRefiner};
-use whereabouts_refine::{DenseCache, JobPace, LocalRefiner, Refiner, Worker, WorkerSettings};
+use whereabouts_refine::{
+    DenseCache, JobServiceTime, LocalRefiner, Refiner, Worker, WorkerSettings,
+};
 use whereabouts_service::{
-    Dispatcher, Janitor, Keys, Limits, OnceSettings, RecallCheck, Reindexes, RetentionSettings,
-    Service, ServiceSettings, Tracks, Webhooks,
+    Dispatcher, IdempotencySettings, Janitor, Keys, Limits, RecallCheck, Reindexes,
+    RetentionSettings, Service, ServiceSettings, Tracks, Webhooks,
 };
-use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
-use whereabouts_store::postgres::{PostgresSettings, PostgresStore};
-use whereabouts_store::{
-    Buckets, DescriptionBounds, JobStore, ObjectSettings, Objects, SharedLimits, Store,
-};
-use whereabouts_telemetry::Troubles;
+use whereabouts_store::{Buckets, JobStore};
+use whereabouts_telemetry::LogIssues;
 use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use whereabouts_vision::{LoadedModels, LoadedSettings, WhyModel};
+
+#[cfg(feature = "postgres")]
+pub use self::store::postgres_settings;
+pub use self::store::{OpenStore, open_store};
 
 /// What a process does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,7 +51,7 @@ pub enum Role {
 pub async fn run(
     role: Role,
     config: Config,
-    troubles: Arc<Troubles>,
+    troubles: Arc<LogIssues>,
     listener: TcpListener,
     shutdown: CancellationToken,
     on_ready: impl FnOnce(SocketAddr) -> anyhow::Result<()>,
@@ -118,7 +121,7 @@ pub async fn run(
     Ok(())
 }
 
-fn about(config: &Config, troubles: Arc<Troubles>) -> anyhow::Result<About> {
+fn about(config: &Config, troubles: Arc<LogIssues>) -> anyhow::Result<About> {
     Ok(About {
         started_at: Timestamp::now(),
         settings: toml::to_string(config)?,
@@ -157,8 +160,8 @@ fn retention(config: &Config) -> RetentionSettings {
     }
 }
 
-fn once(config: &Config) -> OnceSettings {
-    OnceSettings {
+fn once(config: &Config) -> IdempotencySettings {
+    IdempotencySettings {
         keep: Duration::from_secs(u64::from(config.idempotency.keep_hours) * 3600),
         most: config.idempotency.max,
     }
@@ -174,96 +177,15 @@ pub struct Parts {
     pub pools: [CpuPool; 2],
 }
 
-/// A store, and the limits that go with it.
-pub struct Opened {
-    /// The store.
-    pub store: Arc<dyn Store>,
-    /// The limits of all processes, where there may be several.
-    pub shared: Option<Arc<dyn SharedLimits>>,
-}
-
-/// Opens the configured store for a process of that id. Blocks.
-pub fn store(config: &Config, process: Uuid) -> anyhow::Result<Opened> {
-    if !config.database.is_set() {
-        return Ok(Opened { store: Arc::new(embedded(config)?), shared: None });
-    }
-    let objects = objects(config)?;
-    let opening = PostgresStore::open(postgres(config), objects, process);
-    let store = Arc::new(Handle::current().block_on(opening)?);
-    Ok(Opened { store: store.clone(), shared: Some(store) })
-}
-
-/// How the store in PostgreSQL works.
-pub fn postgres(config: &Config) -> PostgresSettings {
-    let database = &config.database;
-    PostgresSettings {
-        url: database.url.expose().to_owned(),
-        max_connections: database.max_connections,
-        timeout: database.timeout(),
-        lifetime: Duration::from_secs(database.lifetime_s),
-        pin: Duration::from_secs(config.objects.keep_unneeded_s),
-        index: index(config),
-        index_memory_mib: database.index_memory_mib,
-        descriptions: descriptions(config),
-    }
-}
-
-fn objects(config: &Config) -> anyhow::Result<Objects> {
-    let objects = &config.objects;
-    if objects.url.is_empty() {
-        return Ok(Objects::folder(&config.data.dir.join("images"), objects.timeout())?);
-    }
-    Ok(Objects::open(&ObjectSettings {
-        url: objects.url.clone(),
-        endpoint: objects.endpoint.clone(),
-        region: objects.region.clone(),
-        allow_http: objects.allow_http,
-        timeout: objects.timeout(),
-    })?)
-}
-
-fn index(config: &Config) -> IndexSettings {
-    IndexSettings {
-        exact_up_to: config.index.exact_up_to,
-        m: config.index.m,
-        ef_construction: config.index.ef_construction,
-        ef_search: config.index.ef_search,
-        max_dead_share: config.index.max_dead_share,
-    }
-}
-
-fn descriptions(config: &Config) -> DescriptionBounds {
-    DescriptionBounds {
-        max_bytes: config.data.description_cache_bytes,
-        max_age: Duration::from_secs(config.data.description_cache_days * 24 * 3600),
-    }
-}
-
-/// Opens the embedded store, which belongs to one process.
-fn embedded(config: &Config) -> anyhow::Result<EmbeddedStore> {
-    Ok(EmbeddedStore::open(&EmbeddedSettings {
-        dir: config.data.dir.clone(),
-        index: index(config),
-        index_threads: match config.index.threads {
-            0 => (cores_unless(0) / 2).max(1),
-            threads => threads,
-        },
-        min_free_bytes: config.data.min_free_bytes,
-        db_cache_bytes: config.data.db_cache_bytes,
-        commit_batch: config.data.commit_batch,
-        descriptions: descriptions(config),
-    })?)
-}
-
 /// Opens the store, loads the model, and puts the service together. Blocks.
 pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     let process = Uuid::now_v7();
-    let Opened { store, shared } = store(config, process)?;
+    let OpenStore { store, shared } = open_store(config, process)?;
     let (models, why) = models(config)?;
     let admission = config.image.admission(config.model.layout());
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
     let pool = CpuPool::new("frames", cores_unless(config.image.threads), admission.permits)?;
-    let job_pace = JobPace::default();
+    let job_pace = JobServiceTime::default();
     // Beside the workers, calibration and whoever looks at matches come to it, one at a time each.
     let refining = CpuPool::new("refine", config.jobs.workers.max(1), config.jobs.workers + 2)?;
     let pools = [pool.clone(), refining.clone()];
