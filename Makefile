@@ -28,7 +28,7 @@ chromium:
 	@deploy/setup/chromium.sh
 
 test: assets nasm chromium ## Set up, build and run every test
-	tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked
+	tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked --workspace
 	tests/scale_out.sh $(CARGO) target/postgres-venv
 	tests/api/conformance.sh $(BINARY) target/api-venv
 	tests/grpc/check.sh $(BINARY) target/grpc-venv
@@ -59,7 +59,7 @@ fuzz: assets nasm ## Feed a million mutated inputs to every parser of untrusted 
 
 lint: ## Check formatting and lints
 	$(CARGO) fmt --check
-	$(CARGO) clippy --release --locked --all-targets -- -D warnings
+	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
 
 format: ## Format the code
 	$(CARGO) fmt

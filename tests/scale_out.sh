@@ -11,7 +11,7 @@ cargo=$1 postgres=$2
 
 blackbox() {
     WHEREABOUTS_TEST_DEPLOYMENT=scale-out "$here/postgres.sh" "$postgres" \
-        "$cargo" test --release --locked --test blackbox -- --include-ignored "$@"
+        "$cargo" test --release --locked --workspace --test blackbox -- --include-ignored "$@"
 }
 
 # The skipped tests are about the data folder or do not reach the store: models, evaluation, admission control. They

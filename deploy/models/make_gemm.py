@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Build the graph that `whereabouts model bench` uses to measure peak GEMM throughput.
 
-    make_gemm.py src/retrieve/gemm.onnx
+    make_gemm.py src/vision/gemm.onnx
 
     input   x   float32 [1024, 1024]
     output  y   float32 [1024, 1024]   x times the same matrix, 8 times over: 17.18 GFLOP
