@@ -1,7 +1,6 @@
 //! Where a camera stood: on the globe or in a map's own metric frame.
 
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use utoipa::ToSchema;
 
 use super::CoordinateFrame;
@@ -57,6 +56,45 @@ pub struct MetricPose {
     pub qw: Option<f64>,
 }
 
+/// The numbers of a pose as a caller sent them: not yet checked against the frame of a map.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PoseInput {
+    /// Latitude in degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lat: Option<f64>,
+    /// Longitude in degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lon: Option<f64>,
+    /// Height above the ellipsoid in metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alt: Option<f64>,
+    /// Viewing direction in degrees clockwise from north.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub heading: Option<f64>,
+    /// Metres along the x axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub x: Option<f64>,
+    /// Metres along the y axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub y: Option<f64>,
+    /// Metres along the z axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub z: Option<f64>,
+    /// Orientation, x part of the unit quaternion.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qx: Option<f64>,
+    /// Orientation, y part.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qy: Option<f64>,
+    /// Orientation, z part.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qz: Option<f64>,
+    /// Orientation, scalar part.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qw: Option<f64>,
+}
+
 /// Why a pose was refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum PoseError {
@@ -91,28 +129,71 @@ pub const EARTH_RADIUS_M: f64 = 6_371_008.8;
 /// Farther from the origin than any building, city or orbit of the Earth; keeps typing errors out.
 const FARTHEST_METRES: f64 = 1e8;
 
-impl Pose {
-    /// Reads a pose written in JSON for a map of the given frame.
-    pub fn from_json(frame: CoordinateFrame, value: Value) -> Result<Self, PoseError> {
-        let (name, expected) = match frame {
-            CoordinateFrame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading"),
-            CoordinateFrame::Metric => ("metric", "x, y and, if known, z, qx, qy, qz, qw"),
-        };
-        let fields = |error: serde_json::Error| PoseError::Fields {
-            frame: name,
-            expected,
-            detail: error.to_string(),
-        };
-        match frame {
-            CoordinateFrame::Wgs84 => {
-                serde_json::from_value::<GeographicPose>(value).map_err(fields)?.checked()
-            }
-            CoordinateFrame::Metric => {
-                serde_json::from_value::<MetricPose>(value).map_err(fields)?.checked()
-            }
+impl PoseInput {
+    /// Whether no number is given.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// The coordinate frame that the numbers belong to, by the pair of coordinates that is given; `None` if
+    /// neither or both pairs are.
+    pub fn frame(&self) -> Option<CoordinateFrame> {
+        match (self.lat.is_some() && self.lon.is_some(), self.x.is_some() && self.y.is_some()) {
+            (true, false) => Some(CoordinateFrame::Wgs84),
+            (false, true) => Some(CoordinateFrame::Metric),
+            _ => None,
         }
     }
 
+    /// The pose in a map of this frame. Fails if a number is missing, belongs to another frame, or is out of
+    /// range.
+    pub fn check(self, frame: CoordinateFrame) -> Result<Pose, PoseError> {
+        let Self { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw } = self;
+        let geographic = [("lat", lat), ("lon", lon), ("alt", alt), ("heading", heading)];
+        let metric = [("x", x), ("y", y), ("z", z), ("qx", qx), ("qy", qy), ("qz", qz), ("qw", qw)];
+        let (name, expected, foreign): (_, _, &[(&str, Option<f64>)]) = match frame {
+            CoordinateFrame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading", &metric),
+            CoordinateFrame::Metric => {
+                ("metric", "x, y and, if known, z, qx, qy, qz, qw", &geographic)
+            }
+        };
+        let misfit = |detail: String| PoseError::Fields { frame: name, expected, detail };
+        if let Some((field, _)) = foreign.iter().find(|(_, value)| value.is_some()) {
+            return Err(misfit(format!("unknown field `{field}`")));
+        }
+        let required = |field: &str, value: Option<f64>| {
+            value.ok_or_else(|| misfit(format!("missing field `{field}`")))
+        };
+        match frame {
+            CoordinateFrame::Wgs84 => GeographicPose {
+                lat: required("lat", lat)?,
+                lon: required("lon", lon)?,
+                alt,
+                heading,
+            }
+            .checked(),
+            CoordinateFrame::Metric => {
+                MetricPose { x: required("x", x)?, y: required("y", y)?, z, qx, qy, qz, qw }
+                    .checked()
+            }
+        }
+    }
+}
+
+impl From<Pose> for PoseInput {
+    fn from(pose: Pose) -> Self {
+        match pose {
+            Pose::Geographic(GeographicPose { lat, lon, alt, heading }) => {
+                Self { lat: Some(lat), lon: Some(lon), alt, heading, ..Self::default() }
+            }
+            Pose::Metric(MetricPose { x, y, z, qx, qy, qz, qw }) => {
+                Self { x: Some(x), y: Some(y), z, qx, qy, qz, qw, ..Self::default() }
+            }
+        }
+    }
+}
+
+impl Pose {
     /// The frame it belongs to.
     pub fn frame(&self) -> CoordinateFrame {
         match self {
@@ -207,35 +288,69 @@ fn within(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use serde_json::json;
+    use serde_json::{Value, json};
+
+    fn read(frame: CoordinateFrame, pose: Value) -> Result<Pose, PoseError> {
+        serde_json::from_value::<PoseInput>(pose).unwrap().check(frame)
+    }
 
     #[test]
     fn a_pose_out_of_range_names_the_field_and_the_range() {
-        let error =
-            Pose::from_json(CoordinateFrame::Wgs84, json!({"lat": 91.0, "lon": 0.0})).unwrap_err();
+        let error = read(CoordinateFrame::Wgs84, json!({"lat": 91.0, "lon": 0.0})).unwrap_err();
         assert_eq!(error.to_string(), "lat is 91; it must be between -90 and 90 degrees");
-        assert!(Pose::from_json(CoordinateFrame::Metric, json!({"x": 1e9, "y": 0.0})).is_err());
+        assert!(read(CoordinateFrame::Metric, json!({"x": 1e9, "y": 0.0})).is_err());
     }
 
     #[test]
     fn a_pose_of_the_other_frame_says_what_this_map_takes() {
-        let error =
-            Pose::from_json(CoordinateFrame::Wgs84, json!({"x": 1.0, "y": 2.0})).unwrap_err();
+        let error = read(CoordinateFrame::Wgs84, json!({"x": 1.0, "y": 2.0})).unwrap_err();
         assert!(error.to_string().contains("takes lat, lon"), "{error}");
-        let error =
-            Pose::from_json(CoordinateFrame::Metric, json!({"lat": 1.0, "lon": 2.0})).unwrap_err();
+        let error = read(CoordinateFrame::Metric, json!({"lat": 1.0, "lon": 2.0})).unwrap_err();
         assert!(error.to_string().contains("takes x, y"), "{error}");
+    }
+
+    #[test]
+    fn a_missing_coordinate_is_named() {
+        let error = read(CoordinateFrame::Wgs84, json!({"lat": 1.0})).unwrap_err();
+        assert!(error.to_string().ends_with("missing field `lon`"), "{error}");
+        assert!(read(CoordinateFrame::Metric, json!({})).is_err());
+    }
+
+    #[test]
+    fn nan_and_infinity_are_out_of_range() {
+        for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            let pose = PoseInput { lat: Some(bad), lon: Some(0.0), ..PoseInput::default() };
+            assert!(pose.check(CoordinateFrame::Wgs84).is_err());
+            let pose =
+                PoseInput { x: Some(0.0), y: Some(0.0), z: Some(bad), ..PoseInput::default() };
+            assert!(pose.check(CoordinateFrame::Metric).is_err());
+            let turned = PoseInput {
+                x: Some(0.0),
+                y: Some(0.0),
+                qx: Some(bad),
+                qy: Some(0.0),
+                qz: Some(0.0),
+                qw: Some(1.0),
+                ..PoseInput::default()
+            };
+            assert!(turned.check(CoordinateFrame::Metric).is_err());
+        }
+    }
+
+    #[test]
+    fn a_checked_pose_survives_the_way_back() {
+        let pose = read(CoordinateFrame::Metric, json!({"x": 1.5, "y": -2.0, "z": 3.0})).unwrap();
+        assert_eq!(PoseInput::from(pose).check(CoordinateFrame::Metric), Ok(pose));
+        assert_eq!(PoseInput::from(pose).frame(), Some(CoordinateFrame::Metric));
     }
 
     #[test]
     fn an_orientation_is_whole_and_of_unit_norm() {
         let with =
             |q: [f64; 4]| json!({"x": 0, "y": 0, "qx": q[0], "qy": q[1], "qz": q[2], "qw": q[3]});
-        assert!(Pose::from_json(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.8])).is_ok());
-        assert!(Pose::from_json(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.6])).is_err());
-        assert!(
-            Pose::from_json(CoordinateFrame::Metric, json!({"x": 0, "y": 0, "qw": 1})).is_err()
-        );
+        assert!(read(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.8])).is_ok());
+        assert!(read(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.6])).is_err());
+        assert!(read(CoordinateFrame::Metric, json!({"x": 0, "y": 0, "qw": 1})).is_err());
     }
 
     #[test]
@@ -248,10 +363,9 @@ mod tests {
 
     #[test]
     fn poses_of_different_frames_have_no_distance() {
-        let metric = Pose::from_json(CoordinateFrame::Metric, json!({"x": 3.0, "y": 4.0})).unwrap();
-        let origin = Pose::from_json(CoordinateFrame::Metric, json!({"x": 0.0, "y": 0.0})).unwrap();
-        let globe =
-            Pose::from_json(CoordinateFrame::Wgs84, json!({"lat": 0.0, "lon": 0.0})).unwrap();
+        let metric = read(CoordinateFrame::Metric, json!({"x": 3.0, "y": 4.0})).unwrap();
+        let origin = read(CoordinateFrame::Metric, json!({"x": 0.0, "y": 0.0})).unwrap();
+        let globe = read(CoordinateFrame::Wgs84, json!({"lat": 0.0, "lon": 0.0})).unwrap();
         assert_eq!(metric.distance_m(&origin), Some(5.0));
         assert_eq!(metric.distance_m(&globe), None);
     }
