@@ -26,12 +26,12 @@ pub trait DescriptionCache: Send + Sync {
     /// Says that this process is about to buy the description of that key, until that moment at the
     /// latest; `false` if another process is at it, whose description will soon be kept. Only stores of many
     /// processes need to know.
-    async fn begin_purchase(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
+    async fn acquire_lease(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
         let _ = (key, until);
         Ok(true)
     }
     /// Says that nothing came of it.
-    async fn end_purchase(&self, key: &Digest) -> Result<(), StoreError> {
+    async fn release_lease(&self, key: &Digest) -> Result<(), StoreError> {
         let _ = key;
         Ok(())
     }

@@ -96,7 +96,7 @@ pub struct Release {
 pub trait JobStore: Send + Sync {
     /// Queues a job unless `limit` jobs wait already ([`StoreError::QueueFull`]).
     async fn submit(&self, record: JobRecord, limit: usize) -> Result<(), StoreError>;
-    /// The same for a request that was reserved with that id ([`IdempotencyStore::reserve_answer`](super::AnswerStore::reserve_answer)); the job and
+    /// The same for a request that was reserved with that id ([`IdempotencyStore::reserve_request`](super::AnswerStore::reserve_request)); the job and
     /// the note that it was queued for this request are one change. If one was queued for it before, by a
     /// process that ended too soon to answer, gives that one and queues nothing.
     async fn submit_once(
@@ -108,7 +108,7 @@ pub trait JobStore: Send + Sync {
     /// Jobs that wait.
     async fn queued(&self) -> Result<usize, StoreError>;
     /// When the oldest job that has not ended was submitted.
-    async fn oldest_open(&self) -> Result<Option<Timestamp>, StoreError>;
+    async fn oldest_unfinished(&self) -> Result<Option<Timestamp>, StoreError>;
     /// One job.
     async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError>;
     /// Jobs, newest first, those older than `before`, at most `limit`. A search for a text may look at a

@@ -29,11 +29,11 @@ use uuid::Uuid;
 
 pub use self::descriptions::DescriptionCache;
 pub use self::jobs::{Claim, JobRecord, JobStore, Query, Release, Step};
-pub use self::limits::{Buckets, SharedLimits, TokenGrant, TokenRequest};
+pub use self::limits::{SharedLimits, TokenBuckets, TokenGrant, TokenRequest};
 pub use self::listing::{JobFilter, JobList};
 #[cfg(feature = "postgres")]
 pub use self::objects::{ObjectSettings, Objects};
-pub use self::webhooks::{ForgottenDeliveries, KeepDeliveries, StoredDelivery, WebhookStore};
+pub use self::webhooks::{DeliveryRetention, RemovedDeliveries, StoredDelivery, WebhookStore};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, DayUsage, Descriptor, Digest, Image, ImageId, Map,
@@ -181,7 +181,7 @@ pub trait MapStore: Send + Sync {
 
     /// Images spread over the map, each with the `k` images of other places that are most like it. See
     /// [`CalibrationSettings`] for what is another place and how many there are.
-    async fn look_alikes(
+    async fn hard_negatives(
         &self,
         map: &Map,
         settings: CalibrationSettings,
@@ -332,24 +332,24 @@ pub trait IdempotencyStore: Send + Sync {
     /// What is known of the request with this id; or, if that is nothing, is older than `since`, or is of a
     /// process that has ended, `None`, and from now on it is `reserved`, together with the job that that
     /// process queued for it.
-    async fn reserve_answer(
+    async fn reserve_request(
         &self,
         id: &str,
         reserved: IdempotencyRecord,
         since: Timestamp,
     ) -> Result<Option<IdempotencyRecord>, StoreError>;
     /// Keeps the answer.
-    async fn keep_answer(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError>;
+    async fn store_response(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError>;
     /// Forgets that there was such a request.
-    async fn forget_answer(&self, id: &str) -> Result<(), StoreError>;
+    async fn forget_request(&self, id: &str) -> Result<(), StoreError>;
     /// Forgets those from before that moment, and the oldest of those that are more than `most`. Returns
     /// how many.
-    async fn forget_answers(&self, before: Timestamp, most: usize) -> Result<usize, StoreError>;
+    async fn prune_responses(&self, before: Timestamp, most: usize) -> Result<usize, StoreError>;
 }
 
 /// Which of the jobs that have ended are kept. A job is removed with its query and its frame.
 #[derive(Debug, Clone, Copy)]
-pub struct KeepJobs {
+pub struct JobRetention {
     /// Only those that ended since then, if it is given.
     pub since: Option<Timestamp>,
     /// Only so many, if it is given; the first to end go first.
@@ -388,11 +388,15 @@ impl std::ops::AddAssign for RemovedJobs {
 #[async_trait]
 pub trait Retention: Send + Sync {
     /// Removes jobs that are not to be kept, at most `batch` of them, so that no change waits long.
-    async fn remove_ended(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError>;
+    async fn remove_ended(
+        &self,
+        keep: JobRetention,
+        batch: usize,
+    ) -> Result<RemovedJobs, StoreError>;
     /// Forgets what was spent before that day.
     async fn forget_usage(&self, before: Date) -> Result<(), StoreError>;
     /// Clears away what processes that are gone have left, and descriptions beyond their bounds.
-    async fn clear_left(&self) -> Result<(), StoreError>;
+    async fn collect_garbage(&self) -> Result<(), StoreError>;
     /// Bytes of the database's files.
     async fn db_bytes(&self) -> Result<u64, StoreError>;
     /// Bytes of each map's descriptors and their index.

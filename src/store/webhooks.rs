@@ -19,7 +19,7 @@ pub struct StoredDelivery {
 
 /// Which deliveries are kept.
 #[derive(Debug, Clone, Copy)]
-pub struct KeepDeliveries {
+pub struct DeliveryRetention {
     /// Of those that have ended, only those that ended since then, if it is given.
     pub since: Option<Timestamp>,
     /// Only so many: the first to end go first, and if that is not enough, the oldest of those that wait.
@@ -28,7 +28,7 @@ pub struct KeepDeliveries {
 
 /// How many deliveries were removed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct ForgottenDeliveries {
+pub struct RemovedDeliveries {
     /// That had ended.
     pub ended: usize,
     /// That were still waiting.
@@ -95,9 +95,9 @@ pub trait WebhookStore: Send + Sync {
     /// Removes deliveries that are not to be kept, at most `batch` of them, so that no change waits long.
     async fn forget_deliveries(
         &self,
-        keep: KeepDeliveries,
+        keep: DeliveryRetention,
         batch: usize,
-    ) -> Result<ForgottenDeliveries, StoreError>;
+    ) -> Result<RemovedDeliveries, StoreError>;
     /// Deliveries that wait.
     async fn waiting_deliveries(&self) -> Result<usize, StoreError>;
     /// Told when deliveries were queued.

@@ -35,7 +35,7 @@ fn remove(trees: &Trees, id: &[u8]) -> Result<(), StoreError> {
 
 #[async_trait]
 impl IdempotencyStore for EmbeddedStore {
-    async fn reserve_answer(
+    async fn reserve_request(
         &self,
         id: &str,
         reserved: IdempotencyRecord,
@@ -62,19 +62,19 @@ impl IdempotencyStore for EmbeddedStore {
         self.inner.writer.commit(reserve, |_| {}).await
     }
 
-    async fn keep_answer(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError> {
+    async fn store_response(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError> {
         let id = id.to_owned();
         let keep = move |trees: &Trees, _: &mut _| write(trees, id.as_bytes(), &answer);
         self.inner.writer.commit(keep, |()| {}).await
     }
 
-    async fn forget_answer(&self, id: &str) -> Result<(), StoreError> {
+    async fn forget_request(&self, id: &str) -> Result<(), StoreError> {
         let id = id.to_owned();
         let forget = move |trees: &Trees, _: &mut _| remove(trees, id.as_bytes());
         self.inner.writer.commit(forget, |()| {}).await
     }
 
-    async fn forget_answers(&self, before: Timestamp, most: usize) -> Result<usize, StoreError> {
+    async fn prune_responses(&self, before: Timestamp, most: usize) -> Result<usize, StoreError> {
         let inner = Arc::clone(&self.inner);
         let old = blocking(move || {
             let ages = &inner.trees.answers_by_age;

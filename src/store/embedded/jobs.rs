@@ -136,9 +136,9 @@ impl JobStore for EmbeddedStore {
         Ok(self.inner.queued.load(Ordering::Relaxed))
     }
 
-    async fn oldest_open(&self) -> Result<Option<Timestamp>, StoreError> {
+    async fn oldest_unfinished(&self) -> Result<Option<Timestamp>, StoreError> {
         let inner = Arc::clone(&self.inner);
-        blocking(move || oldest_open(&inner.trees)).await
+        blocking(move || oldest_unfinished(&inner.trees)).await
     }
 
     async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {
@@ -313,7 +313,7 @@ fn next_waiting(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, Stor
 }
 
 /// When the oldest job in the queue was submitted: the first of one of the priorities.
-fn oldest_open(trees: &Trees) -> Result<Option<Timestamp>, StoreError> {
+fn oldest_unfinished(trees: &Trees) -> Result<Option<Timestamp>, StoreError> {
     let mut oldest: Option<Uuid> = None;
     for priority in [Priority::High, Priority::Normal, Priority::Low] {
         if let Some(key) = trees.queue.scan_prefix([place(priority)]).keys().next() {

@@ -195,7 +195,7 @@ impl LiveMap {
     }
 
     /// Images spread over the map, each with the `k` most similar ones of other places.
-    pub fn look_alikes(&self, settings: CalibrationSettings, k: usize) -> Vec<HardNegatives> {
+    pub fn hard_negatives(&self, settings: CalibrationSettings, k: usize) -> Vec<HardNegatives> {
         let places: Vec<Place> = {
             let entries = self.entries.read();
             let known = entries.iter().enumerate();

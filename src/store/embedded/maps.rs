@@ -248,14 +248,14 @@ impl MapStore for EmbeddedStore {
         blocking(move || Ok(live.search(query.as_slice(), k, mode))).await
     }
 
-    async fn look_alikes(
+    async fn hard_negatives(
         &self,
         map: &Map,
         settings: CalibrationSettings,
         k: usize,
     ) -> Result<Vec<HardNegatives>, StoreError> {
         let live = self.inner.live_revision(map)?;
-        blocking(move || Ok(live.look_alikes(settings, k))).await
+        blocking(move || Ok(live.hard_negatives(settings, k))).await
     }
 
     async fn calibration(&self, map: &Map) -> Result<Option<Arc<Calibration>>, StoreError> {

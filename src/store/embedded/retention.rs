@@ -8,7 +8,7 @@ use async_trait::async_trait;
 use jiff::civil::Date;
 use sled::Transactional;
 
-use super::super::{KeepJobs, RemovedJobs, Retention, StoreError};
+use super::super::{JobRetention, RemovedJobs, Retention, StoreError};
 use super::trees::{BlobOwner, Trees, blob_ref_key, ended_job, failed, transaction_failed};
 use super::{EmbeddedStore, blocking};
 use whereabouts_core::{Digest, MapName};
@@ -22,7 +22,11 @@ struct Taken {
 
 #[async_trait]
 impl Retention for EmbeddedStore {
-    async fn remove_ended(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError> {
+    async fn remove_ended(
+        &self,
+        keep: JobRetention,
+        batch: usize,
+    ) -> Result<RemovedJobs, StoreError> {
         let counting = Arc::clone(&self.inner);
         let change = move |trees: &Trees, _: &mut _| take(trees, keep, &counting.ended, batch);
         let taken = self.inner.writer.commit(change, |_| {}).await?;
@@ -48,7 +52,7 @@ impl Retention for EmbeddedStore {
         self.inner.writer.commit(forget, |()| {}).await
     }
 
-    async fn clear_left(&self) -> Result<(), StoreError> {
+    async fn collect_garbage(&self) -> Result<(), StoreError> {
         // Opening the folder does it, and every description that comes.
         Ok(())
     }
@@ -72,7 +76,7 @@ impl Retention for EmbeddedStore {
 /// Removes the records of up to `batch` of the jobs that have ended, and counts down.
 fn take(
     trees: &Trees,
-    keep: KeepJobs,
+    keep: JobRetention,
     ended: &AtomicUsize,
     batch: usize,
 ) -> Result<Taken, StoreError> {

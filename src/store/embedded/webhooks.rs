@@ -15,7 +15,9 @@ use uuid::Uuid;
 use super::super::changes::{
     attempted, check_ended, disable, no_delivery, no_webhook, too_many_webhooks,
 };
-use super::super::{ForgottenDeliveries, KeepDeliveries, StoreError, StoredDelivery, WebhookStore};
+use super::super::{
+    DeliveryRetention, RemovedDeliveries, StoreError, StoredDelivery, WebhookStore,
+};
 use super::trees::{Trees, decode, failed, put};
 use super::{EmbeddedStore, blocking};
 use whereabouts_core::{Attempt, Delivery, DeliveryState, StoredWebhook};
@@ -219,15 +221,15 @@ impl WebhookStore for EmbeddedStore {
 
     async fn forget_deliveries(
         &self,
-        keep: KeepDeliveries,
+        keep: DeliveryRetention,
         batch: usize,
-    ) -> Result<ForgottenDeliveries, StoreError> {
+    ) -> Result<RemovedDeliveries, StoreError> {
         // Looking costs no commit.
         if self.look_at_webhooks(move |trees| trees.surplus(keep, 1)).await?.is_empty() {
-            return Ok(ForgottenDeliveries::default());
+            return Ok(RemovedDeliveries::default());
         }
         self.change_webhooks(move |trees| {
-            let mut forgotten = ForgottenDeliveries::default();
+            let mut forgotten = RemovedDeliveries::default();
             for key in trees.surplus(keep, batch)? {
                 let Some(delivery) = trees.delivery(&key)? else { continue };
                 match delivery.state {

@@ -75,7 +75,7 @@ impl DescriptionCache for PostgresStore {
         inner.run(query).await.map(drop)
     }
 
-    async fn begin_purchase(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
+    async fn acquire_lease(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
         let inner = &self.inner;
         let for_s = until.duration_since(Timestamp::now()).as_secs_f64().max(0.0);
         let query = sqlx::query(
@@ -92,7 +92,7 @@ impl DescriptionCache for PostgresStore {
         Ok(inner.run(query).await? > 0)
     }
 
-    async fn end_purchase(&self, key: &Digest) -> Result<(), StoreError> {
+    async fn release_lease(&self, key: &Digest) -> Result<(), StoreError> {
         let inner = &self.inner;
         let query = sqlx::query("DELETE FROM purchases WHERE key = $1 AND holder = $2")
             .bind(key.as_bytes().as_slice())

@@ -258,7 +258,7 @@ impl JobStore for PostgresStore {
         inner.call(inner.waiting(&inner.pool, usize::MAX)).await
     }
 
-    async fn oldest_open(&self) -> Result<Option<Timestamp>, StoreError> {
+    async fn oldest_unfinished(&self) -> Result<Option<Timestamp>, StoreError> {
         let inner = &self.inner;
         // Those that are open first, which are few: by the order of ids alone one would pass all that have ended.
         let oldest = sqlx::query_scalar(

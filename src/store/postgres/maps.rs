@@ -106,7 +106,7 @@ impl MapStore for PostgresStore {
         self.inner.call(self.inner.candidates(map, &query, k, mode)).await
     }
 
-    async fn look_alikes(
+    async fn hard_negatives(
         &self,
         map: &Map,
         settings: CalibrationSettings,

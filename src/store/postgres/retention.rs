@@ -4,14 +4,18 @@ use async_trait::async_trait;
 use jiff::civil::Date;
 use jiff_sqlx::ToSqlx;
 
-use super::super::{KeepJobs, RemovedJobs, Retention, StoreError};
+use super::super::{JobRetention, RemovedJobs, Retention, StoreError};
 use super::descriptors::SIZES;
 use super::{Inner, PostgresStore, count, counted};
 use whereabouts_core::MapName;
 
 #[async_trait]
 impl Retention for PostgresStore {
-    async fn remove_ended(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError> {
+    async fn remove_ended(
+        &self,
+        keep: JobRetention,
+        batch: usize,
+    ) -> Result<RemovedJobs, StoreError> {
         let inner = &self.inner;
         let removed = inner.call(inner.remove_jobs(keep, batch)).await?;
         let bytes = inner.remove_unneeded().await?;
@@ -26,7 +30,7 @@ impl Retention for PostgresStore {
         inner.run(set_aside).await.map(drop)
     }
 
-    async fn clear_left(&self) -> Result<(), StoreError> {
+    async fn collect_garbage(&self) -> Result<(), StoreError> {
         self.inner.sweep_left().await?;
         self.inner.tidy_descriptions().await
     }
@@ -62,7 +66,11 @@ impl Retention for PostgresStore {
 
 impl Inner {
     /// Removes the rows of jobs that are not to be kept, and their claim to the bytes of their frames.
-    async fn remove_jobs(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError> {
+    async fn remove_jobs(
+        &self,
+        keep: JobRetention,
+        batch: usize,
+    ) -> Result<RemovedJobs, StoreError> {
         let ended = "SELECT count(*) FROM jobs WHERE ended_at IS NOT NULL";
         let ended: i64 = sqlx::query_scalar(ended).fetch_one(&self.pool).await?;
         let surplus = keep.most.map_or(0, |most| (ended - count(most)).max(0));

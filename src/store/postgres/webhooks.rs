@@ -12,7 +12,9 @@ use uuid::Uuid;
 use super::super::changes::{
     attempted, check_enabled, check_ended, disable, no_delivery, no_webhook, too_many_webhooks,
 };
-use super::super::{ForgottenDeliveries, KeepDeliveries, StoreError, StoredDelivery, WebhookStore};
+use super::super::{
+    DeliveryRetention, RemovedDeliveries, StoreError, StoredDelivery, WebhookStore,
+};
 use super::listener::DELIVERIES;
 use super::statements::alone;
 use super::{Inner, PostgresStore, count, counted, record};
@@ -296,9 +298,9 @@ impl WebhookStore for PostgresStore {
 
     async fn forget_deliveries(
         &self,
-        keep: KeepDeliveries,
+        keep: DeliveryRetention,
         batch: usize,
-    ) -> Result<ForgottenDeliveries, StoreError> {
+    ) -> Result<RemovedDeliveries, StoreError> {
         let inner = &self.inner;
         inner
             .call(async {
@@ -330,7 +332,7 @@ impl WebhookStore for PostgresStore {
                 .bind(count(batch))
                 .fetch_one(&inner.pool)
                 .await?;
-                Ok(ForgottenDeliveries { ended: counted(ended), waiting: counted(waiting) })
+                Ok(RemovedDeliveries { ended: counted(ended), waiting: counted(waiting) })
             })
             .await
     }

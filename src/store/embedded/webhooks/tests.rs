@@ -47,6 +47,6 @@ async fn nothing_is_left_of_deliveries_that_are_gone() {
         assert_eq!(trees.ended.len(), 0);
     };
     left(3);
-    store.forget_deliveries(KeepDeliveries { since: None, most: 1 }, 9).await.unwrap();
+    store.forget_deliveries(DeliveryRetention { since: None, most: 1 }, 9).await.unwrap();
     left(1);
 }

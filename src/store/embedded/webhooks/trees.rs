@@ -6,7 +6,7 @@ use sled::transaction::{ConflictableTransactionResult, TransactionalTree};
 use uuid::Uuid;
 
 use super::super::super::changes::{check_enabled, news_of, no_webhook};
-use super::super::super::{KeepDeliveries, StoreError};
+use super::super::super::{DeliveryRetention, StoreError};
 use super::super::trees::{decode, encode, failed, get, transaction_failed};
 use whereabouts_core::{Delivery, DeliveryState, Job, StoredWebhook};
 
@@ -119,7 +119,11 @@ impl WebhookTrees {
     }
 
     /// Keys of deliveries that are not to be kept.
-    pub fn surplus(&self, keep: KeepDeliveries, batch: usize) -> Result<Vec<[u8; 32]>, StoreError> {
+    pub fn surplus(
+        &self,
+        keep: DeliveryRetention,
+        batch: usize,
+    ) -> Result<Vec<[u8; 32]>, StoreError> {
         let too_many = self.deliveries.len().saturating_sub(keep.most);
         let since = millis(keep.since.unwrap_or(Timestamp::UNIX_EPOCH));
         let mut keys = Vec::new();
