@@ -11,9 +11,9 @@ use super::super::Claim;
 /// The jobs that workers of this process hold. One that the database says the process holds, and that is not
 /// among these, was claimed in a transaction whose end was not heard.
 #[derive(Default)]
-pub(super) struct HeldJobs(Mutex<HashMap<Uuid, (Claim, Instant)>>);
+pub(super) struct LocalClaims(Mutex<HashMap<Uuid, (Claim, Instant)>>);
 
-impl HeldJobs {
+impl LocalClaims {
     fn jobs(&self) -> MutexGuard<'_, HashMap<Uuid, (Claim, Instant)>> {
         self.0.lock()
     }
@@ -31,10 +31,10 @@ impl HeldJobs {
 
     /// Holds a job as long as the returned value lives, or, if that is kept, until it is let go of or so many
     /// seconds have passed.
-    pub fn hold(&self, claim: Claim, for_s: f64) -> Holding<'_> {
+    pub fn hold(&self, claim: Claim, for_s: f64) -> ClaimGuard<'_> {
         let until = Instant::now() + Duration::from_secs_f64(for_s);
         self.jobs().insert(claim.job, (claim, until));
-        Holding { held: self, claim: Some(claim) }
+        ClaimGuard { held: self, claim: Some(claim) }
     }
 
     /// Not of a later claim: the job may have been taken again already.
@@ -47,19 +47,19 @@ impl HeldJobs {
 }
 
 /// A claim whose transaction is being ended.
-pub(super) struct Holding<'a> {
-    held: &'a HeldJobs,
+pub(super) struct ClaimGuard<'a> {
+    held: &'a LocalClaims,
     claim: Option<Claim>,
 }
 
-impl Holding<'_> {
+impl ClaimGuard<'_> {
     /// The transaction has ended well.
     pub fn keep(mut self) {
         self.claim = None;
     }
 }
 
-impl Drop for Holding<'_> {
+impl Drop for ClaimGuard<'_> {
     fn drop(&mut self) {
         if let Some(claim) = self.claim {
             self.held.let_go(claim);

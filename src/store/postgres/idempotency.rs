@@ -53,7 +53,7 @@ impl IdempotencyStore for PostgresStore {
                 if counts {
                     return Ok(Some(known));
                 }
-                let reserved = reserved.in_place_of(&known);
+                let reserved = reserved.replacing(&known);
                 let replace = sqlx::query(
                     "UPDATE answers SET at = $2, holder = $3, record = $4::json WHERE id = $1",
                 );

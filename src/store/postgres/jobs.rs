@@ -12,8 +12,8 @@ use sqlx::{Postgres, Transaction};
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
-use super::super::changes::{ended_at, news_of, no_job, place, submitted_at};
-use super::super::listing::SEARCHED;
+use super::super::changes::{deliveries_for, ended_at, no_job, queue_rank, submitted_at};
+use super::super::listing::MAX_EXAMINED;
 use super::super::{
     Claim, IdempotencyRecord, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
 };
@@ -72,7 +72,7 @@ impl PostgresStore {
                     Err(_) => tx.rollback().await?,
                 }
                 if lets_go && changed.is_ok() {
-                    inner.held.let_go(known.claim());
+                    inner.claims.let_go(known.claim());
                 }
                 changed.map(|()| known.job)
             })
@@ -131,7 +131,7 @@ impl Inner {
             sqlx::query_scalar("SELECT record FROM webhooks ORDER BY id FOR KEY SHARE")
                 .fetch_all(&mut **tx)
                 .await?;
-        let news = news_of(job, webhooks.into_iter().map(|Json(stored)| stored))?;
+        let news = deliveries_for(job, webhooks.into_iter().map(|Json(stored)| stored))?;
         for delivery in &news {
             self.insert_delivery(tx, delivery).await?;
         }
@@ -165,7 +165,7 @@ impl Inner {
         .bind(job.id)
         .bind(job.map.as_str())
         .bind(job.state.as_str())
-        .bind(i16::from(place(job.priority)))
+        .bind(i16::from(queue_rank(job.priority)))
         .bind(new.query.digest.as_bytes().as_slice())
         .bind(record(new)?)
         .bind(JOBS)
@@ -242,7 +242,7 @@ impl JobStore for PostgresStore {
                     if let Some(Json(queued)) = job {
                         return Ok(Some(queued.job));
                     }
-                    known.queued(new.job.id);
+                    known.set_job(new.job.id);
                     let note = sqlx::query("UPDATE answers SET record = $2::json WHERE id = $1");
                     note.bind(request).bind(record(&known)?).execute(&mut *tx).await?;
                 }
@@ -289,7 +289,7 @@ impl JobStore for PostgresStore {
         // The text is looked for here, so that both stores find the same.
         let (mut found, mut before, mut looked) = (JobList::default(), before, 0);
         while found.jobs.len() < limit {
-            if looked >= SEARCHED {
+            if looked >= MAX_EXAMINED {
                 found.searched_to = before;
                 break;
             }
@@ -332,22 +332,22 @@ impl JobStore for PostgresStore {
                     )
                     .bind(inner.process)
                     .bind(inner.lifetime())
-                    .bind(inner.held.all());
+                    .bind(inner.claims.all());
                     let found: Option<(Json<JobRecord>, bool)> =
                         found.fetch_optional(&mut *tx).await?;
                     let Some((Json(known), ours)) = found else { return Ok(None) };
                     // Another worker of this process may have taken it since the list was made.
-                    if !(ours && inner.held.has(known.job.id)) {
+                    if !(ours && inner.claims.has(known.job.id)) {
                         break (tx, known);
                     }
                     tx.rollback().await?;
                 };
-                known.take(now);
+                known.start_attempt(now);
                 inner.write_job(&mut tx, &known, Place::Held { for_s }).await?;
                 // If the answer to the commit is lost, nobody knows of the claim, and the job is free.
-                let holding = inner.held.hold(known.claim(), for_s);
+                let guard = inner.claims.hold(known.claim(), for_s);
                 tx.commit().await?;
-                holding.keep();
+                guard.keep();
                 Ok(Some(known))
             })
             .await
@@ -369,7 +369,7 @@ impl JobStore for PostgresStore {
         let for_s = wait.map_or(0.0, seconds).max(0.0);
         self.change(claim.job, move |known| {
             Ok(known.is_held_by(claim).then(|| {
-                known.give_back(&release);
+                known.requeue(&release);
                 Place::Queue { for_s }
             }))
         })
@@ -394,7 +394,7 @@ impl JobStore for PostgresStore {
 
     async fn retry(&self, id: Uuid) -> Result<Job, StoreError> {
         self.change(id, |known| {
-            known.queue_again()?;
+            known.retry()?;
             Ok(Some(Place::Queue { for_s: 0.0 }))
         })
         .await

@@ -9,12 +9,12 @@
 //! Every call has a time limit. A database that is away, too slow or too busy is
 //! [`StoreError::Unavailable`], and nothing of the call has happened, or all of it.
 
-mod answers;
 mod blobs;
+mod claims;
 mod descriptions;
 mod descriptors;
 mod drafts;
-mod held;
+mod idempotency;
 mod images;
 mod indexer;
 mod jobs;
@@ -88,7 +88,7 @@ struct Inner {
     keys: watch::Sender<()>,
     levels: KnownLevels,
     graphs: descriptors::KnownGraphs,
-    held: held::HeldJobs,
+    claims: claims::LocalClaims,
     /// Ends what works in the background.
     _background: DropGuard,
 }
@@ -118,7 +118,7 @@ impl PostgresStore {
             keys: watch::Sender::new(()),
             levels: KnownLevels::default(),
             graphs: descriptors::KnownGraphs::default(),
-            held: held::HeldJobs::default(),
+            claims: claims::LocalClaims::default(),
             _background: background.clone().drop_guard(),
             pool,
             doubts,
