@@ -1,4 +1,4 @@
-//! What the workers of this process hold.
+//! The claims that this process knows to be its own.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -8,8 +8,8 @@ use uuid::Uuid;
 
 use super::super::Claim;
 
-/// The jobs that workers of this process hold. One that the database says the process holds, and that is not
-/// among these, was claimed in a transaction whose end was not heard.
+/// The jobs that workers of this process hold. If the database says that this process holds another job,
+/// that job was claimed in a transaction whose result was lost, and may be claimed again.
 #[derive(Default)]
 pub(super) struct LocalClaims(Mutex<HashMap<Uuid, (Claim, Instant)>>);
 
@@ -18,7 +18,7 @@ impl LocalClaims {
         self.0.lock()
     }
 
-    /// Those whose leases have not ended.
+    /// Returns the jobs whose leases have not expired.
     pub fn all(&self) -> Vec<Uuid> {
         let (mut jobs, now) = (self.jobs(), Instant::now());
         jobs.retain(|_, (_, until)| *until > now);
@@ -29,31 +29,31 @@ impl LocalClaims {
         self.jobs().get(&job).is_some_and(|(_, until)| *until > Instant::now())
     }
 
-    /// Holds a job as long as the returned value lives, or, if that is kept, until it is let go of or so many
-    /// seconds have passed.
+    /// Registers a claim for a number of seconds. Dropping the guard removes it again, unless
+    /// [`ClaimGuard::keep`] was called.
     pub fn hold(&self, claim: Claim, for_s: f64) -> ClaimGuard<'_> {
         let until = Instant::now() + Duration::from_secs_f64(for_s);
         self.jobs().insert(claim.job, (claim, until));
-        ClaimGuard { held: self, claim: Some(claim) }
+        ClaimGuard { claims: self, claim: Some(claim) }
     }
 
-    /// Not of a later claim: the job may have been taken again already.
-    pub fn let_go(&self, claim: Claim) {
+    /// Removes a claim, but not a later one of the same job.
+    pub fn release(&self, claim: Claim) {
         let mut jobs = self.jobs();
-        if jobs.get(&claim.job).is_some_and(|(known, _)| *known == claim) {
+        if jobs.get(&claim.job).is_some_and(|(current, _)| *current == claim) {
             jobs.remove(&claim.job);
         }
     }
 }
 
-/// A claim whose transaction is being ended.
+/// A claim whose transaction is being committed.
 pub(super) struct ClaimGuard<'a> {
-    held: &'a LocalClaims,
+    claims: &'a LocalClaims,
     claim: Option<Claim>,
 }
 
 impl ClaimGuard<'_> {
-    /// The transaction has ended well.
+    /// Keeps the claim, because the transaction was committed.
     pub fn keep(mut self) {
         self.claim = None;
     }
@@ -62,7 +62,7 @@ impl ClaimGuard<'_> {
 impl Drop for ClaimGuard<'_> {
     fn drop(&mut self) {
         if let Some(claim) = self.claim {
-            self.held.let_go(claim);
+            self.claims.release(claim);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! First answers to requests that may be sent again.
+//! Idempotency records.
 
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -48,7 +48,7 @@ impl IdempotencyStore for PostgresStore {
                     .fetch_optional(&mut *tx)
                     .await?;
                 let Some((Json(known), counts)) = known else {
-                    return Err(unavailable("an answer was forgotten at this moment"));
+                    return Err(unavailable("the record of the request was just deleted"));
                 };
                 if counts {
                     return Ok(Some(known));

@@ -1,7 +1,7 @@
-//! Limits that all processes keep together.
+//! Limits that all processes share.
 //!
-//! TokenBuckets are in a table that is not logged: it costs no wait for the disk, and after a crash of the database
-//! the buckets are full.
+//! Token buckets are in an unlogged table, which does not wait for the disk. After a crash of the
+//! database, all buckets are full.
 
 use async_trait::async_trait;
 use jiff::civil::Date;
@@ -9,10 +9,10 @@ use jiff_sqlx::ToSqlx;
 
 use super::super::{SharedLimits, StoreError, TokenGrant, TokenRequest};
 use super::PostgresStore;
-use super::statements::alone;
+use super::statements::advisory_lock;
 use whereabouts_core::Spent;
 
-/// The advisory lock of those who set something aside.
+/// The advisory lock of calls that reserve a part of the budget.
 const BUDGET_LOCK: i64 = 0x7768_6572_6561_0003;
 
 #[async_trait]
@@ -80,8 +80,8 @@ impl SharedLimits for PostgresStore {
         inner
             .call(async {
                 let mut tx = inner.begin().await?;
-                // One after another, so that no two take the same rest.
-                alone(&mut tx, BUDGET_LOCK).await?;
+                // One at a time, so that no two reservations use the same remainder.
+                advisory_lock(&mut tx, BUDGET_LOCK).await?;
                 let set = set.execute(&mut *tx).await?.rows_affected() > 0;
                 tx.commit().await?;
                 Ok(set)
