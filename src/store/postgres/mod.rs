@@ -3,7 +3,7 @@
 //!
 //! Processes share no state except through the database. A job, draft or idempotent request that a
 //! process holds is marked with the process's id, and becomes free when the heartbeats of that process
-//! stop ([`processes`]). No lock is held longer than a statement or a short transaction. The exception
+//! stop (`processes.rs`). No lock is held longer than a statement or a short transaction. The exception
 //! is building an index, which may take minutes and holds an advisory lock that nothing waits for.
 //!
 //! Every call has a time limit. If the database is down, too slow or too busy, the call fails with
