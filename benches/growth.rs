@@ -25,7 +25,8 @@ use whereabouts_core::{
 use whereabouts_index::IndexSettings;
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore, Examination, compact, examine};
 use whereabouts_store::{
-    BlobStore, DescriptionBounds, JobRecord, JobStore, KeepJobs, MapStore, Query, Retention, Step,
+    BlobStore, DescriptionBounds, JobRecord, JobRetention, JobStore, MapStore, Query, Retention,
+    Step,
 };
 
 const KEPT: usize = 1000;
@@ -134,7 +135,7 @@ async fn job_cycles(jobs: usize) {
 
 async fn sweep(store: &EmbeddedStore) {
     loop {
-        let keep = KeepJobs { since: None, most: Some(KEPT), settled: Timestamp::now() };
+        let keep = JobRetention { since: None, most: Some(KEPT), settled: Timestamp::now() };
         if store.remove_ended(keep, 64).await.unwrap().jobs() < 64 {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }

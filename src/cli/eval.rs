@@ -11,7 +11,7 @@ use super::progress::Progress;
 use whereabouts_core::{DescriptorKind, Digest, RefinerKind, Scene};
 use whereabouts_eval::{
     Dataset, Evaluator, Folders, RunConditions, RunSettings, Sampling, Summary, TruthSource, Watch,
-    predictions, report, table,
+    predictions, refiner_settings, report, table,
 };
 use whereabouts_index::SearchMode;
 use whereabouts_refine::local::{LocalMatcher, LocalSettings};
@@ -266,10 +266,10 @@ impl Args {
             work: config.data.dir.clone(),
             attempts: config.jobs.attempts,
             retry_pause: Duration::from_secs(config.jobs.retry_pause_s),
-            refiner_settings: format!(
-                "{PROMPT_VERSION} {} {:?}",
-                serde_json::to_string(&config.mllm)?,
-                LocalSettings::default()
+            refiner_settings: refiner_settings(
+                PROMPT_VERSION,
+                &serde_json::to_string(&config.mllm)?,
+                &LocalSettings::default(),
             ),
         })
     }

@@ -11,6 +11,7 @@
 //! There is no second pipeline: descriptors, search, refiners and the cache of descriptions are those
 //! of the [`whereabouts_service`], in a data folder that a server could serve.
 
+mod cache_key;
 mod dataset;
 mod folder;
 mod map;
@@ -29,6 +30,7 @@ mod truth;
 #[cfg(test)]
 mod tests;
 
+pub use cache_key::refiner_settings;
 pub use dataset::{Dataset, EvaluatedQuery, Folders, QueryKind, Sampling};
 pub use folder::{PictureFile, pictures};
 pub use outcome::{MethodOutcomes, Outcome, Prediction, Times};

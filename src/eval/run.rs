@@ -11,6 +11,7 @@ use futures_util::{StreamExt, TryStreamExt};
 use jiff::Timestamp;
 use uuid::Uuid;
 
+use super::cache_key::CacheKey;
 use super::map::ReferenceMap;
 use super::outcome::OutcomeCache;
 use super::{Dataset, EvaluatedQuery, MethodOutcomes, Outcome, Prediction, Times};
@@ -120,15 +121,16 @@ impl Evaluator<'_> {
     /// The file of a method's outcomes.
     fn kept(&self, method: Method, references: &ReferenceMap) -> anyhow::Result<OutcomeCache> {
         let RunSettings { k, search, scene, refiner_settings, work, .. } = &self.settings;
-        let refined = method.refiner.map(|_| (scene, refiner_settings));
-        let decides = format!(
-            "{}\n{}\n{}\n{:?}\n{k}\n{refined:?}\n{:?}",
-            env!("CARGO_PKG_VERSION"),
-            references.map.name,
-            references.digest,
-            search,
-            self.service.settings.calibration
-        );
+        let decides = CacheKey {
+            version: env!("CARGO_PKG_VERSION"),
+            map: &references.map.name,
+            references: references.digest,
+            search: *search,
+            k: *k,
+            refinement: method.refiner.map(|_| (*scene, refiner_settings.as_str())),
+            calibration: self.service.settings.calibration,
+        }
+        .text();
         let folder = work.join("outcomes");
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot make the folder {}", folder.display()))?;

@@ -357,4 +357,6 @@ fn exactly(
 }
 
 #[cfg(test)]
+mod property_tests;
+#[cfg(test)]
 mod tests;

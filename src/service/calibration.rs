@@ -84,7 +84,8 @@ impl Service {
     ) -> Result<(), ServiceError> {
         let settings = self.settings.calibration;
         let IndexState { images, .. } = self.maps.index_state(map).await?;
-        let asked = self.maps.look_alikes(map, settings, COMPARED.max(settings.candidates)).await?;
+        let asked =
+            self.maps.hard_negatives(map, settings, COMPARED.max(settings.candidates)).await?;
         let similarity = NullDistribution::from(values(asked.iter().filter_map(|asked| {
             Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
         })));

@@ -67,7 +67,7 @@ impl Service {
 
     /// How long ago the oldest of them was submitted; zero, if there is none.
     pub async fn age_of_oldest_job(&self) -> Result<Duration, ServiceError> {
-        let submitted = self.jobs.oldest_open().await?;
+        let submitted = self.jobs.oldest_unfinished().await?;
         let age = submitted.map(|submitted| Timestamp::now().duration_since(submitted));
         // The clock of whoever submitted it may be ahead.
         Ok(age.and_then(|age| age.try_into().ok()).unwrap_or_default())

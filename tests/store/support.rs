@@ -19,7 +19,7 @@ use whereabouts_index::IndexSettings;
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
 use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
 use whereabouts_store::{
-    Added, DescriptionBounds, Draft, JobRecord, KeepJobs, ObjectSettings, Objects, Query, Store,
+    Added, DescriptionBounds, Draft, JobRecord, JobRetention, ObjectSettings, Objects, Query, Store,
 };
 
 /// Makes each of these promises a test of both stores.
@@ -382,7 +382,7 @@ pub async fn claim(store: &dyn Store) -> Option<JobRecord> {
 
 /// Whether the bytes are there once the janitor has called.
 pub async fn is_kept(store: &dyn Store, bytes: &[u8]) -> bool {
-    let all = KeepJobs { since: None, most: None, settled: Timestamp::now() };
+    let all = JobRetention { since: None, most: None, settled: Timestamp::now() };
     store.remove_ended(all, 64).await.unwrap();
     store.blob(&Digest::of(bytes)).await.unwrap().is_some()
 }

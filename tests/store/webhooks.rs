@@ -9,7 +9,7 @@ use whereabouts_core::{
     Attempt, Delivery, DeliveryState, Job, JobState, StoredWebhook, Then, Webhook, WebhookEvent,
     WebhookSecret,
 };
-use whereabouts_store::{ForgottenDeliveries, KeepDeliveries, Store, StoreError, StoredDelivery};
+use whereabouts_store::{DeliveryRetention, RemovedDeliveries, Store, StoreError, StoredDelivery};
 
 use crate::support::{Fixture, claim, eventually, odd_texts, submit};
 
@@ -256,19 +256,19 @@ async fn the_first_to_end_are_forgotten_and_what_waits_only_if_there_is_no_other
         ids.reverse();
         ids
     };
-    let keep = KeepDeliveries { since: Some(now - day * 30), most: 100 };
+    let keep = DeliveryRetention { since: Some(now - day * 30), most: 100 };
     let forgotten = store.forget_deliveries(keep, 9).await.unwrap();
-    assert_eq!(forgotten, ForgottenDeliveries { ended: 1, waiting: 0 });
-    let keep = KeepDeliveries { since: None, most: 4 };
+    assert_eq!(forgotten, RemovedDeliveries { ended: 1, waiting: 0 });
+    let keep = DeliveryRetention { since: None, most: 4 };
     assert_eq!(store.forget_deliveries(keep, 9).await.unwrap().ended, 1);
     assert_eq!(left().await, [pings[0], pings[1], pings[4], pings[5]]);
-    let keep = KeepDeliveries { since: None, most: 1 };
+    let keep = DeliveryRetention { since: None, most: 1 };
     let forgotten = store.forget_deliveries(keep, 1).await.unwrap();
-    assert_eq!(forgotten, ForgottenDeliveries { ended: 1, waiting: 0 });
+    assert_eq!(forgotten, RemovedDeliveries { ended: 1, waiting: 0 });
     let forgotten = store.forget_deliveries(keep, 9).await.unwrap();
-    assert_eq!(forgotten, ForgottenDeliveries { ended: 0, waiting: 2 });
+    assert_eq!(forgotten, RemovedDeliveries { ended: 0, waiting: 2 });
     assert_eq!(left().await, [pings[5]]);
-    assert_eq!(store.forget_deliveries(keep, 9).await.unwrap(), ForgottenDeliveries::default());
+    assert_eq!(store.forget_deliveries(keep, 9).await.unwrap(), RemovedDeliveries::default());
 }
 
 async fn what_is_queued_is_told(fixture: &Fixture) {

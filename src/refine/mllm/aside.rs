@@ -25,7 +25,7 @@ impl SpendReservation {
     ) -> Result<Option<Self>, StoreError> {
         // On a task of its own: a job that is cancelled now must not leave something set aside.
         let setting = tokio::spawn(async move {
-            let set = shared.set_aside(day, most, limit).await?;
+            let set = shared.reserve(day, most, limit).await?;
             Ok(set.then_some(Self { shared, day, unneeded: most }))
         });
         setting.await.unwrap_or_else(|error| Err(StoreError::Failed(error.to_string())))
@@ -41,7 +41,7 @@ impl Drop for SpendReservation {
     fn drop(&mut self) {
         let (shared, day, unneeded) = (Arc::clone(&self.shared), self.day, self.unneeded);
         tokio::spawn(async move {
-            insist("what a call did not need", || shared.give_back(day, unneeded)).await;
+            insist("what a call did not need", || shared.release(day, unneeded)).await;
         });
     }
 }

@@ -18,7 +18,7 @@ use super::retry::{CallError, Failure, RetryPolicy, retry_after};
 use super::settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError};
 use super::wire::{ChatAnswer, ChatRequest, ErrorAnswer, Message, Reply, Schema};
 use whereabouts_core::Secret;
-use whereabouts_store::Buckets;
+use whereabouts_store::TokenBuckets;
 use whereabouts_telemetry::traces;
 
 /// What is read of a refusal, in bytes, and what is told of it, in characters.
@@ -77,7 +77,7 @@ pub struct MllmClient {
 
 impl MllmClient {
     /// A client for the server of the settings, whose limits these buckets keep. Nothing is sent yet.
-    pub fn new(settings: &MllmSettings, buckets: Buckets) -> Result<Self, MllmSettingsError> {
+    pub fn new(settings: &MllmSettings, buckets: TokenBuckets) -> Result<Self, MllmSettingsError> {
         // reqwest panics without one. Only the first call sets it; a library user may have chosen
         // another.
         let _ = rustls::crypto::ring::default_provider().install_default();
@@ -346,7 +346,7 @@ mod tests {
             api_key: Secret::new("azure-key"),
             ..defaults()
         };
-        let client = MllmClient::new(&settings, Buckets::default()).unwrap();
+        let client = MllmClient::new(&settings, TokenBuckets::default()).unwrap();
         assert_eq!(
             client.url.as_str(),
             "https://x.openai.azure.com/openai/deployments/gpt/chat/completions\
@@ -361,7 +361,7 @@ mod tests {
         for base_url in ["", "api.openai.com/v1", "ftp://host/v1"] {
             let settings = MllmSettings { base_url: base_url.into(), ..defaults() };
             assert!(matches!(
-                MllmClient::new(&settings, Buckets::default()),
+                MllmClient::new(&settings, TokenBuckets::default()),
                 Err(MllmSettingsError::Url { .. })
             ));
         }
@@ -370,7 +370,7 @@ mod tests {
     #[test]
     fn the_client_does_not_show_its_key() {
         let settings = MllmSettings { api_key: Secret::new("sk-shown"), ..defaults() };
-        let client = MllmClient::new(&settings, Buckets::default()).unwrap();
+        let client = MllmClient::new(&settings, TokenBuckets::default()).unwrap();
         assert!(!format!("{client:?}").contains("sk-shown"));
         assert_eq!(client.told(b"{\"error\":{\"message\":\"no sk-shown\"}}"), "no [hidden]");
         assert_eq!(client.told(b"{\"error\":\"model not found\"}"), "model not found");
@@ -380,7 +380,7 @@ mod tests {
     #[test]
     fn a_key_that_no_header_can_carry_is_refused_without_showing_it() {
         let settings = MllmSettings { api_key: Secret::new("bad\nkey"), ..defaults() };
-        let error = MllmClient::new(&settings, Buckets::default()).unwrap_err();
+        let error = MllmClient::new(&settings, TokenBuckets::default()).unwrap_err();
         assert!(!format!("{error} {error:?}").contains("bad"));
     }
 

@@ -54,7 +54,7 @@ use super::{Progress, RefineError, Refinement, Refiner};
 use crate::RefineMetrics;
 use whereabouts_core::{CacheLevels, DayUsage, Evidence, Map, RefinerKind, Spent, Usage, utc_day};
 use whereabouts_store::{
-    BlobStore, Buckets, DescriptionCache, HardNegatives, JobRecord, MapStore, SharedLimits,
+    BlobStore, DescriptionCache, HardNegatives, JobRecord, MapStore, SharedLimits, TokenBuckets,
     UsageStore,
 };
 use whereabouts_vision::ImageLimits;
@@ -112,7 +112,7 @@ pub struct MllmLevels {
 impl MllmRefiner {
     /// Puts a refiner together. Reads the key; calls nobody yet.
     pub fn new(parts: MllmParts, settings: MllmSettings) -> Result<Self, MllmSettingsError> {
-        let client = MllmClient::new(&settings, Buckets::of(parts.shared.clone()))?;
+        let client = MllmClient::new(&settings, TokenBuckets::new(parts.shared.clone()))?;
         let pictures = Pictures::new(parts.blobs, parts.limits, settings.image_max_edge)
             .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
         Ok(Self {

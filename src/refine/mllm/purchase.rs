@@ -33,7 +33,7 @@ impl DescriptionLease {
             let until = Timestamp::now().saturating_add(LONGEST_PURCHASE).unwrap_or(Timestamp::MAX);
             // Made before it is known to be granted: the answer may be lost on its way.
             let purchase = Self { cache: Arc::clone(cache), key: Some(*key) };
-            let begun = patiently(|| cache.begin_purchase(key, until)).await?;
+            let begun = patiently(|| cache.acquire_lease(key, until)).await?;
             let purchase = if begun { Some(purchase) } else { purchase.not_granted() };
             // Whoever was at it a moment ago may have ended just now.
             if let Some(known) = patiently(|| cache.description(key)).await? {
@@ -58,7 +58,7 @@ impl Drop for DescriptionLease {
         let cache = Arc::clone(&self.cache);
         tokio::spawn(async move {
             // Other processes wait for it, as long as this one is alive.
-            let ended = || cache.end_purchase(&key);
+            let ended = || cache.release_lease(&key);
             insist("that a description is not being bought any more", ended).await;
         });
     }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use whereabouts_store::{Buckets, TokenGrant, TokenRequest};
+use whereabouts_store::{TokenBuckets, TokenGrant, TokenRequest};
 
 /// Two buckets that fill steadily up to a minute's worth. Callers are served in order.
 #[derive(Debug)]
@@ -10,12 +10,12 @@ pub struct RateLimiter {
     /// Whoever holds it is the next to be served.
     turn: tokio::sync::Mutex<()>,
     per_minute: [f64; 2],
-    buckets: Buckets,
+    buckets: TokenBuckets,
 }
 
 impl RateLimiter {
     /// Limits that these buckets keep; 0 for none.
-    pub fn new(requests_per_minute: u32, tokens_per_minute: u64, buckets: Buckets) -> Self {
+    pub fn new(requests_per_minute: u32, tokens_per_minute: u64, buckets: TokenBuckets) -> Self {
         let per_minute = [f64::from(requests_per_minute), tokens_per_minute as f64];
         Self { turn: tokio::sync::Mutex::default(), per_minute, buckets }
     }
@@ -28,10 +28,10 @@ impl RateLimiter {
         let _turn = self.turn.lock().await;
         let draws = [self.draw(0, 1.0), self.draw(1, tokens as f64)];
         loop {
-            match self.buckets.draw(NAME, draws).await {
-                Ok(TokenGrant { taken: true, .. }) => return,
-                Ok(TokenGrant { left, .. }) => {
-                    let wait = [0, 1].map(|index| missing(draws[index], left[index]));
+            match self.buckets.take(NAME, draws).await {
+                Ok(TokenGrant { granted: true, .. }) => return,
+                Ok(TokenGrant { remaining, .. }) => {
+                    let wait = [0, 1].map(|index| missing(draws[index], remaining[index]));
                     tokio::time::sleep(wait[0].max(wait[1]).max(FINEST)).await;
                 }
                 Err(error) => {
@@ -48,10 +48,10 @@ impl RateLimiter {
             return;
         }
         let taken = (taken as f64).min(self.per_minute[1]);
-        let nothing = TokenRequest { needed: f64::MIN, taken: 0.0, ..self.draw(0, 0.0) };
+        let nothing = TokenRequest { required: f64::MIN, amount: 0.0, ..self.draw(0, 0.0) };
         let corrected =
-            TokenRequest { needed: f64::MIN, taken: used as f64 - taken, ..self.draw(1, 0.0) };
-        if let Err(error) = self.buckets.draw(NAME, [nothing, corrected]).await {
+            TokenRequest { required: f64::MIN, amount: used as f64 - taken, ..self.draw(1, 0.0) };
+        if let Err(error) = self.buckets.take(NAME, [nothing, corrected]).await {
             tracing::warn!(%error, "tokens that were not needed are not given back");
         }
     }
@@ -63,7 +63,7 @@ impl RateLimiter {
             return TokenRequest::UNLIMITED;
         }
         let cost = cost.min(per_minute);
-        TokenRequest { per_minute, needed: cost, taken: cost }
+        TokenRequest { per_minute, required: cost, amount: cost }
     }
 }
 
@@ -72,7 +72,7 @@ fn missing(draw: TokenRequest, left: f64) -> Duration {
     if draw.per_minute == 0.0 {
         return Duration::ZERO;
     }
-    Duration::from_secs_f64((draw.needed - left).max(0.0) * 60.0 / draw.per_minute)
+    Duration::from_secs_f64((draw.required - left).max(0.0) * 60.0 / draw.per_minute)
 }
 
 /// The name of the buckets of calls to the model.
@@ -91,7 +91,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn requests_beyond_a_minutes_worth_wait() {
-        let limiter = RateLimiter::new(60, 0, Buckets::default());
+        let limiter = RateLimiter::new(60, 0, TokenBuckets::default());
         let start = Instant::now();
         for _ in 0..60 {
             limiter.take(1_000_000).await;
@@ -105,7 +105,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn tokens_not_needed_are_given_back() {
-        let limiter = RateLimiter::new(0, 6000, Buckets::default());
+        let limiter = RateLimiter::new(0, 6000, TokenBuckets::default());
         let start = Instant::now();
         limiter.take(6000).await;
         limiter.settle(6000, 1000).await;
@@ -118,7 +118,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn a_request_larger_than_the_bucket_is_sent_all_the_same() {
-        let limiter = RateLimiter::new(0, 100, Buckets::default());
+        let limiter = RateLimiter::new(0, 100, TokenBuckets::default());
         limiter.take(1_000_000).await;
         let start = Instant::now();
         limiter.take(1_000_000).await;
@@ -127,7 +127,7 @@ mod tests {
 
     #[tokio::test]
     async fn no_limit_never_waits() {
-        let limiter = RateLimiter::new(0, 0, Buckets::default());
+        let limiter = RateLimiter::new(0, 0, TokenBuckets::default());
         for _ in 0..10_000 {
             limiter.take(u64::MAX).await;
         }

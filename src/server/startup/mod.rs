@@ -28,7 +28,7 @@ use whereabouts_service::{
     Dispatcher, IdempotencySettings, Janitor, Keys, Limits, RecallCheck, Reindexes,
     RetentionSettings, Service, ServiceSettings, Tracks, Webhooks,
 };
-use whereabouts_store::{Buckets, JobStore};
+use whereabouts_store::{JobStore, TokenBuckets};
 use whereabouts_telemetry::LogIssues;
 use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use whereabouts_vision::{LoadedModels, LoadedSettings, WhyModel};
@@ -239,7 +239,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     });
     let workers = workers.collect();
     let mut keys = Handle::current().block_on(Keys::load(store.clone()))?;
-    keys.limits = Limits::new(Buckets::of(shared));
+    keys.limits = Limits::new(TokenBuckets::new(shared));
     check_keys(config, &keys)?;
     let service = Service {
         keys,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::super::retention::before;
 use whereabouts_core::Then;
-use whereabouts_store::KeepDeliveries;
+use whereabouts_store::DeliveryRetention;
 
 /// The most tries after the first, and the longest pause between two, in seconds.
 const MOST_RETRIES: usize = 32;
@@ -80,10 +80,10 @@ impl WebhookSettings {
     }
 
     /// Which deliveries are kept at that moment.
-    pub(super) fn keep(&self, now: Timestamp) -> KeepDeliveries {
+    pub(super) fn keep(&self, now: Timestamp) -> DeliveryRetention {
         let age = Duration::from_secs(u64::from(self.keep_days) * 24 * 3600);
         let since = (!age.is_zero()).then(|| before(now, age));
-        KeepDeliveries { since, most: self.max_deliveries }
+        DeliveryRetention { since, most: self.max_deliveries }
     }
 
     /// What becomes of a delivery that failed after so many attempts before. `chance` is 0 to 1.

@@ -228,7 +228,7 @@ impl MapStore for Shelf {
         not_here()
     }
 
-    async fn look_alikes(
+    async fn hard_negatives(
         &self,
         _: &Map,
         _: CalibrationSettings,

@@ -1,4 +1,4 @@
-//! First answers to requests that may be sent again, by the key that their sender gave them.
+//! Idempotency records, by caller and idempotency key.
 
 use std::sync::Arc;
 
@@ -9,20 +9,20 @@ use super::super::{IdempotencyRecord, IdempotencyStore, Progress, StoreError};
 use super::trees::{Trees, decode, failed, get, put};
 use super::{EmbeddedStore, blocking};
 
-/// Sorted by age.
+/// The key in `answers_by_age`, which sorts by age.
 fn age_key(at: Timestamp, id: &[u8]) -> Vec<u8> {
-    // Times before 1970 do not occur, and would sort last.
+    // A time before 1970 would sort last, but none occurs.
     [&at.as_millisecond().to_be_bytes(), id].concat()
 }
 
 pub(super) fn write(
     trees: &Trees,
     id: &[u8],
-    answer: &IdempotencyRecord,
+    record: &IdempotencyRecord,
 ) -> Result<(), StoreError> {
     remove(trees, id)?;
-    put(&trees.answers, id, answer)?;
-    put(&trees.answers_by_age, &age_key(answer.at, id), &())
+    put(&trees.answers, id, record)?;
+    put(&trees.answers_by_age, &age_key(record.at, id), &())
 }
 
 fn remove(trees: &Trees, id: &[u8]) -> Result<(), StoreError> {
@@ -35,7 +35,7 @@ fn remove(trees: &Trees, id: &[u8]) -> Result<(), StoreError> {
 
 #[async_trait]
 impl IdempotencyStore for EmbeddedStore {
-    async fn reserve_answer(
+    async fn reserve_request(
         &self,
         id: &str,
         reserved: IdempotencyRecord,
@@ -45,7 +45,7 @@ impl IdempotencyStore for EmbeddedStore {
         let reserve = move |trees: &Trees, _: &mut _| {
             let known: Option<IdempotencyRecord> = get(&trees.answers, id.as_bytes())?;
             let counts = |known: &IdempotencyRecord| match (&known.progress, &reserved.progress) {
-                // Of a process that has ended nothing more will come.
+                // A process that has ended will not answer any more.
                 (Progress::Running { process, .. }, Progress::Running { process: own, .. }) => {
                     process == own
                 }
@@ -54,7 +54,7 @@ impl IdempotencyStore for EmbeddedStore {
             match known {
                 Some(known) if counts(&known) => Ok(Some(known)),
                 Some(known) => {
-                    write(trees, id.as_bytes(), &reserved.in_place_of(&known)).map(|()| None)
+                    write(trees, id.as_bytes(), &reserved.replacing(&known)).map(|()| None)
                 }
                 None => write(trees, id.as_bytes(), &reserved).map(|()| None),
             }
@@ -62,19 +62,19 @@ impl IdempotencyStore for EmbeddedStore {
         self.inner.writer.commit(reserve, |_| {}).await
     }
 
-    async fn keep_answer(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError> {
+    async fn store_response(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError> {
         let id = id.to_owned();
         let keep = move |trees: &Trees, _: &mut _| write(trees, id.as_bytes(), &answer);
         self.inner.writer.commit(keep, |()| {}).await
     }
 
-    async fn forget_answer(&self, id: &str) -> Result<(), StoreError> {
+    async fn forget_request(&self, id: &str) -> Result<(), StoreError> {
         let id = id.to_owned();
         let forget = move |trees: &Trees, _: &mut _| remove(trees, id.as_bytes());
         self.inner.writer.commit(forget, |()| {}).await
     }
 
-    async fn forget_answers(&self, before: Timestamp, most: usize) -> Result<usize, StoreError> {
+    async fn prune_responses(&self, before: Timestamp, most: usize) -> Result<usize, StoreError> {
         let inner = Arc::clone(&self.inner);
         let old = blocking(move || {
             let ages = &inner.trees.answers_by_age;

@@ -1,4 +1,4 @@
-//! First answers to requests that may be sent again.
+//! Idempotency records.
 
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -10,7 +10,7 @@ use super::{PostgresStore, count, record, unavailable};
 
 #[async_trait]
 impl IdempotencyStore for PostgresStore {
-    async fn reserve_answer(
+    async fn reserve_request(
         &self,
         id: &str,
         reserved: IdempotencyRecord,
@@ -48,12 +48,12 @@ impl IdempotencyStore for PostgresStore {
                     .fetch_optional(&mut *tx)
                     .await?;
                 let Some((Json(known), counts)) = known else {
-                    return Err(unavailable("an answer was forgotten at this moment"));
+                    return Err(unavailable("the record of the request was just deleted"));
                 };
                 if counts {
                     return Ok(Some(known));
                 }
-                let reserved = reserved.in_place_of(&known);
+                let reserved = reserved.replacing(&known);
                 let replace = sqlx::query(
                     "UPDATE answers SET at = $2, holder = $3, record = $4::json WHERE id = $1",
                 );
@@ -70,7 +70,7 @@ impl IdempotencyStore for PostgresStore {
             .await
     }
 
-    async fn keep_answer(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError> {
+    async fn store_response(&self, id: &str, answer: IdempotencyRecord) -> Result<(), StoreError> {
         let inner = &self.inner;
         let holder = matches!(answer.progress, Progress::Running { .. }).then_some(inner.process);
         let query = sqlx::query(
@@ -85,13 +85,13 @@ impl IdempotencyStore for PostgresStore {
         inner.run(query).await.map(drop)
     }
 
-    async fn forget_answer(&self, id: &str) -> Result<(), StoreError> {
+    async fn forget_request(&self, id: &str) -> Result<(), StoreError> {
         let inner = &self.inner;
         let query = sqlx::query("DELETE FROM answers WHERE id = $1").bind(id);
         inner.run(query).await.map(drop)
     }
 
-    async fn forget_answers(&self, before: Timestamp, most: usize) -> Result<usize, StoreError> {
+    async fn prune_responses(&self, before: Timestamp, most: usize) -> Result<usize, StoreError> {
         let inner = &self.inner;
         let query = sqlx::query(
             "DELETE FROM answers WHERE at < $1 OR id IN (
