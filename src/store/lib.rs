@@ -21,6 +21,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
+use futures_util::future::try_join_all;
 use jiff::Timestamp;
 use jiff::civil::Date;
 use serde::{Deserialize, Serialize};
@@ -157,6 +158,15 @@ pub trait MapStore: Send + Sync {
     ) -> Result<Added, StoreError>;
     /// One image.
     async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError>;
+    /// Returns the images with these ids: one entry for each id, in the order of `ids`, and `None` for an
+    /// id that the map does not have.
+    async fn images_by_id(
+        &self,
+        map: &Map,
+        ids: &[ImageId],
+    ) -> Result<Vec<Option<Image>>, StoreError> {
+        try_join_all(ids.iter().map(|id| self.image(map, id))).await
+    }
     /// Images by id, those after `after`, at most `limit`.
     async fn images(
         &self,
