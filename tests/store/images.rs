@@ -111,15 +111,8 @@ async fn images_are_looked_up_by_id_in_the_order_asked_for(fixture: &Fixture) {
     let quoted = Some(add(&*store, &one, "'; DROP TABLE images; --", b"q").await);
     add(&*store, &two, "only in two", b"2").await;
     let ids = |ids: &[&str]| -> Vec<ImageId> { ids.iter().map(|id| id.parse().unwrap()).collect() };
-    let wanted = ids(&[
-        "東京-01",
-        "never added",
-        "a",
-        "only in two",
-        "'; DROP TABLE images; --",
-        "b",
-        "a",
-    ]);
+    let wanted =
+        ids(&["東京-01", "never added", "a", "only in two", "'; DROP TABLE images; --", "b", "a"]);
     let expected = [tokyo, None, a.clone(), None, quoted, b.clone(), a];
     assert_eq!(store.images_by_id(&one, &wanted).await.unwrap(), expected);
     assert_eq!(store.images_by_id(&one, &[]).await.unwrap(), []);

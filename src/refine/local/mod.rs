@@ -16,6 +16,7 @@ mod motion;
 mod mutual;
 mod nearest;
 mod rank;
+mod refiner;
 mod votes;
 
 #[cfg(test)]
@@ -24,6 +25,10 @@ mod tests;
 pub use describe::describe;
 pub use motion::Motion;
 pub use rank::rank;
+pub use refiner::LocalRefiner;
+pub(crate) use refiner::{build, fingerprint};
+
+use serde::Serialize;
 
 use mutual::Mutual;
 use nearest::Nearest;
@@ -32,7 +37,7 @@ use whereabouts_core::dense::DenseFeatures;
 
 /// What the matcher takes for agreement. The defaults are those measured for XFeat; all lengths are
 /// fractions of the picture, so that they hold for any size of feature map.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LocalSettings {
     /// Cosine similarity that two cells must exceed to match at all.
     pub min_similarity: f32,

@@ -14,7 +14,7 @@ use tracing::Instrument;
 
 use super::breaker::Breaker;
 use super::rate::RateLimiter;
-use super::retry::{CallError, Failure, RetryPolicy, retry_after};
+use super::retry::{CallError, CallRetryPolicy, Failure, retry_after};
 use super::settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError};
 use super::wire::{ChatAnswer, ChatRequest, ErrorAnswer, Message, Reply, Schema};
 use whereabouts_core::Secret;
@@ -69,7 +69,7 @@ pub struct MllmClient {
     answer_max_bytes: usize,
     /// Whether the server has not yet refused `response_format`.
     structured: AtomicBool,
-    retry: RetryPolicy,
+    retry: CallRetryPolicy,
     breaker: Breaker,
     rate: RateLimiter,
     turns: Semaphore,
@@ -99,10 +99,10 @@ impl MllmClient {
             timeout: settings.timeout(),
             answer_max_bytes: settings.answer_max_bytes,
             structured: AtomicBool::new(true),
-            retry: RetryPolicy {
+            retry: CallRetryPolicy {
                 attempts: settings.attempts,
                 backoff: Duration::from_millis(settings.backoff_ms),
-                longest_wait: Duration::from_secs(settings.retry_after_max_s),
+                longest_retry_after: Duration::from_secs(settings.retry_after_max_s),
             },
             breaker: Breaker::new(
                 settings.breaker_failures,

@@ -2,13 +2,12 @@
 
 mod faults;
 mod limits;
-mod shelf;
+pub(crate) mod shelf;
 
 use shelf::{Bench, Steps};
 
 use super::*;
-use whereabouts_core::{Descriptor, Scene};
-use whereabouts_store::JobRecord;
+use whereabouts_core::{Descriptor, Scene, Usage};
 use whereabouts_testkit::mock_mllm::{Reply, Script, ranking};
 
 /// Names each description after the number of its call; at concurrency 1, that is the coarse rank.
@@ -74,7 +73,7 @@ async fn each_step_is_told_with_its_cost() {
     let bench = Bench::new(Script::default()).await;
     for known in [0, 4] {
         let steps = Steps::default();
-        let refinement = bench.refiner.refine(&bench.record(4), &steps).await.unwrap();
+        let refinement = bench.refiner.refine(&bench.input(4), &steps).await.unwrap();
         let steps = steps.0.into_inner();
         assert_eq!(steps.len(), 5);
         let told: Vec<_> = steps.iter().filter_map(|step| step.description.as_ref()).collect();
@@ -91,28 +90,28 @@ async fn each_step_is_told_with_its_cost() {
 #[tokio::test]
 async fn the_descriptions_of_a_similar_frame_stand_in() {
     let bench = Bench::with(Script::default(), |settings| settings.similar_frame_min = 0.9).await;
-    let record = |frame: usize, numbers: Vec<f32>, candidates| {
-        let mut record = bench.record(candidates);
-        record.query.digest = bench.shelf.digest(frame);
-        record.query.descriptor = Some(Descriptor::normalised(numbers).unwrap());
-        record
+    let input = |frame: usize, numbers: Vec<f32>, candidates| {
+        let mut input = bench.input(candidates);
+        input.frame.digest = bench.shelf.digest(frame);
+        input.frame.descriptor = Some(Descriptor::normalised(numbers).unwrap());
+        input
     };
-    let first = record(20, vec![1.0, 0.0], 3);
+    let first = input(20, vec![1.0, 0.0], 3);
     bench.refiner.refine(&first, &Steps::default()).await.unwrap();
     assert_eq!(bench.mock.describe_calls(), 3);
 
-    let near = record(21, vec![1.0, 0.1], 4);
+    let near = input(21, vec![1.0, 0.1], 4);
     let refinement = bench.refiner.refine(&near, &Steps::default()).await.unwrap();
     assert_eq!(bench.mock.describe_calls(), 4, "the fourth pair is new");
     assert_eq!((refinement.usage.calls, refinement.usage.cached), (2, 3));
     let [known @ .., bought] = refinement.descriptions.as_slice() else { panic!() };
     for description in known {
         let of = description.stands_in.unwrap();
-        assert!(of.query_id == first.query.id && of.similarity > 0.99, "{of:?}");
+        assert!(of.query_id == first.frame.query_id && of.similarity > 0.99, "{of:?}");
     }
     assert_eq!((bought.stands_in, bought.cached), (None, false));
 
-    let far = record(22, vec![0.0, 1.0], 3);
+    let far = input(22, vec![0.0, 1.0], 3);
     let refinement = bench.refiner.refine(&far, &Steps::default()).await.unwrap();
     assert!(refinement.descriptions.iter().all(|description| description.stands_in.is_none()));
     assert_eq!(bench.mock.describe_calls(), 7);
@@ -234,22 +233,13 @@ async fn the_scene_and_the_switches_shape_the_prompt_and_the_key() {
 #[tokio::test]
 async fn candidates_that_are_gone_stay_behind_the_others() {
     let bench = Bench::new(Script::default()).await;
-    let mut record = bench.record(3);
-    record.candidates[0].image_id = "gone".parse().unwrap();
-    let refinement = bench.refiner.refine(&record, &Steps::default()).await.unwrap();
+    let mut input = bench.input(3);
+    input.candidates[0].image_id = "gone".parse().unwrap();
+    let refinement = bench.refiner.refine(&input, &Steps::default()).await.unwrap();
     assert_eq!(refinement.ranking.as_slice()[2].coarse_rank, 1);
     assert_eq!(bench.mock.describe_calls(), 2);
     let why = refinement.degraded.unwrap();
     assert!(why.contains("1 of 3 candidates were removed"), "{why}");
-}
-
-#[tokio::test]
-async fn a_job_whose_map_is_gone_ends_at_once() {
-    let bench = Bench::new(Script::default()).await;
-    let record = JobRecord { map_uid: uuid::Uuid::from_u128(99), ..bench.record(2) };
-    let error = bench.refiner.refine(&record, &Steps::default()).await.unwrap_err();
-    assert!(matches!(error, RefineError::Permanent(_)));
-    assert_eq!(bench.mock.describe_calls(), 0);
 }
 
 #[tokio::test]

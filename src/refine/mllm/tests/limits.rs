@@ -16,13 +16,13 @@ impl Refiner for Reverse {
 
     async fn refine(
         &self,
-        record: &JobRecord,
+        input: &RefineInput,
         _: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        let order: Vec<usize> = (0..record.candidates.len()).rev().collect();
+        let order: Vec<usize> = (0..input.candidates.len()).rev().collect();
         Ok(Refinement {
             descriptions: vec![],
-            ranking: Ranking::new(&record.candidates, &order).unwrap(),
+            ranking: Ranking::new(&input.candidates, &order).unwrap(),
             evidence: None,
             reasoning: None,
             reasoning_took_ms: None,
@@ -62,7 +62,7 @@ async fn an_open_breaker_hands_the_job_to_the_other_refiner() {
         assert!(why.contains("`local` instead of `mllm`") && why.contains("suspended"), "{why}");
     }
     assert_eq!(bench.mock.describe_calls(), 3);
-    assert!(bench.refiner.levels().unwrap().suspended);
+    assert!(bench.refiner.levels().suspended);
 }
 
 #[tokio::test]
@@ -83,7 +83,7 @@ async fn a_job_that_waits_goes_on_when_the_breaker_lets_it() {
     let refinement = bench.refine(6).await.unwrap();
     assert_eq!(bench.mock.describe_calls(), 6);
     assert!(refinement.degraded.unwrap().starts_with("3 of 6 pairs"));
-    assert!(!bench.refiner.levels().unwrap().suspended);
+    assert!(!bench.refiner.levels().suspended);
 }
 
 #[tokio::test]
@@ -103,9 +103,9 @@ async fn a_job_that_waits_says_for_how_long() {
 #[tokio::test]
 async fn what_earlier_attempts_spent_counts_against_the_budget_of_the_job() {
     let bench = Bench::with(Script::default(), |settings| settings.tokens_per_job = 20_000).await;
-    let mut record = bench.record(2);
-    record.job.usage.prompt_tokens = 19_990;
-    let error = bench.refiner.refine(&record, &Steps::default()).await.unwrap_err();
+    let mut input = bench.input(2);
+    input.spent.prompt_tokens = 19_990;
+    let error = bench.refiner.refine(&input, &Steps::default()).await.unwrap_err();
     assert!(matches!(&error, RefineError::Permanent(why) if why.contains("tokens_per_job")));
     assert_eq!(bench.mock.describe_calls(), 0);
 }
@@ -147,7 +147,7 @@ async fn a_day_never_passes_its_budget() {
     assert_eq!(bench.mock.describe_calls(), 0);
     bench.refiner.seed_spent_today(&spent(0.5));
     assert_eq!(bench.refine(2).await.unwrap().degraded, None);
-    assert!(bench.refiner.levels().unwrap().spent_today.money > 0.5);
+    assert!(bench.refiner.levels().spent_today.money > 0.5);
     let spent: f64 = bench.cache.spent.lock().iter().map(|spent| spent.money).sum();
-    assert!((bench.refiner.levels().unwrap().spent_today.money - 0.5 - spent).abs() < 1e-9);
+    assert!((bench.refiner.levels().spent_today.money - 0.5 - spent).abs() < 1e-9);
 }

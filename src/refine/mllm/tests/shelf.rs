@@ -13,14 +13,15 @@ use uuid::Uuid;
 
 use super::super::settings::tests::defaults;
 use super::*;
-use whereabouts_core::{CachedDescription, DescribedFrame, Secret, SimilarFrame};
+use crate::QueryFrame;
+use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, Secret, SimilarFrame};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, CoordinateFrame, DayUsage, Descriptor,
-    DescriptorKind, Digest, Image, ImageId, Job, Map, MapName, MediaType, Pose, Precision,
-    RefinerKind, StandIn,
+    DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose, Precision, StandIn,
+    Usage,
 };
 use whereabouts_index::SearchMode;
-use whereabouts_store::{Added, BlobPin, HardNegatives, IndexState, Query, Step, StoreError};
+use whereabouts_store::{Added, BlobPin, HardNegatives, IndexState, Step, StoreError};
 use whereabouts_telemetry::metrics::registry;
 use whereabouts_testkit::mock_mllm::{MockMllm, Script};
 use whereabouts_vision::decode::encode_jpeg;
@@ -71,12 +72,12 @@ impl Bench {
         self.refiner = refiner(&self.shelf, &self.cache, self.fallback.clone(), &self.settings);
     }
 
-    pub fn record(&self, candidates: usize) -> JobRecord {
-        self.shelf.record(candidates)
+    pub fn input(&self, candidates: usize) -> RefineInput {
+        self.shelf.input(candidates)
     }
 
     pub async fn refine(&self, candidates: usize) -> Result<Refinement, RefineError> {
-        self.refiner.refine(&self.record(candidates), &Steps::default()).await
+        self.refiner.refine(&self.input(candidates), &Steps::default()).await
     }
 }
 
@@ -106,7 +107,7 @@ fn picture(number: u32) -> Bytes {
 }
 
 impl Shelf {
-    fn new() -> Self {
+    pub fn new() -> Self {
         let map = Map {
             uid: Uuid::from_u128(1),
             name: "m".parse().unwrap(),
@@ -129,29 +130,23 @@ impl Shelf {
         Digest::of(&self.pictures[number])
     }
 
-    fn record(&self, candidates: usize) -> JobRecord {
-        let now = Timestamp::now();
-        let query = Query {
-            id: Uuid::now_v7(),
-            digest: Digest::of(&self.pictures[self.pictures.len() - 1]),
-            media_type: MediaType::Jpeg,
-            created_at: now,
-            descriptor: None,
-        };
+    fn input(&self, candidates: usize) -> RefineInput {
         let candidate = |index: usize| Candidate {
             rank: index + 1,
             image_id: format!("image-{index}").parse().unwrap(),
             similarity: 0.9,
             pose: None,
         };
-        JobRecord {
-            job: Job::queued(self.map.name.clone(), query.id, RefinerKind::Mllm, now),
-            map_uid: self.map.uid,
-            revision: self.map.revision,
-            query,
+        RefineInput {
+            id: Uuid::now_v7(),
+            map: self.map.clone(),
+            frame: QueryFrame {
+                query_id: Uuid::now_v7(),
+                digest: self.digest(self.pictures.len() - 1),
+                descriptor: None,
+            },
             candidates: (0..candidates).map(candidate).collect(),
-            claims: 0,
-            traceparent: None,
+            spent: Usage::default(),
         }
     }
 }
