@@ -9,7 +9,7 @@
 //! | `describe`, `pictures` | one description for each pair |
 //! | `single_flight`, `lease` | a description is bought once: in this process, across processes |
 //! | `rank`, `reason`, `conclude` | the reasoning call, and from its answer to a ranking |
-//! | `client`, `wire` | the chat-completions format over HTTP |
+//! | `client`, `endpoint`, `wire` | the chat-completions format over HTTP |
 //! | `spend` | calls within the limits on spend |
 //! | `budget`, `reservation` | a limit on spend: in this process, across processes |
 //! | `retry`, `breaker`, `rate` | retries, circuit breaker, rate limits |
@@ -21,6 +21,7 @@ mod budget;
 mod client;
 mod conclude;
 mod describe;
+mod endpoint;
 mod lease;
 mod pictures;
 mod prompts;

@@ -33,7 +33,7 @@ impl MllmRefiner {
         let labels = Labels::new(candidates, self.settings.hide_coarse_rank.then_some(job));
         let mut conversation = vec![Message::user(self.reasoning_prompt(run, described, &labels))];
         let first = self.ask(run, &labels, &conversation).await?;
-        let (verdict, took) = match read(&labels, &first) {
+        let (verdict, took) = match parse(&labels, &first) {
             Ok(verdict) => (verdict, first.took),
             Err(why) => {
                 tracing::info!(%job, why, "asking the reasoning model to repair its answer");
@@ -41,7 +41,7 @@ impl MllmRefiner {
                 conversation.push(Message::assistant(self.quoted(&first)));
                 conversation.push(Message::user(prompts::repair(&why, &names)));
                 let second = self.ask(run, &labels, &conversation).await?;
-                let verdict = read(&labels, &second).map_err(|why| {
+                let verdict = parse(&labels, &second).map_err(|why| {
                     CallError::Permanent(format!(
                         "the reasoning model gave no ranking twice: {why}"
                     ))
@@ -113,8 +113,8 @@ impl MllmRefiner {
     }
 }
 
-fn read(labels: &Labels, answer: &Answer) -> Result<Verdict, String> {
-    labels.read(&answer.text).map_err(|error: AnswerError| match &answer.cut {
+fn parse(labels: &Labels, answer: &Answer) -> Result<Verdict, String> {
+    labels.parse(&answer.text).map_err(|error: AnswerError| match &answer.cut {
         Some(cut) => format!("{error} ({cut})"),
         None => error.to_string(),
     })

@@ -1,11 +1,11 @@
-//! Breaker and budget: what a job does while no call may be made.
+//! Circuit breaker and budget: what becomes of a job while no call may be made.
 
 use async_trait::async_trait;
 
 use super::*;
 use whereabouts_core::{Ranking, RefinerKind, Usage};
 
-/// Stands in for the local refiner: turns the coarse order round.
+/// Stands in for the local refiner: reverses the coarse order.
 struct Reverse;
 
 #[async_trait]
@@ -43,7 +43,7 @@ fn failing(first: usize) -> Script {
     }
 }
 
-/// One call at a time, each tried once; three failures open the breaker.
+/// One call at a time and without retries; three failures open the breaker.
 fn brittle(settings: &mut MllmSettings) {
     settings.concurrency = 1;
     settings.attempts = 1;
@@ -51,7 +51,7 @@ fn brittle(settings: &mut MllmSettings) {
 }
 
 #[tokio::test]
-async fn an_open_breaker_hands_the_job_to_the_other_refiner() {
+async fn an_open_breaker_hands_the_job_to_the_fallback() {
     let mut bench = Bench::with(failing(1000), brittle).await;
     bench.fallback = Some(Arc::new(Reverse));
     bench.rebuild(|settings| settings.breaker_open_s = 3600);
@@ -66,14 +66,14 @@ async fn an_open_breaker_hands_the_job_to_the_other_refiner() {
 }
 
 #[tokio::test]
-async fn without_another_refiner_the_job_is_tried_again_later() {
+async fn without_a_fallback_an_open_breaker_is_a_transient_error() {
     let bench = Bench::with(failing(1000), brittle).await;
     let error = bench.refine(5).await.unwrap_err();
     assert!(matches!(error, RefineError::Transient(_)), "{error}");
 }
 
 #[tokio::test]
-async fn a_job_that_waits_goes_on_when_the_breaker_lets_it() {
+async fn a_job_continues_when_the_breaker_closes() {
     let bench = Bench::with(failing(3), |settings| {
         brittle(settings);
         settings.breaker_open_s = 0;
@@ -87,7 +87,7 @@ async fn a_job_that_waits_goes_on_when_the_breaker_lets_it() {
 }
 
 #[tokio::test]
-async fn a_job_that_waits_says_for_how_long() {
+async fn a_deferred_job_states_how_long_to_wait() {
     let bench = Bench::with(failing(1000), |settings| {
         brittle(settings);
         settings.breaker_open_s = 3600;
@@ -101,7 +101,7 @@ async fn a_job_that_waits_says_for_how_long() {
 }
 
 #[tokio::test]
-async fn what_earlier_attempts_spent_counts_against_the_budget_of_the_job() {
+async fn spend_of_earlier_attempts_counts_against_the_budget_of_the_job() {
     let bench = Bench::with(Script::default(), |settings| settings.tokens_per_job = 20_000).await;
     let mut input = bench.input(2);
     input.spent.prompt_tokens = 19_990;
@@ -111,7 +111,7 @@ async fn what_earlier_attempts_spent_counts_against_the_budget_of_the_job() {
 }
 
 #[tokio::test]
-async fn a_job_never_passes_its_budget() {
+async fn a_job_never_exceeds_its_budget() {
     let mut bench = Bench::with(Script::default(), |settings| {
         settings.concurrency = 1;
         settings.tokens_per_job = 6000;
@@ -129,7 +129,7 @@ async fn a_job_never_passes_its_budget() {
 }
 
 #[tokio::test]
-async fn a_day_never_passes_its_budget() {
+async fn a_day_never_exceeds_its_budget() {
     let bench = Bench::with(Script::default(), |settings| {
         settings.price_prompt = 1.0;
         settings.price_completion = 2.0;
