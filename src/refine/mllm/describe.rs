@@ -1,7 +1,6 @@
 //! One description for each pair: cached, in flight, or bought.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use futures_util::{StreamExt, stream};
@@ -10,10 +9,10 @@ use whereabouts_core::{
     CachedDescription, Candidate, DescribedFrame, Description, Digest, ImageId, Scene,
     SimilarFrame, StandIn, Usage,
 };
-use whereabouts_store::{Step, StoreError};
+use whereabouts_store::Step;
 
+use super::buy_once::FoundDescription;
 use super::client::{Call, estimate_tokens};
-use super::lease::{Acquired, DescriptionLease};
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Switches, clean};
 use super::retry::CallError;
@@ -21,8 +20,7 @@ use super::run::RefineRun;
 use super::spend::cost_of;
 use super::wire::{Content, ImageUrl, Message, Part, Role};
 use super::{MllmRefiner, RefineError};
-use crate::store_retry::retry_read;
-use crate::{CacheLookup, RefineInput, milliseconds};
+use crate::{RefineInput, milliseconds};
 
 /// The frame and a candidate that is still in the map.
 pub(super) struct Pair {
@@ -32,21 +30,6 @@ pub(super) struct Pair {
     digest: Digest,
     /// The cache key of the pair's description.
     key: Digest,
-}
-
-/// A description, and the earlier frame it is of if it stands in.
-#[derive(Debug, Clone)]
-pub(super) struct FoundDescription {
-    description: CachedDescription,
-    stands_in: Option<StandIn>,
-    /// Duration of the call, if it was just made.
-    took: Option<Duration>,
-}
-
-impl FoundDescription {
-    fn cached(description: CachedDescription) -> Self {
-        Self { description, stands_in: None, took: None }
-    }
 }
 
 /// A described pair.
@@ -158,12 +141,12 @@ impl MllmRefiner {
         run: &RefineRun<'_>,
         pair: &Pair,
     ) -> (usize, Result<DescribedPair, CallError>) {
-        let bought = AtomicBool::new(false);
-        let find = || self.find_or_buy(run, pair, &bought);
-        let found = self.in_flight.join(pair.key, find).await;
-        // A job that joined another job's call did not pay for it.
-        let cached = !bought.load(Ordering::Relaxed);
-        let described = found.map(|found| described(run, pair.index, found, cached));
+        let scene = run.input.map.scene;
+        let stand_in =
+            |frame: &SimilarFrame| (self.key(&frame.digest, &pair.digest, scene), frame.stand_in);
+        let stand_ins: Vec<_> = run.similar.iter().map(stand_in).collect();
+        let found = self.descriptions.find_or_buy(pair.key, &stand_ins, || self.buy(run, pair));
+        let described = found.await.map(|found| described(run, pair.index, found));
         if let Ok(described) = &described {
             let description = Some(described.description(&run.input.candidates));
             run.progress.step(Step { usage: described.usage, description }).await;
@@ -171,44 +154,11 @@ impl MllmRefiner {
         (pair.index, described)
     }
 
-    /// Runs inside the single flight, and so sees what a flight that has just ended put into the cache.
-    async fn find_or_buy(
+    async fn buy(
         &self,
         run: &RefineRun<'_>,
         pair: &Pair,
-        bought: &AtomicBool,
-    ) -> Result<FoundDescription, CallError> {
-        if let Some(description) =
-            retry_read(|| self.cache.description(&pair.key)).await.map_err(transient)?
-        {
-            self.metrics.description_lookup(CacheLookup::Hit);
-            return Ok(FoundDescription::cached(description));
-        }
-        for frame in &run.similar {
-            let key = self.key(&frame.digest, &pair.digest, run.input.map.scene);
-            if let Some(description) =
-                retry_read(|| self.cache.description(&key)).await.map_err(transient)?
-            {
-                self.metrics.description_lookup(CacheLookup::Similar);
-                let stands_in = Some(frame.stand_in);
-                return Ok(FoundDescription { description, stands_in, took: None });
-            }
-        }
-        let acquired = DescriptionLease::acquire(&self.cache, &pair.key).await;
-        let _lease = match acquired.map_err(transient)? {
-            Acquired::Lease(lease) => lease,
-            Acquired::Description(description) => {
-                self.metrics.description_lookup(CacheLookup::Hit);
-                return Ok(FoundDescription::cached(description));
-            }
-        };
-        self.metrics.description_lookup(CacheLookup::Miss);
-        let found = self.buy(run, pair).await?;
-        bought.store(true, Ordering::Relaxed);
-        Ok(found)
-    }
-
-    async fn buy(&self, run: &RefineRun<'_>, pair: &Pair) -> Result<FoundDescription, CallError> {
+    ) -> Result<(CachedDescription, Duration), CallError> {
         let frame = || self.pictures.picture(&run.input.frame.digest);
         let frame = run.frame.get_or_try_init(frame).await?;
         let candidate = self.pictures.picture(&pair.digest).await?;
@@ -230,7 +180,7 @@ impl MllmRefiner {
         }
         let description = CachedDescription { text, usage, created_at: Timestamp::now() };
         self.record_spend(run, usage, Some((pair.key, description.clone()))).await;
-        Ok(FoundDescription { description, stands_in: None, took: Some(answer.took) })
+        Ok((description, answer.took))
     }
 
     fn switches(&self) -> Switches {
@@ -257,25 +207,14 @@ impl MllmRefiner {
 }
 
 /// Counts a description for this job. The price of a bought one was charged with the call.
-fn described(
-    run: &RefineRun<'_>,
-    index: usize,
-    found: FoundDescription,
-    cached: bool,
-) -> DescribedPair {
-    let FoundDescription { description, stands_in, took } = found;
+fn described(run: &RefineRun<'_>, index: usize, found: FoundDescription) -> DescribedPair {
+    let FoundDescription { description, stands_in, took, cached } = found;
     let from_cache = Usage { cached: 1, ..Usage::default() };
     if cached {
         run.charge(from_cache);
     }
-    DescribedPair {
-        index,
-        text: description.text,
-        cached,
-        stands_in,
-        took: took.filter(|_| !cached),
-        usage: if cached { from_cache } else { description.usage },
-    }
+    let usage = if cached { from_cache } else { description.usage };
+    DescribedPair { index, text: description.text, cached, stands_in, took, usage }
 }
 
 /// Names each picture in the text before it, because models lose count of which is which.
@@ -292,10 +231,6 @@ fn question(prompt: String, frame: &SentPicture, candidate: &SentPicture) -> Mes
         picture(candidate),
     ];
     Message { role: Role::User, content: Content::Parts(parts) }
-}
-
-pub(super) fn transient(error: StoreError) -> CallError {
-    CallError::Transient(error.to_string())
 }
 
 impl From<PictureError> for CallError {

@@ -7,17 +7,17 @@
 //! | `prompts` | the prompts |
 //! | `run` | the state of one refinement |
 //! | `describe`, `pictures` | one description for each pair |
-//! | `single_flight`, `lease` | a description is bought once: in this process, across processes |
+//! | `buy_once`, `single_flight`, `lease` | a description is bought once: in this process, across processes |
 //! | `rank`, `reason`, `conclude` | the reasoning call, and from its answer to a ranking |
 //! | `client`, `endpoint`, `wire` | the chat-completions format over HTTP |
-//! | `spend` | calls within the limits on spend |
-//! | `budget`, `reservation` | a limit on spend: in this process, across processes |
+//! | `spend`, `budget`, `reservation` | limits on spend: in this process, across processes |
 //! | `retry`, `breaker`, `rate` | retries, circuit breaker, rate limits |
 //!
 //! A model's answer is untrusted input: it can change the order of these candidates, and nothing else.
 
 mod breaker;
 mod budget;
+mod buy_once;
 mod client;
 mod conclude;
 mod describe;
@@ -54,13 +54,12 @@ pub use reason::{AnswerError, Labels, Verdict};
 pub use retry::{random_fraction, retry_after};
 pub use settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError, OnUnavailable};
 
-use self::budget::Budget;
+use self::buy_once::BuyOnce;
 use self::client::MllmClient;
-use self::describe::FoundDescription;
 use self::pictures::Pictures;
 use self::retry::CallError;
 use self::run::RefineRun;
-use self::single_flight::SingleFlight;
+use self::spend::SpendControl;
 use crate::{
     BuildError, NegativeEvidence, PaidCallLevels, PaidCalls, Progress, RefineError, RefineInput,
     RefineMetrics, Refinement, Refiner, RefinerContext, RefinerSettings, local,
@@ -93,14 +92,11 @@ pub struct MllmRefiner {
     maps: Arc<dyn MapStore>,
     cache: Arc<dyn DescriptionCache>,
     usage: Arc<dyn UsageStore>,
-    shared: Option<Arc<dyn SharedLimits>>,
-    metrics: Arc<RefineMetrics>,
     fallback: Option<Arc<dyn Refiner>>,
     pictures: Pictures,
     client: MllmClient,
-    budget: Arc<Budget>,
-    /// Descriptions that are being found or bought at the moment.
-    in_flight: SingleFlight<FoundDescription>,
+    descriptions: BuyOnce,
+    spend: SpendControl,
     settings: MllmSettings,
 }
 
@@ -137,15 +133,13 @@ impl MllmRefiner {
             .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
         Ok(Self {
             maps: parts.maps,
+            descriptions: BuyOnce::new(Arc::clone(&parts.cache), parts.metrics),
             cache: parts.cache,
             usage: parts.usage,
-            shared: parts.shared,
-            metrics: parts.metrics,
             fallback: parts.fallback,
             pictures,
             client,
-            budget: Arc::new(Budget::new(settings.limits())),
-            in_flight: SingleFlight::default(),
+            spend: SpendControl::new(settings.limits(), parts.shared),
             settings,
         })
     }
@@ -155,7 +149,7 @@ impl MllmRefiner {
         let now = Timestamp::now();
         let today = utc_day(now);
         let spent = spent.iter().filter(|spent| spent.date == today);
-        self.budget.seed(now, spent.map(Spent::from).fold(Spent::default(), Spent::plus));
+        self.spend.budget.seed(now, spent.map(Spent::from).fold(Spent::default(), Spent::plus));
     }
 
     /// Has the fallback refine the job, and reports that in `degraded`.
@@ -202,7 +196,8 @@ impl Refiner for MllmRefiner {
         input: &RefineInput,
         progress: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        let budget = self.budget.for_job(input.spent.prompt_tokens, input.spent.completion_tokens);
+        let budget =
+            self.spend.budget.for_job(input.spent.prompt_tokens, input.spent.completion_tokens);
         let similar = self.similar_frames(input).await?;
         let run = RefineRun::new(input, budget, similar, progress);
         let pairs = self.pairs(input).await?;
@@ -230,8 +225,8 @@ impl PaidCalls for MllmRefiner {
     fn levels(&self) -> PaidCallLevels {
         PaidCallLevels {
             suspended: self.client.is_suspended(),
-            spent_today: self.budget.spent(Timestamp::now()),
-            limit: self.daily_limit(),
+            spent_today: self.spend.budget.spent(Timestamp::now()),
+            limit: self.spend.daily_limit(),
             cache: self.cache.levels(),
         }
     }
