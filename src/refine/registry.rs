@@ -48,9 +48,14 @@ pub struct RefinerEntry {
     /// its cache of outcomes by it.
     pub fingerprint: fn(&RefinerSettings) -> Result<String, BuildError>,
     /// Builds the refiner.
-    pub build:
-        for<'a> fn(&'a RefinerContext) -> BoxFuture<'a, Result<Arc<dyn Refiner>, BuildError>>,
+    pub build: BuildRefiner,
 }
+
+/// Builds a refiner from the parts of a process.
+pub type BuildRefiner = for<'a> fn(&'a RefinerContext) -> BoxFuture<'a, BuiltRefiner>;
+
+/// A refiner, or why it could not be built.
+pub type BuiltRefiner = Result<Arc<dyn Refiner>, BuildError>;
 
 /// The settings of all refiners.
 #[derive(Debug, Clone)]
