@@ -2,26 +2,23 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 use anyhow::{Context, bail};
 use parking_lot::Mutex;
 
 use super::progress::Progress;
-use whereabouts_core::{DescriptorKind, Digest, RefinerKind, Scene};
+use whereabouts_core::{DescriptorKind, Digest, Scene};
 use whereabouts_eval::{
     Dataset, Evaluator, Folders, RunConditions, RunSettings, Sampling, Summary, TruthSource, Watch,
-    predictions, refiner_settings, report, table,
+    predictions, report, table,
 };
 use whereabouts_index::SearchMode;
-use whereabouts_refine::local::{LocalMatcher, LocalSettings};
-use whereabouts_refine::mllm::PROMPT_VERSION;
-use whereabouts_refine::{LocalRefiner, Refiner};
+use whereabouts_refine::{REFINERS, Refiner, RefinerContext, RefinerSettings};
 use whereabouts_server::Metrics;
-use whereabouts_server::config::{Config, Overrides, Refiner as ConfiguredRefiner};
+use whereabouts_server::config::{Config, Overrides, RefinerChoice};
 use whereabouts_server::startup;
+use whereabouts_server::startup::Parts;
 use whereabouts_service::Service;
-use whereabouts_vision::CpuPool;
 
 /// Indexes a folder of references, asks every picture of a folder of queries, and prints Recall@1,
 /// 5 and 10 before and after refinement. Which references are true for which query is taken from, in
@@ -63,7 +60,7 @@ pub struct Args {
     descriptor: Vec<DescriptorKind>,
     /// Who refines its candidates: local, mllm, both, or off
     #[arg(long, value_delimiter = ',', default_value = "local")]
-    refine: Vec<ConfiguredRefiner>,
+    refine: Vec<RefinerChoice>,
     /// Candidates that are refined [default: as configured, which is 10 with mllm, else 20]
     #[arg(short, value_parser = clap::value_parser!(u8).range(1..=100))]
     k: Option<u8>,
@@ -125,13 +122,14 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let config = args.config()?;
     let _logs =
         whereabouts_telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
-    let service = open(config.clone()).await?;
+    let Parts { service, refiners, .. } = open(config.clone()).await?;
+    let service = Arc::new(service);
     let model = service.models.default_model().to_owned();
     let execution = service.installed_model(&model).await?.execution().to_string();
     let limits = service.models.limits();
     let watch = Bars::default();
     let evaluator = Evaluator {
-        refiners: args.refiners(&service, &config)?,
+        refiners: args.refiners(&service, &refiners).await?,
         service,
         settings: args.settings(&config)?,
         watch: &watch,
@@ -147,7 +145,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         truth: truth.said(),
         model,
         execution,
-        k: config.refine.compared(),
+        k: config.compared_candidates(),
         known_threshold: args.known_threshold.0,
         known_confidence: config.localize.known_confidence,
         search: if args.exact { "exact" } else { "fast" }.into(),
@@ -168,14 +166,11 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
 }
 
 /// The service on the work folder. Its workers are not needed: there is no queue of jobs.
-async fn open(config: Config) -> anyhow::Result<Arc<Service>> {
+async fn open(config: Config) -> anyhow::Result<Parts> {
     let work = config.data.dir.clone();
     let building =
         tokio::task::spawn_blocking(move || startup::build(&config, Arc::new(Metrics::new())));
-    let parts = building
-        .await?
-        .with_context(|| format!("the work folder is {} (--work)", work.display()))?;
-    Ok(Arc::new(parts.service))
+    building.await?.with_context(|| format!("the work folder is {} (--work)", work.display()))
 }
 
 fn write(file: &Path, bytes: &[u8]) -> anyhow::Result<()> {
@@ -219,8 +214,12 @@ impl Args {
 
     /// The configuration of a server on the work folder.
     fn config(&self) -> anyhow::Result<Config> {
-        let mllm = self.refine.contains(&ConfiguredRefiner::Mllm);
-        let refiner = if mllm { ConfiguredRefiner::Mllm } else { ConfiguredRefiner::Off };
+        // The last of the table is the one whose settings matter most: it decides how many candidates all
+        // of them compare.
+        let chosen = REFINERS.iter().rev().find_map(|entry| {
+            self.refine.iter().copied().find(|choice| choice.kind() == Some(entry.kind))
+        });
+        let refiner = chosen.unwrap_or(RefinerChoice::OFF);
         let flags = Overrides::default()
             .data(Some(self.work_folder()?))
             .model(self.model.clone())
@@ -259,43 +258,38 @@ impl Args {
 
     fn settings(&self, config: &Config) -> anyhow::Result<RunSettings> {
         Ok(RunSettings {
-            k: config.refine.compared(),
+            k: config.compared_candidates(),
             search: if self.exact { SearchMode::Exact } else { SearchMode::Fast },
             scene: self.scene,
             side_by_side: self.side_by_side(),
             work: config.data.dir.clone(),
-            attempts: config.jobs.attempts,
-            retry_pause: Duration::from_secs(config.jobs.retry_pause_s),
-            refiner_settings: refiner_settings(
-                PROMPT_VERSION,
-                &serde_json::to_string(&config.mllm)?,
-                &LocalSettings::default(),
-            ),
+            attempts: startup::attempts(config),
+            refiner_settings: fingerprint(&config.refiner_settings())?,
         })
     }
 
     /// Those that were asked for, in the order of the flag.
-    fn refiners(
+    async fn refiners(
         &self,
-        service: &Arc<Service>,
-        config: &Config,
+        service: &Service,
+        context: &RefinerContext,
     ) -> anyhow::Result<Vec<Arc<dyn Refiner>>> {
         let mut refiners: Vec<Arc<dyn Refiner>> = Vec::new();
-        for kind in self.refine.iter().filter_map(|refiner| refiner.kind()) {
-            refiners.push(match (kind, &service.refiner) {
-                (RefinerKind::Mllm, Some(mllm)) => Arc::clone(mllm),
-                _ => Arc::new(LocalRefiner {
-                    maps: Arc::clone(&service.maps),
-                    blobs: Arc::clone(&service.blobs),
-                    models: service.models.clone(),
-                    dense: Arc::clone(&service.dense),
-                    pool: CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?,
-                    matcher: LocalMatcher::new(LocalSettings::default()),
-                }),
+        for entry in self.refine.iter().filter_map(|choice| choice.entry()) {
+            let running = service.refiner.as_ref().filter(|known| known.kind() == entry.kind);
+            refiners.push(match running {
+                Some(refiner) => Arc::clone(refiner),
+                None => (entry.build)(context).await?,
             });
         }
         Ok(refiners)
     }
+}
+
+/// Returns a text that changes with everything that decides what refiners find.
+fn fingerprint(settings: &RefinerSettings) -> anyhow::Result<String> {
+    let fingerprints = REFINERS.iter().map(|entry| Ok((entry.fingerprint)(settings)?));
+    Ok(fingerprints.collect::<anyhow::Result<Vec<String>>>()?.join(" "))
 }
 
 /// One bar after another.

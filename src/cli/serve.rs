@@ -8,7 +8,8 @@ use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-use whereabouts_server::config::{Config, Overrides, Refiner};
+use whereabouts_refine::{REFINERS, RefinerEntry};
+use whereabouts_server::config::{Config, Overrides, RefinerChoice};
 use whereabouts_server::startup;
 use whereabouts_server::startup::Role;
 
@@ -32,7 +33,7 @@ pub struct Args {
     model: Option<String>,
     /// Who refines the candidates
     #[arg(long)]
-    refiner: Option<Refiner>,
+    refiner: Option<RefinerChoice>,
     /// Ask nobody for a key, whatever the server listens on: whoever reaches it may do everything
     #[arg(long)]
     no_keys: bool,
@@ -82,8 +83,12 @@ fn check_worker(config: &Config) -> anyhow::Result<()> {
     if config.jobs.workers == 0 {
         bail!("a worker refines: leave --no-workers out, and set jobs.workers to 1 or more");
     }
-    if config.refine.refiner == Refiner::Off {
-        bail!("a worker refines: set refine.refiner to local or mllm, as the servers have it");
+    if config.refine.refiner == RefinerChoice::OFF {
+        let refiners: Vec<&str> = REFINERS.iter().map(RefinerEntry::name).collect();
+        bail!(
+            "a worker refines: set refine.refiner to {}, as the servers have it",
+            refiners.join(" or ")
+        );
     }
     Ok(())
 }

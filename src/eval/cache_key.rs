@@ -6,7 +6,6 @@
 
 use whereabouts_core::{CalibrationSettings, Digest, MapName, Scene};
 use whereabouts_index::SearchMode;
-use whereabouts_refine::local::LocalSettings;
 
 /// Everything that decides the outcome of a method for a query.
 pub(super) struct CacheKey<'a> {
@@ -20,7 +19,7 @@ pub(super) struct CacheKey<'a> {
     pub search: SearchMode,
     /// Number of candidates.
     pub k: usize,
-    /// The scene and the settings of the refiners ([`refiner_settings`]), for a refined method.
+    /// The scene and the fingerprint of the refiners' settings, for a refined method.
     pub refinement: Option<(Scene, &'a str)>,
     /// The settings of the calibration.
     pub calibration: CalibrationSettings,
@@ -55,47 +54,8 @@ impl CacheKey<'_> {
     }
 }
 
-/// Returns the text of all settings that decide what the refiners find: the version of the prompts, the
-/// settings of the model as JSON, and those of the local matcher.
-pub fn refiner_settings(
-    prompts: impl std::fmt::Display,
-    mllm: &str,
-    local: &LocalSettings,
-) -> String {
-    let LocalSettings {
-        min_similarity,
-        neighbourhood,
-        motion_tolerance,
-        grid_slack,
-        min_support,
-        vote_temperature,
-        motion_rounds,
-    } = local;
-    let [
-        min_similarity,
-        neighbourhood,
-        motion_tolerance,
-        grid_slack,
-        min_support,
-        vote_temperature,
-    ] = [
-        min_similarity,
-        neighbourhood,
-        motion_tolerance,
-        grid_slack,
-        min_support,
-        vote_temperature,
-    ]
-    .map(|number| float(*number));
-    format!(
-        "{prompts} {mllm} LocalSettings {{ min_similarity: {min_similarity}, neighbourhood: \
-         {neighbourhood}, motion_tolerance: {motion_tolerance}, grid_slack: {grid_slack}, min_support: \
-         {min_support}, vote_temperature: {vote_temperature}, motion_rounds: {motion_rounds} }}"
-    )
-}
-
 /// Writes a finite number with a decimal point, in as few digits as identify it.
-fn float<T: Copy + std::fmt::Display>(number: T) -> String {
+fn float(number: f64) -> String {
     let text = number.to_string();
     if text.contains('.') { text } else { text + ".0" }
 }
@@ -111,23 +71,6 @@ mod tests {
 
     #[test]
     fn the_key_has_the_bytes_that_named_the_files_of_earlier_releases() {
-        let settings = refiner_settings(
-            "v3",
-            r#"{"model":"gpt \\ 'x'","key":null}"#,
-            &LocalSettings {
-                min_similarity: 0.0,
-                neighbourhood: 0.16,
-                motion_tolerance: 0.1,
-                grid_slack: 1.5,
-                min_support: 0.06,
-                vote_temperature: 2.0,
-                motion_rounds: 6,
-            },
-        );
-        assert_eq!(
-            settings,
-            r#"v3 {"model":"gpt \\ 'x'","key":null} LocalSettings { min_similarity: 0.0, neighbourhood: 0.16, motion_tolerance: 0.1, grid_slack: 1.5, min_support: 0.06, vote_temperature: 2.0, motion_rounds: 6 }"#
-        );
         let key = |search, refinement| {
             let calibration = CalibrationSettings {
                 images: 200,

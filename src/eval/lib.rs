@@ -30,7 +30,6 @@ mod truth;
 #[cfg(test)]
 mod tests;
 
-pub use cache_key::refiner_settings;
 pub use dataset::{Dataset, EvaluatedQuery, Folders, QueryKind, Sampling};
 pub use folder::{PictureFile, pictures};
 pub use outcome::{MethodOutcomes, Outcome, Prediction, Times};

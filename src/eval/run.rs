@@ -8,18 +8,19 @@ use anyhow::{Context, bail};
 use async_trait::async_trait;
 use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt};
-use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::cache_key::CacheKey;
 use super::map::ReferenceMap;
 use super::outcome::OutcomeCache;
 use super::{Dataset, EvaluatedQuery, MethodOutcomes, Outcome, Prediction, Times};
-use whereabouts_core::{Calibration, DescriptorKind, Digest, Job, Map, RefinerKind, Scene, Usage};
+use whereabouts_core::{Calibration, DescriptorKind, Digest, Map, RefinerKind, Scene, Usage};
 use whereabouts_index::SearchMode;
-use whereabouts_refine::{DenseKey, Progress, RefineError, Refinement, Refiner};
+use whereabouts_refine::{
+    AttemptPolicy, DenseKey, Progress, QueryFrame, RefineError, RefineInput, Refinement, Refiner,
+};
 use whereabouts_service::{Retrieved, Service};
-use whereabouts_store::{JobRecord, Query, Step};
+use whereabouts_store::Step;
 use whereabouts_vision::AdmissionRequest;
 
 /// A way to answer.
@@ -54,10 +55,8 @@ pub struct RunSettings {
     pub side_by_side: usize,
     /// Where outcomes are kept.
     pub work: PathBuf,
-    /// How often a refinement is tried.
-    pub attempts: u32,
-    /// The pause before the second try; it doubles each time.
-    pub retry_pause: Duration,
+    /// How often a refinement is attempted.
+    pub attempts: AttemptPolicy,
     /// All else that decides what the refiners find; part of the names of files.
     pub refiner_settings: String,
 }
@@ -141,8 +140,8 @@ impl Evaluator<'_> {
     /// What chance resemblance is like in the map. Measured anew each time: what an earlier run kept may
     /// be of other references.
     async fn calibrated(&self, map: &Map) -> anyhow::Result<Arc<Calibration>> {
-        let local = self.refiners.iter().find(|refiner| refiner.kind() == RefinerKind::Local);
-        self.service.calibrate(map, local.map(AsRef::as_ref)).await?;
+        let measures = self.refiners.iter().find_map(|refiner| refiner.negative_evidence());
+        self.service.calibrate(map, measures).await?;
         Ok(self.service.maps.calibration(map).await?.unwrap_or_default())
     }
 
@@ -170,7 +169,7 @@ impl Evaluator<'_> {
             .with_context(named)?;
         let coarse = coarse(query, digest, &retrieved, calibration);
         let mut outcomes = Vec::with_capacity(kept.len());
-        let record = self.record(map, digest, retrieved);
+        let input = self.input(map, digest, retrieved);
         // The refiners fetch the frame from the store; the pin keeps it there meanwhile.
         let _pin = self.service.blobs.put_blob(digest, frame).await?;
         for (place, (known, kept)) in known.into_iter().zip(kept).enumerate() {
@@ -179,7 +178,7 @@ impl Evaluator<'_> {
                 (None, None) => coarse.clone(),
                 (None, Some(refiner)) => {
                     let refiner = self.refiners[refiner].as_ref();
-                    self.refine(refiner, &record, &coarse, calibration).await.with_context(named)?
+                    self.refine(refiner, &input, &coarse, calibration).await.with_context(named)?
                 }
             };
             kept.keep(&outcome)?;
@@ -188,71 +187,55 @@ impl Evaluator<'_> {
         Ok(outcomes)
     }
 
-    /// The job that a server would have queued.
-    fn record(&self, map: &Map, digest: Digest, retrieved: Retrieved) -> JobRecord {
+    /// The input of the job that a server would have queued.
+    fn input(&self, map: &Map, digest: Digest, retrieved: Retrieved) -> RefineInput {
         let Retrieved { model, mut candidates, extraction, .. } = retrieved;
         candidates.truncate(self.settings.k);
         let key = DenseKey { model, picture: digest };
         self.service.dense.insert(key, Arc::new(extraction.dense));
-        let now = Timestamp::now();
-        let query = Query {
+        RefineInput {
             id: Uuid::now_v7(),
-            digest,
-            media_type: extraction.media_type,
-            created_at: now,
-            descriptor: Some(extraction.descriptor),
-        };
-        let job = Job::queued(map.name.clone(), query.id, RefinerKind::Local, now);
-        JobRecord {
-            job,
-            map_uid: map.uid,
-            revision: map.revision,
-            query,
+            map: map.clone(),
+            frame: QueryFrame {
+                query_id: Uuid::now_v7(),
+                digest,
+                descriptor: Some(extraction.descriptor),
+            },
             candidates,
-            claims: 0,
-            traceparent: None,
+            spent: Usage::default(),
         }
     }
 
     async fn refine(
         &self,
         refiner: &dyn Refiner,
-        record: &JobRecord,
+        input: &RefineInput,
         coarse: &Outcome,
         calibration: &Calibration,
     ) -> anyhow::Result<Outcome> {
-        let mut record = record.clone();
-        record.job.refiner = refiner.kind();
-        if !refiner.wants_descriptor() {
-            record.query.descriptor = None;
-        }
-        let mut tries = 1;
-        loop {
+        let mut input = input.clone();
+        input.frame.descriptor.take_if(|_| !refiner.wants_descriptor());
+        let attempt = || async {
             let start = Instant::now();
-            match refiner.refine(&record, &NoProgress).await {
-                Ok(refinement) => {
-                    let took = start.elapsed();
-                    let confidence = refinement.ranking.first().map_or(0.0, |first| {
-                        calibration.refined_confidence(
-                            &record.candidates,
-                            &first.image_id,
-                            refinement.evidence,
-                        )
-                    });
-                    return Ok(refined(coarse, refinement, confidence, took));
-                }
-                Err(RefineError::Deferred { why, after }) => bail!(
-                    "{why}; what was found so far is kept: run the same command again in {} s",
-                    after.as_secs()
-                ),
-                Err(RefineError::Transient(_)) if tries < self.settings.attempts => {
-                    let pause = self.settings.retry_pause * 2_u32.saturating_pow(tries - 1);
-                    tokio::time::sleep(pause).await;
-                    tries += 1;
-                }
-                Err(RefineError::Transient(why) | RefineError::Permanent(why)) => {
-                    return Ok(Outcome { degraded: Some(why), ..coarse.clone() });
-                }
+            Ok((refiner.refine(&input, &NoProgress).await?, start.elapsed()))
+        };
+        match self.settings.attempts.run(attempt).await {
+            Ok((refinement, took)) => {
+                let confidence = refinement.ranking.first().map_or(0.0, |first| {
+                    calibration.refined_confidence(
+                        &input.candidates,
+                        &first.image_id,
+                        refinement.evidence,
+                    )
+                });
+                Ok(refined(coarse, refinement, confidence, took))
+            }
+            Err(RefineError::Deferred { why, after }) => bail!(
+                "{why}; what was found so far is kept: run the same command again in {} s",
+                after.as_secs()
+            ),
+            Err(RefineError::Transient(why) | RefineError::Permanent(why)) => {
+                Ok(Outcome { degraded: Some(why), ..coarse.clone() })
             }
         }
     }

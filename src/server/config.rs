@@ -6,6 +6,7 @@ mod answers;
 mod database;
 mod model;
 mod overrides;
+mod refiner;
 mod server;
 
 use std::path::{Path, PathBuf};
@@ -14,10 +15,11 @@ use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
-pub use self::answers::{Confidence, Idempotency, Jobs, Localize, Refine, Refiner};
+pub use self::answers::{Confidence, Idempotency, Jobs, Localize, Refine};
 pub use self::database::{Database, ObjectStore};
 pub use self::model::{Image, Model, PrecisionWish, ProviderWish, cores_unless};
 pub use self::overrides::Overrides;
+pub use self::refiner::RefinerChoice;
 pub use self::server::Server;
 use crate::http::Tiles;
 use whereabouts_refine::mllm::MllmSettings;
@@ -293,8 +295,8 @@ impl Config {
         if self.index.m > 256 {
             return Some("index.m must not exceed 256".into());
         }
-        if self.refine.refiner == Refiner::Mllm
-            && let Some(why) = self.mllm.validate(self.jobs.timeout_s)
+        if let Some(refiner) = self.refine.refiner.entry()
+            && let Some(why) = (refiner.validate)(&self.refiner_settings())
         {
             return Some(why);
         }

@@ -8,7 +8,7 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use whereabouts_telemetry::metrics::Registry;
 
-use whereabouts_refine::mllm::MllmLevels;
+use whereabouts_refine::PaidCallLevels;
 use whereabouts_telemetry::metrics::register;
 use whereabouts_vision::AdmissionLevels;
 
@@ -31,8 +31,8 @@ pub struct Levels {
     pub dense_cache_bytes: usize,
     /// Pictures in work and waiting.
     pub admission: AdmissionLevels,
-    /// How the refiner stands, if it asks models outside.
-    pub mllm: Option<MllmLevels>,
+    /// The refiner's calls to a paid model, if it makes any.
+    pub mllm: Option<PaidCallLevels>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]

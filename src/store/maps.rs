@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use async_trait::async_trait;
+use futures_util::future::try_join_all;
 
 use super::StoreError;
 use whereabouts_core::{
@@ -75,6 +76,15 @@ pub trait MapStore: Send + Sync {
     ) -> Result<Added, StoreError>;
     /// Returns one image.
     async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError>;
+    /// Returns the images with these ids: one entry for each id, in the order of `ids`, and `None` for an
+    /// id that the map does not have.
+    async fn images_by_id(
+        &self,
+        map: &Map,
+        ids: &[ImageId],
+    ) -> Result<Vec<Option<Image>>, StoreError> {
+        try_join_all(ids.iter().map(|id| self.image(map, id))).await
+    }
     /// Returns up to `limit` images whose ids sort after `after`, in order of id.
     async fn images(
         &self,

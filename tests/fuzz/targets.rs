@@ -110,7 +110,7 @@ pub fn answer(bytes: &[u8]) -> bool {
     const CANDIDATES: usize = 10;
     let text = String::from_utf8_lossy(bytes);
     let labels = Labels::new((0..CANDIDATES).collect(), None);
-    let Ok(verdict) = labels.read(&text) else { return false };
+    let Ok(verdict) = labels.parse(&text) else { return false };
     let once: HashSet<usize> = verdict.order.iter().copied().collect();
     assert!(once.len() == CANDIDATES && verdict.order.len() == CANDIDATES);
     assert!(once.iter().all(|&index| index < CANDIDATES));

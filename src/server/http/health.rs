@@ -67,7 +67,7 @@ async fn metrics_text(metrics: &Metrics, service: &Service) -> Result<String, Se
         db_bytes: service.retention.db_bytes().await?,
         dense_cache_bytes: service.dense.bytes(),
         admission: service.admission.levels(),
-        mllm: service.refiner.as_ref().and_then(|refiner| refiner.levels()),
+        mllm: service.refiner.as_ref().and_then(|refiner| Some(refiner.paid_calls()?.levels())),
     });
     metrics.encode().map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))
 }

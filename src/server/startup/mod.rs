@@ -16,13 +16,11 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use crate::Metrics;
-use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
+use crate::config::{Config, cores_unless};
 use crate::http::{About, AppState, Connections, HttpSettings, router, worker_router};
-use whereabouts_core::{CalibrationSettings, utc_day};
-use whereabouts_refine::local::{LocalMatcher, LocalSettings};
-use whereabouts_refine::mllm::{MllmParts, MllmRefiner};
+use whereabouts_core::CalibrationSettings;
 use whereabouts_refine::{
-    DenseCache, JobServiceTime, LocalRefiner, Refiner, Worker, WorkerSettings,
+    AttemptPolicy, DenseCache, JobServiceTime, Refiner, RefinerContext, Worker, WorkerSettings,
 };
 use whereabouts_service::{
     Dispatcher, IdempotencySettings, Janitor, Keys, Limits, RecallCheck, Reindexes,
@@ -74,7 +72,7 @@ pub async fn run(
     let (drain_timeout, retention) = (config.server.drain_timeout(), retention(&config));
     let counted = Arc::clone(&metrics.service);
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
-    let Parts { service, workers, pools } = building.await.context("the start broke off")??;
+    let Parts { service, workers, pools, .. } = building.await.context("the start broke off")??;
     let janitor = Janitor {
         store: Arc::clone(&service.retention),
         answers: Arc::clone(&service.answers),
@@ -175,6 +173,8 @@ pub struct Parts {
     pub workers: Vec<Worker>,
     /// Whoever decodes, infers and compares; to be waited for before the process ends.
     pub pools: [CpuPool; 2],
+    /// The parts that further refiners can be built from.
+    pub refiners: RefinerContext,
 }
 
 /// Opens the store, loads the model, and puts the service together. Blocks.
@@ -190,34 +190,18 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     let refining = CpuPool::new("refine", config.jobs.workers.max(1), config.jobs.workers + 2)?;
     let pools = [pool.clone(), refining.clone()];
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
-    let local = Arc::new(LocalRefiner {
-        maps: store.clone(),
-        blobs: store.clone(),
+    let refiners = RefinerContext {
+        store: store.clone(),
+        shared: shared.clone(),
         models: models.clone(),
         dense: Arc::clone(&dense),
         pool: refining,
-        matcher: LocalMatcher::new(LocalSettings::default()),
-    });
-    let refiner: Option<Arc<dyn Refiner>> = match config.refine.refiner {
-        ConfiguredRefiner::Off => None,
-        ConfiguredRefiner::Local => Some(local),
-        ConfiguredRefiner::Mllm => {
-            let parts = MllmParts {
-                maps: store.clone(),
-                blobs: store.clone(),
-                cache: store.clone(),
-                usage: store.clone(),
-                shared: shared.clone(),
-                metrics: Arc::clone(&metrics.refine),
-                limits: models.limits(),
-                fallback: Some(local),
-            };
-            let refiner = MllmRefiner::new(parts, config.mllm.clone())?;
-            // Nobody else spends before the workers start.
-            let today = utc_day(Timestamp::now());
-            refiner.seed_spent_today(&Handle::current().block_on(store.usage(today))?);
-            Some(Arc::new(refiner))
-        }
+        metrics: Arc::clone(&metrics.refine),
+        settings: config.refiner_settings(),
+    };
+    let refiner: Option<Arc<dyn Refiner>> = match config.refine.refiner.entry() {
+        Some(entry) => Some(Handle::current().block_on((entry.build)(&refiners))?),
+        None => None,
     };
     let jobs: Arc<dyn JobStore> = store.clone();
     let workers = refiner.iter().flat_map(|refiner| {
@@ -226,14 +210,13 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             maps: store.clone(),
             refiner: Arc::clone(refiner),
             metrics: Arc::clone(&metrics.refine),
-            pace: Arc::clone(&job_pace),
+            service_time: Arc::clone(&job_pace),
             settings: WorkerSettings {
                 lease: Duration::from_secs(config.jobs.lease_s),
                 timeout: Duration::from_secs(config.jobs.timeout_s),
-                attempts: config.jobs.attempts,
-                retry_pause: Duration::from_secs(config.jobs.retry_pause_s),
+                attempts: attempts(config),
                 known_confidence: config.localize.known_confidence,
-                side_by_side: config.jobs.workers,
+                workers: config.jobs.workers,
             },
         })
     });
@@ -272,11 +255,11 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             calibration: CalibrationSettings {
                 images: config.confidence.images,
                 refined: config.confidence.refined,
-                candidates: config.refine.compared(),
+                candidates: config.compared_candidates(),
                 place_images: config.confidence.place_images,
                 place_m: config.confidence.place_m,
             },
-            candidates: config.refine.compared(),
+            candidates: config.compared_candidates(),
             job_queue: config.jobs.queue,
             shed_jobs_at: config.jobs.shed_at,
             max_wait: Duration::from_secs(config.jobs.max_wait_s),
@@ -291,7 +274,16 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     tracing::info!(model, %why, "the model of maps that name none");
     service.models.manifest(model)?;
     Handle::current().block_on(service.installed_model(model))?;
-    Ok(Parts { service, workers, pools })
+    Ok(Parts { service, workers, pools, refiners })
+}
+
+/// How often a refinement is attempted.
+pub fn attempts(config: &Config) -> AttemptPolicy {
+    AttemptPolicy {
+        attempts: config.jobs.attempts,
+        pause: Duration::from_secs(config.jobs.retry_pause_s),
+        longest_pause: Duration::MAX,
+    }
 }
 
 /// Says whether callers need a key; a server that nobody could use does not start.

@@ -192,6 +192,19 @@ impl MapStore for EmbeddedStore {
         blocking(move || Ok(inner.trees.image(uid, &id)?.map(|stored| stored.image))).await
     }
 
+    async fn images_by_id(
+        &self,
+        map: &Map,
+        ids: &[ImageId],
+    ) -> Result<Vec<Option<Image>>, StoreError> {
+        let (inner, uid, ids) = (Arc::clone(&self.inner), map.uid, ids.to_vec());
+        blocking(move || {
+            let image = |id| Ok(inner.trees.image(uid, id)?.map(|stored| stored.image));
+            ids.iter().map(image).collect()
+        })
+        .await
+    }
+
     async fn images(
         &self,
         map: &Map,

@@ -1,6 +1,8 @@
 //! The images of maps. A single statement adds an image together with its descriptor, the count of
 //! images and the reference to its bytes, and another removes all of them.
 
+use std::collections::HashMap;
+
 use async_trait::async_trait;
 use jiff::Timestamp;
 use sqlx::AssertSqlSafe;
@@ -96,6 +98,23 @@ impl Inner {
         let found: Option<Json<Image>> =
             found.bind(map_uid).bind(id.as_str()).fetch_optional(&self.pool).await?;
         Ok(found.map(|Json(image)| image))
+    }
+
+    pub(super) async fn images_by_id(
+        &self,
+        map_uid: Uuid,
+        ids: &[ImageId],
+    ) -> Result<Vec<Option<Image>>, StoreError> {
+        let keys: Vec<&str> = ids.iter().map(ImageId::as_str).collect();
+        let found: Vec<Json<Image>> =
+            sqlx::query_scalar("SELECT record FROM images WHERE map_uid = $1 AND id = ANY($2)")
+                .bind(map_uid)
+                .bind(keys)
+                .fetch_all(&self.pool)
+                .await?;
+        let found: HashMap<ImageId, Image> =
+            found.into_iter().map(|Json(image)| (image.id.clone(), image)).collect();
+        Ok(ids.iter().map(|id| found.get(id).cloned()).collect())
     }
 
     pub(super) async fn images(

@@ -78,6 +78,14 @@ impl MapStore for PostgresStore {
         self.inner.call(self.inner.image(map.uid, id)).await
     }
 
+    async fn images_by_id(
+        &self,
+        map: &Map,
+        ids: &[ImageId],
+    ) -> Result<Vec<Option<Image>>, StoreError> {
+        self.inner.call(self.inner.images_by_id(map.uid, ids)).await
+    }
+
     async fn images(
         &self,
         map: &Map,

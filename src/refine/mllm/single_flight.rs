@@ -1,4 +1,4 @@
-//! One call where several jobs want the same answer at once.
+//! Single flight: concurrent jobs that need the same result share one computation.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -10,7 +10,7 @@ use whereabouts_core::Digest;
 
 type Cell<T> = Arc<OnceCell<T>>;
 
-/// Answers that are on their way, by key.
+/// Computations in progress, by key.
 #[derive(Debug)]
 pub struct SingleFlight<T> {
     cells: Mutex<HashMap<Digest, Cell<T>>>,
@@ -23,17 +23,17 @@ impl<T> Default for SingleFlight<T> {
 }
 
 impl<T: Clone> SingleFlight<T> {
-    /// What `make` gives, or what another caller of the same key is making at the moment. If that
-    /// one fails or leaves, the next takes its place.
+    /// Runs `make`, or waits for the result of another caller with the same key. If that caller fails or is
+    /// cancelled, the next one runs its own `make`.
     pub async fn join<F, E>(&self, key: Digest, make: impl FnOnce() -> F) -> Result<T, E>
     where
         F: Future<Output = Result<T, E>>,
     {
-        let seat = self.board(key);
-        seat.cell.get_or_try_init(make).await.cloned()
+        let follower = self.follow(key);
+        follower.cell.get_or_try_init(make).await.cloned()
     }
 
-    fn board(&self, key: Digest) -> Follower<'_, T> {
+    fn follow(&self, key: Digest) -> Follower<'_, T> {
         let cell = Arc::clone(self.cells().entry(key).or_default());
         Follower { flights: self, key, cell }
     }
@@ -43,7 +43,7 @@ impl<T: Clone> SingleFlight<T> {
     }
 }
 
-/// One caller's share in a flight; the last one to leave ends it.
+/// One caller of a flight. Dropping the last one removes the flight.
 struct Follower<'a, T: Clone> {
     flights: &'a SingleFlight<T>,
     key: Digest,
@@ -53,7 +53,7 @@ struct Follower<'a, T: Clone> {
 impl<T: Clone> Drop for Follower<'_, T> {
     fn drop(&mut self) {
         let mut cells = self.flights.cells();
-        // The map's own and this one: cells are only cloned under the lock.
+        // Two references are the map's and this one's; cells are cloned under the lock only.
         if Arc::strong_count(&self.cell) <= 2 {
             cells.remove(&self.key);
         }
@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn two_at_once_share_one_answer() {
+    async fn concurrent_callers_share_one_result() {
         let flights = SingleFlight::<u8>::default();
         let (answer, wait) = oneshot::channel();
         let mut first =
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn when_the_first_leaves_the_second_takes_its_place() {
+    async fn when_the_first_caller_is_cancelled_the_second_takes_over() {
         let flights = SingleFlight::<u8>::default();
         let mut second = pin!(flights.join(key(), || async { Ok::<_, Infallible>(8) }));
         {
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn nothing_is_kept_after_the_last_has_left() {
+    async fn a_flight_is_removed_with_its_last_caller() {
         let flights = SingleFlight::<u8>::default();
         let failed = flights.join(key(), || async { Err("down") }).await;
         assert_eq!(failed, Err("down"));
