@@ -38,7 +38,7 @@ fn main() -> anyhow::Result<()> {
     println!("{MODEL} at {SIZE}×{SIZE}, {:.2} GFLOP a picture, {threads} threads", flop / 1e9);
     let execution =
         fastest(&run_ours(&bench, ProviderPreference::default(), threads, 1)?)?.execution;
-    let wanted = ProviderPreference {
+    let preference = ProviderPreference {
         provider: Some(execution.provider),
         precision: Some(execution.precision),
     };
@@ -47,7 +47,7 @@ fn main() -> anyhow::Result<()> {
         println!("\nbatch {batch}; whereabouts by {execution}");
         let (mut more, mut longer) = (Vec::new(), Vec::new());
         for _ in 0..ROUNDS {
-            let rows = run_ours(&bench, wanted, threads, batch)?;
+            let rows = run_ours(&bench, preference, threads, batch)?;
             let most = fastest(&rows)?;
             let figures = most.right().context("no descriptors were right")?;
             let alone = rows.iter().filter_map(|row| Some(row.right()?.alone)).min();
@@ -89,7 +89,7 @@ fn median(mut numbers: Vec<f64>) -> f64 {
 /// is configured by `whereabouts model bench --write`.
 fn run_ours(
     bench: &Bench,
-    wanted: ProviderPreference,
+    preference: ProviderPreference,
     threads: usize,
     max_batch: usize,
 ) -> anyhow::Result<Vec<BenchRow>> {
@@ -97,7 +97,7 @@ fn run_ours(
     let layout = |max_batch| [1, threads].map(|sessions| Layout { threads, sessions, max_batch });
     let layouts = batches.into_iter().flat_map(layout).collect();
     let duration = Duration::from_secs_f64(SECONDS);
-    Ok(bench.run(&BenchSettings { wanted, layouts, duration }, |_| {})?)
+    Ok(bench.run(&BenchSettings { preference, layouts, duration }, |_| {})?)
 }
 
 /// The row with the most pictures a second.

@@ -68,7 +68,7 @@ fn in_process(model: &str, frames: &[bytes::Bytes]) -> anyhow::Result<(Times, f6
     let threads = std::thread::available_parallelism()?.get();
     // By whoever is fastest on this machine, and as the server does.
     let settings = ExtractorSettings {
-        wanted: ProviderPreference::default(),
+        preference: ProviderPreference::default(),
         layout: config.model.layout(),
         exact_decode: config.image.exact,
         ..ExtractorSettings::plain(model, threads, ImageLimits { max_pixels: 50_000_000 })

@@ -138,7 +138,7 @@ pub struct CalibrationSettings {
 
 impl CalibrationSettings {
     /// Images on either side that show the same place, in a map of so many.
-    pub fn place_images_of(&self, images: usize) -> usize {
+    pub fn place_radius(&self, images: usize) -> usize {
         self.place_images.min(images / 10)
     }
 
@@ -156,7 +156,7 @@ impl CalibrationSettings {
         other: (usize, Option<Pose>),
     ) -> bool {
         let distance = one.1.zip(other.1).and_then(|(a, b)| a.distance_m(&b));
-        one.0.abs_diff(other.0) > self.place_images_of(images)
+        one.0.abs_diff(other.0) > self.place_radius(images)
             && distance.is_none_or(|distance| distance > self.place_m)
     }
 }
@@ -263,6 +263,6 @@ mod tests {
     #[test]
     fn a_small_map_has_small_places() {
         let settings = CalibrationSettings { place_images: 4, ..Default::default() };
-        assert_eq!([8, 25, 40, 4000].map(|n| settings.place_images_of(n)), [0, 2, 4, 4]);
+        assert_eq!([8, 25, 40, 4000].map(|n| settings.place_radius(n)), [0, 2, 4, 4]);
     }
 }

@@ -214,7 +214,7 @@ pub struct Job {
 
 impl Job {
     /// The same without what refinement found out.
-    pub fn brief(self) -> Self {
+    pub fn summary(self) -> Self {
         Self { descriptions: Vec::new(), ranking: None, reasoning: None, ..self }
     }
 

@@ -89,7 +89,7 @@ pub struct StoredKey {
 
 impl StoredKey {
     /// Whether this is the key; takes as long for a wrong one as for the right one.
-    pub fn is(&self, token: &Token) -> bool {
+    pub fn matches(&self, token: &Token) -> bool {
         token.digest().as_bytes().ct_eq(self.digest.as_bytes()).into()
     }
 }
@@ -214,7 +214,7 @@ mod tests {
         key.revoked_at = Some(at("2026-01-02T00:00:00Z"));
         assert!(!key.is_valid(at("2026-01-03T00:00:00Z")));
         let stored = StoredKey { key, digest: token(1).digest() };
-        assert!(stored.is(&token(1)) && !stored.is(&token(2)));
+        assert!(stored.matches(&token(1)) && !stored.matches(&token(2)));
     }
 
     #[test]

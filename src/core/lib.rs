@@ -36,7 +36,7 @@ pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;
 pub use webhook::{
-    Attempt, Delivery, DeliveryState, Message, StoredWebhook, Then, Webhook, WebhookEvent,
+    Attempt, Delivery, DeliveryState, Disposition, Message, StoredWebhook, Webhook, WebhookEvent,
     WebhookSecret,
 };
 

@@ -177,7 +177,7 @@ pub struct Map {
 impl Map {
     /// Whether the descriptors of another map would fit among those of this one: they are of the same
     /// model, run and pooled alike.
-    pub fn is_like(&self, other: &Self) -> bool {
+    pub fn is_compatible_with(&self, other: &Self) -> bool {
         self.model == other.model
             && self.model_digest == other.model_digest
             && self.precision == other.precision

@@ -25,7 +25,7 @@ impl ServiceTime {
     }
 
     /// How long one piece takes; zero before any was measured.
-    pub fn one(&self) -> Duration {
+    pub fn mean(&self) -> Duration {
         Duration::from_secs_f64(self.measured.map_or(0.0, |(one, _)| one))
     }
 
@@ -44,7 +44,7 @@ mod tests {
         let mut time = ServiceTime::default();
         assert_eq!(time.until_done(10), Duration::ZERO);
         time.record(Duration::from_secs(2), 4);
-        assert_eq!(time.one(), Duration::from_secs(2));
+        assert_eq!(time.mean(), Duration::from_secs(2));
         assert_eq!(time.until_done(10), Duration::from_secs(5));
     }
 
@@ -53,6 +53,6 @@ mod tests {
         let mut time = ServiceTime::default();
         time.record(Duration::from_secs(100), 1);
         (0..100).for_each(|_| time.record(Duration::from_millis(10), 1));
-        assert!(time.one() < Duration::from_millis(20), "{time:?}");
+        assert!(time.mean() < Duration::from_millis(20), "{time:?}");
     }
 }

@@ -83,7 +83,7 @@ pub struct Webhook {
 
 impl Webhook {
     /// Whether it is to be told of this event of a job.
-    pub fn wants(&self, event: WebhookEvent, job: &Job) -> bool {
+    pub fn subscribes_to(&self, event: WebhookEvent, job: &Job) -> bool {
         self.disabled_at.is_none()
             && self.events.contains(&event)
             && self.map.as_ref().is_none_or(|map| *map == job.map)
@@ -214,16 +214,16 @@ pub struct Attempt {
     /// What went wrong.
     pub error: Option<String>,
     /// What becomes of the delivery.
-    pub then: Then,
+    pub disposition: Disposition,
 }
 
 /// What becomes of a delivery after an attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Then {
+pub enum Disposition {
     /// It is delivered.
     Delivered,
     /// It is tried again at this moment.
-    Again(Timestamp),
+    RetryAt(Timestamp),
     /// It is given up.
     Dead,
 }
@@ -248,18 +248,18 @@ impl Delivery {
     }
 
     /// Queues it anew, as if it had never been tried.
-    pub fn again(self, now: Timestamp) -> Self {
+    pub fn requeued(self, now: Timestamp) -> Self {
         let Self { id, webhook, event, job, created_at, .. } = self;
         Self { id, created_at, ..Self::queued(webhook, event, job, now) }
     }
 
     /// The same after an attempt.
-    pub fn after(self, attempt: Attempt) -> Self {
-        let Attempt { at, status, error, then } = attempt;
-        let (state, next_attempt_at, ended_at) = match then {
-            Then::Delivered => (DeliveryState::Delivered, None, Some(at)),
-            Then::Again(next) => (DeliveryState::Waiting, Some(next), None),
-            Then::Dead => (DeliveryState::Dead, None, Some(at)),
+    pub fn with_attempt(self, attempt: Attempt) -> Self {
+        let Attempt { at, status, error, disposition } = attempt;
+        let (state, next_attempt_at, ended_at) = match disposition {
+            Disposition::Delivered => (DeliveryState::Delivered, None, Some(at)),
+            Disposition::RetryAt(next) => (DeliveryState::Waiting, Some(next), None),
+            Disposition::Dead => (DeliveryState::Dead, None, Some(at)),
         };
         Self {
             state,
@@ -274,7 +274,7 @@ impl Delivery {
     }
 
     /// The same, given up without another attempt.
-    pub fn given_up(self, at: Timestamp, why: &str) -> Self {
+    pub fn dead_lettered(self, at: Timestamp, why: &str) -> Self {
         Self {
             state: DeliveryState::Dead,
             last_error: Some(why.to_owned()),
@@ -335,10 +335,14 @@ mod tests {
     fn a_delivery_that_is_queued_anew_keeps_its_id_and_forgets_its_attempts() {
         let now = Timestamp::now();
         let first = Delivery::queued(Uuid::now_v7(), WebhookEvent::Ping, None, now);
-        let attempt =
-            Attempt { at: now, status: Some(500), error: Some("500".into()), then: Then::Dead };
-        let dead = first.clone().after(attempt);
+        let attempt = Attempt {
+            at: now,
+            status: Some(500),
+            error: Some("500".into()),
+            disposition: Disposition::Dead,
+        };
+        let dead = first.clone().with_attempt(attempt);
         assert_eq!((dead.state, dead.attempts), (DeliveryState::Dead, 1));
-        assert_eq!(dead.again(now), first);
+        assert_eq!(dead.requeued(now), first);
     }
 }

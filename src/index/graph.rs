@@ -2,7 +2,7 @@
 
 use hnsw_rs::prelude::{Distance, FilterT, Hnsw};
 
-use super::{Found, IndexSettings};
+use super::{IndexSettings, ScoredSlot};
 use whereabouts_core::dot;
 
 /// One minus the dot product of unit vectors.
@@ -69,12 +69,15 @@ impl Graph {
         k: usize,
         ef: usize,
         keep: &dyn Fn(usize) -> bool,
-    ) -> Vec<Found> {
+    ) -> Vec<ScoredSlot> {
         let filter = |slot: &usize| keep(*slot);
         self.hnsw
             .search_filter(query, k, ef, Some(&filter as &dyn FilterT))
             .into_iter()
-            .map(|neighbour| Found { slot: neighbour.d_id, similarity: 1.0 - neighbour.distance })
+            .map(|neighbour| ScoredSlot {
+                slot: neighbour.d_id,
+                similarity: 1.0 - neighbour.distance,
+            })
             .collect()
     }
 }

@@ -50,7 +50,7 @@ pub struct IndexSettings {
 
 /// A stored descriptor and its similarity to the query.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Found {
+pub struct ScoredSlot {
     /// Where the descriptor is stored.
     pub slot: usize,
     /// Cosine similarity, −1 to 1.
@@ -185,7 +185,7 @@ impl MapIndex {
         query: &[f32],
         k: usize,
         mode: SearchMode,
-    ) -> Vec<Found> {
+    ) -> Vec<ScoredSlot> {
         let live = self.live();
         let is_live = |slot: usize| live.slots.get(slot).copied().unwrap_or(false);
         let graphs = match mode {
@@ -194,7 +194,7 @@ impl MapIndex {
         };
         let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
         let mut best = Best::new(k);
-        let mut found_in = |slots: Range<usize>, found: Vec<Found>| {
+        let mut found_in = |slots: Range<usize>, found: Vec<ScoredSlot>| {
             // Among many removed images a graph can lose its way to the rest.
             let end = slots.end.min(live.slots.len());
             let all = live.slots[slots.start.min(end)..end].iter().filter(|live| **live).take(k);
@@ -351,7 +351,7 @@ fn exactly(
 ) {
     vectors.scan(slots, &mut |slot, vector| {
         if is_live(slot) {
-            best.offer(Found { slot, similarity: dot(query, vector) });
+            best.offer(ScoredSlot { slot, similarity: dot(query, vector) });
         }
     });
 }

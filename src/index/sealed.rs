@@ -16,7 +16,7 @@ use multiversion::multiversion;
 
 use super::exact::Best;
 use super::graph::Linked;
-use super::{Found, IndexSettings, Vectors};
+use super::{IndexSettings, ScoredSlot, Vectors};
 use whereabouts_core::dot;
 
 /// Fills rows of neighbours that are shorter than the longest.
@@ -169,7 +169,7 @@ impl SealedGraph {
     }
 
     /// Whether it was built as these settings say.
-    pub fn fits(&self, settings: &IndexSettings) -> bool {
+    pub fn is_built_with(&self, settings: &IndexSettings) -> bool {
         self.built == (settings.m, settings.ef_construction)
     }
 
@@ -209,7 +209,7 @@ impl SealedGraph {
         query: &[f32],
         (k, ef): (usize, usize),
         keep: impl Fn(usize) -> bool,
-    ) -> Vec<Found> {
+    ) -> Vec<ScoredSlot> {
         if self.is_empty() || query.len() != self.dim {
             return Vec::new();
         }
@@ -221,7 +221,7 @@ impl SealedGraph {
         for ranked in near.into_iter().rev().take(2 * k + 16) {
             let slot = self.slots[point_of(ranked) as usize] as usize;
             vectors.scan(slot..slot + 1, &mut |slot, vector| {
-                best.offer(Found { slot, similarity: dot(query, vector) });
+                best.offer(ScoredSlot { slot, similarity: dot(query, vector) });
             });
         }
         best.into_sorted()
@@ -280,7 +280,7 @@ impl SealedGraph {
             }
             let row = point_of(nearest) as usize * self.degree;
             fresh.clear();
-            // Found first and compared afterwards, so that the fetches of codes overlap.
+            // ScoredSlot first and compared afterwards, so that the fetches of codes overlap.
             let neighbours = &self.lowest[row..row + self.degree];
             fresh.extend(neighbours.iter().copied().take_while(|p| *p != NONE).filter(|p| see(*p)));
             for &point in &fresh {

@@ -161,7 +161,7 @@ impl Service {
         let finishing = tokio::task::spawn_blocking(move || extractor.finish(inferred, kind)).await;
         let extraction = finishing
             .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))??;
-        permit.served();
+        permit.complete();
         Ok(extraction)
     }
 
@@ -173,7 +173,7 @@ impl Service {
         match self.pool.run(work).await {
             Ok(result) => Ok(result?),
             Err(PoolError::Overloaded(overloaded)) => Err(overloaded.into()),
-            Err(error @ PoolError::BrokeOff) => {
+            Err(error @ PoolError::Aborted) => {
                 Err(ServiceError::new(ErrorKind::Internal, error.to_string()))
             }
         }

@@ -134,7 +134,7 @@ impl Service {
         let pause = match why.reason {
             NoJobReason::QueueFull => {
                 let pace = self.job_pace.lock();
-                self.admission.within_bounds(pace.until_done(1))
+                self.admission.clamp_pause(pace.until_done(1))
             }
             _ => self.admission.retry_after(),
         };

@@ -108,7 +108,7 @@ impl Service {
 }
 
 fn fits(map: &Map, from: &Map) -> bool {
-    map.is_like(from) && map.frame == from.frame
+    map.is_compatible_with(from) && map.frame == from.frame
 }
 
 fn unlike(map: &Map, from: &Map) -> ServiceError {

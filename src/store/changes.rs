@@ -5,8 +5,8 @@ use uuid::Uuid;
 
 use super::{IdempotencyRecord, JobRecord, Progress, Release, Step, StoreError, StoredDelivery};
 use whereabouts_core::{
-    Attempt, Delivery, DeliveryState, Descriptor, Image, Job, JobState, Map, Message, Priority,
-    StoredWebhook, Then, Usage, WebhookEvent,
+    Attempt, Delivery, DeliveryState, Descriptor, Disposition, Image, Job, JobState, Map, Message,
+    Priority, StoredWebhook, Usage, WebhookEvent,
 };
 
 impl JobRecord {
@@ -112,7 +112,7 @@ pub(super) fn news_of(
     let message = Message { event, timestamp, data: job };
     let body =
         serde_json::to_vec(&message).map_err(|error| StoreError::Failed(error.to_string()))?;
-    let wanting = webhooks.into_iter().filter(|stored| stored.webhook.wants(event, job));
+    let wanting = webhooks.into_iter().filter(|stored| stored.webhook.subscribes_to(event, job));
     let delivery = |stored: StoredWebhook| StoredDelivery {
         delivery: Delivery::queued(stored.webhook.id, event, Some(job.id), now),
         body: body.clone(),
@@ -129,7 +129,7 @@ pub(super) fn changed_map(
     if stored.revision != wanted.revision {
         return Err(StoreError::Superseded(stored.name));
     }
-    let same = stored.is_like(&wanted) && stored.frame == wanted.frame;
+    let same = stored.is_compatible_with(&wanted) && stored.frame == wanted.frame;
     if !same && has_images() {
         return Err(StoreError::Conflict(format!(
             "the map {} has images, so its model ({} at {} precision), descriptor ({}) and frame ({}) \
@@ -228,8 +228,9 @@ pub(super) fn disable(stored: &mut StoredWebhook, at: Timestamp, why: &str) -> b
 /// A delivery after an attempt; `None` if it waits no more.
 pub(super) fn attempted(known: Delivery, attempt: Attempt) -> Option<Delivery> {
     // What was given up meanwhile has been delivered all the same.
-    let counts = known.state == DeliveryState::Waiting || attempt.then == Then::Delivered;
-    counts.then(|| known.after(attempt))
+    let counts =
+        known.state == DeliveryState::Waiting || attempt.disposition == Disposition::Delivered;
+    counts.then(|| known.with_attempt(attempt))
 }
 
 pub(super) fn too_many_webhooks(most: usize) -> StoreError {

@@ -154,7 +154,7 @@ impl Admission {
     }
 
     /// Waits for a permit. A future that is dropped waits no longer.
-    pub async fn enter(&self, demand: AdmissionRequest) -> Result<Permit, Rejected> {
+    pub async fn acquire(&self, demand: AdmissionRequest) -> Result<Permit, Rejected> {
         let waiting = match self.shared.join(demand)? {
             Place::Inside(permit) => return Ok(permit),
             Place::Waiting(waiting) => waiting,
@@ -185,8 +185,8 @@ impl Admission {
     }
 
     /// A pause that callers may be told to make.
-    pub fn within_bounds(&self, pause: Duration) -> Duration {
-        self.shared.within_bounds(pause)
+    pub fn clamp_pause(&self, pause: Duration) -> Duration {
+        self.shared.clamp_pause(pause)
     }
 
     /// What is in work and what waits at the moment.
@@ -201,7 +201,7 @@ impl Admission {
 
 impl Permit {
     /// The work was done to its end: its time tells those who come how long it takes.
-    pub fn served(&self) {
+    pub fn complete(&self) {
         let mut line = self.shared.lock();
         let side_by_side = line.in_use;
         line.pace.record(self.since.elapsed(), side_by_side);
@@ -258,7 +258,7 @@ impl Shared {
         if wait > self.settings.max_wait {
             return Err(self.refused(line, RejectReason::WaitTooLong));
         }
-        let answered = Instant::now() + wait + line.pace.one();
+        let answered = Instant::now() + wait + line.pace.mean();
         if demand.deadline.is_some_and(|deadline| deadline < answered) {
             return Err(self.refused(line, RejectReason::DeadlineTooSoon));
         }
@@ -270,10 +270,10 @@ impl Shared {
     }
 
     fn retry_after(&self, line: &WaitQueue) -> Duration {
-        self.within_bounds(line.pace.until_done(line.bounded() + line.in_use))
+        self.clamp_pause(line.pace.until_done(line.bounded() + line.in_use))
     }
 
-    fn within_bounds(&self, pause: Duration) -> Duration {
+    fn clamp_pause(&self, pause: Duration) -> Duration {
         pause.min(self.settings.max_retry_after).max(Duration::from_secs(1))
     }
 

@@ -9,7 +9,7 @@ use super::batcher::{Batcher, Layout};
 use super::extractor::{ExtractError, Opened, sample};
 use super::manifest;
 use super::preprocess::Tensor;
-use super::provider::{self, Execution, LEAST_SIMILARITY, ProviderPreference};
+use super::provider::{self, Execution, MIN_SIMILARITY, ProviderPreference};
 use super::runtime::Assets;
 use super::session::{InferenceError, Model};
 
@@ -22,7 +22,7 @@ const GEMM_FLOP: f64 = 8.0 * 2.0 * 1024.0 * 1024.0 * 1024.0;
 #[derive(Debug, Clone)]
 pub struct BenchSettings {
     /// By whom and at which precision.
-    pub wanted: ProviderPreference,
+    pub preference: ProviderPreference,
     /// How threads are shared.
     pub layouts: Vec<Layout>,
     /// How long each figure is measured.
@@ -37,12 +37,12 @@ pub struct BenchRow {
     /// How threads are shared.
     pub layout: Layout,
     /// The figures, or why there are none.
-    pub outcome: Result<Figures, String>,
+    pub outcome: Result<BenchFigures, String>,
 }
 
 /// Figures of inference alone, without decoding or search.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Figures {
+pub struct BenchFigures {
     /// The median time of a picture that comes alone.
     pub alone: Duration,
     /// Pictures a second while enough of them wait.
@@ -56,8 +56,8 @@ pub struct Figures {
 
 impl BenchRow {
     /// The figures of a way whose descriptors are right.
-    pub fn right(&self) -> Option<&Figures> {
-        self.outcome.as_ref().ok().filter(|figures| figures.similarity >= LEAST_SIMILARITY)
+    pub fn accepted(&self) -> Option<&BenchFigures> {
+        self.outcome.as_ref().ok().filter(|figures| figures.similarity >= MIN_SIMILARITY)
     }
 }
 
@@ -109,7 +109,7 @@ impl Bench {
         let model = &self.opened.model;
         let reference = provider::descriptors(model, Execution::REFERENCE, 1, &self.sample)?;
         let mut rows = Vec::new();
-        for execution in Execution::candidates(settings.wanted) {
+        for execution in Execution::candidates(settings.preference) {
             let similarity = provider::descriptors(model, execution, 1, &self.sample)
                 .map(|tried| provider::least_similarity(&tried, &reference));
             let mut peaks = BTreeMap::new();
@@ -121,7 +121,7 @@ impl Bench {
                         None => gemm_peak(model, execution, layout.threads, settings.duration)?,
                     };
                     peaks.insert(layout.threads, peak);
-                    Ok(Figures { alone, per_second, similarity, peak })
+                    Ok(BenchFigures { alone, per_second, similarity, peak })
                 });
                 let outcome = outcome.map_err(|error| error.to_string());
                 let row = BenchRow { execution, layout, outcome };

@@ -22,9 +22,9 @@ pub struct ExtractorSettings {
     /// How inference shares its threads among pictures.
     pub layout: Layout,
     /// By whom and at which precision it may be run.
-    pub wanted: ProviderPreference,
+    pub preference: ProviderPreference,
     /// Where the choice among these is remembered; measured at each start if nowhere.
-    pub remember: Option<PathBuf>,
+    pub choice_file: Option<PathBuf>,
     /// Bounds on a picture.
     pub limits: ImageLimits,
     /// Whether every pixel of a large JPEG is decoded before it is scaled down.
@@ -38,11 +38,11 @@ impl ExtractorSettings {
         Self {
             model: model.into(),
             layout: Layout { threads, sessions: 1, max_batch: 1 },
-            wanted: ProviderPreference {
+            preference: ProviderPreference {
                 provider: Some(reference.provider),
                 precision: Some(reference.precision),
             },
-            remember: None,
+            choice_file: None,
             limits,
             exact_decode: true,
         }
@@ -152,7 +152,7 @@ impl Extractor {
     /// Loads a model and checks it by running one picture through it.
     pub fn load(assets: &Assets, settings: &ExtractorSettings) -> Result<Self, ExtractError> {
         let Opened { model, digest } =
-            Opened::open(assets, &settings.model, settings.wanted.provider)?;
+            Opened::open(assets, &settings.model, settings.preference.provider)?;
         let execution = chosen(&model, digest, settings)?;
         let batcher = Batcher::start(&model, execution, settings.layout)?;
         let mut extractor = Self {
@@ -278,17 +278,17 @@ fn chosen(
     let key = format!(
         "model {digest}, {} threads, {}, processor {}, {}",
         settings.layout.threads,
-        settings.wanted,
+        settings.preference,
         provider::processor(),
         ort::info()
     );
-    let remembered = settings.remember.as_deref();
+    let remembered = settings.choice_file.as_deref();
     if let Some(known) = remembered.and_then(|file| provider::recall(file, &key)) {
         return Ok(known);
     }
     let sample = sample(&model.manifest.input)?;
     let (execution, trials) =
-        provider::choose(model, settings.wanted, settings.layout.threads, &sample)?;
+        provider::choose(model, settings.preference, settings.layout.threads, &sample)?;
     for trial in &trials {
         match &trial.outcome {
             Ok(measured) => tracing::info!(

@@ -26,7 +26,7 @@ pub use admission::{
     Rejected, WorkClass,
 };
 pub use batcher::Layout;
-pub use bench::{Bench, BenchRow, BenchSettings, Figures};
+pub use bench::{Bench, BenchFigures, BenchRow, BenchSettings};
 pub use decode::{DecodeError, ImageLimits, Needed, Picture};
 pub use extractor::{
     ExtractError, Extraction, Extractor, ExtractorSettings, Inference, PendingExtraction,
@@ -35,5 +35,5 @@ pub use extractor::{
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
-pub use provider::{Execution, LEAST_SIMILARITY, Measured, Provider, ProviderPreference, Trial};
+pub use provider::{Execution, MIN_SIMILARITY, Measurement, Provider, ProviderPreference, Trial};
 pub use runtime::{AUTO, Assets, BUILT_IN_MODEL, CHOSEN, PREFERRED_MODELS, RuntimeError, WhyModel};

@@ -16,12 +16,12 @@ use whereabouts_core::{Digest, Map, Precision};
 #[derive(Debug, Clone)]
 pub struct LoadedSettings {
     /// The most models; one that nobody uses makes room, the least recently used first.
-    pub most: usize,
+    pub max_loaded: usize,
     /// The folder where the choice of a provider is remembered for each model.
-    pub remember: PathBuf,
+    pub choice_dir: PathBuf,
     /// How each of them is loaded. Its model is the default one; its precision, if there is one,
     /// holds for all.
-    pub each: ExtractorSettings,
+    pub extractor: ExtractorSettings,
 }
 
 /// The models in memory. Clones share them.
@@ -87,17 +87,17 @@ impl LoadedModels {
 
     /// The model of maps for which none is named.
     pub fn default_model(&self) -> &str {
-        &self.shared.settings.each.model
+        &self.shared.settings.extractor.model
     }
 
     /// Bounds on the pictures that models take.
     pub fn limits(&self) -> ImageLimits {
-        self.shared.settings.each.limits
+        self.shared.settings.extractor.limits
     }
 
     /// The precision that the settings prescribe, if any.
     pub fn precision(&self) -> Option<Precision> {
-        self.shared.settings.each.wanted.precision
+        self.shared.settings.extractor.preference.precision
     }
 
     /// What an installed model says about itself. Reads a file.
@@ -147,12 +147,12 @@ impl Shared {
             return Ok(extractor);
         }
         self.make_room()?;
-        let LoadedSettings { remember, each, .. } = &self.settings;
+        let LoadedSettings { choice_dir, extractor, .. } = &self.settings;
         let settings = ExtractorSettings {
             model: name.to_owned(),
-            wanted: ProviderPreference { precision, ..each.wanted },
-            remember: Some(remember.join(format!("inference-{name}.toml"))),
-            ..each.clone()
+            preference: ProviderPreference { precision, ..extractor.preference },
+            choice_file: Some(choice_dir.join(format!("inference-{name}.toml"))),
+            ..extractor.clone()
         };
         let loaded = Extractor::load(&self.assets, &settings);
         let extractor = Arc::new(loaded.map_err(|error| broken(name, &error))?);
@@ -190,13 +190,13 @@ impl Shared {
     /// Drops one that nobody uses, if one more would be too many.
     fn make_room(&self) -> Result<(), ModelError> {
         let mut loaded = self.loaded();
-        if loaded.len() < self.settings.most {
+        if loaded.len() < self.settings.max_loaded {
             return Ok(());
         }
         // Only under this lock does anybody get hold of one.
         let idle = |loaded: &Loaded| Arc::strong_count(&loaded.extractor) == 1;
         let place = loaded.iter().position(idle);
-        let place = place.ok_or(ModelError::AllInUse(self.settings.most))?;
+        let place = place.ok_or(ModelError::AllInUse(self.settings.max_loaded))?;
         let dropped = loaded.remove(place).extractor;
         tracing::info!(model = dropped.manifest().name, "model dropped to make room");
         Ok(())

@@ -48,7 +48,7 @@ pub enum PoolError {
     Overloaded(#[from] Overloaded),
     /// It was taken and broke off: a bug in the work, or the pool is gone.
     #[error("the work broke off")]
-    BrokeOff,
+    Aborted,
 }
 
 impl CpuPool {
@@ -80,9 +80,9 @@ impl CpuPool {
         });
         self.queue.try_send(task).map_err(|error| match error {
             TrySendError::Full(_) => PoolError::Overloaded(Overloaded),
-            TrySendError::Disconnected(_) => PoolError::BrokeOff,
+            TrySendError::Disconnected(_) => PoolError::Aborted,
         })?;
-        result.await.map_err(|_| PoolError::BrokeOff)
+        result.await.map_err(|_| PoolError::Aborted)
     }
 
     /// Blocks until no work is being done, but no longer than `longest`. A process that ends while a
@@ -138,7 +138,7 @@ mod tests {
     #[tokio::test]
     async fn a_panic_reaches_its_caller_and_spares_the_thread() {
         let pool = CpuPool::new("test", 1, 4).unwrap();
-        assert_eq!(pool.run(|| -> u8 { panic!("on purpose") }).await, Err(PoolError::BrokeOff));
+        assert_eq!(pool.run(|| -> u8 { panic!("on purpose") }).await, Err(PoolError::Aborted));
         assert_eq!(pool.run(|| 7).await, Ok(7));
     }
 

@@ -1,7 +1,7 @@
 //! Where a model runs: by which execution provider of ONNX Runtime, and at which precision.
 //!
 //! [`choose`] measures what the machine has. A faster choice is taken only if its descriptors stay
-//! within [`LEAST_SIMILARITY`] of those of the CPU at full precision, on pictures of streets rather
+//! within [`MIN_SIMILARITY`] of those of the CPU at full precision, on pictures of streets rather
 //! than on noise, whose tokens resemble nothing that a model meets.
 
 use std::path::Path;
@@ -18,7 +18,7 @@ use whereabouts_core::{Descriptor, DescriptorKind, Digest, Precision};
 
 /// The least cosine similarity between a descriptor of a faster choice and that of the CPU at full
 /// precision.
-pub const LEAST_SIMILARITY: f32 = 0.999;
+pub const MIN_SIMILARITY: f32 = 0.999;
 
 /// Who runs a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -60,12 +60,12 @@ pub struct Trial {
     /// What was tried.
     pub execution: Execution,
     /// What came of it.
-    pub outcome: Result<Measured, String>,
+    pub outcome: Result<Measurement, String>,
 }
 
 /// What one execution does.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Measured {
+pub struct Measurement {
     /// The median time of one picture alone, of a few.
     pub latency: Duration,
     /// The least cosine similarity of a descriptor to that of the CPU at full precision.
@@ -177,10 +177,10 @@ pub(super) fn choose(
     let mut trials = Vec::new();
     for execution in candidates {
         let outcome = if execution == Execution::REFERENCE {
-            Ok(Measured { latency: reference.latency, similarity: 1.0 })
+            Ok(Measurement { latency: reference.latency, similarity: 1.0 })
         } else {
             try_one(model, execution, threads, sample).map_err(|error| error.to_string()).map(
-                |tried| Measured {
+                |tried| Measurement {
                     latency: tried.latency,
                     similarity: least_similarity(&tried.descriptors, &reference.descriptors),
                 },
@@ -190,7 +190,7 @@ pub(super) fn choose(
     }
     let right = trials.iter().filter_map(|trial| {
         let measured = trial.outcome.as_ref().ok()?;
-        (measured.similarity >= LEAST_SIMILARITY).then_some((trial.execution, measured.latency))
+        (measured.similarity >= MIN_SIMILARITY).then_some((trial.execution, measured.latency))
     });
     match right.min_by_key(|(_, latency)| *latency) {
         Some((fastest, _)) => Ok((fastest, trials)),

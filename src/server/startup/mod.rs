@@ -320,14 +320,14 @@ fn check_keys(config: &Config, keys: &Keys) -> anyhow::Result<()> {
 fn models(config: &Config) -> anyhow::Result<(LoadedModels, WhyModel)> {
     let assets = Assets::locate(config.model.assets());
     let (model, why) = assets.resolve(&config.model.name)?;
-    let each = ExtractorSettings {
+    let extractor = ExtractorSettings {
         model,
-        wanted: config.model.wanted(),
-        remember: None,
+        preference: config.model.wanted(),
+        choice_file: None,
         layout: config.model.layout(),
         limits: ImageLimits { max_pixels: config.image.max_pixels },
         exact_decode: config.image.exact,
     };
-    let (most, remember) = (config.model.loaded, config.data.dir.clone());
-    Ok((LoadedModels::new(assets, LoadedSettings { most, remember, each }), why))
+    let (max_loaded, choice_dir) = (config.model.loaded, config.data.dir.clone());
+    Ok((LoadedModels::new(assets, LoadedSettings { max_loaded, choice_dir, extractor }), why))
 }

@@ -10,7 +10,7 @@ use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
 use parking_lot::RwLock;
 use whereabouts_core::{Calibration, CalibrationSettings, Candidate, ImageId, Map, Pose};
-use whereabouts_index::{Found, IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
+use whereabouts_index::{IndexSettings, MapIndex, ScoredSlot, SealedGraph, SearchMode, Vectors};
 
 pub(super) struct LiveMap {
     /// The map as stored; scene and description may change.
@@ -87,7 +87,7 @@ impl LiveMap {
             }
         };
         match SealedGraph::from_bytes(&bytes) {
-            Ok(sealed) if sealed.dim() == self.vectors.dim() && sealed.fits(&settings) => {
+            Ok(sealed) if sealed.dim() == self.vectors.dim() && sealed.is_built_with(&settings) => {
                 // Its slots are never given to other images.
                 self.next_slot.fetch_max(sealed.end(), Ordering::Relaxed);
                 self.index.restore(sealed);
@@ -177,7 +177,7 @@ impl LiveMap {
         self.candidates(&self.index.search(self.vectors.as_ref(), query, k, mode))
     }
 
-    fn candidates(&self, found: &[Found]) -> Vec<Candidate> {
+    fn candidates(&self, found: &[ScoredSlot]) -> Vec<Candidate> {
         let entries = self.entries.read();
         found
             .iter()
@@ -215,7 +215,7 @@ impl LiveMap {
         k: usize,
     ) -> Option<HardNegatives> {
         let asked = &places[at];
-        let of_another_place = |found: &Found| {
+        let of_another_place = |found: &ScoredSlot| {
             // Where it stands in the order of addition.
             let position = places.partition_point(|place| place.slot < found.slot);
             let pose = places.get(position).and_then(|place| place.pose);
@@ -225,12 +225,13 @@ impl LiveMap {
         self.vectors
             .scan(asked.slot..asked.slot + 1, &mut |_, numbers| descriptor = numbers.to_vec());
         // Twice as many, until enough of them are of other places.
-        let mut wanted = k + 2 * settings.place_images_of(places.len()) + 1;
-        let others: Vec<Found> = loop {
+        let mut wanted = k + 2 * settings.place_radius(places.len()) + 1;
+        let others: Vec<ScoredSlot> = loop {
             let found =
                 self.index.search(self.vectors.as_ref(), &descriptor, wanted, SearchMode::Fast);
             let all = found.len() < wanted;
-            let others: Vec<Found> = found.into_iter().filter(of_another_place).take(k).collect();
+            let others: Vec<ScoredSlot> =
+                found.into_iter().filter(of_another_place).take(k).collect();
             if others.len() == k || all {
                 break others;
             }

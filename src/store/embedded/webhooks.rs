@@ -126,7 +126,7 @@ impl WebhookStore for EmbeddedStore {
             };
             trees.enabled(webhook)?;
             check_ended(&known)?;
-            let again = known.clone().again(now);
+            let again = known.clone().requeued(now);
             trees.replace(&known, &again)?;
             Ok(again)
         });
@@ -209,7 +209,7 @@ impl WebhookStore for EmbeddedStore {
             let keys = trees.due_until(webhook, Timestamp::MAX, limit)?;
             for key in &keys {
                 if let Some(known) = trees.delivery(key)? {
-                    trees.replace(&known, &known.clone().given_up(at, &why))?;
+                    trees.replace(&known, &known.clone().dead_lettered(at, &why))?;
                 }
             }
             Ok(keys.len())

@@ -323,7 +323,7 @@ impl Inner {
                 settings.are_apart(places.len(), (at, pose), (position, found.pose))
             };
             // Twice as many, until enough of them are of other places.
-            let mut wanted = k + 2 * settings.place_images_of(places.len()) + 1;
+            let mut wanted = k + 2 * settings.place_radius(places.len()) + 1;
             let others = loop {
                 let found = self.find(map, &descriptor, wanted, SearchMode::Fast).await?;
                 let all = found.len() < wanted;

@@ -182,7 +182,7 @@ impl WebhookStore for PostgresStore {
                     tx.rollback().await?;
                     return checked.map(|()| known);
                 }
-                let again = known.again(now);
+                let again = known.requeued(now);
                 inner.update_delivery(&mut tx, &again).await?;
                 inner.tell_of_deliveries(&mut tx).await?;
                 tx.commit().await?;
@@ -286,7 +286,7 @@ impl WebhookStore for PostgresStore {
                 .await?;
                 let given_up = waiting.len();
                 for Json(delivery) in waiting {
-                    inner.update_delivery(&mut tx, &delivery.given_up(at, why)).await?;
+                    inner.update_delivery(&mut tx, &delivery.dead_lettered(at, why)).await?;
                 }
                 tx.commit().await?;
                 Ok(given_up)

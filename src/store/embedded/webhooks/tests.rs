@@ -5,7 +5,7 @@ use uuid::Uuid;
 
 use super::super::drafts::tests::settings;
 use super::*;
-use whereabouts_core::{Then, Webhook, WebhookEvent, WebhookSecret};
+use whereabouts_core::{Disposition, Webhook, WebhookEvent, WebhookSecret};
 
 /// A webhook of which so many pings wait.
 async fn pinged(store: &EmbeddedStore, pings: usize) -> (Uuid, Vec<Uuid>) {
@@ -36,7 +36,7 @@ async fn nothing_is_left_of_deliveries_that_are_gone() {
     let (gone, pings) = pinged(&store, REMOVED_AT_ONCE + 3).await;
     pinged(&store, 3).await;
     let at = Timestamp::now();
-    let dead = Attempt { at, status: None, error: None, then: Then::Dead };
+    let dead = Attempt { at, status: None, error: None, disposition: Disposition::Dead };
     store.note_attempt(gone, pings[0], dead).await.unwrap();
     assert!(store.delete_webhook(gone).await.unwrap());
     let left = |count: usize| {
