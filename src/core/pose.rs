@@ -1,4 +1,4 @@
-//! Where a camera stood: on the globe or in a map's own metric frame.
+//! Camera poses, geographic or in a map's local metric frame.
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -6,17 +6,17 @@ use utoipa::ToSchema;
 
 use super::CoordinateFrame;
 
-/// Where a camera stood, in the frame of its map.
+/// The pose of a camera in the coordinate frame of its map.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(untagged)]
 pub enum Pose {
-    /// In a `wgs84` map.
+    /// Pose in a `wgs84` map.
     Geographic(GeographicPose),
-    /// In a `metric` map.
+    /// Pose in a `metric` map.
     Metric(MetricPose),
 }
 
-/// A pose on the globe (WGS84).
+/// A geographic pose (WGS84).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct GeographicPose {
@@ -32,7 +32,7 @@ pub struct GeographicPose {
     pub heading: Option<f64>,
 }
 
-/// A pose in a map's own frame: metres and a unit quaternion.
+/// A pose in a map's local frame: metres and a unit quaternion.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MetricPose {
@@ -43,44 +43,44 @@ pub struct MetricPose {
     /// Metres along the frame's z axis.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub z: Option<f64>,
-    /// Orientation, x part of the unit quaternion; all four parts are given or none.
+    /// Orientation: x component of the unit quaternion. Give all four components or none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub qx: Option<f64>,
-    /// Orientation, y part.
+    /// Orientation: y component.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub qy: Option<f64>,
-    /// Orientation, z part.
+    /// Orientation: z component.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub qz: Option<f64>,
-    /// Orientation, scalar part.
+    /// Orientation: scalar component.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub qw: Option<f64>,
 }
 
-/// Why a pose was refused.
+/// Why a pose is invalid.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum PoseError {
-    /// The fields are not those of the map's frame.
+    /// The fields do not match the map's coordinate frame.
     #[error("the pose does not fit a {frame} map, which takes {expected}: {detail}")]
     Fields {
-        /// The map's frame.
+        /// Coordinate frame of the map.
         frame: &'static str,
-        /// The fields that a pose of this frame has.
+        /// Fields of a pose in this frame.
         expected: &'static str,
-        /// What the reader said.
+        /// Message of the JSON parser.
         detail: String,
     },
-    /// A number lies outside its range.
+    /// A value is out of range.
     #[error("{field} is {value}; it must be {range}")]
     Range {
-        /// The field.
+        /// Name of the field.
         field: &'static str,
         /// Its value.
         value: f64,
-        /// What it may be.
+        /// The valid range.
         range: &'static str,
     },
-    /// The orientation is given in part, or is not a unit quaternion.
+    /// The orientation is incomplete or not a unit quaternion.
     #[error("{0}")]
     Quaternion(&'static str),
 }
@@ -88,11 +88,11 @@ pub enum PoseError {
 /// Mean radius of the Earth in metres (IUGG).
 pub const EARTH_RADIUS_M: f64 = 6_371_008.8;
 
-/// Farther from the origin than any building, city or orbit of the Earth; keeps typing errors out.
-const FARTHEST_METRES: f64 = 1e8;
+/// Coordinates beyond this distance from the origin are rejected as typing errors.
+const MAX_COORDINATE_M: f64 = 1e8;
 
 impl Pose {
-    /// Reads a pose written in JSON for a map of the given frame.
+    /// Parses a JSON pose for a map with the given coordinate frame.
     pub fn from_json(frame: CoordinateFrame, value: Value) -> Result<Self, PoseError> {
         let (name, expected) = match frame {
             CoordinateFrame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading"),
@@ -113,7 +113,7 @@ impl Pose {
         }
     }
 
-    /// The frame it belongs to.
+    /// The coordinate frame of the pose.
     pub fn frame(&self) -> CoordinateFrame {
         match self {
             Self::Geographic(_) => CoordinateFrame::Wgs84,
@@ -121,7 +121,7 @@ impl Pose {
         }
     }
 
-    /// Checks the ranges of a pose that was built in code.
+    /// Validates a pose that was constructed in code.
     pub fn checked(self) -> Result<Self, PoseError> {
         match self {
             Self::Geographic(pose) => pose.checked(),
@@ -129,10 +129,10 @@ impl Pose {
         }
     }
 
-    /// Distance in metres to another pose of the same frame, `None` across frames.
+    /// Distance in metres to another pose; `None` if the two are in different kinds of frames.
     ///
-    /// On the globe this is the great-circle distance of the haversine formula over a sphere of
-    /// the mean Earth radius 6,371,008.8 m (IUGG), good to 0.6 %.
+    /// For geographic poses this is the great-circle distance by the haversine formula on a sphere with
+    /// the mean Earth radius of 6,371,008.8 m (IUGG), accurate to 0.6 %.
     pub fn distance_m(&self, other: &Self) -> Option<f64> {
         match (self, other) {
             (Self::Geographic(a), Self::Geographic(b)) => Some(a.haversine_m(b)),
@@ -149,7 +149,7 @@ impl GeographicPose {
     fn checked(self) -> Result<Pose, PoseError> {
         within("lat", Some(self.lat), -90.0, 90.0, "between -90 and 90 degrees")?;
         within("lon", Some(self.lon), -180.0, 180.0, "between -180 and 180 degrees")?;
-        within("alt", self.alt, -FARTHEST_METRES, FARTHEST_METRES, "within 100,000 km")?;
+        within("alt", self.alt, -MAX_COORDINATE_M, MAX_COORDINATE_M, "within 100,000 km")?;
         within("heading", self.heading, 0.0, 360.0, "between 0 and 360 degrees")?;
         Ok(Pose::Geographic(self))
     }
@@ -166,7 +166,7 @@ impl GeographicPose {
 impl MetricPose {
     fn checked(self) -> Result<Pose, PoseError> {
         for (field, value) in [("x", Some(self.x)), ("y", Some(self.y)), ("z", self.z)] {
-            within(field, value, -FARTHEST_METRES, FARTHEST_METRES, "within 100,000 km")?;
+            within(field, value, -MAX_COORDINATE_M, MAX_COORDINATE_M, "within 100,000 km")?;
         }
         match [self.qx, self.qy, self.qz, self.qw] {
             [None, None, None, None] => {}
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_of_the_other_frame_says_what_this_map_takes() {
+    fn a_pose_of_the_wrong_frame_names_the_expected_fields() {
         let error =
             Pose::from_json(CoordinateFrame::Wgs84, json!({"x": 1.0, "y": 2.0})).unwrap_err();
         assert!(error.to_string().contains("takes lat, lon"), "{error}");
@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn an_orientation_is_whole_and_of_unit_norm() {
+    fn an_orientation_is_complete_and_of_unit_norm() {
         let with =
             |q: [f64; 4]| json!({"x": 0, "y": 0, "qx": q[0], "qy": q[1], "qz": q[2], "qw": q[3]});
         assert!(Pose::from_json(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.8])).is_ok());
