@@ -2,9 +2,8 @@
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use utoipa::ToSchema;
-use whereabouts_core::{ExportedImage, Image, Map, Pose};
+use whereabouts_core::{ExportedImage, Image, Map, Pose, PoseInput};
 
 /// What a caller says about an image.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
@@ -16,7 +15,7 @@ pub struct ImageMeta {
     /// Where it was taken from, in the frame of the map.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Pose>)]
-    pub pose: Option<Value>,
+    pub pose: Option<PoseInput>,
     /// When it was taken.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub captured_at: Option<Timestamp>,

@@ -84,6 +84,8 @@ impl Ranking {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     fn candidates(count: usize) -> Vec<Candidate> {
@@ -108,6 +110,40 @@ mod tests {
     fn an_order_that_is_not_a_permutation_is_rejected() {
         for order in [&[0, 0, 1][..], &[0, 1], &[0, 1, 3], &[0, 1, 2, 2]] {
             assert!(Ranking::new(&candidates(3), order).is_err(), "{order:?}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn a_ranking_is_a_permutation_of_the_candidates(
+            order in (0..12_usize).prop_flat_map(|count| {
+                Just((0..count).collect::<Vec<_>>()).prop_shuffle()
+            }),
+        ) {
+            let candidates = candidates(order.len());
+            let ranking = Ranking::new(&candidates, &order).unwrap();
+            prop_assert_eq!(ranking.first(), ranking.as_slice().first());
+            let mut coarse = Vec::new();
+            for (position, ranked) in ranking.as_slice().iter().enumerate() {
+                let candidate = &candidates[order[position]];
+                prop_assert_eq!(ranked.rank, position + 1);
+                prop_assert_eq!(&ranked.image_id, &candidate.image_id);
+                prop_assert_eq!(ranked.coarse_rank, candidate.rank);
+                coarse.push(ranked.coarse_rank);
+            }
+            coarse.sort_unstable();
+            prop_assert!(coarse.into_iter().eq(1..=candidates.len()));
+        }
+
+        #[test]
+        fn an_order_is_accepted_exactly_if_it_is_a_permutation(
+            count in 0..6_usize,
+            order in proptest::collection::vec(0..7_usize, 0..7),
+        ) {
+            let mut sorted = order.clone();
+            sorted.sort_unstable();
+            let is_permutation = sorted.into_iter().eq(0..count);
+            prop_assert_eq!(Ranking::new(&candidates(count), &order).is_ok(), is_permutation);
         }
     }
 }

@@ -31,7 +31,7 @@ pub use job::{
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use map::{CoordinateFrame, DescriptorKind, Map, MapName, Precision, Scene};
-pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError};
+pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, PoseInput};
 pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;

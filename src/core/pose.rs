@@ -1,7 +1,6 @@
 //! Camera poses, geographic or in a map's local metric frame.
 
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use utoipa::ToSchema;
 
 use super::CoordinateFrame;
@@ -57,6 +56,45 @@ pub struct MetricPose {
     pub qw: Option<f64>,
 }
 
+/// The numbers of a pose as sent by a caller, not yet validated against the coordinate frame of a map.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PoseInput {
+    /// Latitude in degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lat: Option<f64>,
+    /// Longitude in degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lon: Option<f64>,
+    /// Height above the ellipsoid in metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alt: Option<f64>,
+    /// Viewing direction in degrees clockwise from north.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub heading: Option<f64>,
+    /// Metres along the x axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub x: Option<f64>,
+    /// Metres along the y axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub y: Option<f64>,
+    /// Metres along the z axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub z: Option<f64>,
+    /// Orientation: x component of the unit quaternion.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qx: Option<f64>,
+    /// Orientation: y component.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qy: Option<f64>,
+    /// Orientation: z component.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qz: Option<f64>,
+    /// Orientation: scalar component.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qw: Option<f64>,
+}
+
 /// Why a pose is invalid.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum PoseError {
@@ -67,7 +105,7 @@ pub enum PoseError {
         frame: &'static str,
         /// Fields of a pose in this frame.
         expected: &'static str,
-        /// Message of the JSON parser.
+        /// Which field is missing or unknown.
         detail: String,
     },
     /// A value is out of range.
@@ -91,28 +129,71 @@ pub const EARTH_RADIUS_M: f64 = 6_371_008.8;
 /// Coordinates beyond this distance from the origin are rejected as typing errors.
 const MAX_COORDINATE_M: f64 = 1e8;
 
-impl Pose {
-    /// Parses a JSON pose for a map with the given coordinate frame.
-    pub fn from_json(frame: CoordinateFrame, value: Value) -> Result<Self, PoseError> {
-        let (name, expected) = match frame {
-            CoordinateFrame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading"),
-            CoordinateFrame::Metric => ("metric", "x, y and, if known, z, qx, qy, qz, qw"),
-        };
-        let fields = |error: serde_json::Error| PoseError::Fields {
-            frame: name,
-            expected,
-            detail: error.to_string(),
-        };
-        match frame {
-            CoordinateFrame::Wgs84 => {
-                serde_json::from_value::<GeographicPose>(value).map_err(fields)?.checked()
-            }
-            CoordinateFrame::Metric => {
-                serde_json::from_value::<MetricPose>(value).map_err(fields)?.checked()
-            }
+impl PoseInput {
+    /// Whether no number is set.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// The coordinate frame that the numbers belong to, judged by which pair of coordinates is set; `None` if
+    /// neither or both pairs are.
+    pub fn frame(&self) -> Option<CoordinateFrame> {
+        match (self.lat.is_some() && self.lon.is_some(), self.x.is_some() && self.y.is_some()) {
+            (true, false) => Some(CoordinateFrame::Wgs84),
+            (false, true) => Some(CoordinateFrame::Metric),
+            _ => None,
         }
     }
 
+    /// Validates the numbers for a map with this coordinate frame. Fails if a number is missing, belongs to
+    /// another frame, or is out of range.
+    pub fn check(self, frame: CoordinateFrame) -> Result<Pose, PoseError> {
+        let Self { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw } = self;
+        let geographic = [("lat", lat), ("lon", lon), ("alt", alt), ("heading", heading)];
+        let metric = [("x", x), ("y", y), ("z", z), ("qx", qx), ("qy", qy), ("qz", qz), ("qw", qw)];
+        let (name, expected, foreign): (_, _, &[(&str, Option<f64>)]) = match frame {
+            CoordinateFrame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading", &metric),
+            CoordinateFrame::Metric => {
+                ("metric", "x, y and, if known, z, qx, qy, qz, qw", &geographic)
+            }
+        };
+        let misfit = |detail: String| PoseError::Fields { frame: name, expected, detail };
+        if let Some((field, _)) = foreign.iter().find(|(_, value)| value.is_some()) {
+            return Err(misfit(format!("unknown field `{field}`")));
+        }
+        let required = |field: &str, value: Option<f64>| {
+            value.ok_or_else(|| misfit(format!("missing field `{field}`")))
+        };
+        match frame {
+            CoordinateFrame::Wgs84 => GeographicPose {
+                lat: required("lat", lat)?,
+                lon: required("lon", lon)?,
+                alt,
+                heading,
+            }
+            .checked(),
+            CoordinateFrame::Metric => {
+                MetricPose { x: required("x", x)?, y: required("y", y)?, z, qx, qy, qz, qw }
+                    .checked()
+            }
+        }
+    }
+}
+
+impl From<Pose> for PoseInput {
+    fn from(pose: Pose) -> Self {
+        match pose {
+            Pose::Geographic(GeographicPose { lat, lon, alt, heading }) => {
+                Self { lat: Some(lat), lon: Some(lon), alt, heading, ..Self::default() }
+            }
+            Pose::Metric(MetricPose { x, y, z, qx, qy, qz, qw }) => {
+                Self { x: Some(x), y: Some(y), z, qx, qy, qz, qw, ..Self::default() }
+            }
+        }
+    }
+}
+
+impl Pose {
     /// The coordinate frame of the pose.
     pub fn frame(&self) -> CoordinateFrame {
         match self {
@@ -205,54 +286,4 @@ fn within(
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use serde_json::json;
-
-    #[test]
-    fn a_pose_out_of_range_names_the_field_and_the_range() {
-        let error =
-            Pose::from_json(CoordinateFrame::Wgs84, json!({"lat": 91.0, "lon": 0.0})).unwrap_err();
-        assert_eq!(error.to_string(), "lat is 91; it must be between -90 and 90 degrees");
-        assert!(Pose::from_json(CoordinateFrame::Metric, json!({"x": 1e9, "y": 0.0})).is_err());
-    }
-
-    #[test]
-    fn a_pose_of_the_wrong_frame_names_the_expected_fields() {
-        let error =
-            Pose::from_json(CoordinateFrame::Wgs84, json!({"x": 1.0, "y": 2.0})).unwrap_err();
-        assert!(error.to_string().contains("takes lat, lon"), "{error}");
-        let error =
-            Pose::from_json(CoordinateFrame::Metric, json!({"lat": 1.0, "lon": 2.0})).unwrap_err();
-        assert!(error.to_string().contains("takes x, y"), "{error}");
-    }
-
-    #[test]
-    fn an_orientation_is_complete_and_of_unit_norm() {
-        let with =
-            |q: [f64; 4]| json!({"x": 0, "y": 0, "qx": q[0], "qy": q[1], "qz": q[2], "qw": q[3]});
-        assert!(Pose::from_json(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.8])).is_ok());
-        assert!(Pose::from_json(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.6])).is_err());
-        assert!(
-            Pose::from_json(CoordinateFrame::Metric, json!({"x": 0, "y": 0, "qw": 1})).is_err()
-        );
-    }
-
-    #[test]
-    fn a_degree_of_latitude_is_111_kilometres() {
-        let at =
-            |lat| Pose::Geographic(GeographicPose { lat, lon: 139.7, alt: None, heading: None });
-        let distance = at(35.0).distance_m(&at(36.0)).unwrap();
-        assert!((distance - 111_195.0).abs() < 10.0, "{distance}");
-    }
-
-    #[test]
-    fn poses_of_different_frames_have_no_distance() {
-        let metric = Pose::from_json(CoordinateFrame::Metric, json!({"x": 3.0, "y": 4.0})).unwrap();
-        let origin = Pose::from_json(CoordinateFrame::Metric, json!({"x": 0.0, "y": 0.0})).unwrap();
-        let globe =
-            Pose::from_json(CoordinateFrame::Wgs84, json!({"lat": 0.0, "lon": 0.0})).unwrap();
-        assert_eq!(metric.distance_m(&origin), Some(5.0));
-        assert_eq!(metric.distance_m(&globe), None);
-    }
-}
+mod tests;

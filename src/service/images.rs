@@ -193,7 +193,7 @@ impl CheckedMeta {
         check_tags(&meta.tags)?;
         Ok(Self {
             id: meta.id.map(|id| id.parse()).transpose()?,
-            pose: meta.pose.map(|pose| Pose::from_json(map.frame, pose)).transpose()?,
+            pose: meta.pose.map(|pose| pose.check(map.frame)).transpose()?,
             captured_at: meta.captured_at,
             tags: meta.tags,
         })

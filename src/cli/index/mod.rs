@@ -269,7 +269,7 @@ impl Sender<'_> {
         let posed = pose.is_some();
         let meta = ImageMeta {
             id: Some(picture.id.to_string()),
-            pose: pose.map(serde_json::to_value).transpose()?,
+            pose: pose.map(Into::into),
             ..ImageMeta::default()
         };
         let meta = serde_json::to_string(&meta)?;

@@ -1,11 +1,10 @@
 //! Between the messages of the contract and the types of the service.
 
 use jiff::Timestamp;
-use serde_json::{Map as JsonObject, Value};
 
 use super::proto;
 use whereabouts_api::RefineMode;
-use whereabouts_core::{CoordinateFrame, DescriptorKind, JobState, Priority, Scene};
+use whereabouts_core::{CoordinateFrame, DescriptorKind, JobState, PoseInput, Priority, Scene};
 use whereabouts_service::ServiceError;
 
 /// The value of an enum by its number.
@@ -76,47 +75,37 @@ pub(super) fn moment(moment: prost_types::Timestamp) -> Result<Timestamp, Servic
         .map_err(|error| ServiceError::unprocessable(format!("captured_at: {error}")))
 }
 
-/// A pose in the form in which the service checks it against the map.
-pub(super) fn pose(pose: proto::Pose) -> Result<Value, ServiceError> {
-    let fields = match pose.frame {
-        None => Vec::new(),
-        Some(proto::pose::Frame::Geographic(pose)) => vec![
-            ("lat", Some(pose.lat)),
-            ("lon", Some(pose.lon)),
-            ("alt", pose.alt),
-            ("heading", pose.heading),
-        ],
+/// A pose as the service checks it against the frame of the map.
+pub(super) fn pose(pose: proto::Pose) -> PoseInput {
+    match pose.frame {
+        None => PoseInput::default(),
+        Some(proto::pose::Frame::Geographic(pose)) => PoseInput {
+            lat: Some(pose.lat),
+            lon: Some(pose.lon),
+            alt: pose.alt,
+            heading: pose.heading,
+            ..PoseInput::default()
+        },
         Some(proto::pose::Frame::Metric(pose)) => {
             let part = |of: fn(&proto::Quaternion) -> f64| pose.orientation.as_ref().map(of);
-            vec![
-                ("x", Some(pose.x)),
-                ("y", Some(pose.y)),
-                ("z", pose.z),
-                ("qx", part(|q| q.x)),
-                ("qy", part(|q| q.y)),
-                ("qz", part(|q| q.z)),
-                ("qw", part(|q| q.w)),
-            ]
+            PoseInput {
+                x: Some(pose.x),
+                y: Some(pose.y),
+                z: pose.z,
+                qx: part(|q| q.x),
+                qy: part(|q| q.y),
+                qz: part(|q| q.z),
+                qw: part(|q| q.w),
+                ..PoseInput::default()
+            }
         }
-    };
-    let mut given = JsonObject::new();
-    for (field, value) in fields {
-        let Some(value) = value else { continue };
-        // JSON has no word for it.
-        if !value.is_finite() {
-            let detail = format!("{field} is {value}; it must be a number");
-            return Err(ServiceError::unprocessable(detail));
-        }
-        given.insert(field.to_owned(), value.into());
     }
-    Ok(Value::Object(given))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use whereabouts_api::moment_to;
-    use whereabouts_core::Pose;
 
     #[test]
     fn a_pose_comes_back_as_it_was_sent() {
@@ -128,16 +117,14 @@ mod tests {
                 orientation: Some(proto::Quaternion { x: 0.0, y: 0.0, z: 0.6, w: 0.8 }),
             })),
         };
-        let read = Pose::from_json(CoordinateFrame::Metric, pose(sent).unwrap()).unwrap();
+        let read = pose(sent).check(CoordinateFrame::Metric).unwrap();
         assert_eq!(proto::Pose::from(read), sent);
-        assert!(Pose::from_json(CoordinateFrame::Wgs84, pose(sent).unwrap()).is_err());
-        assert!(
-            Pose::from_json(CoordinateFrame::Metric, pose(proto::Pose { frame: None }).unwrap())
-                .is_err()
-        );
+        assert!(pose(sent).check(CoordinateFrame::Wgs84).is_err());
+        assert!(pose(proto::Pose { frame: None }).check(CoordinateFrame::Metric).is_err());
         let nowhere = proto::MetricPose { x: 0.0, y: 0.0, z: Some(f64::NAN), orientation: None };
         let nowhere = proto::Pose { frame: Some(proto::pose::Frame::Metric(nowhere)) };
-        assert!(pose(nowhere).unwrap_err().detail.contains('z'));
+        let error = pose(nowhere).check(CoordinateFrame::Metric).unwrap_err();
+        assert!(error.to_string().starts_with("z is NaN"), "{error}");
     }
 
     #[test]

@@ -106,7 +106,7 @@ fn image(
     }
     let meta = ImageMeta {
         id,
-        pose: pose.map(convert::pose).transpose()?,
+        pose: pose.map(convert::pose),
         captured_at: captured_at.map(convert::moment).transpose()?,
         tags,
     };

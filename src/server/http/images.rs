@@ -8,7 +8,6 @@ use axum::response::IntoResponse;
 use bytes::Bytes;
 use jiff::Timestamp;
 use serde::Deserialize;
-use serde_json::{Map as JsonObject, Value};
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody, Segments};
@@ -16,7 +15,7 @@ use super::maps::map_name;
 use super::problem::Problem;
 use super::state::{AppState, Ready};
 use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
-use whereabouts_core::{Image, ImageId, MediaType};
+use whereabouts_core::{Image, ImageId, MediaType, PoseInput};
 use whereabouts_service::{Deadline, NewImage, ServiceError};
 use whereabouts_store::Added;
 use whereabouts_vision::{AdmissionRequest, WorkClass};
@@ -65,25 +64,10 @@ impl MetaParams {
             && self.pose().is_none()
     }
 
-    fn pose(&self) -> Option<Value> {
-        let fields = [
-            ("lat", self.lat),
-            ("lon", self.lon),
-            ("alt", self.alt),
-            ("heading", self.heading),
-            ("x", self.x),
-            ("y", self.y),
-            ("z", self.z),
-            ("qx", self.qx),
-            ("qy", self.qy),
-            ("qz", self.qz),
-            ("qw", self.qw),
-        ];
-        let given: JsonObject<String, Value> = fields
-            .into_iter()
-            .filter_map(|(field, value)| Some((field.to_owned(), value?.into())))
-            .collect();
-        (!given.is_empty()).then_some(Value::Object(given))
+    fn pose(&self) -> Option<PoseInput> {
+        let Self { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw, .. } = *self;
+        let pose = PoseInput { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw };
+        (!pose.is_empty()).then_some(pose)
     }
 
     fn into_meta(self) -> ImageMeta {
