@@ -17,7 +17,7 @@ pub struct DenseFeatures {
 }
 
 /// Why a buffer is not valid as [`DenseFeatures`].
-#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+#[derive(Debug, Clone, thiserror::Error, PartialEq, Eq)]
 pub enum DenseFeaturesError {
     /// The buffer is empty or does not hold `height * width * channels` numbers.
     #[error("dense features of {height}×{width}×{channels} cannot hold {got} numbers")]

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 pub struct Descriptor(Vec<f32>);
 
 /// Why a vector is not valid as a [`Descriptor`].
-#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+#[derive(Debug, Clone, thiserror::Error, PartialEq, Eq)]
 pub enum DescriptorError {
     /// The vector is empty or all zeros, so it has no direction.
     #[error("the descriptor is all zeros: the model found no features in the picture")]

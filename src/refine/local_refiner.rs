@@ -14,7 +14,7 @@ use whereabouts_core::{
     RefinerKind, Usage,
 };
 use whereabouts_store::{BlobStore, HardNegatives, JobRecord, MapStore};
-use whereabouts_vision::{CpuPool, ExtractError, Extractor, LoadedModels, ModelError};
+use whereabouts_vision::{CpuPool, ExtractError, Extractor, FeatureSet, LoadedModels, ModelError};
 
 /// Geometric matching of dense features, on this machine.
 pub struct LocalRefiner {
@@ -182,9 +182,11 @@ fn compare(
         Source::Dense(features) => Ok(features),
         Source::Bytes(key, bytes) => {
             let extraction = extractor
-                .extract(&bytes, DescriptorKind::Gem)
+                .extract(&bytes, DescriptorKind::Gem, FeatureSet::DescriptorAndDense)
                 .map_err(|error: ExtractError| RefineError::Transient(error.to_string()))?;
-            let features = Arc::new(extraction.dense);
+            let features = extraction.dense.map(Arc::new).ok_or_else(|| {
+                RefineError::Permanent("the model computed no dense features".into())
+            })?;
             dense.insert(key, Arc::clone(&features));
             Ok(features)
         }

@@ -39,7 +39,7 @@ pub fn run(place: &Place, args: BenchArgs) -> anyhow::Result<()> {
     if !(0.05..=600.0).contains(&args.seconds) {
         bail!("--seconds must be between 0.05 and 600");
     }
-    let preference = place.config.model.wanted();
+    let preference = place.config.model.preference();
     let (name, why) =
         place.assets.resolve(args.name.as_deref().unwrap_or(&place.config.model.name))?;
     let bench = Bench::open(&place.assets, &name, preference)?;

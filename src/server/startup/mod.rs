@@ -16,7 +16,7 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use crate::Metrics;
-use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
+use crate::config::{Config, Refiner as ConfiguredRefiner};
 use crate::http::{About, AppState, Connections, HttpSettings, router, worker_router};
 use whereabouts_core::{CalibrationSettings, utc_day};
 use whereabouts_refine::local::{LocalMatcher, LocalSettings};
@@ -30,7 +30,7 @@ use whereabouts_service::{
 };
 use whereabouts_store::{Buckets, JobStore};
 use whereabouts_telemetry::LogIssues;
-use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
+use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings};
 use whereabouts_vision::{LoadedModels, LoadedSettings, WhyModel};
 
 #[cfg(feature = "postgres")]
@@ -184,7 +184,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     let (models, why) = models(config)?;
     let admission = config.image.admission(config.model.layout());
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
-    let pool = CpuPool::new("frames", cores_unless(config.image.threads), admission.permits)?;
+    let pool = CpuPool::new("frames", config.image.decode_threads(), admission.permits)?;
     let job_pace = JobServiceTime::default();
     // Beside the workers, calibration and whoever looks at matches come to it, one at a time each.
     let refining = CpuPool::new("refine", config.jobs.workers.max(1), config.jobs.workers + 2)?;
@@ -322,10 +322,10 @@ fn models(config: &Config) -> anyhow::Result<(LoadedModels, WhyModel)> {
     let (model, why) = assets.resolve(&config.model.name)?;
     let extractor = ExtractorSettings {
         model,
-        preference: config.model.wanted(),
+        preference: config.model.preference(),
         choice_file: None,
         layout: config.model.layout(),
-        limits: ImageLimits { max_pixels: config.image.max_pixels },
+        limits: config.image.limits(),
         exact_decode: config.image.exact,
     };
     let (max_loaded, choice_dir) = (config.model.loaded, config.data.dir.clone());
