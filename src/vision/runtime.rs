@@ -40,9 +40,9 @@ pub enum WhyModel {
 impl fmt::Display for WhyModel {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Named => f.write_str("model.name says so"),
+            Self::Named => f.write_str("set by model.name"),
             Self::Chosen(file) => write!(f, "chosen in {}", file.display()),
-            Self::Preferred => f.write_str("the first DINOv2 that is installed"),
+            Self::Preferred => f.write_str("the first installed DINOv2 model"),
             Self::BuiltIn => f.write_str("built in; no DINOv2 is installed"),
         }
     }
