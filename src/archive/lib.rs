@@ -145,4 +145,6 @@ fn map_name(map: &MapName) -> String {
 }
 
 #[cfg(test)]
+mod round_trip;
+#[cfg(test)]
 mod tests;

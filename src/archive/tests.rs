@@ -7,13 +7,11 @@ use bytes::Bytes;
 use tempfile::TempDir;
 use uuid::Uuid;
 
-mod round_trip;
-
 use super::*;
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{CoordinateFrame, Descriptor, DescriptorKind, Image, Map, Precision, Scene};
 
-fn map(name: &str) -> Map {
+pub(super) fn map(name: &str) -> Map {
     Map {
         uid: Uuid::nil(),
         name: name.parse().unwrap(),
@@ -30,7 +28,7 @@ fn map(name: &str) -> Map {
     }
 }
 
-fn image(id: &str) -> (ExportedImage, Bytes) {
+pub(super) fn image(id: &str) -> (ExportedImage, Bytes) {
     let bytes = Bytes::from(format!("picture of {id}"));
     let image = Image {
         id: id.parse().unwrap(),
@@ -80,7 +78,7 @@ fn write(dir: &TempDir) -> PathBuf {
     path
 }
 
-fn read(path: &Path) -> Result<Vec<Item>, ArchiveError> {
+pub(super) fn read(path: &Path) -> Result<Vec<Item>, ArchiveError> {
     let (mut reader, mut items) = (Reader::open(path)?, Vec::new());
     while let Some(item) = reader.next_item()? {
         items.push(item);

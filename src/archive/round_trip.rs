@@ -1,13 +1,17 @@
 //! Property tests: any archive reads back what was written, however often writing was interrupted.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
+use bytes::Bytes;
 use proptest::collection::{btree_map, vec};
 use proptest::option;
 use proptest::prelude::*;
+use tempfile::TempDir;
 
+use super::tests::{image, map, read};
 use super::*;
-use whereabouts_core::{GeographicPose, Pose};
+use whereabouts_core::{Descriptor, ExportedImage, GeographicPose, Pose};
 
 /// An image of a map, or the reason why it was left out.
 #[derive(Debug, Clone)]
