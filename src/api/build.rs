@@ -18,9 +18,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         .build_transport(false)
         .bytes(".whereabouts.v1")
         .compile_fds(compiler.file_descriptor_set())?;
-    // What reflection tells, without the comments.
-    let mut told = compiler.file_descriptor_set();
-    told.file.iter_mut().for_each(|file| file.source_code_info = None);
+    // Reflection serves the descriptors without the comments of the source.
+    let mut descriptors = compiler.file_descriptor_set();
+    descriptors.file.iter_mut().for_each(|file| file.source_code_info = None);
     let out = PathBuf::from(env::var("OUT_DIR")?).join("whereabouts.v1.bin");
-    Ok(fs::write(out, told.encode_to_vec())?)
+    Ok(fs::write(out, descriptors.encode_to_vec())?)
 }

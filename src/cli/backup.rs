@@ -12,7 +12,9 @@ use serde::{Deserialize, Serialize};
 use super::client::{Client, ServerArg, explained, segment};
 use super::progress::Progress;
 use whereabouts_api::{ExportPage, MapState};
-use whereabouts_archive::{ArchivedMap, Checkpoint, LeftOut, Manifest, Resumed, Writer, growing};
+use whereabouts_archive::{
+    ArchivedMap, Checkpoint, LeftOut, Manifest, Resumed, Writer, partial_path,
+};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, Image, ImageId, Map, MapName};
 
@@ -82,7 +84,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         format!(
             "the backup is not whole; {} keeps what was saved, and the same command goes on from \
              there",
-            growing(&args.file).display()
+            partial_path(&args.file).display()
         )
     })?;
     backup.progress.end();
@@ -121,9 +123,9 @@ async fn states(client: &Client, wanted: &[MapName]) -> anyhow::Result<Vec<MapSt
 }
 
 fn writer(args: &Args, names: &[MapName]) -> anyhow::Result<(Writer, Resumed)> {
-    let partial = growing(&args.file);
+    let partial = partial_path(&args.file);
     if !args.anew
-        && let Some((writer, manifest, resumed)) = Writer::go_on(&args.file, names)?
+        && let Some((writer, manifest, resumed)) = Writer::resume(&args.file, names)?
     {
         let images: usize = resumed.maps.iter().map(|map| map.images).sum();
         eprintln!(
@@ -155,7 +157,7 @@ impl Backup {
         // The last one may have more images than the archive has.
         let last = resumed.maps.pop();
         let begun = last.as_ref().and_then(|last| names.iter().position(|n| *n == last.name));
-        let mut going_on = last.zip(resumed.begins).map(|(last, begins)| Saving {
+        let mut going_on = last.zip(resumed.map_start).map(|(last, begins)| Saving {
             begins,
             map: resumed.map,
             images: last.images,
@@ -164,7 +166,7 @@ impl Backup {
         });
         let (mut maps, mut gone) = (resumed.maps, Vec::new());
         for name in &names[begun.unwrap_or(0)..] {
-            let saving = going_on.take().unwrap_or_else(|| Saving::new(self.writer.mark()));
+            let saving = going_on.take().unwrap_or_else(|| Saving::new(self.writer.checkpoint()));
             match self.map(name, saving).await? {
                 Saved::Whole(map) => maps.push(map),
                 Saved::Gone => {
@@ -182,9 +184,9 @@ impl Backup {
             let cursor = saving.last.as_ref().map(|id| ("cursor", id.to_string()));
             let query: Vec<_> = cursor.into_iter().chain([("limit", PAGE.to_string())]).collect();
             let ask = || Ok(self.client.get(&format!("{}/export", path(name))).query(&query));
-            let answer = self.client.answer_patiently(ask).await?;
+            let answer = self.client.response_with_retries(ask).await?;
             if answer.status() == StatusCode::NOT_FOUND {
-                self.writer.go_back(&saving.begins)?;
+                self.writer.rewind(&saving.begins)?;
                 return Ok(Saved::Gone);
             }
             if !answer.status().is_success() {
@@ -202,7 +204,7 @@ impl Backup {
                         "{name} was reindexed or made anew meanwhile, so it is saved from its \
                          beginning"
                     ));
-                    self.writer.go_back(&saving.begins)?;
+                    self.writer.rewind(&saving.begins)?;
                     saving = Saving::new(saving.begins);
                     beginnings += 1;
                     continue;
@@ -277,7 +279,7 @@ enum Fetched {
 async fn fetch(client: &Client, map: &MapName, image: &Image) -> anyhow::Result<Fetched> {
     let path = format!("{}/images/{}", path(map), segment(image.id.as_str()));
     let content = || Ok(client.get(&format!("{path}/content")));
-    let answer = client.answer_patiently(content).await?;
+    let answer = client.response_with_retries(content).await?;
     let why = match answer.status() {
         StatusCode::NOT_FOUND => return Ok(Fetched::Gone),
         status if status.is_success() => {
@@ -290,7 +292,7 @@ async fn fetch(client: &Client, map: &MapName, image: &Image) -> anyhow::Result<
         StatusCode::INTERNAL_SERVER_ERROR => explained(answer).await.to_string(),
         _ => return Err(explained(answer).await),
     };
-    let now = client.answer_patiently(|| Ok(client.get(&path))).await?;
+    let now = client.response_with_retries(|| Ok(client.get(&path))).await?;
     match now.status().is_success() {
         true if now.json::<Image>().await?.digest == image.digest => Ok(Fetched::Broken(why)),
         _ => Ok(Fetched::Gone),

@@ -1,6 +1,6 @@
 //! Which server a command talks to.
 
-pub use whereabouts_api::{Client, LONGEST_PAUSE, PATIENCE, explained, segment};
+pub use whereabouts_api::{Client, MAX_ATTEMPTS, MAX_PAUSE, explained, segment};
 
 /// Which server a command talks to.
 #[derive(Debug, Clone, clap::Args)]

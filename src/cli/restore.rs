@@ -251,7 +251,7 @@ async fn present(client: &Client, path: &str) -> anyhow::Result<HashMap<ImageId,
         let cursor_of = cursor.iter().map(|cursor| ("cursor", cursor.clone()));
         let query: Vec<_> = cursor_of.chain([("limit", PAGE.to_string())]).collect();
         let ask = || Ok(client.get(&format!("{path}/images")).query(&query));
-        let page: Page = client.send_patiently(ask).await?.json().await?;
+        let page: Page = client.send_with_retries(ask).await?.json().await?;
         present.extend(page.images.into_iter().map(|image| (image.id, image.digest)));
         cursor = page.next_cursor;
         if cursor.is_none() {
@@ -273,7 +273,7 @@ async fn send(
     let media_type = image.image.media_type.as_str();
     let meta = serde_json::to_string(&ImportedImage { map: target.map.clone(), image })?;
     let answer = client
-        .answer_patiently(|| {
+        .response_with_retries(|| {
             let part = Part::stream(bytes.clone()).mime_str(media_type)?;
             let form = Form::new().part("image", part).text("meta", meta.clone());
             Ok(client.post(&format!("{}/import", target.path)).multipart(form))

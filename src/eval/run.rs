@@ -21,7 +21,7 @@ use whereabouts_refine::{
 };
 use whereabouts_service::{Retrieved, Service};
 use whereabouts_store::Step;
-use whereabouts_vision::AdmissionRequest;
+use whereabouts_vision::{AdmissionRequest, FeatureSet};
 
 /// A way to answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -162,9 +162,16 @@ impl Evaluator<'_> {
             return Ok(known.into_iter().flatten().collect());
         }
         let wanted = self.settings.k.max(LEAST_ANSWERS);
+        let refines_locally =
+            self.refiners.iter().any(|refiner| refiner.kind() == RefinerKind::Local);
+        let features = match refines_locally {
+            true => FeatureSet::DescriptorAndDense,
+            false => FeatureSet::DescriptorOnly,
+        };
+        let search = (wanted, self.settings.search);
         let retrieved = self
             .service
-            .retrieve(&map.name, &frame, wanted, self.settings.search, AdmissionRequest::BACKGROUND)
+            .retrieve(&map.name, &frame, search, features, AdmissionRequest::BACKGROUND)
             .await
             .with_context(named)?;
         let coarse = coarse(query, digest, &retrieved, calibration);
@@ -192,7 +199,9 @@ impl Evaluator<'_> {
         let Retrieved { model, mut candidates, extraction, .. } = retrieved;
         candidates.truncate(self.settings.k);
         let key = DenseKey { model, picture: digest };
-        self.service.dense.insert(key, Arc::new(extraction.dense));
+        if let Some(dense) = extraction.dense {
+            self.service.dense.insert(key, Arc::new(dense));
+        }
         RefineInput {
             id: Uuid::now_v7(),
             map: map.clone(),

@@ -1,13 +1,13 @@
-//! Approximate search: an HNSW graph (Malkov and Yashunin, 2018) built by `hnsw_rs`.
+//! The growing graph: HNSW (Malkov and Yashunin, 2018) by `hnsw_rs`.
 
 use hnsw_rs::prelude::{Distance, FilterT, Hnsw};
 
-use super::{Found, IndexSettings};
+use super::{IndexSettings, ScoredSlot};
 use whereabouts_core::dot;
 
 /// One minus the dot product of unit vectors.
 ///
-/// The crate's own `DistDot` panics on a dot product slightly above 1, which rounding produces.
+/// The crate's own `DistDot` panics if rounding makes a dot product exceed 1.
 #[derive(Clone, Copy, Default)]
 struct CosineDistance;
 
@@ -17,11 +17,11 @@ impl Distance<f32> for CosineDistance {
     }
 }
 
-/// A point of a graph.
+/// A point of the graph and its links.
 pub(super) struct Linked {
-    /// Its slot.
+    /// Slot of the point.
     pub slot: usize,
-    /// The slots of its neighbours in each of its layers, the lowest layer first.
+    /// Slots of the point's neighbours in each of its layers, lowest layer first.
     pub layers: Vec<Vec<usize>>,
 }
 
@@ -31,7 +31,7 @@ pub(super) struct Graph {
 
 impl Graph {
     pub fn new(settings: &IndexSettings) -> Self {
-        // The number of elements is a hint for the first allocation, not a bound.
+        // A hint for the initial allocation, not a limit.
         const EXPECTED: usize = 16_384;
         const LAYERS: usize = 16;
         let hnsw =
@@ -43,7 +43,7 @@ impl Graph {
         self.hnsw.insert((vector, slot));
     }
 
-    /// Its points, each with its neighbours.
+    /// All points with their links.
     pub fn linked(&self) -> Vec<Linked> {
         let points = self.hnsw.get_point_indexation();
         let layers = 0..=usize::from(points.get_max_level_observed());
@@ -54,7 +54,7 @@ impl Graph {
                 layers: point
                     .get_neighborhood_id()
                     .iter()
-                    // A point has room for all layers, but is part of those up to its own.
+                    // A point has lists for all layers, but belongs only to those up to its own.
                     .take(usize::from(point.get_point_id().0) + 1)
                     .map(|layer| layer.iter().map(|neighbour| neighbour.d_id).collect())
                     .collect(),
@@ -62,19 +62,22 @@ impl Graph {
             .collect()
     }
 
-    /// The `k` nearest among the slots that `keep` lets through.
+    /// Returns the `k` nearest slots that pass `keep`.
     pub fn search(
         &self,
         query: &[f32],
         k: usize,
         ef: usize,
         keep: &dyn Fn(usize) -> bool,
-    ) -> Vec<Found> {
+    ) -> Vec<ScoredSlot> {
         let filter = |slot: &usize| keep(*slot);
         self.hnsw
             .search_filter(query, k, ef, Some(&filter as &dyn FilterT))
             .into_iter()
-            .map(|neighbour| Found { slot: neighbour.d_id, similarity: 1.0 - neighbour.distance })
+            .map(|neighbour| ScoredSlot {
+                slot: neighbour.d_id,
+                similarity: 1.0 - neighbour.distance,
+            })
             .collect()
     }
 }

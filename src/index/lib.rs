@@ -1,17 +1,17 @@
-//! The index of one map: which stored descriptors are most similar to a query's.
+//! Nearest-neighbour search over the descriptors of one map.
 //!
-//! The index is derived. It reads descriptors from wherever they are stored ([`Vectors`]) by
-//! *slot*, the position in which they were stored, and can be thrown away and made again.
+//! The index is derived data. It reads descriptors from the store ([`Vectors`]) by *slot*, the position at which
+//! they were stored, and can be rebuilt from them at any time.
 //!
-//! Small maps are searched exactly. For larger ones an HNSW graph covers the slots below
-//! [`MapIndex::graphed`], and the rest, which arrived since, is searched exactly: adding an image
-//! never waits for the graph, and a map answers while its graph is still being built. A graph that
-//! has caught up is sealed ([`SealedGraph`]), which makes it smaller and its search faster, and lets
-//! it be written to a file.
+//! Small maps are searched exactly. In larger maps an HNSW graph covers the slots below [`MapIndex::graphed`]; newer
+//! slots are searched exactly. Adding an image therefore never waits for the graph, and a map can be searched while
+//! its graph is being built. A graph that has caught up is sealed ([`SealedGraph`]): a sealed graph is smaller,
+//! faster to search, and can be written to a file.
 
 mod exact;
 mod graph;
 mod sealed;
+mod settings;
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -20,75 +20,62 @@ use parking_lot::{Mutex, MutexGuard, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use rayon::ThreadPool;
 use rayon::prelude::*;
 
-use self::exact::Best;
+use self::exact::TopK;
 use self::graph::Graph;
 pub use self::sealed::{DamagedGraph, SealedGraph};
+pub use self::settings::IndexSettings;
 use whereabouts_core::dot;
 
 /// Stored descriptors, by slot.
 pub trait Vectors: Send + Sync {
-    /// Numbers in each descriptor.
+    /// Dimension of the descriptors.
     fn dim(&self) -> usize;
-    /// Calls `visit` with each slot of the range that is stored, in order.
+    /// Calls `visit` with every stored slot in the range and its descriptor, in order.
     fn scan(&self, slots: Range<usize>, visit: &mut dyn FnMut(usize, &[f32]));
 }
 
-/// How a map is indexed.
-#[derive(Debug, Clone, Copy)]
-pub struct IndexSettings {
-    /// Maps with at most this many images are searched exactly, without a graph.
-    pub exact_up_to: usize,
-    /// Neighbours of a point in the graph (M).
-    pub m: usize,
-    /// Points looked at when inserting (efConstruction).
-    pub ef_construction: usize,
-    /// Points looked at when searching (ef); raised to k where that is larger.
-    pub ef_search: usize,
-    /// A sealed graph is built again once this share of its points, 0 to 1, has been removed.
-    pub max_dead_share: f32,
-}
-
-/// A stored descriptor and its similarity to the query.
+/// A search result: a stored descriptor and its similarity to the query.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Found {
-    /// Where the descriptor is stored.
+pub struct ScoredSlot {
+    /// Slot of the descriptor.
     pub slot: usize,
     /// Cosine similarity, −1 to 1.
     pub similarity: f32,
 }
 
-/// How to search.
+/// The search method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SearchMode {
-    /// The graph where there is one.
+    /// Approximate search by graph, where there is one.
     Fast,
-    /// Every descriptor: the reference.
+    /// Exact search over every descriptor; the reference.
     Exact,
 }
 
 /// The index of one map.
 ///
-/// Slots below [`SealedGraph::end`] are in the sealed graph, those from there to
-/// [`MapIndex::graphed`] in the growing one, and the rest in none.
+/// Slots below [`SealedGraph::end`] are in the sealed graph, slots from there to [`MapIndex::graphed`] are in the
+/// growing graph, and the rest are in none.
 pub struct MapIndex {
     settings: IndexSettings,
-    /// Whether the image in each slot is still part of the map.
-    live: RwLock<Live>,
+    /// Which slots hold an image that is part of the map.
+    live: RwLock<LiveSlots>,
     graphs: RwLock<Graphs>,
-    /// A graph over everything, on its way to replace those there are. Only the indexer touches it.
+    /// A graph over all slots that will replace both graphs. Used by the indexer only.
     merging: Mutex<Option<Merging>>,
 }
 
 #[derive(Default)]
-struct Live {
+struct LiveSlots {
     slots: Vec<bool>,
     count: usize,
-    /// Where the sealed graph ends, and how many of the slots below are live.
+    /// End of the sealed graph.
     sealed_end: usize,
+    /// Live slots in the sealed graph.
     sealed_count: usize,
 }
 
-impl Live {
+impl LiveSlots {
     fn set(&mut self, slot: usize, live: bool) {
         if self.slots.len() <= slot {
             self.slots.resize(slot + 1, false);
@@ -113,27 +100,27 @@ impl Live {
 struct Graphs {
     sealed: Option<Arc<SealedGraph>>,
     growing: Option<Arc<Graph>>,
-    /// Slots below this one are in one of the two, unless they were removed before they got there.
+    /// Slots below this one are in one of the graphs, unless they were removed before being inserted.
     graphed: usize,
 }
 
 struct Merging {
     graph: Graph,
-    /// Slots below this one are in it.
+    /// Slots below this one have been inserted.
     done: usize,
-    /// Slots below this one will be.
+    /// Slots below this one are to be inserted.
     end: usize,
 }
 
 impl Graphs {
-    /// Where the growing graph begins.
+    /// Start of the growing graph.
     fn sealed_end(&self) -> usize {
         self.sealed.as_ref().map_or(0, |sealed| sealed.end())
     }
 }
 
 impl MapIndex {
-    /// An empty index.
+    /// Creates an empty index.
     pub fn new(settings: IndexSettings) -> Self {
         Self {
             settings,
@@ -143,49 +130,49 @@ impl MapIndex {
         }
     }
 
-    /// Searches with a graph that was sealed by an earlier process.
+    /// Restores a graph that was sealed by an earlier process.
     pub fn restore(&self, sealed: SealedGraph) {
         self.replace_graphs(Arc::new(sealed));
     }
 
-    /// Makes the image in `slot` part of every later answer.
+    /// Includes the image in `slot` in later searches.
     pub fn add(&self, slot: usize) {
         self.live_mut().set(slot, true);
     }
 
-    /// Keeps the image in `slot` out of every later answer.
+    /// Excludes the image in `slot` from later searches.
     pub fn remove(&self, slot: usize) {
         self.live_mut().set(slot, false);
     }
 
-    /// How many images are part of the map.
+    /// Number of images in the map.
     pub fn len(&self) -> usize {
         self.live().count
     }
 
-    /// Whether no image is part of the map.
+    /// Whether the map has no images.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Slots below this one are in a graph, unless they were removed before they got there.
+    /// Slots below this one are in a graph, unless they were removed before being inserted.
     pub fn graphed(&self) -> usize {
         self.graphs().graphed
     }
 
-    /// Bytes of the sealed graph, in memory as on disk. The growing one is not counted.
+    /// Size of the sealed graph in bytes, in memory and on disk. The growing graph is not included.
     pub fn sealed_bytes(&self) -> usize {
         self.graphs().sealed.as_ref().map_or(0, |sealed| sealed.bytes())
     }
 
-    /// The `k` most similar images, best first; equal similarities keep the order of the slots.
+    /// Returns the `k` most similar images, best first. Ties are ordered by slot.
     pub fn search(
         &self,
         vectors: &dyn Vectors,
         query: &[f32],
         k: usize,
         mode: SearchMode,
-    ) -> Vec<Found> {
+    ) -> Vec<ScoredSlot> {
         let live = self.live();
         let is_live = |slot: usize| live.slots.get(slot).copied().unwrap_or(false);
         let graphs = match mode {
@@ -193,44 +180,45 @@ impl MapIndex {
             SearchMode::Exact => Graphs::default(),
         };
         let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
-        let mut best = Best::new(k);
-        let mut found_in = |slots: Range<usize>, found: Vec<Found>| {
-            // Among many removed images a graph can lose its way to the rest.
+        let mut best = TopK::new(k);
+        let mut merge = |slots: Range<usize>, found: Vec<ScoredSlot>| {
+            // If many images have been removed, a graph search can return too few of the remaining ones.
             let end = slots.end.min(live.slots.len());
-            let all = live.slots[slots.start.min(end)..end].iter().filter(|live| **live).take(k);
-            if found.len() >= all.count() {
+            let expected =
+                live.slots[slots.start.min(end)..end].iter().filter(|live| **live).take(k);
+            if found.len() >= expected.count() {
                 found.into_iter().for_each(|found| best.offer(found));
             } else {
-                exactly(vectors, query, slots, &is_live, &mut best);
+                search_exactly(vectors, query, slots, &is_live, &mut best);
             }
         };
         let ef = self.settings.ef_search.max(k);
         if let Some(sealed) = &graphs.sealed {
-            found_in(0..sealed_end, sealed.search(vectors, query, (k, ef), is_live));
+            merge(0..sealed_end, sealed.search(vectors, query, (k, ef), is_live));
         }
         if let Some(growing) = &graphs.growing {
-            // It may hold more than `graphed` says by now.
+            // Slots may have been inserted since `graphed` was read.
             let kept = |slot: usize| slot < graphed && is_live(slot);
-            found_in(sealed_end..graphed, growing.search(query, k, ef, &kept));
+            merge(sealed_end..graphed, growing.search(query, k, ef, &kept));
         }
-        exactly(vectors, query, graphed..live.slots.len(), &is_live, &mut best);
+        search_exactly(vectors, query, graphed..live.slots.len(), &is_live, &mut best);
         best.into_sorted()
     }
 
-    /// Whether slots wait to be put into a graph.
+    /// Whether there are slots to be inserted into a graph.
     pub fn is_behind(&self) -> bool {
         let graphed = self.graphed();
         let live = self.live();
         live.count > self.settings.exact_up_to && graphed < live.slots.len()
     }
 
-    /// Whether [`MapIndex::catch_up`] has anything to do.
+    /// Whether [`MapIndex::catch_up`] has work to do.
     pub fn has_work(&self) -> bool {
         self.is_behind() || self.merging().is_some() || self.wants_sealing()
     }
 
-    /// Whether the growing graph has become as large as the sealed one, or too many points of the
-    /// sealed one are dead: a search walks over them in vain.
+    /// Whether the growing graph is as large as the sealed one, or too many points of the sealed graph have
+    /// been removed, which slows searches down.
     fn wants_sealing(&self) -> bool {
         let graphs = self.graphs();
         let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
@@ -240,21 +228,21 @@ impl MapIndex {
         has_grown || dead as f32 > self.settings.max_dead_share * points as f32
     }
 
-    /// Does a piece of the work that waits, over at most `most` slots; returns the graph that was
-    /// sealed by it, if one was. Call from one thread at a time; searches go on meanwhile.
+    /// Does one step of the pending work, inserting at most `max_slots` slots on `threads`. Returns the new
+    /// sealed graph if the step sealed one. Must be called by one thread at a time; searches run concurrently.
     ///
-    /// New slots go into the growing graph. When none waits and that graph has become as large as
-    /// the sealed one, the two are made one, which is then sealed: each slot is put into a graph
-    /// twice on average, whatever the size of the map. `threads` share the work on the graph.
+    /// New slots are inserted into the growing graph. Once it has caught up and is as large as the sealed
+    /// graph, both are merged into a new sealed graph. Each slot is inserted twice on average, regardless of
+    /// the size of the map.
     pub fn catch_up(
         &self,
         vectors: &dyn Vectors,
-        most: usize,
+        max_slots: usize,
         threads: &ThreadPool,
     ) -> Option<Arc<SealedGraph>> {
         let mut merging = self.merging();
         if let Some(merge) = merging.as_mut() {
-            let end = merge.end.min(merge.done + most);
+            let end = merge.end.min(merge.done + max_slots);
             self.insert(&merge.graph, vectors, merge.done..end, threads);
             merge.done = end;
             if merge.done < merge.end {
@@ -266,7 +254,7 @@ impl MapIndex {
         if self.is_behind() {
             let graphs = self.graphs().clone();
             let growing = graphs.growing.unwrap_or_else(|| Arc::new(Graph::new(&self.settings)));
-            let end = self.live().slots.len().min(graphs.graphed + most);
+            let end = self.live().slots.len().min(graphs.graphed + max_slots);
             self.insert(&growing, vectors, graphs.graphed..end, threads);
             let mut graphs = self.graphs_mut();
             graphs.growing = Some(growing);
@@ -307,7 +295,7 @@ impl MapIndex {
         threads.install(|| rows.par_iter().for_each(|(slot, vector)| graph.insert(*slot, vector)));
     }
 
-    /// Replaces the graphs there are by a finished one.
+    /// Replaces both graphs by a finished one.
     fn seal(&self, graph: &Graph, end: usize, vectors: &dyn Vectors) -> Arc<SealedGraph> {
         let sealed = Arc::new(SealedGraph::new(&graph.linked(), end, vectors, &self.settings));
         self.replace_graphs(Arc::clone(&sealed));
@@ -320,11 +308,11 @@ impl MapIndex {
         self.live_mut().seal(graphed);
     }
 
-    fn live_mut(&self) -> RwLockWriteGuard<'_, Live> {
+    fn live_mut(&self) -> RwLockWriteGuard<'_, LiveSlots> {
         self.live.write()
     }
 
-    fn live(&self) -> RwLockReadGuard<'_, Live> {
+    fn live(&self) -> RwLockReadGuard<'_, LiveSlots> {
         self.live.read()
     }
 
@@ -341,17 +329,17 @@ impl MapIndex {
     }
 }
 
-/// Offers every live slot of a range.
-fn exactly(
+/// Scores every live slot of the range.
+fn search_exactly(
     vectors: &dyn Vectors,
     query: &[f32],
     slots: Range<usize>,
     is_live: &dyn Fn(usize) -> bool,
-    best: &mut Best,
+    best: &mut TopK,
 ) {
     vectors.scan(slots, &mut |slot, vector| {
         if is_live(slot) {
-            best.offer(Found { slot, similarity: dot(query, vector) });
+            best.offer(ScoredSlot { slot, similarity: dot(query, vector) });
         }
     });
 }

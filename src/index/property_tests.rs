@@ -47,6 +47,8 @@ const SETTINGS: IndexSettings = IndexSettings {
     // At least as many as there are slots, so that the graph has no excuse for missing one.
     ef_search: MAX_SLOTS,
     max_dead_share: 0.3,
+    threads: 0,
+    check_s: 0,
 };
 
 fn steps() -> impl Strategy<Value = Vec<Step>> {

@@ -1,85 +1,85 @@
-//! A graph that is finished: `hnsw_rs` builds it, and this searches it.
+//! A sealed graph: built by `hnsw_rs`, converted to a read-only layout, and searched here.
 //!
-//! While a graph grows, each of its points holds counted references to its neighbours, and a search
-//! keeps a hash map of the points it has seen. Once it is finished that freedom is not needed:
-//! neighbours become rows of a flat array, the points seen a bitmap, and descriptors 8-bit codes
-//! beside one another, a quarter of the bytes that a comparison has to fetch. The best are scored
-//! again with the stored descriptors, so that what is returned is exact.
+//! In a growing graph, each point holds reference-counted links to its neighbours, and a search keeps a hash map of
+//! visited points. A read-only graph can do with less: neighbours are rows of a flat array, visited points are a
+//! bitmap, and descriptors are contiguous 8-bit codes, a quarter of the memory traffic per comparison. The best
+//! candidates are scored again with the stored descriptors, so the returned similarities are exact.
 //!
-//! The algorithm is that of Malkov and Yashunin (2018): descend greedily through the upper layers,
-//! then search the lowest one with a queue of the `ef` best.
+//! The search is that of Malkov and Yashunin (2018): descend greedily through the upper layers, then run a beam
+//! search of width `ef` in the lowest one.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use multiversion::multiversion;
 
-use super::exact::Best;
+use super::exact::TopK;
 use super::graph::Linked;
-use super::{Found, IndexSettings, Vectors};
+use super::{IndexSettings, ScoredSlot, Vectors};
 use whereabouts_core::dot;
 
-/// Fills rows of neighbours that are shorter than the longest.
+/// Padding of neighbour rows.
 const NONE: u32 = u32::MAX;
 
-/// What a file begins with; the last byte is its version.
+/// Magic bytes of a graph file; the last byte is the version.
 const MAGIC: [u8; 8] = *b"WBGRAPH1";
-/// Magic and the checksum of the rest.
+/// Size of the magic bytes and the checksum.
 const HEADER_BYTES: usize = 8 + 4;
 
-/// A finished graph over the slots below [`SealedGraph::end`].
+/// A read-only graph over the slots below [`SealedGraph::end`].
 #[derive(Debug, PartialEq)]
 pub struct SealedGraph {
-    /// How it was built: M and efConstruction.
+    /// M and ef_construction with which the graph was built.
     built: (usize, usize),
-    /// Slots from here on are not in it.
+    /// Slots from here on are not in the graph.
     end: usize,
     dim: usize,
-    /// Point → slot.
+    /// Slot of each point.
     slots: Vec<u32>,
-    /// The neighbours of each point in the lowest layer, in rows of `degree`.
+    /// Neighbours of each point in the lowest layer, in rows of `degree`, padded with [`NONE`].
     lowest: Vec<u32>,
     degree: usize,
-    /// The layers above it, the highest first.
+    /// The upper layers, highest first.
     upper: Vec<Layer>,
-    /// Point → `dim` codes.
+    /// 8-bit codes of each point's descriptor, `dim` per point.
     codes: Vec<i8>,
-    /// Point → what one step of its codes is worth.
+    /// Quantisation step of each point's codes.
     scales: Vec<f32>,
 }
 
-/// A layer of few points.
+/// An upper layer, which contains few of the points.
 #[derive(Debug, Default, PartialEq)]
 struct Layer {
-    /// Its points, in order.
+    /// Points of the layer, sorted.
     points: Vec<u32>,
-    /// Where the neighbours of each begin in `neighbours`, and the end.
+    /// Start of each point's neighbours in `neighbours`, followed by the end of the last.
     starts: Vec<u32>,
     neighbours: Vec<u32>,
 }
 
 impl Layer {
-    fn of(&self, point: u32) -> &[u32] {
-        let Ok(place) = self.points.binary_search(&point) else { return &[] };
-        &self.neighbours[self.starts[place] as usize..self.starts[place + 1] as usize]
+    fn neighbours_of(&self, point: u32) -> &[u32] {
+        let Ok(index) = self.points.binary_search(&point) else { return &[] };
+        &self.neighbours[self.starts[index] as usize..self.starts[index + 1] as usize]
     }
 }
 
-/// A file that holds no graph of this kind.
+/// The file is not a valid graph.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
-#[error("the graph's file is damaged or of another version")]
+#[error("the graph file is damaged or of another version")]
 pub struct DamagedGraph;
 
-/// A descriptor in 8-bit codes.
-struct Coded<'a> {
+/// A descriptor quantised to 8-bit codes.
+struct Quantised<'a> {
     codes: &'a [i8],
     scale: f32,
 }
 
-fn code(vector: &[f32], into: &mut Vec<i8>) -> f32 {
-    let largest = vector.iter().fold(f32::MIN_POSITIVE, |most, x| most.max(x.abs()));
+/// Appends the 8-bit codes of a vector to `into` and returns their quantisation step.
+fn quantise(vector: &[f32], into: &mut Vec<i8>) -> f32 {
+    let largest = vector.iter().fold(f32::MIN_POSITIVE, |max, x| max.max(x.abs()));
     let scale = largest / 127.0;
-    // Rounded away from zero at halves; the cast keeps within −127..=127.
+    // `round` rounds half away from zero; the codes are within −127..=127.
     into.extend(vector.iter().map(|x| (x / scale).round() as i8));
     scale
 }
@@ -89,14 +89,14 @@ fn coded_dot(a: &[i8], b: &[i8]) -> i32 {
     let length = a.len().min(b.len());
     let (a, b) = (&a[..length], &b[..length]);
     let mut sum = 0;
-    // Indices, because adapters of iterators are not always compiled into their caller.
+    // Indices, because iterator adapters are not always inlined into a multiversioned function.
     for index in 0..length {
         sum += i32::from(a[index]) * i32::from(b[index]);
     }
     sum
 }
 
-/// Similarity and point in one number that sorts by similarity.
+/// Packs a similarity and a point into an integer that sorts by similarity.
 fn ranked(similarity: f32, point: u32) -> u64 {
     let bits = similarity.to_bits();
     let ordered = if bits >> 31 == 0 { bits | 1 << 31 } else { !bits };
@@ -108,8 +108,8 @@ fn point_of(ranked: u64) -> u32 {
 }
 
 impl SealedGraph {
-    /// Takes a grown graph apart. `linked` are its points with their neighbours, `vectors` their
-    /// descriptors; it covers the slots below `end`.
+    /// Converts a grown graph that covers the slots below `end`. `linked` are its points with their links, and
+    /// `vectors` their descriptors.
     pub(super) fn new(
         linked: &[Linked],
         end: usize,
@@ -129,7 +129,7 @@ impl SealedGraph {
         let mut lowest = vec![NONE; linked.len() * degree];
         for (row, linked) in lowest.chunks_exact_mut(degree).zip(linked) {
             let neighbours = linked.layers.first().map_or(Vec::new(), |slots| points(slots));
-            row.iter_mut().zip(neighbours).for_each(|(place, neighbour)| *place = neighbour);
+            row.iter_mut().zip(neighbours).for_each(|(entry, neighbour)| *entry = neighbour);
         }
         let highest = linked.iter().map(|linked| linked.layers.len()).max().unwrap_or(0);
         let layer = |level: usize| {
@@ -150,10 +150,10 @@ impl SealedGraph {
         let mut scales = Vec::with_capacity(linked.len());
         for (point, linked) in linked.iter().enumerate() {
             vectors.scan(linked.slot..linked.slot + 1, &mut |_, vector| {
-                scales.push(code(vector, &mut codes));
+                scales.push(quantise(vector, &mut codes));
             });
             if scales.len() == point {
-                // Its row has gone. It is not part of the map then, but a way to its neighbours.
+                // The descriptor has been removed. The point stays, because it links its neighbours.
                 scales.push(0.0);
                 codes.resize(codes.len() + dim, 0);
             }
@@ -168,8 +168,8 @@ impl SealedGraph {
         self.end
     }
 
-    /// Whether it was built as these settings say.
-    pub fn fits(&self, settings: &IndexSettings) -> bool {
+    /// Whether the graph was built with these settings.
+    pub fn is_built_with(&self, settings: &IndexSettings) -> bool {
         self.built == (settings.m, settings.ef_construction)
     }
 
@@ -178,7 +178,7 @@ impl SealedGraph {
         self.dim
     }
 
-    /// Bytes of its arrays.
+    /// Size of the arrays in bytes.
     pub fn bytes(&self) -> usize {
         let of_layer = |layer: &Layer| {
             size_of_val(&layer.points[..])
@@ -192,56 +192,57 @@ impl SealedGraph {
             + size_of_val(&self.scales[..])
     }
 
-    /// Points in the graph.
+    /// Number of points.
     pub fn len(&self) -> usize {
         self.slots.len()
     }
 
-    /// Whether there is no point in the graph.
+    /// Whether the graph has no points.
     pub fn is_empty(&self) -> bool {
         self.slots.is_empty()
     }
 
-    /// The `k` nearest that `keep` lets through, scored with the stored descriptors.
+    /// Returns the `k` nearest slots that pass `keep`, scored with the stored descriptors.
     pub(super) fn search(
         &self,
         vectors: &dyn Vectors,
         query: &[f32],
         (k, ef): (usize, usize),
         keep: impl Fn(usize) -> bool,
-    ) -> Vec<Found> {
+    ) -> Vec<ScoredSlot> {
         if self.is_empty() || query.len() != self.dim {
             return Vec::new();
         }
         let mut codes = Vec::with_capacity(self.dim);
-        let scale = code(query, &mut codes);
-        let near = self.beam(&Coded { codes: &codes, scale }, ef, keep);
-        // Codes are right to about a hundredth: a few more than k hold the k best.
-        let mut best = Best::new(k);
+        let scale = quantise(query, &mut codes);
+        let near = self.beam_search(&Quantised { codes: &codes, scale }, ef, keep);
+        // Quantised similarities are accurate to about 0.01, so slightly more than k candidates contain the k
+        // best.
+        let mut best = TopK::new(k);
         for ranked in near.into_iter().rev().take(2 * k + 16) {
             let slot = self.slots[point_of(ranked) as usize] as usize;
             vectors.scan(slot..slot + 1, &mut |slot, vector| {
-                best.offer(Found { slot, similarity: dot(query, vector) });
+                best.offer(ScoredSlot { slot, similarity: dot(query, vector) });
             });
         }
         best.into_sorted()
     }
 
-    fn similarity(&self, query: &Coded<'_>, point: u32) -> f32 {
+    fn similarity(&self, query: &Quantised<'_>, point: u32) -> f32 {
         let point = point as usize;
         let codes = &self.codes[point * self.dim..(point + 1) * self.dim];
         coded_dot(query.codes, codes) as f32 * (query.scale * self.scales[point])
     }
 
-    /// Where the search of the lowest layer begins: the best that the upper layers lead to.
-    fn descend(&self, query: &Coded<'_>) -> u64 {
+    /// Descends greedily through the upper layers to the entry point of the lowest one.
+    fn descend(&self, query: &Quantised<'_>) -> u64 {
         let entry = self.upper.first().and_then(|layer| layer.points.first()).copied();
         let entry = entry.unwrap_or(0);
         let mut best = ranked(self.similarity(query, entry), entry);
         for layer in &self.upper {
             loop {
                 let nearer = layer
-                    .of(point_of(best))
+                    .neighbours_of(point_of(best))
                     .iter()
                     .map(|&point| ranked(self.similarity(query, point), point))
                     .max()
@@ -255,18 +256,23 @@ impl SealedGraph {
         best
     }
 
-    /// The `ef` nearest of the lowest layer that `keep` lets through, the farthest first.
-    fn beam(&self, query: &Coded<'_>, ef: usize, keep: impl Fn(usize) -> bool) -> Vec<u64> {
-        let mut seen = vec![0_u64; self.len().div_ceil(64)];
-        let mut see = |point: u32| {
-            let (word, bit) = (&mut seen[point as usize / 64], 1 << (point % 64));
+    /// Returns the `ef` nearest points of the lowest layer that pass `keep`, farthest first.
+    fn beam_search(
+        &self,
+        query: &Quantised<'_>,
+        ef: usize,
+        keep: impl Fn(usize) -> bool,
+    ) -> Vec<u64> {
+        let mut visited = vec![0_u64; self.len().div_ceil(64)];
+        let mut visit = |point: u32| {
+            let (word, bit) = (&mut visited[point as usize / 64], 1 << (point % 64));
             let new = *word & bit == 0;
             *word |= bit;
             new
         };
         let kept = |point: u32| keep(self.slots[point as usize] as usize);
         let entry = self.descend(query);
-        see(point_of(entry));
+        visit(point_of(entry));
         let mut open = BinaryHeap::from([entry]);
         let mut best: BinaryHeap<Reverse<u64>> = BinaryHeap::with_capacity(ef + 1);
         if kept(point_of(entry)) {
@@ -280,9 +286,11 @@ impl SealedGraph {
             }
             let row = point_of(nearest) as usize * self.degree;
             fresh.clear();
-            // Found first and compared afterwards, so that the fetches of codes overlap.
+            // Collect unvisited neighbours first, so that the memory accesses of the comparisons overlap.
             let neighbours = &self.lowest[row..row + self.degree];
-            fresh.extend(neighbours.iter().copied().take_while(|p| *p != NONE).filter(|p| see(*p)));
+            fresh.extend(
+                neighbours.iter().copied().take_while(|p| *p != NONE).filter(|p| visit(*p)),
+            );
             for &point in &fresh {
                 let candidate = ranked(self.similarity(query, point), point);
                 let worst = best.peek().filter(|_| best.len() >= ef).map_or(0, |worst| worst.0);
@@ -300,7 +308,7 @@ impl SealedGraph {
         best.into_sorted_vec().into_iter().rev().map(|Reverse(ranked)| ranked).collect()
     }
 
-    /// The graph as a file holds it: a header with a checksum, then the arrays, little-endian.
+    /// Serializes the graph: a header with a checksum, then the arrays in little-endian order.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut rest = Vec::with_capacity(self.codes.len() + 4 * (self.lowest.len() + 4));
         let (m, ef_construction) = self.built;
@@ -324,14 +332,14 @@ impl SealedGraph {
         bytes
     }
 
-    /// Reads what [`SealedGraph::to_bytes`] wrote.
+    /// Deserializes the output of [`SealedGraph::to_bytes`].
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, DamagedGraph> {
         let rest = bytes.strip_prefix(&MAGIC).ok_or(DamagedGraph)?;
         let (checksum, rest) = rest.split_first_chunk::<4>().ok_or(DamagedGraph)?;
         if crc32fast::hash(rest) != u32::from_le_bytes(*checksum) {
             return Err(DamagedGraph);
         }
-        // What follows is what was written: the checksum says so.
+        // The checksum guarantees that the rest is what `to_bytes` wrote.
         let mut reader = Reader(rest);
         let [m, ef_construction, end, dim, len, degree, layers, codes] = reader.counts()?;
         let slots = reader.numbers(len)?;
@@ -381,31 +389,4 @@ impl<'a> Reader<'a> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_sorts_later_is_more_similar() {
-        let similarities = [-1.0, -0.5, -0.0, 0.0, 1e-9, 0.5, 1.0];
-        let ranks: Vec<u64> = similarities.iter().map(|&s| ranked(s, 7)).collect();
-        assert!(ranks.is_sorted());
-        assert_eq!(point_of(ranked(-0.3, 12)), 12);
-    }
-
-    #[test]
-    fn codes_keep_a_similarity_to_about_a_hundredth() {
-        let wave = |phase: f32| -> Vec<f32> {
-            let wave: Vec<f32> = (0..384).map(|i| (i as f32 * 0.7 + phase).sin()).collect();
-            let norm = wave.iter().map(|x| x * x).sum::<f32>().sqrt();
-            wave.iter().map(|x| x / norm).collect()
-        };
-        let a = wave(0.0);
-        for phase in [0.0, 0.3, 1.5, 3.0] {
-            let b = wave(phase);
-            let (mut ca, mut cb) = (Vec::new(), Vec::new());
-            let (sa, sb) = (code(&a, &mut ca), code(&b, &mut cb));
-            let coded = coded_dot(&ca, &cb) as f32 * sa * sb;
-            assert!((coded - dot(&a, &b)).abs() < 0.01);
-        }
-    }
-}
+mod tests;

@@ -1,4 +1,4 @@
-//! Indexes of vectors in memory.
+//! Search, sealing and removal on vectors in memory.
 
 use super::*;
 
@@ -16,19 +16,21 @@ impl Vectors for Rows {
     }
 }
 
-const SETTINGS: IndexSettings = IndexSettings {
+pub(super) const SETTINGS: IndexSettings = IndexSettings {
     exact_up_to: 100,
     m: 16,
     ef_construction: 100,
     ef_search: 64,
+    threads: 1,
     max_dead_share: 0.3,
+    check_s: 0,
 };
 
 fn threads() -> ThreadPool {
     rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap()
 }
 
-/// Unit vectors around a few dozen centres, as the descriptors of one building are.
+/// Unit vectors clustered around a few dozen centres, like the descriptors of one building.
 fn clustered(count: usize, dim: usize) -> Rows {
     let mut state = 1_u64;
     let mut random = move || {
@@ -73,7 +75,7 @@ fn the_graph_finds_what_exact_search_finds() {
 }
 
 #[test]
-fn a_sealed_graph_survives_a_file_and_notices_damage() {
+fn a_sealed_graph_round_trips_and_detects_damage() {
     let rows = clustered(400, 20);
     let index = filled(&rows);
     let mut sealed = None;
@@ -81,12 +83,12 @@ fn a_sealed_graph_survives_a_file_and_notices_damage() {
         sealed = index.catch_up(&rows, 100, &threads()).or(sealed);
     }
     let mut bytes = sealed.unwrap().to_bytes();
-    let again = filled(&rows);
-    again.restore(SealedGraph::from_bytes(&bytes).unwrap());
-    assert_eq!((again.graphed(), again.has_work()), (400, false));
+    let restored = filled(&rows);
+    restored.restore(SealedGraph::from_bytes(&bytes).unwrap());
+    assert_eq!((restored.graphed(), restored.has_work()), (400, false));
     for query in rows.0.iter().step_by(37) {
         let search = |index: &MapIndex| index.search(&rows, query, 5, SearchMode::Fast);
-        assert_eq!(search(&again), search(&index));
+        assert_eq!(search(&restored), search(&index));
     }
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
@@ -97,13 +99,13 @@ fn a_sealed_graph_survives_a_file_and_notices_damage() {
 }
 
 #[test]
-fn graphs_are_made_one_as_a_map_grows_and_every_image_is_found_meanwhile() {
+fn graphs_are_merged_as_a_map_grows_and_every_image_is_found_meanwhile() {
     let rows = clustered(1000, 24);
     let index = MapIndex::new(SETTINGS);
     let mut seals = Vec::new();
     for slot in 0..1000 {
         index.add(slot);
-        // Images come in bursts; between them there is time to seal what has grown.
+        // Images arrive in bursts, between which the indexer catches up.
         while slot % 100 == 70 && index.has_work() {
             seals.extend(index.catch_up(&rows, 16, &threads()).map(|sealed| sealed.end()));
         }
@@ -124,7 +126,7 @@ fn graphs_are_made_one_as_a_map_grows_and_every_image_is_found_meanwhile() {
 }
 
 #[test]
-fn an_image_is_found_before_the_graph_has_it() {
+fn an_image_is_found_before_it_is_in_the_graph() {
     let rows = clustered(300, 16);
     let index = filled(&rows);
     index.catch_up(&rows, 250, &threads());
@@ -153,22 +155,22 @@ fn a_removed_image_is_never_found() {
 }
 
 #[test]
-fn a_graph_with_too_many_dead_points_is_built_again_without_them() {
+fn a_graph_with_too_many_removed_points_is_rebuilt_without_them() {
     let rows = clustered(400, 16);
     let index = filled(&rows);
     let threads = threads();
-    let settle = || {
+    let catch_up = || {
         let mut sealed = None;
         while index.has_work() {
             sealed = index.catch_up(&rows, 64, &threads).or(sealed);
         }
         sealed.map(|sealed| sealed.len())
     };
-    assert_eq!(settle(), Some(400));
+    assert_eq!(catch_up(), Some(400));
     (0..100).for_each(|slot| index.remove(slot));
-    assert_eq!(settle(), None);
+    assert_eq!(catch_up(), None);
     (100..125).for_each(|slot| index.remove(slot));
-    assert_eq!(settle(), Some(275));
+    assert_eq!(catch_up(), Some(275));
     let found = index.search(&rows, &rows.0[200], 1, SearchMode::Fast);
     assert_eq!(found[0].slot, 200);
 }
@@ -183,7 +185,7 @@ fn a_small_map_never_builds_a_graph() {
 }
 
 #[test]
-fn an_empty_map_finds_nothing() {
+fn an_empty_map_returns_nothing() {
     let index = MapIndex::new(SETTINGS);
     assert!(index.search(&clustered(1, 8), &[0.0; 8], 10, SearchMode::Fast).is_empty());
 }

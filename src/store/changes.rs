@@ -5,8 +5,8 @@ use uuid::Uuid;
 
 use super::{IdempotencyRecord, JobRecord, Progress, Release, Step, StoreError, StoredDelivery};
 use whereabouts_core::{
-    Attempt, Delivery, DeliveryState, Descriptor, Image, Job, JobState, Map, Message, Priority,
-    StoredWebhook, Then, Usage, WebhookEvent,
+    Attempt, Delivery, DeliveryState, Descriptor, Disposition, Image, Job, JobState, Map, Message,
+    Priority, StoredWebhook, Usage, WebhookEvent,
 };
 
 impl JobRecord {
@@ -112,7 +112,7 @@ pub(super) fn deliveries_for(
     let message = Message { event, timestamp, data: job };
     let body =
         serde_json::to_vec(&message).map_err(|error| StoreError::Failed(error.to_string()))?;
-    let subscribed = webhooks.into_iter().filter(|stored| stored.webhook.wants(event, job));
+    let subscribed = webhooks.into_iter().filter(|stored| stored.webhook.subscribes_to(event, job));
     let delivery = |stored: StoredWebhook| StoredDelivery {
         delivery: Delivery::queued(stored.webhook.id, event, Some(job.id), now),
         body: body.clone(),
@@ -129,7 +129,7 @@ pub(super) fn changed_map(
     if stored.revision != requested.revision {
         return Err(StoreError::Superseded(stored.name));
     }
-    let same = stored.is_like(&requested) && stored.frame == requested.frame;
+    let same = stored.is_compatible_with(&requested) && stored.frame == requested.frame;
     if !same && has_images() {
         return Err(StoreError::Conflict(format!(
             "the map {} has images, so its model ({} at {} precision), descriptor ({}) and frame ({}) \
@@ -229,8 +229,9 @@ pub(super) fn disable(stored: &mut StoredWebhook, at: Timestamp, why: &str) -> b
 /// Returns a delivery as it is after an attempt; `None` if it was no longer waiting.
 pub(super) fn attempted(delivery: Delivery, attempt: Attempt) -> Option<Delivery> {
     // A success counts even if the delivery was given up while the attempt ran.
-    let counts = delivery.state == DeliveryState::Waiting || attempt.then == Then::Delivered;
-    counts.then(|| delivery.after(attempt))
+    let counts =
+        delivery.state == DeliveryState::Waiting || attempt.disposition == Disposition::Delivered;
+    counts.then(|| delivery.with_attempt(attempt))
 }
 
 pub(super) fn too_many_webhooks(max: usize) -> StoreError {

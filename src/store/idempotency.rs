@@ -53,7 +53,7 @@ pub trait IdempotencyStore: Send + Sync {
     /// Reserves a request, or returns the record of an earlier one with the same id.
     ///
     /// An earlier record does not count if it is older than `since` or belongs to a process that has
-    /// ended. Then `reserved` replaces it, inherits the job queued for it, and `None` is returned.
+    /// ended. Disposition `reserved` replaces it, inherits the job queued for it, and `None` is returned.
     async fn reserve_request(
         &self,
         id: &str,

@@ -133,7 +133,9 @@ fn index(tuning: Tuning) -> IndexSettings {
         m: 16,
         ef_construction: 100,
         ef_search: 64,
+        threads: 0,
         max_dead_share: 0.3,
+        check_s: 0,
     }
 }
 

@@ -47,10 +47,8 @@ impl Choosing {
                 let [smallest, ..] = PREFERRED_MODELS;
                 let entry = catalogue.find(smallest).cloned();
                 let entry = entry.with_context(|| format!("the catalogue lacks {smallest}"))?;
-                let answer = tokio::spawn(ask(
-                    entry.address(&config.model.hub, &entry.manifest.file),
-                    patience,
-                ));
+                let answer =
+                    tokio::spawn(ask(entry.url(&config.model.hub, &entry.manifest.file), patience));
                 let hub = Box::new(Hub { config, assets, entry });
                 return Ok(Self::Asking { hub, answer });
             }

@@ -11,7 +11,7 @@ use futures_util::StreamExt;
 use reqwest::multipart::{Form, Part};
 use serde::Serialize;
 
-use super::client::{Client, LONGEST_PAUSE, PATIENCE, ServerArg, segment};
+use super::client::{Client, MAX_ATTEMPTS, MAX_PAUSE, ServerArg, segment};
 use super::progress::Progress;
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 use whereabouts_api::{ErrorKind, ImageMeta, MapChange};
@@ -223,7 +223,7 @@ impl Sender<'_> {
                 Err(error) => done.push((picture.file, Err(error))),
             }
         }
-        for patience in (0..PATIENCE).rev() {
+        for patience in (0..MAX_ATTEMPTS).rev() {
             if waiting.is_empty() {
                 return done;
             }
@@ -255,7 +255,7 @@ impl Sender<'_> {
                 }
             }
             if let Some(pause) = pause {
-                tokio::time::sleep(pause.min(LONGEST_PAUSE)).await;
+                tokio::time::sleep(pause.min(MAX_PAUSE)).await;
             }
             waiting = again;
         }
@@ -287,7 +287,7 @@ impl Sender<'_> {
             }
             Ok(self.client.post(&self.path).timeout(LONGEST).multipart(form))
         };
-        let response = self.client.send_patiently(make).await?;
+        let response = self.client.send_with_retries(make).await?;
         let answer: BatchAnswer =
             response.json().await.context("the server's answer is not the JSON expected")?;
         ensure!(

@@ -19,7 +19,7 @@ pub async fn run(client: &Client, args: &Args) -> anyhow::Result<()> {
     let begun: MapState = client.json(begin).await?;
     let progress = Progress::new("images", begun.images);
     let ended = loop {
-        let looked = client.send_patiently(|| Ok(client.get(&path))).await;
+        let looked = client.send_with_retries(|| Ok(client.get(&path))).await;
         let unknown = || format!("it is not known how the reindex ended; GET {path} tells");
         let map: MapState = looked.with_context(unknown)?.json().await.with_context(unknown)?;
         let Some(reindex) = &map.reindex else {

@@ -122,7 +122,7 @@ pub fn show(place: &Place, name: &str, json: bool) -> anyhow::Result<()> {
         }
         None => entry.and_then(|entry| entry.bytes),
     };
-    let address = entry.map(|entry| entry.address(&place.config.model.hub, &manifest.file));
+    let address = entry.map(|entry| entry.url(&place.config.model.hub, &manifest.file));
     if json {
         let shown = json!({
             "name": name, "installed": folder.is_some(), "folder": folder, "bytes": bytes,

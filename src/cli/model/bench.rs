@@ -8,7 +8,7 @@ use serde_json::json;
 use toml_edit::{DocumentMut, Item, Table, value};
 
 use super::Place;
-use whereabouts_vision::{Bench, BenchRow, BenchSettings, LEAST_SIMILARITY, Layout};
+use whereabouts_vision::{Bench, BenchRow, BenchSettings, Layout, MIN_SIMILARITY};
 
 /// What to try, and what to do with the result.
 #[derive(Debug, clap::Args)]
@@ -39,12 +39,12 @@ pub fn run(place: &Place, args: BenchArgs) -> anyhow::Result<()> {
     if !(0.05..=600.0).contains(&args.seconds) {
         bail!("--seconds must be between 0.05 and 600");
     }
-    let wanted = place.config.model.wanted();
+    let preference = place.config.model.preference();
     let (name, why) =
         place.assets.resolve(args.name.as_deref().unwrap_or(&place.config.model.name))?;
-    let bench = Bench::open(&place.assets, &name, wanted)?;
+    let bench = Bench::open(&place.assets, &name, preference)?;
     let settings = BenchSettings {
-        wanted,
+        preference,
         layouts: layouts(&args),
         duration: Duration::from_secs_f64(args.seconds),
     };
@@ -112,7 +112,7 @@ fn layouts(args: &BenchArgs) -> Vec<Layout> {
 /// The row with the most pictures a second; of those within a twentieth, the one that answers a
 /// picture alone the soonest.
 fn best(rows: &[BenchRow]) -> Option<&BenchRow> {
-    let right = || rows.iter().filter_map(|row| Some((row, row.right()?)));
+    let right = || rows.iter().filter_map(|row| Some((row, row.accepted()?)));
     let most = right().map(|(_, figures)| figures.per_second).fold(0.0, f64::max);
     right()
         .filter(|(_, figures)| figures.per_second >= 0.95 * most)
@@ -133,7 +133,7 @@ fn line(row: &BenchRow, flop: Option<f64>) -> String {
             let share = flop.map_or("-".to_owned(), |flop| {
                 format!("{:.0} %", 100.0 * figures.per_second * flop / figures.peak)
             });
-            let wrong = if figures.similarity < LEAST_SIMILARITY { "  too far off" } else { "" };
+            let wrong = if figures.similarity < MIN_SIMILARITY { "  too far off" } else { "" };
             format!(
                 "{how}  {:>8.1}  {:>10.1}  {:.5}  {share:>12}{wrong}",
                 figures.alone.as_secs_f64() * 1e3,
@@ -189,7 +189,7 @@ fn write(file: &Path, best: &BenchRow) -> anyhow::Result<()> {
 mod tests {
     use super::*;
     use whereabouts_core::Precision;
-    use whereabouts_vision::{Execution, Figures, Provider};
+    use whereabouts_vision::{BenchFigures, Execution, Provider};
 
     fn row(
         precision: Precision,
@@ -201,7 +201,7 @@ mod tests {
         BenchRow {
             execution: Execution { provider: Provider::OpenVino, precision },
             layout: Layout { threads: 2, sessions, max_batch: 4 },
-            outcome: Ok(Figures {
+            outcome: Ok(BenchFigures {
                 alone: Duration::from_millis(ms),
                 per_second,
                 similarity,

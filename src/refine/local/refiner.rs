@@ -11,7 +11,7 @@ use whereabouts_core::{
     PairRegion, Ranking, RefinerKind, Usage,
 };
 use whereabouts_store::{BlobStore, HardNegatives, MapStore};
-use whereabouts_vision::{CpuPool, ExtractError, Extractor, LoadedModels, ModelError};
+use whereabouts_vision::{CpuPool, ExtractError, Extractor, FeatureSet, LoadedModels, ModelError};
 
 use super::{LocalMatcher, LocalSettings, Match, PairMatch, describe, rank};
 use crate::{
@@ -222,9 +222,11 @@ fn match_all(
         FeatureSource::Cached(features) => Ok(features),
         FeatureSource::Picture(key, bytes) => {
             let extraction = extractor
-                .extract(&bytes, DescriptorKind::Gem)
+                .extract(&bytes, DescriptorKind::Gem, FeatureSet::DescriptorAndDense)
                 .map_err(|error: ExtractError| RefineError::Transient(error.to_string()))?;
-            let features = Arc::new(extraction.dense);
+            let features = extraction.dense.map(Arc::new).ok_or_else(|| {
+                RefineError::Permanent("the model computed no dense features".into())
+            })?;
             dense.insert(key, Arc::clone(&features));
             Ok(features)
         }

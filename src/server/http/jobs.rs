@@ -59,7 +59,7 @@ pub(super) async fn list_jobs(
     let cursor = params.cursor.as_deref().map(job_id).transpose()?;
     let mut page = service.list_jobs(filter, cursor, params.limit).await?;
     if params.brief {
-        page.jobs = page.jobs.into_iter().map(Job::brief).collect();
+        page.jobs = page.jobs.into_iter().map(Job::summary).collect();
     }
     Ok(Json(page))
 }

@@ -16,7 +16,7 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use crate::Metrics;
-use crate::config::{Config, cores_unless};
+use crate::config::Config;
 use crate::http::{About, AppState, Connections, HttpSettings, router, worker_router};
 use whereabouts_core::CalibrationSettings;
 use whereabouts_refine::{
@@ -28,7 +28,7 @@ use whereabouts_service::{
 };
 use whereabouts_store::{JobStore, TokenBuckets};
 use whereabouts_telemetry::LogIssues;
-use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
+use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings};
 use whereabouts_vision::{LoadedModels, LoadedSettings, WhyModel};
 
 #[cfg(feature = "postgres")]
@@ -184,7 +184,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     let (models, why) = models(config)?;
     let admission = config.image.admission(config.model.layout());
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
-    let pool = CpuPool::new("frames", cores_unless(config.image.threads), admission.permits)?;
+    let pool = CpuPool::new("frames", config.image.decode_threads(), admission.permits)?;
     let job_pace = JobServiceTime::default();
     // Beside the workers, calibration and whoever looks at matches come to it, one at a time each.
     let refining = CpuPool::new("refine", config.jobs.workers.max(1), config.jobs.workers + 2)?;
@@ -312,14 +312,14 @@ fn check_keys(config: &Config, keys: &Keys) -> anyhow::Result<()> {
 fn models(config: &Config) -> anyhow::Result<(LoadedModels, WhyModel)> {
     let assets = Assets::locate(config.model.assets());
     let (model, why) = assets.resolve(&config.model.name)?;
-    let each = ExtractorSettings {
+    let extractor = ExtractorSettings {
         model,
-        wanted: config.model.wanted(),
-        remember: None,
+        preference: config.model.preference(),
+        choice_file: None,
         layout: config.model.layout(),
-        limits: ImageLimits { max_pixels: config.image.max_pixels },
+        limits: config.image.limits(),
         exact_decode: config.image.exact,
     };
-    let (most, remember) = (config.model.loaded, config.data.dir.clone());
-    Ok((LoadedModels::new(assets, LoadedSettings { most, remember, each }), why))
+    let (max_loaded, choice_dir) = (config.model.loaded, config.data.dir.clone());
+    Ok((LoadedModels::new(assets, LoadedSettings { max_loaded, choice_dir, extractor }), why))
 }

@@ -10,7 +10,7 @@ use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
 use parking_lot::RwLock;
 use whereabouts_core::{Calibration, CalibrationSettings, Candidate, ImageId, Map, Pose};
-use whereabouts_index::{Found, IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
+use whereabouts_index::{IndexSettings, MapIndex, ScoredSlot, SealedGraph, SearchMode, Vectors};
 
 pub(super) struct LiveMap {
     /// The map as stored; scene and description may change.
@@ -88,7 +88,7 @@ impl LiveMap {
             }
         };
         match SealedGraph::from_bytes(&bytes) {
-            Ok(sealed) if sealed.dim() == self.vectors.dim() && sealed.fits(&settings) => {
+            Ok(sealed) if sealed.dim() == self.vectors.dim() && sealed.is_built_with(&settings) => {
                 // Its slots must not be reused for other images.
                 self.next_slot.fetch_max(sealed.end(), Ordering::Relaxed);
                 self.index.restore(sealed);
@@ -178,7 +178,7 @@ impl LiveMap {
         self.candidates(&self.index.search(self.vectors.as_ref(), query, k, mode))
     }
 
-    fn candidates(&self, found: &[Found]) -> Vec<Candidate> {
+    fn candidates(&self, found: &[ScoredSlot]) -> Vec<Candidate> {
         let entries = self.entries.read();
         found
             .iter()
@@ -216,7 +216,7 @@ impl LiveMap {
         k: usize,
     ) -> Option<HardNegatives> {
         let query = &images[at];
-        let of_another_place = |found: &Found| {
+        let of_another_place = |found: &ScoredSlot| {
             // Its position in insertion order.
             let position = images.partition_point(|image| image.slot < found.slot);
             let pose = images.get(position).and_then(|image| image.pose);
@@ -226,12 +226,13 @@ impl LiveMap {
         self.vectors
             .scan(query.slot..query.slot + 1, &mut |_, numbers| descriptor = numbers.to_vec());
         // Double the limit until enough results are of other places.
-        let mut limit = k + 2 * settings.place_images_of(images.len()) + 1;
-        let others: Vec<Found> = loop {
+        let mut limit = k + 2 * settings.place_radius(images.len()) + 1;
+        let others: Vec<ScoredSlot> = loop {
             let found =
                 self.index.search(self.vectors.as_ref(), &descriptor, limit, SearchMode::Fast);
             let exhausted = found.len() < limit;
-            let others: Vec<Found> = found.into_iter().filter(of_another_place).take(k).collect();
+            let others: Vec<ScoredSlot> =
+                found.into_iter().filter(of_another_place).take(k).collect();
             if others.len() == k || exhausted {
                 break others;
             }

@@ -128,7 +128,7 @@ impl WebhookStore for EmbeddedStore {
             };
             trees.enabled(webhook)?;
             check_ended(&ended)?;
-            let again = ended.clone().again(now);
+            let again = ended.clone().requeued(now);
             trees.replace(&ended, &again)?;
             Ok(again)
         });
@@ -211,7 +211,7 @@ impl WebhookStore for EmbeddedStore {
             let keys = trees.due_until(webhook, Timestamp::MAX, limit)?;
             for key in &keys {
                 if let Some(waiting) = trees.delivery(key)? {
-                    trees.replace(&waiting, &waiting.clone().given_up(at, &why))?;
+                    trees.replace(&waiting, &waiting.clone().dead_lettered(at, &why))?;
                 }
             }
             Ok(keys.len())

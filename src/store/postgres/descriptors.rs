@@ -235,7 +235,7 @@ impl Inner {
     ) -> Result<Vec<Found>, StoreError> {
         if mode == SearchMode::Fast && self.has_graph(map).await? {
             let found = self.nearest(map, query, k, true).await?;
-            // If many images were removed, an index scan may end before it has found enough. Then search
+            // If many images were removed, an index scan may end before it has found enough. Disposition search
             // exactly.
             if found.len() == k {
                 return Ok(found);
@@ -329,7 +329,7 @@ impl Inner {
                 settings.are_apart(images.len(), (at, pose), (position, found.pose))
             };
             // Double the limit until enough results are of other places.
-            let mut limit = k + 2 * settings.place_images_of(images.len()) + 1;
+            let mut limit = k + 2 * settings.place_radius(images.len()) + 1;
             let others = loop {
                 let found = self.find(map, &descriptor, limit, SearchMode::Fast).await?;
                 let exhausted = found.len() < limit;

@@ -187,7 +187,7 @@ impl WebhookStore for PostgresStore {
                     tx.rollback().await?;
                     return checked.map(|()| ended);
                 }
-                let again = ended.again(now);
+                let again = ended.requeued(now);
                 inner.update_delivery(&mut tx, &again).await?;
                 inner.notify_deliveries(&mut tx).await?;
                 tx.commit().await?;
@@ -291,7 +291,7 @@ impl WebhookStore for PostgresStore {
                 .await?;
                 let given_up = waiting.len();
                 for Json(delivery) in waiting {
-                    inner.update_delivery(&mut tx, &delivery.given_up(at, why)).await?;
+                    inner.update_delivery(&mut tx, &delivery.dead_lettered(at, why)).await?;
                 }
                 tx.commit().await?;
                 Ok(given_up)

@@ -6,7 +6,7 @@ use uuid::Uuid;
 
 use super::super::drafts::tests::settings;
 use super::*;
-use whereabouts_core::{Then, Webhook, WebhookEvent, WebhookSecret};
+use whereabouts_core::{Disposition, Webhook, WebhookEvent, WebhookSecret};
 
 /// Adds a webhook with a number of waiting pings.
 async fn pinged(store: &EmbeddedStore, pings: usize) -> (Uuid, Vec<Uuid>) {
@@ -37,7 +37,7 @@ async fn a_removed_delivery_leaves_no_records() {
     let (deleted, pings) = pinged(&store, REMOVAL_BATCH + 3).await;
     pinged(&store, 3).await;
     let at = Timestamp::now();
-    let dead = Attempt { at, status: None, error: None, then: Then::Dead };
+    let dead = Attempt { at, status: None, error: None, disposition: Disposition::Dead };
     store.note_attempt(deleted, pings[0], dead).await.unwrap();
     assert!(store.delete_webhook(deleted).await.unwrap());
     let assert_remaining = |count: usize| {
