@@ -29,6 +29,11 @@ impl Best {
         }
     }
 
+    /// The similarity of the worst of the `k`, once there are as many.
+    pub fn worst(&self) -> Option<f32> {
+        self.kept.peek().filter(|_| self.kept.len() >= self.k).map(|worst| worst.0.similarity)
+    }
+
     pub fn into_sorted(self) -> Vec<Found> {
         self.kept.into_sorted_vec().into_iter().map(|WorstFirst(found)| found).collect()
     }
