@@ -29,6 +29,11 @@ impl TopK {
         }
     }
 
+    /// Returns the similarity of the worst of the `k` results, once there are as many.
+    pub fn worst(&self) -> Option<f32> {
+        self.kept.peek().filter(|_| self.kept.len() >= self.k).map(|worst| worst.0.similarity)
+    }
+
     pub fn into_sorted(self) -> Vec<ScoredSlot> {
         self.kept.into_sorted_vec().into_iter().map(|WorstFirst(found)| found).collect()
     }

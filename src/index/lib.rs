@@ -1,25 +1,35 @@
-//! Nearest-neighbour search over the descriptors of one map.
+//! The nearest-neighbour index of one map: finds the stored descriptors most similar to that of a query.
 //!
-//! The index is derived data. It reads descriptors from the store ([`Vectors`]) by *slot*, the position at which
-//! they were stored, and can be rebuilt from them at any time.
+//! The index is derived data. It reads descriptors by *slot*, their position in the store ([`Vectors`]), and can be
+//! rebuilt at any time.
 //!
-//! Small maps are searched exactly. In larger maps an HNSW graph covers the slots below [`MapIndex::graphed`]; newer
-//! slots are searched exactly. Adding an image therefore never waits for the graph, and a map can be searched while
-//! its graph is being built. A graph that has caught up is sealed ([`SealedGraph`]): a sealed graph is smaller,
-//! faster to search, and can be written to a file.
+//! Small maps are searched exactly. For larger ones HNSW graphs cover the slots below [`MapIndex::graphed`]; slots that
+//! arrived since are searched exactly, so that adding an image never waits for a graph and a map answers while its
+//! graph is being built.
+//!
+//! There are two graphs: a compact one over the map as it was when it was last sealed ([`SealedGraph`]), which is kept
+//! in a file, and one of `hnsw_rs` that grows with every new image. Once the growing one covers as many slots as the
+//! sealed one, a new sealed graph is built over all of them ([`Builder`]).
 
+mod builder;
+mod codes;
 mod exact;
 mod graph;
+mod layer;
+mod repair;
 mod sealed;
 mod settings;
 
+use std::collections::HashSet;
 use std::ops::Range;
 use std::sync::Arc;
 
 use parking_lot::{Mutex, MutexGuard, RwLock, RwLockReadGuard, RwLockWriteGuard};
+
 use rayon::ThreadPool;
 use rayon::prelude::*;
 
+use self::builder::Builder;
 use self::exact::TopK;
 use self::graph::Graph;
 pub use self::sealed::{DamagedGraph, SealedGraph};
@@ -28,54 +38,53 @@ use whereabouts_core::dot;
 
 /// Stored descriptors, by slot.
 pub trait Vectors: Send + Sync {
-    /// Dimension of the descriptors.
+    /// Numbers in each descriptor.
     fn dim(&self) -> usize;
-    /// Calls `visit` with every stored slot in the range and its descriptor, in order.
+    /// Calls `visit` with each stored slot of the range, in order.
     fn scan(&self, slots: Range<usize>, visit: &mut dyn FnMut(usize, &[f32]));
 }
 
-/// A search result: a stored descriptor and its similarity to the query.
+/// A stored descriptor and its similarity to the query.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ScoredSlot {
-    /// Slot of the descriptor.
+    /// The slot of the descriptor.
     pub slot: usize,
     /// Cosine similarity, −1 to 1.
     pub similarity: f32,
 }
 
-/// The search method.
+/// Approximate or exact search.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SearchMode {
-    /// Approximate search by graph, where there is one.
+    /// Through the graphs, if there are any.
     Fast,
-    /// Exact search over every descriptor; the reference.
+    /// Every descriptor is compared.
     Exact,
 }
 
 /// The index of one map.
 ///
-/// Slots below [`SealedGraph::end`] are in the sealed graph, slots from there to [`MapIndex::graphed`] are in the
-/// growing graph, and the rest are in none.
+/// Slots below [`SealedGraph::end`] are in the sealed graph, those from there to
+/// [`MapIndex::graphed`] in the growing one, and the rest in none.
 pub struct MapIndex {
     settings: IndexSettings,
-    /// Which slots hold an image that is part of the map.
-    live: RwLock<LiveSlots>,
+    /// Whether the image in each slot is still part of the map.
+    live: RwLock<Live>,
     graphs: RwLock<Graphs>,
-    /// A graph over all slots that will replace both graphs. Used by the indexer only.
-    merging: Mutex<Option<Merging>>,
+    /// The graph that will replace the others. Only the indexer uses it.
+    building: Mutex<Option<Builder>>,
 }
 
 #[derive(Default)]
-struct LiveSlots {
+struct Live {
     slots: Vec<bool>,
     count: usize,
-    /// End of the sealed graph.
+    /// The end of the sealed graph, and the number of live slots below it.
     sealed_end: usize,
-    /// Live slots in the sealed graph.
     sealed_count: usize,
 }
 
-impl LiveSlots {
+impl Live {
     fn set(&mut self, slot: usize, live: bool) {
         if self.slots.len() <= slot {
             self.slots.resize(slot + 1, false);
@@ -100,52 +109,44 @@ impl LiveSlots {
 struct Graphs {
     sealed: Option<Arc<SealedGraph>>,
     growing: Option<Arc<Graph>>,
-    /// Slots below this one are in one of the graphs, unless they were removed before being inserted.
+    /// Slots below this one are in one of the two graphs, unless they were removed before they were inserted.
     graphed: usize,
 }
 
-struct Merging {
-    graph: Graph,
-    /// Slots below this one have been inserted.
-    done: usize,
-    /// Slots below this one are to be inserted.
-    end: usize,
-}
-
 impl Graphs {
-    /// Start of the growing graph.
+    /// The first slot of the growing graph.
     fn sealed_end(&self) -> usize {
         self.sealed.as_ref().map_or(0, |sealed| sealed.end())
     }
 }
 
 impl MapIndex {
-    /// Creates an empty index.
+    /// An empty index.
     pub fn new(settings: IndexSettings) -> Self {
         Self {
             settings,
             live: RwLock::default(),
             graphs: RwLock::default(),
-            merging: Mutex::default(),
+            building: Mutex::default(),
         }
     }
 
-    /// Restores a graph that was sealed by an earlier process.
+    /// Uses a graph that an earlier process sealed.
     pub fn restore(&self, sealed: SealedGraph) {
         self.replace_graphs(Arc::new(sealed));
     }
 
-    /// Includes the image in `slot` in later searches.
+    /// Adds the image in `slot` to all later results.
     pub fn add(&self, slot: usize) {
         self.live_mut().set(slot, true);
     }
 
-    /// Excludes the image in `slot` from later searches.
+    /// Removes the image in `slot` from all later results.
     pub fn remove(&self, slot: usize) {
         self.live_mut().set(slot, false);
     }
 
-    /// Number of images in the map.
+    /// The number of images in the map.
     pub fn len(&self) -> usize {
         self.live().count
     }
@@ -155,17 +156,17 @@ impl MapIndex {
         self.len() == 0
     }
 
-    /// Slots below this one are in a graph, unless they were removed before being inserted.
+    /// Slots below this one are in a graph, unless they were removed before they were inserted.
     pub fn graphed(&self) -> usize {
         self.graphs().graphed
     }
 
-    /// Size of the sealed graph in bytes, in memory and on disk. The growing graph is not included.
+    /// Bytes of the sealed graph, in memory and on disk. The growing graph is not counted.
     pub fn sealed_bytes(&self) -> usize {
         self.graphs().sealed.as_ref().map_or(0, |sealed| sealed.bytes())
     }
 
-    /// Returns the `k` most similar images, best first. Ties are ordered by slot.
+    /// The `k` most similar images, best first; equal similarities keep the order of the slots.
     pub fn search(
         &self,
         vectors: &dyn Vectors,
@@ -181,31 +182,38 @@ impl MapIndex {
         };
         let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
         let mut best = TopK::new(k);
-        let mut merge = |slots: Range<usize>, found: Vec<ScoredSlot>| {
-            // If many images have been removed, a graph search can return too few of the remaining ones.
+        let mut found_in = |slots: Range<usize>, found: Vec<ScoredSlot>| {
+            // If many images were removed, a graph search may end before it has found enough live ones.
             let end = slots.end.min(live.slots.len());
-            let expected =
-                live.slots[slots.start.min(end)..end].iter().filter(|live| **live).take(k);
-            if found.len() >= expected.count() {
+            let all = live.slots[slots.start.min(end)..end].iter().filter(|live| **live).take(k);
+            if found.len() >= all.count() {
                 found.into_iter().for_each(|found| best.offer(found));
             } else {
-                search_exactly(vectors, query, slots, &is_live, &mut best);
+                exactly(vectors, query, slots, &is_live, &mut best);
             }
         };
         let ef = self.settings.ef_search.max(k);
         if let Some(sealed) = &graphs.sealed {
-            merge(0..sealed_end, sealed.search(vectors, query, (k, ef), is_live));
+            found_in(0..sealed_end, sealed.search(vectors, query, (k, ef), is_live));
         }
         if let Some(growing) = &graphs.growing {
-            // Slots may have been inserted since `graphed` was read.
+            // It may already hold slots beyond `graphed`.
             let kept = |slot: usize| slot < graphed && is_live(slot);
-            merge(sealed_end..graphed, growing.search(query, k, ef, &kept));
+            let mut found = growing.search(query, k, ef, &kept);
+            let known: HashSet<usize> = found.iter().map(|found| found.slot).collect();
+            let stray = growing.stray_slots(k, &kept);
+            for slot in stray.into_iter().filter(|slot| !known.contains(slot)) {
+                vectors.scan(slot..slot + 1, &mut |slot, vector| {
+                    found.push(ScoredSlot { slot, similarity: dot(query, vector) });
+                });
+            }
+            found_in(sealed_end..graphed, found);
         }
-        search_exactly(vectors, query, graphed..live.slots.len(), &is_live, &mut best);
+        exactly(vectors, query, graphed..live.slots.len(), &is_live, &mut best);
         best.into_sorted()
     }
 
-    /// Whether there are slots to be inserted into a graph.
+    /// Whether slots wait to be inserted into a graph.
     pub fn is_behind(&self) -> bool {
         let graphed = self.graphed();
         let live = self.live();
@@ -214,65 +222,58 @@ impl MapIndex {
 
     /// Whether [`MapIndex::catch_up`] has work to do.
     pub fn has_work(&self) -> bool {
-        self.is_behind() || self.merging().is_some() || self.wants_sealing()
+        self.is_behind() || self.building().is_some() || self.wants_sealing()
     }
 
-    /// Whether the growing graph is as large as the sealed one, or too many points of the sealed graph have
-    /// been removed, which slows searches down.
+    /// Whether as many slots lie beyond the sealed graph as in it, or too many of its slots are dead, which slow down
+    /// every search.
     fn wants_sealing(&self) -> bool {
-        let graphs = self.graphs();
-        let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
-        let has_grown = graphs.growing.is_some() && graphed - sealed_end >= sealed_end.max(1);
-        let points = graphs.sealed.as_ref().map_or(0, |sealed| sealed.len());
-        let dead = points.saturating_sub(self.live().sealed_count);
+        let sealed = self.graphs().sealed.clone();
+        let (end, points) = sealed.map_or((0, 0), |sealed| (sealed.end(), sealed.len()));
+        let live = self.live();
+        let has_grown = live.count > self.settings.exact_up_to
+            && live.slots.len().saturating_sub(end) >= end.max(1);
+        let dead = points.saturating_sub(live.sealed_count);
         has_grown || dead as f32 > self.settings.max_dead_share * points as f32
     }
 
-    /// Does one step of the pending work, inserting at most `max_slots` slots on `threads`. Returns the new
-    /// sealed graph if the step sealed one. Must be called by one thread at a time; searches run concurrently.
+    /// Processes up to `most` waiting slots; returns the sealed graph, if this completed one. Only one thread may call
+    /// it at a time; searches continue meanwhile.
     ///
-    /// New slots are inserted into the growing graph. Once it has caught up and is as large as the sealed
-    /// graph, both are merged into a new sealed graph. Each slot is inserted twice on average, regardless of
-    /// the size of the map.
+    /// New slots go into the growing graph. Once it covers as many slots as the sealed graph, a graph over all slots
+    /// is built, which replaces both: on average each slot is inserted into a sealed graph twice, whatever the size of
+    /// the map. `threads` share the work.
     pub fn catch_up(
         &self,
         vectors: &dyn Vectors,
-        max_slots: usize,
+        most: usize,
         threads: &ThreadPool,
     ) -> Option<Arc<SealedGraph>> {
-        let mut merging = self.merging();
-        if let Some(merge) = merging.as_mut() {
-            let end = merge.end.min(merge.done + max_slots);
-            self.insert(&merge.graph, vectors, merge.done..end, threads);
-            merge.done = end;
-            if merge.done < merge.end {
+        let mut building = self.building();
+        if let Some(builder) = building.as_mut() {
+            if !builder.link(most, threads) {
                 return None;
             }
-            let Merging { graph, end, .. } = merging.take()?;
-            return Some(self.seal(&graph, end, vectors));
+            let sealed = Arc::new(building.take()?.finish(threads));
+            self.replace_graphs(Arc::clone(&sealed));
+            return Some(sealed);
+        }
+        if self.wants_sealing() {
+            let live = self.live().slots.clone();
+            *building = Some(Builder::new(&live, vectors, self.settings));
+            return None;
         }
         if self.is_behind() {
             let graphs = self.graphs().clone();
             let growing = graphs.growing.unwrap_or_else(|| Arc::new(Graph::new(&self.settings)));
-            let end = self.live().slots.len().min(graphs.graphed + max_slots);
+            let end = self.live().slots.len().min(graphs.graphed + most);
             self.insert(&growing, vectors, graphs.graphed..end, threads);
+            growing.check(vectors, graphs.graphed..end, threads);
             let mut graphs = self.graphs_mut();
             graphs.growing = Some(growing);
             graphs.graphed = end;
-            return None;
         }
-        if !self.wants_sealing() {
-            return None;
-        }
-        let Graphs { sealed, growing, graphed } = self.graphs().clone();
-        match (sealed, growing) {
-            (None, Some(growing)) => Some(self.seal(&growing, graphed, vectors)),
-            _ => {
-                let graph = Graph::new(&self.settings);
-                *merging = Some(Merging { graph, done: 0, end: graphed });
-                None
-            }
-        }
+        None
     }
 
     fn insert(
@@ -296,23 +297,17 @@ impl MapIndex {
     }
 
     /// Replaces both graphs by a finished one.
-    fn seal(&self, graph: &Graph, end: usize, vectors: &dyn Vectors) -> Arc<SealedGraph> {
-        let sealed = Arc::new(SealedGraph::new(&graph.linked(), end, vectors, &self.settings));
-        self.replace_graphs(Arc::clone(&sealed));
-        sealed
-    }
-
     fn replace_graphs(&self, sealed: Arc<SealedGraph>) {
         let graphed = sealed.end();
         *self.graphs_mut() = Graphs { sealed: Some(sealed), growing: None, graphed };
         self.live_mut().seal(graphed);
     }
 
-    fn live_mut(&self) -> RwLockWriteGuard<'_, LiveSlots> {
+    fn live_mut(&self) -> RwLockWriteGuard<'_, Live> {
         self.live.write()
     }
 
-    fn live(&self) -> RwLockReadGuard<'_, LiveSlots> {
+    fn live(&self) -> RwLockReadGuard<'_, Live> {
         self.live.read()
     }
 
@@ -324,13 +319,13 @@ impl MapIndex {
         self.graphs.write()
     }
 
-    fn merging(&self) -> MutexGuard<'_, Option<Merging>> {
-        self.merging.lock()
+    fn building(&self) -> MutexGuard<'_, Option<Builder>> {
+        self.building.lock()
     }
 }
 
-/// Scores every live slot of the range.
-fn search_exactly(
+/// Offers every live slot of the range to `best`.
+fn exactly(
     vectors: &dyn Vectors,
     query: &[f32],
     slots: Range<usize>,

@@ -167,7 +167,8 @@ impl Doctor<'_> {
     fn graph(&mut self, map: &Map, folder: &Path) {
         let file = folder.join("graph");
         let Ok(bytes) = fs::read(&file) else { return };
-        if SealedGraph::from_bytes(&bytes).is_ok_and(|graph| graph.dim() == map.dim) {
+        let sound = |graph: SealedGraph| graph.dim() == map.dim && graph.unreachable() == 0;
+        if SealedGraph::from_bytes(&bytes).is_ok_and(sound) {
             return;
         }
         let repaired = self.options.repair && fs::remove_file(&file).is_ok();
