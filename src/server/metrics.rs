@@ -17,9 +17,6 @@ use whereabouts_telemetry::metrics::{self, Registry, latency, register};
 
 use super::levels::{Gauges, Levels};
 
-/// The routes that localize a frame.
-const FRAME_ROUTES: [&str; 2] = ["/localize", "/whereabouts.v1.LocalizationService/Localize"];
-
 /// All metrics of a process: those of the server itself, and those that other members registered.
 #[derive(Debug)]
 pub struct Metrics {
@@ -83,9 +80,9 @@ impl Metrics {
         }
     }
 
-    /// Counts an answered request.
-    pub fn request(&self, method: &str, route: &str, status: u16, took: Duration) {
-        let is_frame = status == 200 && FRAME_ROUTES.contains(&route);
+    /// Counts an answered request; `localizes` says whether its answer is a localized frame.
+    pub fn request(&self, method: &str, route: &str, status: u16, took: Duration, localizes: bool) {
+        let is_frame = status == 200 && localizes;
         self.last_hour.answered(Timestamp::now(), status, is_frame.then_some(took));
         let route = route.to_owned();
         self.request_seconds

@@ -1,7 +1,6 @@
 //! The operator's console: a page of plain modules and one stylesheet, all in the binary. It knows no more than
 //! the API gives, to whoever has signed in.
 
-use axum::Router;
 use axum::extract::Path;
 use axum::http::header::{
     CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, ETAG, IF_NONE_MATCH,
@@ -11,6 +10,7 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 
+use crate::gate::{RoutePolicy, Routes};
 use whereabouts_core::Digest;
 
 /// The page.
@@ -53,21 +53,22 @@ struct Guarded {
 }
 
 /// The routes of the page. `tiles` is the address of map tiles, from whose host pictures may come.
-pub fn routes<S: Clone + Send + Sync + 'static>(tiles: Option<&str>) -> Router<S> {
+pub(crate) fn routes<S: Clone + Send + Sync + 'static>(tiles: Option<&str>) -> Routes<S> {
     let guarded = Guarded {
         policy: HeaderValue::from_str(&policy(tiles)).ok(),
         // Servers of tiles want to know who asks.
         referrer: if tiles.is_some() { "strict-origin" } else { "no-referrer" },
     };
     let of_page = guarded.clone();
-    Router::new()
-        .route("/", get(move |headers: HeaderMap| async move { file(PAGE, &headers, of_page) }))
-        .route(
-            "/console/{file}",
-            get(move |Path(name): Path<String>, headers: HeaderMap| async move {
-                file(&name, &headers, guarded)
-            }),
-        )
+    let page = get(move |headers: HeaderMap| async move { file(PAGE, &headers, of_page) });
+    let files = get(move |Path(name): Path<String>, headers: HeaderMap| async move {
+        file(&name, &headers, guarded)
+    });
+    Routes::new().get("/", RoutePolicy::public(), page).get(
+        "/console/{file}",
+        RoutePolicy::public(),
+        files,
+    )
 }
 
 /// Nothing but what this server serves, and the tiles; no script or style within the page.

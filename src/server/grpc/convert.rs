@@ -76,6 +76,16 @@ pub(super) fn moment(moment: prost_types::Timestamp) -> Result<Timestamp, Servic
         .map_err(|error| ServiceError::unprocessable(format!("captured_at: {error}")))
 }
 
+/// An error of one item among several.
+pub(super) fn problem(error: ServiceError) -> proto::Problem {
+    proto::Problem {
+        kind: error.kind.word().to_owned(),
+        detail: error.detail,
+        // No wait is too long for a duration of protobuf.
+        retry_after: error.retry_after.and_then(|pause| pause.try_into().ok()),
+    }
+}
+
 /// A pose in the form in which the service checks it against the map.
 pub(super) fn pose(pose: proto::Pose) -> Result<Value, ServiceError> {
     let fields = match pose.frame {

@@ -35,36 +35,36 @@ impl Health for Api {
         &self,
         request: Request<HealthCheckRequest>,
     ) -> Result<Response<HealthCheckResponse>, Status> {
-        let asked = &request.get_ref().service;
-        if !SERVICES.contains(&asked.as_str()) {
-            let shown: String = asked.chars().take(80).collect();
+        let name = &request.get_ref().service;
+        if !SERVICES.contains(&name.as_str()) {
+            let shown: String = name.chars().take(80).collect();
             let known = SERVICES[1..].join(", ");
             return Err(Status::not_found(format!(
                 "there is no service {shown:?}; there are {known}"
             )));
         }
-        Ok(Response::new(answer(*self.door.phases().borrow())))
+        Ok(Response::new(answer(*self.readiness.phases().borrow())))
     }
 
     async fn watch(
         &self,
         request: Request<HealthCheckRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
         if !SERVICES.contains(&request.get_ref().service.as_str()) {
             // As the protocol has it: the service might appear later.
             let unknown = HealthCheckResponse { status: ServingStatus::ServiceUnknown.into() };
             let unknown = stream::iter([Ok(unknown)]).chain(stream::pending());
-            return Ok(Response::new(until_over(unknown, &self.door, asked)));
+            return Ok(Response::new(until_over(unknown, &self.readiness, context)));
         }
-        let mut phases = self.door.phases();
+        let mut phases = self.readiness.phases();
         phases.mark_changed();
         let changes = stream::unfold(phases, |mut phases| async {
             phases.changed().await.ok()?;
             let now = answer(*phases.borrow_and_update());
             Some((Ok(now), phases))
         });
-        Ok(Response::new(until_over(changes, &self.door, asked)))
+        Ok(Response::new(until_over(changes, &self.readiness, context)))
     }
 }
 

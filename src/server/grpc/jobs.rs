@@ -13,13 +13,13 @@ use super::proto::{
     WatchJobResponse,
 };
 use super::streams::{Answers, until_over};
-use super::{Api, Asked, convert, status};
+use super::{Api, CallContext, convert, status};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::Job;
 use whereabouts_service::{JobEvent, ServiceError, search_text, uuid};
 use whereabouts_store::JobFilter;
 
-/// Jobs in a page unless more are asked for: clients take no more than four megabytes at a time by themselves.
+/// Jobs in a page unless more are context for: clients take no more than four megabytes at a time by themselves.
 const PAGE_SIZE: usize = 20;
 
 #[tonic::async_trait]
@@ -30,9 +30,9 @@ impl JobService for Api {
         &self,
         request: Request<GetJobRequest>,
     ) -> Result<Response<GetJobResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
         let GetJobRequest { id, wait_s } = request.into_inner();
-        let job = asked.job(&id, wait_s).await.map_err(status::of)?;
+        let job = context.job(&id, wait_s).await.map_err(status::of)?;
         Ok(Response::new(GetJobResponse { job: Some(job.into()) }))
     }
 
@@ -40,10 +40,10 @@ impl JobService for Api {
         &self,
         request: Request<WatchJobRequest>,
     ) -> Result<Response<Self::WatchJobStream>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
         let following = async {
-            let id = asked.job(&request.into_inner().id, 0.0).await?.id;
-            asked.service.follow_job(id).await
+            let id = context.job(&request.into_inner().id, 0.0).await?.id;
+            context.service.follow_job(id).await
         };
         let events = following.await.map_err(status::of)?;
         let events = events.map(|event| {
@@ -62,15 +62,15 @@ impl JobService for Api {
             };
             Ok(WatchJobResponse { event: Some(event) })
         });
-        Ok(Response::new(until_over(events, &self.door, asked)))
+        Ok(Response::new(until_over(events, &self.readiness, context)))
     }
 
     async fn list_jobs(
         &self,
         request: Request<ListJobsRequest>,
     ) -> Result<Response<ListJobsResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let page = asked.jobs(request.into_inner()).await.map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let page = context.jobs(request.into_inner()).await.map_err(status::of)?;
         Ok(Response::new(page))
     }
 
@@ -78,10 +78,10 @@ impl JobService for Api {
         &self,
         request: Request<CancelJobRequest>,
     ) -> Result<Response<CancelJobResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
         let cancelling = async {
-            let id = asked.job(&request.into_inner().id, 0.0).await?.id;
-            asked.service.cancel_job(id).await
+            let id = context.job(&request.into_inner().id, 0.0).await?.id;
+            context.service.cancel_job(id).await
         };
         let job = cancelling.await.map_err(status::of)?;
         Ok(Response::new(CancelJobResponse { job: Some(job.into()) }))
@@ -91,17 +91,17 @@ impl JobService for Api {
         &self,
         request: Request<RetryJobRequest>,
     ) -> Result<Response<RetryJobResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
         let retrying = async {
-            let id = asked.job(&request.into_inner().id, 0.0).await?.id;
-            asked.service.retry_job(id).await
+            let id = context.job(&request.into_inner().id, 0.0).await?.id;
+            context.service.retry_job(id).await
         };
         let job = retrying.await.map_err(status::of)?;
         Ok(Response::new(RetryJobResponse { job: Some(job.into()) }))
     }
 }
 
-impl Asked {
+impl CallContext {
     /// A job of a map that the caller may use, at once or when it has ended.
     async fn job(&self, id: &str, wait_s: f64) -> Result<Job, ServiceError> {
         let id = uuid("job", id)?;

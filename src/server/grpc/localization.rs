@@ -13,7 +13,7 @@ use super::proto::{
     self, LocalizeRequest, LocalizeResponse, LocalizeStreamRequest, LocalizeStreamResponse,
 };
 use super::streams::{Answers, until_over};
-use super::{Api, Asked, convert, status};
+use super::{Api, CallContext, convert, status};
 use whereabouts_service::{ServiceError, TrackStep};
 
 #[tonic::async_trait]
@@ -24,8 +24,8 @@ impl LocalizationService for Api {
         &self,
         request: Request<LocalizeRequest>,
     ) -> Result<Response<LocalizeResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let answer = asked.localize(request.into_inner()).await.map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let answer = context.localize(request.into_inner()).await.map_err(status::of)?;
         Ok(Response::new(answer))
     }
 
@@ -33,25 +33,25 @@ impl LocalizationService for Api {
         &self,
         request: Request<Streaming<LocalizeStreamRequest>>,
     ) -> Result<Response<Self::LocalizeStreamStream>, Status> {
-        let asked = Arc::new(self.asked(request.extensions()).map_err(status::of)?);
+        let context = Arc::new(self.context(request.extensions()).map_err(status::of)?);
         let frames = Frames {
             coming: request.into_inner(),
             newest: None,
             skipped: 0,
             counted: false,
             ended: None,
-            asked: Arc::clone(&asked),
+            context: Arc::clone(&context),
         };
         let answers = stream::unfold(frames, |mut frames| async {
             let answer = frames.next().await?;
             Some((answer, frames))
         });
-        let answers = until_over(answers, &self.door, asked.as_ref().clone());
+        let answers = until_over(answers, &self.readiness, context.as_ref().clone());
         Ok(Response::new(answers))
     }
 }
 
-impl Asked {
+impl CallContext {
     async fn localize(&self, request: LocalizeRequest) -> Result<LocalizeResponse, ServiceError> {
         let LocalizeRequest { map, image, k, refine, priority, track } = request;
         let track = track.map(|track| self.step(track)).transpose()?;
@@ -84,7 +84,7 @@ struct Frames {
     counted: bool,
     /// How the frames ended, once they have.
     ended: Option<Result<(), Status>>,
-    asked: Arc<Asked>,
+    context: Arc<CallContext>,
 }
 
 impl Frames {
@@ -105,14 +105,14 @@ impl Frames {
         };
         let skipped = std::mem::take(&mut self.skipped);
         let LocalizeStreamRequest { frame_number, frame } = frame;
-        let (asked, begun) = (Arc::clone(&self.asked), Instant::now());
+        let (context, begun) = (Arc::clone(&self.context), Instant::now());
         let counted = std::mem::replace(&mut self.counted, true);
         let mut working = std::pin::pin!(async move {
             // Each frame counts as a request of the key, of which the first is counted already.
             if counted {
-                asked.service.keys.limits.take_one_more(&asked.caller).await?;
+                context.service.keys.limits.take_one_more(&context.caller).await?;
             }
-            asked.localize(frame.unwrap_or_default()).await
+            context.localize(frame.unwrap_or_default()).await
         });
         let answer = loop {
             tokio::select! {
@@ -120,13 +120,13 @@ impl Frames {
                 next = self.coming.message(), if self.ended.is_none() => self.take(next),
             }
         };
-        let metrics = &self.asked.metrics;
+        let metrics = &self.context.metrics;
         let outcome = match answer {
             Ok(answer) => {
                 metrics.frame_of_stream(begun.elapsed());
                 Outcome::Answer(answer)
             }
-            Err(error) => Outcome::Problem(status::problem(error)),
+            Err(error) => Outcome::Problem(convert::problem(error)),
         };
         let outcome = Some(outcome);
         Some(Ok(LocalizeStreamResponse { frame_number, skipped, outcome }))
@@ -135,7 +135,7 @@ impl Frames {
     fn take(&mut self, next: Result<Option<LocalizeStreamRequest>, Status>) {
         match next {
             Ok(Some(frame)) => {
-                let replaced = self.newest.replace((frame, self.asked.held.take())).is_some();
+                let replaced = self.newest.replace((frame, self.context.budget.take())).is_some();
                 self.skipped += u32::from(replaced);
             }
             Ok(None) => self.ended = Some(Ok(())),

@@ -5,7 +5,7 @@ use std::pin::Pin;
 use futures_util::{FutureExt, Stream, StreamExt, future, stream};
 use tonic::Status;
 
-use super::{Asked, status};
+use super::{CallContext, status};
 use whereabouts_service::Readiness;
 
 /// Answers, one after another.
@@ -14,11 +14,11 @@ pub(super) type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send
 /// Answers until they end, the server drains, the caller may ask no more, or wants no more.
 pub(super) fn until_over<T: Send + 'static>(
     answers: impl Stream<Item = Result<T, Status>> + Send + 'static,
-    door: &Readiness,
-    asked: Asked,
+    readiness: &Readiness,
+    context: CallContext,
 ) -> Answers<T> {
-    let Asked { service, caller, deadline, .. } = asked;
-    let over = service.over(door, caller, deadline).map(|why| Err(status::of(why)));
+    let CallContext { service, caller, deadline, .. } = context;
+    let over = service.over(readiness, caller, deadline).map(|why| Err(status::of(why)));
     // The end of either ends both: what is over is told once.
     let answers = answers.map(Some).chain(stream::iter([None]));
     let over = stream::once(over).map(Some).chain(stream::iter([None]));

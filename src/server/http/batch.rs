@@ -6,30 +6,22 @@ mod form;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Duration;
 
-use axum::body::{Body, BodyDataStream};
+use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::{Extension, Json};
-use bytes::Bytes;
-use futures_util::{Stream, StreamExt, stream};
-use tokio::runtime::Handle;
+use futures_util::{Stream, StreamExt};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use utoipa::ToSchema;
 
 use super::body::{Segments, content_type};
-use super::guard::{discard, too_large};
 use super::maps::map_name;
-use super::messages::no_bulk_memory;
-use super::problem::Problem;
-use super::state::{AppState, HttpSettings, Ready};
+use super::state::AppState;
+use crate::gate::{BodyPaused, GateSettings, Problem, Ready, no_bulk_memory, too_large};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 use whereabouts_api::{ErrorKind, ImageMeta};
 use whereabouts_service::{BulkImage, BulkResult, Deadline, Principal, ServiceError};
 use whereabouts_store::Added;
-
-/// The route.
-pub(super) const PATH: &str = "/maps/{map}/images:batch";
 
 /// The largest description of an image, in bytes.
 const LARGEST_META: usize = 64 << 10;
@@ -46,7 +38,7 @@ const STEP: usize = 4 << 20;
 /// The room that there is for an image that comes in.
 #[derive(Clone)]
 struct Room {
-    settings: Arc<HttpSettings>,
+    settings: Arc<GateSettings>,
     memory: Arc<Semaphore>,
     /// How many bytes of the body may still come before whoever reads it gets on.
     allowance: Arc<AtomicUsize>,
@@ -138,8 +130,8 @@ pub(super) async fn add_images(
 ) -> Result<Json<BatchAnswer>, Problem> {
     let map = map_name(&map)?;
     service.get_map(&map).await?;
-    let until = service.over(&state.door, caller.clone(), deadline);
-    let (settings, memory) = (state.settings, state.bulk_memory);
+    let until = service.over(&state.gate.readiness, caller.clone(), deadline);
+    let (settings, memory) = (state.gate.settings, state.gate.bulk_memory);
     let images = images(request, Room { settings, memory, allowance: Arc::default() }).await?;
     let results = service.add_images(&map, &caller, images, until).await?;
     let results: Vec<BatchResult> = results.into_iter().map(batch_result).collect();
@@ -170,53 +162,10 @@ async fn images(request: Request, room: Room) -> Result<Images, Problem> {
     }
 }
 
-/// A body that may take any time, if nothing of it waits for long.
-pub(super) fn unhurried(body: Body, pause: Duration) -> Body {
-    let unhurried = Unhurried { body: Some(body.into_data_stream()), pause };
-    Body::from_stream(stream::unfold(unhurried, |mut unhurried| async move {
-        let next = unhurried.next().await?;
-        Some((next, unhurried))
-    }))
-}
-
-/// What of a body is still to come. What nobody reads is thrown away for a while, or the client, which is still
-/// sending, would see a reset connection instead of the answer.
-struct Unhurried {
-    body: Option<BodyDataStream>,
-    pause: Duration,
-}
-
-impl Unhurried {
-    async fn next(&mut self) -> Option<Result<Bytes, axum::Error>> {
-        let next = tokio::time::timeout(self.pause, self.body.as_mut()?.next()).await;
-        let next = next.unwrap_or_else(|_| Some(Err(axum::Error::new(Paused(self.pause)))));
-        if !matches!(next, Some(Ok(_))) {
-            self.body = None;
-        }
-        next
-    }
-}
-
-impl Drop for Unhurried {
-    fn drop(&mut self) {
-        if let (Some(body), Ok(runtime)) = (self.body.take(), Handle::try_current()) {
-            runtime.spawn(discard(body));
-        }
-    }
-}
-
-/// Nothing of a body came for so long.
-#[derive(Debug, thiserror::Error)]
-#[error(
-    "nothing of the body came for {} s (server.body_pause_s); send it again, what was stored is left as it is",
-    .0.as_secs()
-)]
-struct Paused(Duration);
-
 /// What an error of a body or its reader means, whose own words for it are these.
 fn unreadable(error: &(dyn std::error::Error + 'static), words: &str) -> Problem {
     let mut causes = std::iter::successors(Some(error), |error| error.source());
-    match causes.find_map(|cause| cause.downcast_ref::<Paused>()) {
+    match causes.find_map(|cause| cause.downcast_ref::<BodyPaused>()) {
         Some(paused) => Problem::new(ErrorKind::TooSlow, paused.to_string()),
         None => Problem::new(ErrorKind::Malformed, format!("the body cannot be read: {words}")),
     }

@@ -4,13 +4,11 @@ use axum::extract::{FromRequest, FromRequestParts, Multipart, Path, Query, Reque
 use axum::http::header::CONTENT_TYPE;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, StatusCode};
-use bytes::{Bytes, BytesMut};
-use futures_util::StreamExt;
+use bytes::Bytes;
 use serde::de::DeserializeOwned;
 
-use super::guard::{discard, throw_away, too_large};
-use super::problem::Problem;
 use super::state::AppState;
+use crate::gate::{Problem, read_whole, throw_away, too_large};
 use whereabouts_api::ErrorKind;
 use whereabouts_service::Service;
 use whereabouts_vision::AdmissionRequest;
@@ -50,7 +48,7 @@ impl<T: DeserializeOwned> FromRequest<AppState> for JsonBody<T> {
     type Rejection = Problem;
 
     async fn from_request(request: Request, state: &AppState) -> Result<Self, Problem> {
-        let bytes = whole(request, state).await?;
+        let bytes = read_whole(request.into_body(), state.gate.settings.body_limit_bytes).await?;
         let text: &[u8] = if bytes.is_empty() { b"{}" } else { &bytes };
         serde_json::from_slice(text).map(Self).map_err(|error| {
             Problem::new(
@@ -80,8 +78,12 @@ impl PictureBody {
             return Err(refused.into());
         }
         match body_type(request.headers())? {
-            BodyType::Raw => Ok(Self { picture: whole(request, state).await?, meta: None }),
-            BodyType::Form => from_form(request, state.settings.body_limit_bytes).await,
+            BodyType::Raw => Ok(Self {
+                picture: read_whole(request.into_body(), state.gate.settings.body_limit_bytes)
+                    .await?,
+                meta: None,
+            }),
+            BodyType::Form => from_form(request, state.gate.settings.body_limit_bytes).await,
         }
     }
 }
@@ -141,23 +143,4 @@ pub(super) async fn from_form(request: Request, limit: usize) -> Result<PictureB
     }
     let picture = picture.ok_or_else(|| malformed("the form has no part \"image\"".into()))?;
     Ok(PictureBody { picture, meta })
-}
-
-/// The whole body. What exceeds the bound is thrown away for a while, or the client, which is still
-/// sending, would see a reset connection instead of the answer.
-pub(super) async fn whole(request: Request, state: &AppState) -> Result<Bytes, Problem> {
-    let limit = state.settings.body_limit_bytes;
-    let mut chunks = request.into_body().into_data_stream();
-    let mut body = BytesMut::new();
-    while let Some(chunk) = chunks.next().await {
-        let chunk = chunk.map_err(|error| {
-            Problem::new(ErrorKind::Malformed, format!("the body cannot be read: {error}"))
-        })?;
-        if body.len() + chunk.len() > limit {
-            tokio::spawn(discard(chunks));
-            return Err(Problem::new(ErrorKind::TooLarge, too_large(limit)));
-        }
-        body.extend_from_slice(&chunk);
-    }
-    Ok(body.freeze())
 }

@@ -6,16 +6,15 @@ use utoipa::openapi::schema::{ObjectBuilder, Type};
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
 use utoipa::openapi::{ContentBuilder, OpenApi, Ref, RefOr, Required, Response, ResponseBuilder};
 
-use super::auth::{Access, access};
 use super::examples;
-use super::idempotency::{LONGEST_KEY, applies};
+use crate::gate::{Access, LONGEST_KEY, Policies};
 
 /// The name of the security scheme.
 const KEY: &str = "key";
 
 /// Adds to every call what can be said of it without knowing what it does: who may make it, and how it can
 /// fail.
-pub(super) fn completed(mut description: OpenApi) -> OpenApi {
+pub(super) fn completed(mut description: OpenApi, policies: &Policies) -> OpenApi {
     let scheme = HttpBuilder::new().scheme(HttpAuthScheme::Bearer).description(Some(
         "An API key, made by `whereabouts keys create`. A server that listens on loopback only asks for none \
          unless it is set to.",
@@ -31,10 +30,11 @@ pub(super) fn completed(mut description: OpenApi) -> OpenApi {
         ];
         for (method, operation) in operations {
             if let Some(operation) = operation
-                && let Some(Access::Role(role)) = access(&method, route)
+                && let Some(policy) = policies.of(&method, route)
+                && let Access::Role(role) = policy.access
             {
                 complete(operation, role.as_str());
-                if applies(&method, route) {
+                if policy.idempotent {
                     take_key(operation);
                 }
             }

@@ -12,8 +12,9 @@ use utoipa::IntoParams;
 use super::body::{Params, Segments};
 use super::jobs::job_id;
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_service::{AnyJobEvent, Deadline, JobEvent, Principal, ServiceError};
 
 /// A comment is sent after so long without an event, so that nothing on the way hangs up.
@@ -36,7 +37,7 @@ pub(super) async fn follow_job(
     Extension(caller): Extension<Principal>,
     Segments(id): Segments<String>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
-    let permit = state.stream()?;
+    let permit = state.gate.stream_permit()?;
     let events = service.follow_job(job_id(&id)?).await?.map(move |event| {
         // Given back when the stream ends or the client has gone.
         let _permit = &permit;
@@ -46,7 +47,7 @@ pub(super) async fn follow_job(
             JobEvent::Ended(job) => Event::default().event("end").json_data(job),
         }
     });
-    Ok(streamed(events, service.over(&state.door, caller, Deadline::default())))
+    Ok(streamed(events, service.over(&state.gate.readiness, caller, Deadline::default())))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -75,7 +76,7 @@ pub(super) async fn follow_jobs(
     Params(params): Params<FollowParams>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let map = params.map.as_deref().map(map_name).transpose()?;
-    let permit = state.stream()?;
+    let permit = state.gate.stream_permit()?;
     let events = service.follow_jobs(map).map(move |event| {
         let _permit = &permit;
         match event {
@@ -84,7 +85,10 @@ pub(super) async fn follow_jobs(
         }
     });
     let opened = stream::once(async { Ok(Event::default().comment("open")) });
-    Ok(streamed(opened.chain(events), service.over(&state.door, caller, Deadline::default())))
+    Ok(streamed(
+        opened.chain(events),
+        service.over(&state.gate.readiness, caller, Deadline::default()),
+    ))
 }
 
 /// Sends events until they end, the server drains, or the caller may ask no more. A drain does not wait for

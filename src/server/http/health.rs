@@ -5,8 +5,9 @@ use axum::extract::State;
 use axum::http::header::{CONTENT_SECURITY_POLICY, CONTENT_TYPE};
 use axum::response::{Html, IntoResponse, Response};
 
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use crate::{Levels, Metrics};
 use whereabouts_api::ErrorKind;
 use whereabouts_service::{Service, ServiceError};
@@ -23,8 +24,8 @@ pub(super) async fn livez() -> &'static str {
     (status = 503, body = Problem, description = "Starting or draining", content_type = "application/problem+json"),
 ))]
 pub(super) async fn readyz(State(state): State<AppState>) -> Result<&'static str, Problem> {
-    state.door.service()?;
-    if state.door.draining().is_cancelled() {
+    state.gate.readiness.service()?;
+    if state.gate.readiness.draining().is_cancelled() {
         return Err(Problem::new(ErrorKind::Unavailable, "the server is draining; use another"));
     }
     Ok("ready\n")
@@ -39,7 +40,7 @@ pub(super) async fn metrics(
     Ready(service): Ready,
 ) -> Result<impl IntoResponse, Problem> {
     const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
-    let text = metrics_text(&state.metrics, &service).await?;
+    let text = metrics_text(&state.gate.metrics, &service).await?;
     Ok(([(CONTENT_TYPE, OPEN_METRICS)], text))
 }
 

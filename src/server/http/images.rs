@@ -13,8 +13,9 @@ use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody, Segments};
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
 use whereabouts_core::{Image, ImageId, MediaType};
 use whereabouts_service::{Deadline, NewImage, ServiceError};

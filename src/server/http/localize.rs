@@ -7,10 +7,11 @@ use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody};
-use super::idempotency::IdempotencyId;
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::IdempotencyId;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{Answer, RefineMode};
 use whereabouts_core::Priority;
 use whereabouts_service::{Deadline, LocalizeRequest, Principal, ServiceError, TrackStep};

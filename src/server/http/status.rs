@@ -8,8 +8,9 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::Today;
 use whereabouts_core::RefinerKind;
 use whereabouts_service::ServiceError;
@@ -17,7 +18,7 @@ use whereabouts_telemetry::{LogIssue, LogIssues, Minute};
 
 /// What is known of the server from its start on.
 #[derive(Debug)]
-pub struct About {
+pub(crate) struct About {
     /// When it was started.
     pub started_at: Timestamp,
     /// The settings in force in TOML, without secrets.
@@ -122,7 +123,7 @@ pub(super) async fn status(
         started_at: about.started_at,
         now,
         refiner: service.refiner.as_ref().map(|refiner| refiner.kind()),
-        keys_required: state.settings.keys_required,
+        keys_required: state.gate.settings.keys_required,
         default_model: service.models.default_model().to_owned(),
         models: models.collect(),
         jobs: OpenOf { open: service.open_jobs().await?, limit: service.settings.job_queue },
@@ -134,7 +135,7 @@ pub(super) async fn status(
         free_bytes: service.retention.free_bytes().await,
         today: service.today(),
         tiles: about.tiles.clone(),
-        minutes: state.metrics.last_hour.minutes(now),
+        minutes: state.gate.metrics.last_hour.minutes(now),
         errors: about.troubles.last(),
         settings: about.settings.clone(),
     }))

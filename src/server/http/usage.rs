@@ -7,8 +7,8 @@ use whereabouts_api::UsageReport;
 
 use super::body::Params;
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::Ready;
+use crate::gate::Problem;
+use crate::gate::Ready;
 
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]

@@ -7,8 +7,8 @@ use utoipa::{IntoParams, ToSchema};
 use uuid::Uuid;
 
 use super::body::{JsonBody, Params, Segments};
-use super::problem::Problem;
-use super::state::Ready;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{DeliveryPage, MadeWebhook, NewWebhook};
 use whereabouts_core::{Delivery, DeliveryState, Webhook};
 use whereabouts_service::{self};

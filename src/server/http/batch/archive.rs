@@ -11,7 +11,7 @@ use tokio::sync::{OwnedSemaphorePermit, mpsc};
 use tokio_util::io::{StreamReader, SyncIoBridge};
 
 use super::{LARGEST_META, Room, described, unreadable};
-use crate::http::problem::Problem;
+use crate::gate::Problem;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::{BulkImage, ServiceError};
 

@@ -7,7 +7,7 @@ use futures_util::{Stream, stream};
 use tokio::sync::OwnedSemaphorePermit;
 
 use super::{LARGEST_META, Room, STEP, described, unreadable};
-use crate::http::problem::Problem;
+use crate::gate::Problem;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::{BulkImage, ServiceError};
 

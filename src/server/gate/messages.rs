@@ -1,5 +1,5 @@
-//! The messages of a gRPC call as they come in: bounded one by one in size and time, and all together by
-//! memory.
+//! Bounds the messages of a gRPC call as they arrive: the size and time of each, and the memory of all
+//! together.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,52 +10,53 @@ use futures_util::{StreamExt, stream};
 use tokio::sync::Semaphore;
 use tokio::time::{Instant, timeout};
 
-use super::guard::too_large;
+use super::body::too_large;
+use super::body_budget::BodyBudget;
 use super::incoming::no_memory;
+use super::policy::RoutePolicy;
 use super::problem::Problem;
-use super::state::{AppState, HttpSettings};
+use super::state::{Gate, GateSettings, no_bulk_memory};
 use crate::Metrics;
-use crate::grpc::{BodyBudget, Call};
 use whereabouts_api::ErrorKind;
 use whereabouts_service::Rejection;
 
-/// The bytes before a message: whether it is compressed, and its length.
+/// Bytes before each message: whether it is compressed, and its length.
 const PREFIX: usize = 5;
 
-/// The largest message of a call that carries no picture, in bytes.
+/// Largest message of a call without pictures, in bytes.
 const LARGEST_PLAIN: usize = 64 << 10;
 
-/// Reads along.
+/// Follows the framing of a body while its reader reads it.
 struct Messages {
     body: BodyDataStream,
-    call: Call,
-    settings: Arc<HttpSettings>,
+    policy: RoutePolicy,
+    settings: Arc<GateSettings>,
     metrics: Arc<Metrics>,
-    /// Of all bodies, or of those of bulk uploads.
+    /// The memory of all bodies, or of those of bulk uploads.
     memory: Arc<Semaphore>,
-    held: BodyBudget,
+    budget: BodyBudget,
     prefix: [u8; PREFIX],
-    /// Bytes of the prefix that have come.
+    /// Bytes of the prefix that have arrived.
     prefix_bytes: usize,
-    /// Bytes of the message that are still to come.
-    left: usize,
+    /// Bytes of the message that have not arrived yet.
+    missing: usize,
     failed: bool,
 }
 
-/// Bounds the messages of a call. Its reader hears of what is wrong as a status. What they take of the memory
-/// is in `held`, until the reader takes it from there or the call has been answered.
-pub(super) fn bounded(body: Body, call: Call, state: &AppState, held: BodyBudget) -> Body {
-    let memory = if call.many { &state.bulk_memory } else { &state.bodies_memory };
+/// Bounds the messages of a call; its reader gets a fault as a status. The memory of the messages is held in
+/// `budget` until the reader takes it over or the call is answered.
+pub(super) fn bounded(body: Body, policy: RoutePolicy, gate: &Gate, budget: BodyBudget) -> Body {
+    let memory = if policy.bulk { &gate.bulk_memory } else { &gate.bodies_memory };
     let messages = Messages {
         body: body.into_data_stream(),
-        call,
-        settings: Arc::clone(&state.settings),
-        metrics: Arc::clone(&state.metrics),
+        policy,
+        settings: Arc::clone(&gate.settings),
+        metrics: Arc::clone(&gate.metrics),
         memory: Arc::clone(memory),
-        held,
+        budget,
         prefix: [0; PREFIX],
         prefix_bytes: 0,
-        left: 0,
+        missing: 0,
         failed: false,
     };
     Body::from_stream(stream::unfold(messages, |mut messages| async {
@@ -69,8 +70,8 @@ impl Messages {
         if self.failed {
             return None;
         }
-        let within = self.left > 0 || self.prefix_bytes > 0;
-        let pause = match self.call.streams && !within {
+        let within = self.missing > 0 || self.prefix_bytes > 0;
+        let pause = match self.policy.streams && !within {
             true => self.settings.stream_idle,
             false => self.settings.body_pause,
         };
@@ -86,14 +87,14 @@ impl Messages {
         })
     }
 
-    /// Follows the prefixes and messages of a chunk, and takes memory: of many messages for the whole of each
-    /// before it has come, or uploads would wait for one another; else for what has come.
+    /// Follows the framing of a chunk, and reserves memory for it. A bulk upload reserves the whole of each
+    /// message in advance: two uploads that each hold half a message would wait for each other.
     async fn count(&mut self, chunk: &[u8]) -> Result<(), Problem> {
         let mut rest = chunk;
         while !rest.is_empty() {
-            if self.left > 0 {
-                let of_message = self.left.min(rest.len());
-                self.left -= of_message;
+            if self.missing > 0 {
+                let of_message = self.missing.min(rest.len());
+                self.missing -= of_message;
                 rest = &rest[of_message..];
                 continue;
             }
@@ -105,31 +106,31 @@ impl Messages {
                 self.begin().await?;
             }
         }
-        if self.call.many || self.held.try_add(&self.memory, chunk.len()) {
+        if self.policy.bulk || self.budget.try_add(&self.memory, chunk.len()) {
             return Ok(());
         }
         let detail = no_memory(self.settings.bodies_limit_bytes);
         Err(Problem::new(ErrorKind::Overloaded, detail))
     }
 
-    /// A message begins.
+    /// Reads the prefix of a message.
     async fn begin(&mut self) -> Result<(), Problem> {
         let [_, length @ ..] = self.prefix;
         let length = u32::from_be_bytes(length);
-        (self.prefix_bytes, self.left) = (0, length as usize);
-        let limit = match self.call.pictures {
+        (self.prefix_bytes, self.missing) = (0, length as usize);
+        let limit = match self.policy.pictures {
             true => self.settings.body_limit_bytes,
             false => LARGEST_PLAIN,
         };
-        if self.left > limit {
+        if self.missing > limit {
             return Err(Problem::new(ErrorKind::TooLarge, too_large(limit)));
         }
-        if !self.call.many || self.held.is_answered() {
+        if !self.policy.bulk || self.budget.is_closed() {
             return Ok(());
         }
         let taking = Arc::clone(&self.memory).acquire_many_owned(length);
         match timeout(self.settings.request_timeout, taking).await {
-            Ok(Ok(taken)) => self.held.add(taken),
+            Ok(Ok(taken)) => self.budget.add(taken),
             _ => return Err(no_bulk_memory()),
         }
         Ok(())
@@ -142,16 +143,9 @@ impl Messages {
             ErrorKind::Overloaded => self.metrics.refused(Rejection::Bodies),
             _ => {}
         }
-        // Who reads the body passes a status on as it is.
+        // tonic passes a status within the error on to the client.
         axum::Error::new(tonic::Status::from(problem))
     }
-}
-
-/// The images of bulk uploads have filled the memory that there is for them, for too long.
-pub(super) fn no_bulk_memory() -> Problem {
-    let detail = "the images of uploads in progress fill the memory that there is for them \
-                  (bulk.memory_bytes); try again in a moment";
-    Problem::new(ErrorKind::Overloaded, detail)
 }
 
 fn slow(pause: Duration, within: bool) -> Problem {
@@ -171,25 +165,13 @@ fn slow(pause: Duration, within: bool) -> Problem {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::grpc;
+    use crate::gate::policy::RoutePolicy;
 
-    const STREAM: &str = "/whereabouts.v1.LocalizationService/LocalizeStream";
-    const IMAGES: &str = "/whereabouts.v1.MapService/AddImages";
+    const STREAM: RoutePolicy = RoutePolicy::robot().grpc().streams().pictures();
+    const IMAGES: RoutePolicy = RoutePolicy::operator().grpc().bulk().pictures();
 
-    fn state() -> AppState {
-        AppState::for_tests(HttpSettings {
-            body_limit_bytes: 100,
-            bodies_limit_bytes: 250,
-            bulk_memory_bytes: 150,
-            body_timeout: Duration::from_secs(1),
-            body_pause: Duration::from_millis(60),
-            request_timeout: Duration::from_millis(200),
-            max_wait: Duration::from_secs(1),
-            max_requests: 1,
-            max_streams: 1,
-            stream_idle: Duration::from_millis(60),
-            keys_required: false,
-        })
+    fn gate() -> Gate {
+        Gate::new(GateSettings::small(), Arc::default())
     }
 
     fn message(length: u32) -> Vec<u8> {
@@ -199,22 +181,21 @@ mod tests {
         message
     }
 
-    /// Reads until nothing more comes, and takes what each chunk holds if it is told to.
+    /// Reads until nothing more arrives; `takes` over the memory of each chunk, as a handler does.
     async fn read(
-        path: &str,
+        policy: RoutePolicy,
         chunks: Vec<Vec<u8>>,
-        state: &AppState,
+        gate: &Gate,
         takes: bool,
     ) -> Result<usize, String> {
         let chunks = stream::iter(chunks).map(|chunk| Ok::<_, axum::Error>(Bytes::from(chunk)));
         let body = Body::from_stream(chunks.chain(stream::pending()));
-        let held = BodyBudget::default();
-        let call = grpc::call(path).unwrap();
-        let mut body = bounded(body, call, state, held.clone()).into_data_stream();
+        let budget = BodyBudget::default();
+        let mut body = bounded(body, policy, gate, budget.clone()).into_data_stream();
         let mut bytes = 0;
         while let Some(chunk) = body.next().await {
             if takes {
-                drop(held.take());
+                drop(budget.take());
             }
             match chunk {
                 Ok(chunk) => bytes += chunk.len(),
@@ -226,41 +207,41 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn messages_are_followed_however_they_are_cut() {
+    async fn message_framing_is_followed_across_chunk_boundaries() {
         let all = [message(100), message(0), message(3)].concat();
         for cut in [1, 4, 7, 200] {
-            let state = state();
+            let gate = gate();
             let chunks = || all.chunks(cut).map(<[u8]>::to_vec).collect();
-            assert_eq!(read(STREAM, chunks(), &state, false).await, Ok(all.len()));
-            assert_eq!(read(IMAGES, chunks(), &state, false).await, Ok(all.len()));
-            assert_eq!(state.bodies_memory.available_permits(), 250, "all is given back");
-            assert_eq!(state.bulk_memory.available_permits(), 150);
+            assert_eq!(read(STREAM, chunks(), &gate, false).await, Ok(all.len()));
+            assert_eq!(read(IMAGES, chunks(), &gate, false).await, Ok(all.len()));
+            assert_eq!(gate.bodies_memory.available_permits(), 250, "everything is released");
+            assert_eq!(gate.bulk_memory.available_permits(), 150);
         }
         let many = || (0..20).map(|_| message(80)).collect();
-        assert_eq!(read(STREAM, many(), &state(), true).await, Ok(20 * 85));
-        assert_eq!(read(IMAGES, many(), &state(), true).await, Ok(20 * 85));
+        assert_eq!(read(STREAM, many(), &gate(), true).await, Ok(20 * 85));
+        assert_eq!(read(IMAGES, many(), &gate(), true).await, Ok(20 * 85));
     }
 
     #[tokio::test]
-    async fn what_is_too_large_or_too_slow_or_too_much_is_refused() {
-        let state = state();
-        let refused = read(STREAM, vec![message(101)], &state, true).await.unwrap_err();
+    async fn messages_beyond_the_size_time_or_memory_bound_are_refused() {
+        let gate = gate();
+        let refused = read(STREAM, vec![message(101)], &gate, true).await.unwrap_err();
         assert!(refused.contains("server.body_limit_bytes"), "{refused}");
         let cut = message(50)[..20].to_vec();
-        let refused = read(STREAM, vec![cut], &state, true).await.unwrap_err();
+        let refused = read(STREAM, vec![cut], &gate, true).await.unwrap_err();
         assert!(refused.contains("nothing of the message"), "{refused}");
         let many = || (0..4).map(|_| message(80)).collect();
-        let refused = read(STREAM, many(), &state, false).await.unwrap_err();
+        let refused = read(STREAM, many(), &gate, false).await.unwrap_err();
         assert!(refused.contains("server.bodies_limit_bytes"), "{refused}");
-        let refused = read(IMAGES, many(), &state, false).await.unwrap_err();
+        let refused = read(IMAGES, many(), &gate, false).await.unwrap_err();
         assert!(refused.contains("bulk.memory_bytes"), "{refused}");
-        // A prefix alone takes nothing.
+        // A prefix alone reserves nothing.
         let prefix = message(100)[..PREFIX].to_vec();
-        let taken = Arc::clone(&state.bodies_memory).try_acquire_many_owned(240).unwrap();
-        let refused = read(STREAM, vec![prefix], &state, false).await.unwrap_err();
+        let reserved = Arc::clone(&gate.bodies_memory).try_acquire_many_owned(240).unwrap();
+        let refused = read(STREAM, vec![prefix], &gate, false).await.unwrap_err();
         assert!(refused.contains("nothing of the message"), "{refused}");
-        drop(taken);
-        assert_eq!(state.bodies_memory.available_permits(), 250);
-        assert_eq!(state.bulk_memory.available_permits(), 150);
+        drop(reserved);
+        assert_eq!(gate.bodies_memory.available_permits(), 250);
+        assert_eq!(gate.bulk_memory.available_permits(), 150);
     }
 }
