@@ -1,4 +1,4 @@
-//! Metrics of requests and connections, and the registry that all members put their families into.
+//! Metrics of requests and connections, and the registry of all metric families.
 
 use std::fmt;
 use std::sync::Arc;
@@ -63,15 +63,10 @@ impl Metrics {
             request_seconds: register(
                 registry,
                 "http_request_seconds",
-                "Time from the request's head to the answer's",
+                "Time from the head of the request to the head of the response",
                 Family::new_with_constructor(latency),
             ),
-            connections: register(
-                registry,
-                "connections",
-                "Connections that are open",
-                Gauge::default(),
-            ),
+            connections: register(registry, "connections", "Open connections", Gauge::default()),
             service: Arc::new(ServiceMetrics::register(registry, rejections)),
             refine: Arc::new(RefineMetrics::register(registry, Arc::clone(&last_hour))),
             last_hour,
@@ -111,7 +106,7 @@ impl Metrics {
         self.connections.dec();
     }
 
-    /// Sets what is measured when it is asked for.
+    /// Sets the gauges that are read at a scrape.
     pub fn set_levels(&self, levels: &Levels) {
         self.levels.set(levels);
     }

@@ -41,7 +41,7 @@ impl Drop for AuditEntry {
         tracing::info!(
             target: "audit",
             request_id = %request_id.0, key = %key.id, key_name = %key.name, role = %key.role,
-            %method, path, status, "{}", if status.is_some() { "a call" } else { "a call that was given up" }
+            %method, path, status, "{}", if status.is_some() { "a call" } else { "an abandoned call" }
         );
     }
 }

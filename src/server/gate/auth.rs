@@ -26,7 +26,7 @@ pub(super) async fn authorize(
     next: Next,
 ) -> Response {
     let policy = match request.extensions().get() {
-        // A path without a route is answered 404, whoever calls.
+        // A path without a route is answered 404 to every caller.
         None => return next.run(request).await,
         Some(RouteMatch::Declared(policy)) => *policy,
         // Refused below, and only an admin learns how.
@@ -115,7 +115,7 @@ async fn check(
         return Err(ServiceError::new(
             ErrorKind::Forbidden,
             format!(
-                "this takes the role {role}, and the key {} has the role {}; ask an admin for another key",
+                "this call requires the role {role}, but the key {} has the role {}; ask an admin for another key",
                 key.id, key.role
             ),
         ));
@@ -145,7 +145,7 @@ async fn check(
         Some(Err(_)) => Ok(()),
         None => Err(ServiceError::new(
             ErrorKind::Forbidden,
-            "this key is for some maps only, and the request is about all; name one with ?map=, or ask an \
+            "this key is restricted to some maps, but the request is about all; name one with ?map=, or ask an \
              admin for another key",
         )),
     }

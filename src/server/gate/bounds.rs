@@ -27,8 +27,8 @@ pub(super) async fn bound(State(gate): State<Gate>, mut request: Request, next: 
     let arrival = Instant::now();
     let policy = policy(&request);
     if policy.is_some_and(|policy| policy.is_grpc()) && !is_grpc(request.headers()) {
-        let detail = "this is a call of gRPC, whose Content-Type is application/grpc; GET /docs lists the calls \
-                      of HTTP";
+        let detail = "this is a gRPC call, which needs the Content-Type application/grpc; GET /docs lists the \
+                      HTTP calls";
         return refuse(request, Problem::new(ErrorKind::UnsupportedMedia, detail));
     }
     if let Some(policy) = policy.filter(|policy| policy.probe) {
@@ -43,7 +43,7 @@ pub(super) async fn bound(State(gate): State<Gate>, mut request: Request, next: 
     let Ok(_permit) = Arc::clone(&gate.requests).try_acquire_owned() else {
         gate.metrics.refused(Rejection::Requests);
         let detail = format!(
-            "{} requests are in progress, the bound (server.max_requests); try again in a moment",
+            "{} requests are in progress, the limit (server.max_requests); try again in a moment",
             gate.settings.max_requests
         );
         return refuse(request, Problem::new(ErrorKind::Overloaded, detail));

@@ -62,8 +62,8 @@ pub(super) fn passed(wait: Duration) -> Problem {
     Problem::new(
         ErrorKind::DeadlinePassed,
         format!(
-            "the {} ms that the request was given (X-Deadline-Ms, grpc-timeout) have passed, and it was \
-             given up; allow more time, or send a later frame",
+            "the deadline of {} ms (X-Deadline-Ms, grpc-timeout) has passed, and the request was abandoned; \
+             allow more time, or send a newer frame",
             wait.as_millis()
         ),
     )

@@ -73,11 +73,11 @@ async fn answer(gate: Gate, request: Request, next: Next) -> Result<Response, Pr
         Once::Again(stored) => Ok(replay(stored)),
         Once::Other => Err(Problem::new(
             ErrorKind::Unprocessable,
-            "this Idempotency-Key was sent with another request before; each request has a key of its own",
+            "this Idempotency-Key was used for another request; use a new key for each request",
         )),
         Once::Running => {
             let detail =
-                "a request with this Idempotency-Key is in progress; ask again in a second";
+                "a request with this Idempotency-Key is in progress; try again in a second";
             let mut response = Problem::new(ErrorKind::Conflict, detail).into_response();
             response.headers_mut().insert(RETRY_AFTER, HeaderValue::from_static("1"));
             Ok(response)
@@ -140,7 +140,7 @@ async fn run_and_store(
     let text = match to_bytes(body, LARGEST_ANSWER).await {
         Ok(bytes) => bytes,
         Err(error) => {
-            let detail = format!("the answer broke off: {error}");
+            let detail = format!("the answer was cut short: {error}");
             return Problem::new(ErrorKind::Internal, detail).into_response();
         }
     };

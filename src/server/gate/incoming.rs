@@ -41,7 +41,7 @@ impl std::fmt::Display for Fault {
             ),
             Self::Paused(longest) => write!(
                 f,
-                "nothing of the body came for {} s (server.body_pause_s); send it again in one go",
+                "no data of the body arrived for {} s (server.body_pause_s); send it again in one go",
                 longest.as_secs()
             ),
             Self::NoMemory(most) => f.write_str(&no_memory(*most)),
@@ -52,7 +52,7 @@ impl std::fmt::Display for Fault {
 /// Says that all bodies together fill the memory for them.
 pub(super) fn no_memory(most: usize) -> String {
     format!(
-        "the bodies of all requests in progress hold {most} bytes, the bound (server.bodies_limit_bytes); try \
+        "the bodies of all requests in progress hold {most} bytes, the limit (server.bodies_limit_bytes); try \
          again in a moment"
     )
 }

@@ -75,10 +75,10 @@ impl Messages {
             true => self.settings.stream_idle,
             false => self.settings.body_pause,
         };
-        let begun = Instant::now();
+        let start = Instant::now();
         let chunk = match timeout(pause, self.body.next()).await {
             Ok(next) => next?,
-            Err(_) => return Some(Err(self.fail(slow(begun.elapsed(), within)))),
+            Err(_) => return Some(Err(self.fail(slow(start.elapsed(), within)))),
         };
         let Ok(chunk) = chunk else { return Some(chunk) };
         Some(match self.count(&chunk).await {
@@ -128,9 +128,9 @@ impl Messages {
         if !self.policy.bulk || self.budget.is_closed() {
             return Ok(());
         }
-        let taking = Arc::clone(&self.memory).acquire_many_owned(length);
-        match timeout(self.settings.request_timeout, taking).await {
-            Ok(Ok(taken)) => self.budget.add(taken),
+        let permit = Arc::clone(&self.memory).acquire_many_owned(length);
+        match timeout(self.settings.request_timeout, permit).await {
+            Ok(Ok(permit)) => self.budget.add(permit),
             _ => return Err(no_bulk_memory()),
         }
         Ok(())
@@ -152,10 +152,10 @@ fn slow(pause: Duration, within: bool) -> Problem {
     let seconds = pause.as_secs_f64().round();
     let detail = match within {
         true => format!(
-            "nothing of the message came for {seconds} s (server.body_pause_s); send it in one go"
+            "no data of the message arrived for {seconds} s (server.body_pause_s); send it in one go"
         ),
         false => format!(
-            "no message came for {seconds} s (server.stream_idle_s, of a single message \
+            "no message arrived for {seconds} s (server.stream_idle_s, of a single message \
              server.body_pause_s); call again when there is one"
         ),
     };
@@ -199,7 +199,7 @@ mod tests {
             }
             match chunk {
                 Ok(chunk) => bytes += chunk.len(),
-                Err(error) if error.to_string().contains("no message came") => return Ok(bytes),
+                Err(error) if error.to_string().contains("no message arrived") => return Ok(bytes),
                 Err(error) => return Err(error.to_string()),
             }
         }
@@ -229,7 +229,7 @@ mod tests {
         assert!(refused.contains("server.body_limit_bytes"), "{refused}");
         let cut = message(50)[..20].to_vec();
         let refused = read(STREAM, vec![cut], &gate, true).await.unwrap_err();
-        assert!(refused.contains("nothing of the message"), "{refused}");
+        assert!(refused.contains("no data of the message"), "{refused}");
         let many = || (0..4).map(|_| message(80)).collect();
         let refused = read(STREAM, many(), &gate, false).await.unwrap_err();
         assert!(refused.contains("server.bodies_limit_bytes"), "{refused}");
@@ -239,7 +239,7 @@ mod tests {
         let prefix = message(100)[..PREFIX].to_vec();
         let reserved = Arc::clone(&gate.bodies_memory).try_acquire_many_owned(240).unwrap();
         let refused = read(STREAM, vec![prefix], &gate, false).await.unwrap_err();
-        assert!(refused.contains("nothing of the message"), "{refused}");
+        assert!(refused.contains("no data of the message"), "{refused}");
         drop(reserved);
         assert_eq!(gate.bodies_memory.available_permits(), 250);
         assert_eq!(gate.bulk_memory.available_permits(), 150);

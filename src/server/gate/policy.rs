@@ -93,7 +93,7 @@ pub(crate) struct RoutePolicy {
     /// Whether it may take any time: it is bounded by the pauses within its body and by
     /// `server.max_streams`, rather than by a timeout and `server.max_requests`.
     pub streams: bool,
-    /// Whether its messages carry pictures; others are bounded to a few kilobytes. Calls of gRPC only.
+    /// Whether its messages carry pictures; others are bounded to 64 KiB. gRPC calls only.
     pub pictures: bool,
     /// Whether it is a bulk upload, whose memory is that of `bulk.memory_bytes`.
     pub bulk: bool,
@@ -157,11 +157,6 @@ impl RoutePolicy {
         Self { waits, ..self }
     }
 
-    /// The same, for any length of time.
-    pub const fn streams(self) -> Self {
-        Self { streams: true, ..self }
-    }
-
     /// The same, of a bulk upload.
     pub const fn bulk(self) -> Self {
         Self { bulk: true, streams: true, ..self }
@@ -193,6 +188,11 @@ impl RoutePolicy {
     /// The same, as a call of gRPC, whose maps are in its messages.
     pub const fn grpc(self) -> Self {
         Self { protocol: Protocol::Grpc, map: MapSource::Handler, ..self }
+    }
+
+    /// The same, for any length of time.
+    pub const fn streams(self) -> Self {
+        Self { streams: true, ..self }
     }
 
     /// The same, with pictures in its messages.

@@ -15,19 +15,19 @@ use super::observe::RequestId;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::ServiceError;
 
-/// What went wrong, for programs and people (RFC 9457, `application/problem+json`).
+/// An error, for programs and people (RFC 9457, `application/problem+json`).
 #[derive(Debug, Clone, Serialize, ToSchema)]
 pub(crate) struct Problem {
-    /// Which kind of problem: `about:blank#` and a word.
+    /// The type of the problem: `about:blank#` and a keyword.
     #[serde(rename = "type")]
     kind: String,
-    /// The kind in words.
+    /// The type as text.
     title: &'static str,
     /// The HTTP status.
     status: u16,
-    /// What happened and what to do next.
+    /// What happened, and what to do next.
     detail: String,
-    /// The id of the request, as in the `x-request-id` header and the logs.
+    /// Id of the request, as in the `x-request-id` header and the logs.
     request_id: String,
     /// The kind, for other forms of the same error.
     #[serde(skip)]
@@ -138,7 +138,7 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
     let id = request.extensions().get::<RequestId>().cloned().unwrap_or_default();
     let mut response = next.run(request).await;
     let Some(mut problem) = response.extensions_mut().remove::<Problem>() else { return response };
-    if problem.status == StatusCode::INTERNAL_SERVER_ERROR {
+    if problem.error_kind == ErrorKind::Internal {
         tracing::error!(request_id = %id.0, status = problem.status, detail = problem.detail);
     }
     problem.request_id = id.0;
@@ -187,8 +187,7 @@ pub(super) async fn no_such_path(request: Request) -> Response {
     let path = request.uri().path();
     #[cfg(feature = "grpc")]
     if is_grpc(request.headers()) {
-        let detail =
-            format!("there is no call {path}; ask the reflection service for those there are");
+        let detail = format!("there is no call {path}; the reflection service lists the calls");
         return tonic::Status::unimplemented(detail).into_http();
     }
     let detail = format!("there is nothing at {path}; GET /docs lists the calls");

@@ -34,6 +34,7 @@ pub struct GateSettings {
     /// Most streams that are open.
     pub max_streams: usize,
     /// Longest pause between two messages of a gRPC stream.
+    #[cfg_attr(not(feature = "grpc"), expect(dead_code, reason = "only gRPC streams messages"))]
     pub stream_idle: Duration,
     /// Whether callers need a key.
     pub keys_required: bool,
@@ -79,7 +80,7 @@ impl Gate {
         Arc::clone(&self.streams).try_acquire_owned().map_err(|_| {
             self.metrics.refused(Rejection::Requests);
             let detail = format!(
-                "{} streams are open, the bound (server.max_streams); ask with GET /jobs or \
+                "{} streams are open, the limit (server.max_streams); poll GET /jobs or \
                  GET /jobs/{{id}}?wait= instead",
                 self.settings.max_streams
             );
@@ -110,8 +111,8 @@ impl GateSettings {
 
 /// The problem of a bulk upload whose images found no memory in time.
 pub(crate) fn no_bulk_memory() -> Problem {
-    let detail = "the images of uploads in progress fill the memory that there is for them \
-                  (bulk.memory_bytes); try again in a moment";
+    let detail = "uploads in progress fill the memory for their images (bulk.memory_bytes); try again in a \
+                  moment";
     Problem::new(ErrorKind::Overloaded, detail)
 }
 

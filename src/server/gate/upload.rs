@@ -44,10 +44,10 @@ impl Drop for Upload {
     }
 }
 
-/// The error of an upload of which nothing came for the longest pause allowed.
+/// The error of an upload that paused for longer than allowed.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "nothing of the body came for {} s (server.body_pause_s); send it again, what was stored is left as it is",
+    "no data of the body arrived for {} s (server.body_pause_s); send it again, what was stored stays stored",
     .0.as_secs()
 )]
 pub(crate) struct BodyPaused(Duration);

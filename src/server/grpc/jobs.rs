@@ -1,4 +1,4 @@
-//! Jobs: show, follow, list, cancel, retry.
+//! `JobService`: get, watch, list, cancel, retry.
 
 use std::time::Duration;
 
@@ -12,19 +12,19 @@ use super::proto::{
     ListJobsResponse, PairDescribed, RetryJobRequest, RetryJobResponse, WatchJobRequest,
     WatchJobResponse,
 };
-use super::streams::{Answers, until_over};
+use super::streams::{ResponseStream, until_over};
 use super::{Api, CallContext, convert, status};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::Job;
 use whereabouts_service::{JobEvent, ServiceError, search_text, uuid};
 use whereabouts_store::JobFilter;
 
-/// Jobs in a page unless more are context for: clients take no more than four megabytes at a time by themselves.
+/// Default page size. By default, gRPC clients accept messages of four megabytes at most.
 const PAGE_SIZE: usize = 20;
 
 #[tonic::async_trait]
 impl JobService for Api {
-    type WatchJobStream = Answers<WatchJobResponse>;
+    type WatchJobStream = ResponseStream<WatchJobResponse>;
 
     async fn get_job(
         &self,
@@ -41,11 +41,11 @@ impl JobService for Api {
         request: Request<WatchJobRequest>,
     ) -> Result<Response<Self::WatchJobStream>, Status> {
         let context = self.context(request.extensions()).map_err(status::of)?;
-        let following = async {
+        let watching = async {
             let id = context.job(&request.into_inner().id, 0.0).await?.id;
             context.service.follow_job(id).await
         };
-        let events = following.await.map_err(status::of)?;
+        let events = watching.await.map_err(status::of)?;
         let events = events.map(|event| {
             let event = match event {
                 JobEvent::State(now) => Event::Status(JobStatus {
@@ -102,7 +102,7 @@ impl JobService for Api {
 }
 
 impl CallContext {
-    /// A job of a map that the caller may use, at once or when it has ended.
+    /// Returns a job of a map that the caller may use; with `wait_s`, once it has ended or the time is up.
     async fn job(&self, id: &str, wait_s: f64) -> Result<Job, ServiceError> {
         let id = uuid("job", id)?;
         let job = self.service.get_job(id, None).await?;
@@ -122,8 +122,8 @@ impl CallContext {
         if map.is_none() && !self.caller.may_use_all() {
             return Err(ServiceError::new(
                 ErrorKind::Forbidden,
-                "this key is for some maps only, and the request is about all; name one in `map`, or ask an \
-                 admin for another key",
+                "this key is restricted to some maps, but the request is about all; name one in `map`, or ask \
+                 an admin for another key",
             ));
         }
         let (state, text) = (convert::job_state(state)?, search_text(&text)?);

@@ -1,4 +1,4 @@
-//! Maps: list, show, change, remove, fill.
+//! `MapService`: list, get, put, delete, add images.
 
 use futures_util::{StreamExt, TryStreamExt, stream};
 use tokio::sync::OwnedSemaphorePermit;
@@ -63,13 +63,13 @@ impl MapService for Api {
         request: Request<Streaming<AddImagesRequest>>,
     ) -> Result<Response<AddImagesResponse>, Status> {
         let context = self.context(request.extensions()).map_err(status::of)?;
-        let mut coming = request.into_inner();
-        let Some(first) = coming.message().await? else {
+        let mut incoming = request.into_inner();
+        let Some(first) = incoming.message().await? else {
             return Ok(Response::new(AddImagesResponse { results: Vec::new() }));
         };
         let map = context.map(&first.map).map_err(status::of)?;
         context.service.get_map(&map).await.map_err(status::of)?;
-        let images = stream::iter([Ok(first)]).chain(coming);
+        let images = stream::iter([Ok(first)]).chain(incoming);
         let images = images.map_ok(|next| image(&map, next, context.budget.take()));
         let until = context.service.over(&self.readiness, context.caller.clone(), context.deadline);
         let results = context.service.add_images(&map, &context.caller, images, until).await?;
@@ -92,7 +92,7 @@ impl CallContext {
     }
 }
 
-/// The next image of a stream, if it can be one.
+/// Converts the next image of a stream.
 fn image(
     map: &MapName,
     next: AddImagesRequest,

@@ -110,7 +110,7 @@ impl Api {
 }
 
 impl CallContext {
-    /// A map that the caller may use. Every map of a request passes here.
+    /// Parses the name of a map, and checks that the caller may use it. Every map of a request passes here.
     fn map(&self, name: &str) -> Result<MapName, ServiceError> {
         let map: MapName = name.parse()?;
         self.caller.check_map(&map)?;

@@ -1,4 +1,4 @@
-//! Reading requests: queries, JSON, pictures raw or in a form.
+//! Extracts queries, path segments, JSON, and pictures, raw or in a form.
 
 use axum::extract::{FromRequest, FromRequestParts, Multipart, Path, Query, Request};
 use axum::http::header::CONTENT_TYPE;
@@ -66,16 +66,16 @@ pub(super) struct PictureBody {
 }
 
 impl PictureBody {
-    /// Reads a picture that there is room for; else it is refused before it has come.
+    /// Reads a picture, unless the server is overloaded: then it is refused before its body is read.
     pub async fn read(
         request: Request,
         state: &AppState,
         service: &Service,
         demand: AdmissionRequest,
     ) -> Result<Self, Problem> {
-        if let Err(refused) = service.check_admission(demand) {
+        if let Err(rejected) = service.check_admission(demand) {
             throw_away(request);
-            return Err(refused.into());
+            return Err(rejected.into());
         }
         match body_type(request.headers())? {
             BodyType::Raw => Ok(Self {
@@ -93,15 +93,15 @@ enum BodyType {
     Form,
 }
 
-/// The `Content-Type` as it was sent, and what it comes to without its parameters.
+/// The `Content-Type` as it was sent, and its media type in lower case without parameters.
 pub(super) fn content_type(headers: &HeaderMap) -> (&str, String) {
     let header = headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or("");
     (header, header.split(';').next().unwrap_or("").trim().to_ascii_lowercase())
 }
 
 fn body_type(headers: &HeaderMap) -> Result<BodyType, Problem> {
-    let (header, essence) = content_type(headers);
-    match essence.as_str() {
+    let (header, media_type) = content_type(headers);
+    match media_type.as_str() {
         "image/jpeg" | "image/png" | "image/webp" | "application/octet-stream" => Ok(BodyType::Raw),
         "multipart/form-data" => Ok(BodyType::Form),
         _ => Err(Problem::new(
@@ -115,7 +115,7 @@ fn body_type(headers: &HeaderMap) -> Result<BodyType, Problem> {
     }
 }
 
-/// Reads a form of at most `limit` bytes; the router bounds them.
+/// Reads a form. The router bounds its size; `limit` is only for the error.
 pub(super) async fn from_form(request: Request, limit: usize) -> Result<PictureBody, Problem> {
     let malformed = |detail: String| Problem::new(ErrorKind::Malformed, detail);
     let mut form = Multipart::from_request(request, &())

@@ -1,4 +1,4 @@
-//! Alive, ready, metrics, and the description of the API.
+//! Liveness, readiness, metrics, and the description of the API.
 
 use axum::Json;
 use axum::extract::State;
@@ -18,7 +18,7 @@ pub(super) async fn livez() -> &'static str {
     "alive\n"
 }
 
-/// Whether requests are taken
+/// Whether requests are accepted
 #[utoipa::path(get, path = "/readyz", tag = "service", responses(
     (status = 200, body = String),
     (status = 503, body = Problem, description = "Starting or draining", content_type = "application/problem+json"),
@@ -48,14 +48,14 @@ pub(super) async fn openapi_json(description: utoipa::openapi::OpenApi) -> Respo
     Json(description).into_response()
 }
 
-/// The page that shows `/openapi.json` to people; all of it is in the binary.
+/// The page that renders `/openapi.json`. It loads nothing from elsewhere.
 pub(super) async fn docs() -> impl IntoResponse {
     const POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; script-src \
                           'unsafe-inline'; connect-src 'self'";
     ([(CONTENT_SECURITY_POLICY, POLICY)], Html(include_str!("docs.html")))
 }
 
-/// All metrics as text, with the levels of this moment.
+/// Encodes all metrics, with gauges as of now.
 async fn metrics_text(metrics: &Metrics, service: &Service) -> Result<String, ServiceError> {
     let maps = service.list_maps().await?.into_iter();
     let index_bytes = service.retention.index_bytes().await?.into_iter();

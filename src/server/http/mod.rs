@@ -26,7 +26,7 @@ use utoipa_axum::routes;
 
 use crate::gate::{MapSource, Policies, RoutePolicy, Routes, Waits};
 
-pub use self::examples::{Example, ExampleBody, ExamplePart, Taken, examples};
+pub use self::examples::{Captured, Example, ExampleBody, ExamplePart, examples};
 pub(crate) use self::state::AppState;
 pub(crate) use self::status::About;
 pub use self::status::Tiles;
@@ -37,7 +37,7 @@ pub use self::status::Tiles;
         title = "whereabouts",
         description = "Tells a robot where it is from one camera frame. Maps of reference images \
                        are searched by global descriptor; a job then compares the frame with each \
-                       candidate and orders them anew. Errors are RFC 9457 problems.",
+                       candidate and ranks them again. Errors are RFC 9457 problems.",
         license(name = "Apache-2.0", identifier = "Apache-2.0")
     ),
     components(schemas(
@@ -51,10 +51,10 @@ pub use self::status::Tiles;
     tags(
         (name = "maps", description = "Named sets of reference images"),
         (name = "images", description = "Reference images with their poses"),
-        (name = "localize", description = "From a frame to candidates"),
-        (name = "jobs", description = "Refinements of the candidates"),
-        (name = "keys", description = "API keys, where the server asks for them"),
-        (name = "webhooks", description = "Who is told of the ends of jobs"),
+        (name = "localize", description = "Find the candidates of a frame"),
+        (name = "jobs", description = "Refine the ranking of the candidates"),
+        (name = "keys", description = "API keys, where the server requires them"),
+        (name = "webhooks", description = "URLs that are notified when jobs end"),
         (name = "service", description = "Health, metrics and this description")
     )
 )]
@@ -171,7 +171,7 @@ pub(crate) fn worker_routes() -> Routes<AppState> {
         .get("/metrics", RoutePolicy::operator().probe(), get(health::metrics))
 }
 
-/// Whether a request is a form that an upload can be: a part `image`, and perhaps one `meta`.
+/// Whether a request is a form that an upload accepts: a part `image`, and optionally one `meta`. For fuzzing.
 pub async fn is_picture_form(request: axum::extract::Request) -> bool {
     body::from_form(request, usize::MAX).await.is_ok()
 }
@@ -180,7 +180,7 @@ pub async fn is_picture_form(request: axum::extract::Request) -> bool {
 mod tests {
     use super::*;
 
-    /// All that a description refers to.
+    /// Collects all references within a description.
     fn references(value: &serde_json::Value, found: &mut Vec<String>) {
         match value {
             serde_json::Value::Object(fields) => {
@@ -197,14 +197,14 @@ mod tests {
     }
 
     #[test]
-    fn the_description_refers_to_nothing_that_is_not_there() {
+    fn every_reference_of_the_description_resolves() {
         let description = serde_json::to_value(openapi()).unwrap();
         let mut found = Vec::new();
         references(&description, &mut found);
         assert!(found.len() > 100);
         for reference in found {
-            let place = reference.strip_prefix('#').unwrap();
-            assert!(description.pointer(place).is_some(), "{reference}");
+            let pointer = reference.strip_prefix('#').unwrap();
+            assert!(description.pointer(pointer).is_some(), "{reference}");
         }
     }
 

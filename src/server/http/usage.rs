@@ -14,15 +14,15 @@ use crate::gate::Ready;
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct UsageParams {
-    /// Only what was spent in this map.
+    /// Only the usage of this map.
     map: Option<String>,
-    /// How many days back, today (UTC) included; 30 by default.
+    /// Number of days to report, including today (UTC); 30 by default.
     days: Option<u32>,
 }
 
-/// What calls to models outside have cost
+/// Usage and cost of external models
 ///
-/// By day and map, as it was billed. A map that was deleted keeps its entries.
+/// By day and map, as billed. Entries of a deleted map are kept.
 #[utoipa::path(get, path = "/usage", tag = "jobs", params(UsageParams), responses(
     (status = 200, body = UsageReport),
     (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
