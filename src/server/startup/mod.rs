@@ -17,7 +17,9 @@ use uuid::Uuid;
 
 use crate::Metrics;
 use crate::config::Config;
-use crate::http::{About, AppState, Connections, HttpSettings, router, worker_router};
+use crate::gate::{Connections, Gate, GateSettings};
+use crate::http::{About, AppState};
+use crate::router::{router, worker_router};
 use whereabouts_core::CalibrationSettings;
 use whereabouts_refine::{
     AttemptPolicy, DenseCache, JobServiceTime, Refiner, RefinerContext, Worker, WorkerSettings,
@@ -56,8 +58,8 @@ pub async fn run(
 ) -> anyhow::Result<()> {
     let address = listener.local_addr().context("the listener has no address")?;
     let metrics = Arc::new(Metrics::new());
-    let state =
-        AppState::new(http_settings(&config), about(&config, troubles)?, Arc::clone(&metrics));
+    let gate = Gate::new(gate_settings(&config), Arc::clone(&metrics));
+    let state = AppState { gate, about: Arc::new(about(&config, troubles)?) };
     let connections = Connections {
         settings: config.server.connections(),
         router: match role {
@@ -82,7 +84,7 @@ pub async fn run(
     let Webhooks { store, settings } = &service.webhooks;
     let dispatcher = Dispatcher::new(Arc::clone(store), counted, settings.clone());
     let service = Arc::new(service);
-    state.door().open(Arc::clone(&service));
+    state.gate.readiness().open(Arc::clone(&service));
     let mut running = JoinSet::new();
     if role == Role::Serve {
         let until = shutdown.clone();
@@ -100,7 +102,7 @@ pub async fn run(
 
     shutdown.cancelled().await;
     tracing::info!("draining");
-    state.door().drain();
+    state.gate.readiness().drain();
     let drained = async {
         let served = server.await;
         while running.join_next().await.is_some() {}
@@ -129,8 +131,8 @@ fn about(config: &Config, troubles: Arc<LogIssues>) -> anyhow::Result<About> {
     })
 }
 
-fn http_settings(config: &Config) -> HttpSettings {
-    HttpSettings {
+fn gate_settings(config: &Config) -> GateSettings {
+    GateSettings {
         body_limit_bytes: config.server.body_limit_bytes,
         bodies_limit_bytes: config.server.bodies_limit_bytes,
         body_timeout: Duration::from_secs(config.server.body_timeout_s),

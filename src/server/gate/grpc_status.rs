@@ -1,4 +1,4 @@
-//! Errors as statuses of gRPC. This is the one place that maps an error's kind to a code.
+//! Errors as gRPC statuses. The only place that maps the kind of an error to a gRPC code.
 
 use std::time::Duration;
 
@@ -6,11 +6,11 @@ use axum::response::Response;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-use super::proto;
+use super::problem::Problem;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::ServiceError;
 
-/// Whose errors they are (`google.rpc.ErrorInfo.domain`).
+/// The domain of all errors (`google.rpc.ErrorInfo.domain`).
 const DOMAIN: &str = "whereabouts";
 
 fn code_of(kind: ErrorKind) -> Code {
@@ -30,9 +30,9 @@ fn code_of(kind: ErrorKind) -> Code {
     }
 }
 
-/// A status with what programs want to know: `ErrorInfo`, whose reason is the kind of the problem, and
-/// `RetryInfo` where it is known when to try again.
-pub fn status(kind: ErrorKind, detail: &str, retry_after: Option<Duration>) -> Status {
+/// A status with details for programs: `ErrorInfo`, whose reason is the kind of the problem, and `RetryInfo`
+/// where it is known when to try again.
+fn status(kind: ErrorKind, detail: &str, retry_after: Option<Duration>) -> Status {
     let mut details = ErrorDetails::new();
     let reason = kind.word().replace('-', "_").to_uppercase();
     details.set_error_info(reason, DOMAIN, []);
@@ -43,26 +43,22 @@ pub fn status(kind: ErrorKind, detail: &str, retry_after: Option<Duration>) -> S
 }
 
 /// An error of the service as a status.
-pub(super) fn of(error: ServiceError) -> Status {
+pub(crate) fn of(error: ServiceError) -> Status {
     if error.kind == ErrorKind::Internal {
         tracing::error!(detail = error.detail, "a call failed");
     }
     status(error.kind, &error.detail, error.retry_after)
 }
 
-/// The same of one thing among several.
-pub(super) fn problem(error: ServiceError) -> proto::Problem {
-    proto::Problem {
-        kind: error.kind.word().to_owned(),
-        detail: error.detail,
-        // None is too long for a duration of protobuf.
-        retry_after: error.retry_after.and_then(|pause| pause.try_into().ok()),
+impl From<Problem> for Status {
+    fn from(problem: Problem) -> Self {
+        status(problem.kind(), problem.detail(), problem.retry_after())
     }
 }
 
-/// The status of HTTP that comes nearest to what a response of gRPC says before its body, for counts and
-/// logs.
-pub fn as_http(response: &Response) -> Option<u16> {
+/// The HTTP status nearest to the gRPC code in the headers of a response, for counts and logs; `None` for a
+/// response whose code follows its body.
+pub(super) fn as_http(response: &Response) -> Option<u16> {
     let code = response.headers().get(Status::GRPC_STATUS)?;
     Some(match Code::from_bytes(code.as_bytes()) {
         Code::Ok => 200,
@@ -86,7 +82,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_status_says_what_it_is_and_when_to_come_again() {
+    fn a_status_carries_the_reason_and_the_retry_delay() {
         let error = ServiceError::new(ErrorKind::Overloaded, "later")
             .retry_after(Duration::from_millis(1500));
         let status = of(error);

@@ -1,4 +1,4 @@
-//! Bodies as they come in: bounded by time, and all together by memory.
+//! Bounds a body as it arrives: its time, and the memory of all bodies together.
 
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
@@ -9,21 +9,21 @@ use futures_util::{StreamExt, stream};
 use tokio::sync::Semaphore;
 use tokio::time::{Instant, timeout_at};
 
+use super::body_budget::BodyBudget;
 use super::problem::Problem;
-use super::state::HttpSettings;
-use crate::grpc::BodyBudget;
+use super::state::GateSettings;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::Rejection;
 
-/// Watches one body. What it takes of the common memory is given back when the request is answered.
+/// Watches one body. Its memory is released when the request is answered. Clones share it.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Watch {
+pub(super) struct BodyWatch {
     fault: Arc<OnceLock<Fault>>,
-    /// What it holds of the memory of all.
-    pub held: BodyBudget,
+    /// Memory held by the part that has arrived.
+    pub budget: BodyBudget,
 }
 
-/// Why a body was not read to its end.
+/// Why a body was cut off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Fault {
     TookTooLong(Duration),
@@ -41,7 +41,7 @@ impl std::fmt::Display for Fault {
             ),
             Self::Paused(longest) => write!(
                 f,
-                "nothing of the body came for {} s (server.body_pause_s); send it again in one go",
+                "no data of the body arrived for {} s (server.body_pause_s); send it again in one go",
                 longest.as_secs()
             ),
             Self::NoMemory(most) => f.write_str(&no_memory(*most)),
@@ -49,30 +49,30 @@ impl std::fmt::Display for Fault {
     }
 }
 
-/// All bodies together hold as much as they may.
+/// Says that all bodies together fill the memory for them.
 pub(super) fn no_memory(most: usize) -> String {
     format!(
-        "the bodies of all requests in progress hold {most} bytes, the bound (server.bodies_limit_bytes); try \
+        "the bodies of all requests in progress hold {most} bytes, the limit (server.bodies_limit_bytes); try \
          again in a moment"
     )
 }
 
 impl std::error::Error for Fault {}
 
-/// The chunks of a body, and what bounds them.
+/// The chunks of a body, with its bounds.
 struct Chunks {
     body: BodyDataStream,
-    watch: Watch,
-    settings: Arc<HttpSettings>,
+    watch: BodyWatch,
+    settings: Arc<GateSettings>,
     memory: Arc<Semaphore>,
     end: Instant,
     counted: usize,
 }
 
-impl Watch {
-    /// Bounds a body. A reader hears of a fault as an error of the body; [`Self::problem`] tells
-    /// what it was, whoever read it.
-    pub fn over(&self, body: Body, settings: &Arc<HttpSettings>, memory: &Arc<Semaphore>) -> Body {
+impl BodyWatch {
+    /// Bounds a body. A fault ends it with an error; [`Self::problem`] says which fault it was, whatever the
+    /// reader made of the error.
+    pub fn over(&self, body: Body, settings: &Arc<GateSettings>, memory: &Arc<Semaphore>) -> Body {
         if body.is_end_stream() {
             return body;
         }
@@ -90,7 +90,7 @@ impl Watch {
         }))
     }
 
-    /// What is to be answered in the place of any other answer, and what it counts as.
+    /// The problem to answer instead of the handler's response, and the reason to count it under.
     pub fn problem(&self) -> Option<(Problem, Rejection)> {
         let fault = self.fault.get()?;
         let (kind, reason) = match fault {
@@ -111,7 +111,7 @@ impl Chunks {
         if self.watch.fault.get().is_some() {
             return None;
         }
-        let HttpSettings { body_timeout, body_pause, body_limit_bytes, .. } = *self.settings;
+        let GateSettings { body_timeout, body_pause, body_limit_bytes, .. } = *self.settings;
         let pause = Instant::now() + body_pause;
         let chunk = match timeout_at(pause.min(self.end), self.body.next()).await {
             Ok(next) => next?,
@@ -121,10 +121,10 @@ impl Chunks {
             Err(_) => return Some(Err(self.watch.fail(Fault::TookTooLong(body_timeout)))),
         };
         let Ok(chunk) = chunk else { return Some(chunk) };
-        // Of a body that is too large no more than that is kept.
+        // The reader stops at the limit; what exceeds it is not kept.
         if self.counted <= body_limit_bytes {
             self.counted += chunk.len();
-            if !self.watch.held.try_add(&self.memory, chunk.len()) {
+            if !self.watch.budget.try_add(&self.memory, chunk.len()) {
                 let most = self.settings.bodies_limit_bytes;
                 return Some(Err(self.watch.fail(Fault::NoMemory(most))));
             }

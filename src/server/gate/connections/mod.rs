@@ -1,4 +1,4 @@
-//! Connections: how many, how long one may stay silent, and how they end.
+//! Connections: bounds on their number, heads and slowness, and graceful shutdown.
 
 mod answers;
 mod preface;
@@ -27,33 +27,33 @@ use tokio_util::task::TaskTracker;
 use tower::ServiceExt;
 
 use self::answers::Answers;
-use self::preface::{Looked, Version};
+use self::preface::{Peeked, Version};
 use self::slots::{Slot, Slots};
 pub use self::tls::{Tls, TlsError};
 use self::writes::TimedWrites;
 use crate::Metrics;
 use whereabouts_service::Rejection;
 
-/// What a client of HTTP/2 may send of one request before it is read, in bytes.
+/// Flow-control window of one HTTP/2 stream, in bytes.
 const STREAM_WINDOW: u32 = 512 << 10;
 
-/// The same of all requests on its connection.
+/// Flow-control window of an HTTP/2 connection, in bytes.
 const CONNECTION_WINDOW: u32 = 1 << 20;
 
 /// Bounds on connections.
 #[derive(Debug, Clone)]
 pub struct ConnectionSettings {
-    /// The most that are open.
+    /// Most connections that are open.
     pub most: usize,
-    /// The longest wait for the whole head of a request.
+    /// Longest time for the whole head of a request to arrive.
     pub header_timeout: Duration,
-    /// The largest head, in bytes, at least 8192.
+    /// Largest head, in bytes, at least 8192.
     pub max_header_bytes: usize,
-    /// The most headers, of HTTP/1.
+    /// Most headers of an HTTP/1 request.
     pub max_headers: usize,
-    /// The most requests in progress on one connection, of HTTP/2.
+    /// Most requests in progress on one HTTP/2 connection.
     pub max_concurrent: u32,
-    /// The longest time that a client takes nothing of an answer.
+    /// Longest time that a client may read nothing of a response.
     pub write_timeout: Duration,
 }
 
@@ -61,27 +61,27 @@ pub struct ConnectionSettings {
 pub struct Connections {
     /// Bounds.
     pub settings: ConnectionSettings,
-    /// What answers.
+    /// Answers the requests.
     pub router: Router,
-    /// What is counted.
+    /// Counts connections and rejections.
     pub metrics: Arc<Metrics>,
-    /// The certificate, where connections are encrypted.
+    /// The certificate; `None` for plain HTTP.
     pub tls: Option<Arc<Tls>>,
 }
 
 impl Connections {
-    /// Takes connections until `shutdown`, then returns when the last request has been answered.
+    /// Accepts connections until `shutdown`, then returns once the last request has been answered.
     pub async fn serve(self, listener: TcpListener, shutdown: CancellationToken) {
         let (this, open) = (Arc::new(self), TaskTracker::new());
         let slots = Slots::new(this.settings.most);
         if let Some(tls) = this.tls.clone() {
             let shutdown = shutdown.clone();
-            open.spawn(async move { tls.follow(shutdown).await });
+            open.spawn(async move { tls.reload_until(shutdown).await });
         }
         while let Some(stream) = shutdown.run_until_cancelled(accept(&listener)).await {
             let Some(slot) = slots.take() else {
                 this.metrics.refused(Rejection::Connections);
-                // Who expects TLS would not understand a sentence.
+                // A client in a TLS handshake could not read a plain answer.
                 if this.tls.is_none() {
                     refuse(stream);
                 }
@@ -93,7 +93,7 @@ impl Connections {
                 let slot = Arc::new(slot);
                 tokio::select! {
                     () = this.serve_one(stream, &slot, shutdown) => {}
-                    () = slot.taken_away() => this.metrics.refused(Rejection::Connections),
+                    () = slot.evicted() => this.metrics.refused(Rejection::Connections),
                 }
                 this.metrics.connection_closed();
             });
@@ -104,22 +104,23 @@ impl Connections {
     }
 
     async fn serve_one(&self, stream: TcpStream, slot: &Arc<Slot>, shutdown: CancellationToken) {
-        // An answer should not wait for the acknowledgement of the one before.
+        // Nagle's algorithm would delay a response until the previous one is acknowledged.
         let _ = stream.set_nodelay(true);
         let Some(tls) = &self.tls else {
             let plain = TimedWrites::new(stream, self.settings.write_timeout);
-            return self.talk(plain, slot, shutdown).await;
+            return self.answer_all(plain, slot, shutdown).await;
         };
-        let shaken = tokio::time::timeout(self.settings.header_timeout, self.encrypt(tls, stream));
-        match shutdown.run_until_cancelled(shaken).await {
-            Some(Ok(Ok(encrypted))) => self.talk(encrypted, slot, shutdown.clone()).await,
-            Some(Ok(Err(error))) => tracing::debug!(%error, "a connection was not encrypted"),
+        let handshake =
+            tokio::time::timeout(self.settings.header_timeout, self.encrypt(tls, stream));
+        match shutdown.run_until_cancelled(handshake).await {
+            Some(Ok(Ok(encrypted))) => self.answer_all(encrypted, slot, shutdown.clone()).await,
+            Some(Ok(Err(error))) => tracing::debug!(%error, "a TLS handshake failed"),
             Some(Err(_)) => self.metrics.refused(Rejection::Slow),
             None => {}
         }
     }
 
-    /// Shakes hands. Who speaks without TLS is told so.
+    /// Performs the TLS handshake. A client that speaks plain HTTP gets a plain answer that says so.
     async fn encrypt(
         &self,
         tls: &Tls,
@@ -129,7 +130,7 @@ impl Connections {
         let mut first = [0];
         if stream.peek(&mut first).await? == 1 && first != [HANDSHAKE] {
             let detail = "this port speaks HTTPS; begin the address with https://";
-            let answer = bare("400 Bad Request", "malformed", "Malformed request", detail);
+            let answer = raw_problem("400 Bad Request", "malformed", "Malformed request", detail);
             let mut plain = TimedWrites::new(stream, self.settings.write_timeout);
             plain.write_all(answer.as_bytes()).await?;
             return Err(ErrorKind::InvalidData.into());
@@ -138,33 +139,33 @@ impl Connections {
     }
 
     /// Answers the requests of a connection, in the version of HTTP that the client speaks.
-    async fn talk<S: AsyncRead + AsyncWrite + Unpin>(
+    async fn answer_all<S: AsyncRead + AsyncWrite + Unpin>(
         &self,
         stream: S,
         slot: &Arc<Slot>,
         shutdown: CancellationToken,
     ) {
         let answers = Answers::new(Arc::clone(slot));
-        let mut stream = Looked::new(stream);
-        let looked = tokio::time::timeout(self.settings.header_timeout, stream.version());
-        match shutdown.run_until_cancelled(looked).await {
+        let mut stream = Peeked::new(stream);
+        let detected = tokio::time::timeout(self.settings.header_timeout, stream.version());
+        match shutdown.run_until_cancelled(detected).await {
             Some(Ok(Ok(Version::Http1))) => {
-                self.talk_http1(stream, answers, shutdown.clone()).await
+                self.answer_http1(stream, answers, shutdown.clone()).await
             }
             Some(Ok(Ok(Version::Http2))) => {
-                self.talk_http2(stream, answers, shutdown.clone()).await
+                self.answer_http2(stream, answers, shutdown.clone()).await
             }
-            Some(Ok(Err(error))) => tracing::debug!(%error, "a connection broke off"),
-            // Who has sent nothing has asked for nothing.
-            Some(Err(_)) if stream.has_begun() => self.give_up(stream).await,
+            Some(Ok(Err(error))) => tracing::debug!(%error, "a connection failed"),
+            // A client that has sent nothing expects no answer.
+            Some(Err(_)) if stream.has_begun() => self.reject_slow_head(stream).await,
             Some(Err(_)) | None => {}
         }
     }
 
-    /// Answers one request after another.
-    async fn talk_http1<S: AsyncRead + AsyncWrite + Unpin>(
+    /// Answers HTTP/1, one request after another.
+    async fn answer_http1<S: AsyncRead + AsyncWrite + Unpin>(
         &self,
-        stream: Looked<S>,
+        stream: Peeked<S>,
         answers: Answers,
         shutdown: CancellationToken,
     ) {
@@ -187,20 +188,20 @@ impl Connections {
             }
         };
         let Err(error) = ended else { return };
-        tracing::debug!(%error, "a connection broke off");
+        tracing::debug!(%error, "a connection failed");
         if error.is_timeout() {
             let parts = connection.into_parts();
             if !parts.read_buf.is_empty() {
-                self.give_up(parts.io.into_inner()).await;
+                self.reject_slow_head(parts.io.into_inner()).await;
             }
         }
     }
 
-    /// Answers several requests at a time. A client that takes nothing of an answer is given up, though
-    /// it takes others.
-    async fn talk_http2<S: AsyncRead + AsyncWrite + Unpin>(
+    /// Answers HTTP/2, several requests at a time. The connection is closed if the client stops reading any
+    /// one response, even if it reads others.
+    async fn answer_http2<S: AsyncRead + AsyncWrite + Unpin>(
         &self,
-        stream: Looked<S>,
+        stream: Peeked<S>,
         answers: Answers,
         shutdown: CancellationToken,
     ) {
@@ -208,12 +209,12 @@ impl Connections {
             let answer = self.answer(&answers, request);
             async {
                 let mut response = answer.await?;
-                // There is no such header in HTTP/2, and no need to hang up.
+                // HTTP/2 has no such header, and its connection need not be closed.
                 response.headers_mut().remove(CONNECTION);
                 Ok::<_, Infallible>(response)
             }
         };
-        let patience = self.settings.write_timeout;
+        let timeout = self.settings.write_timeout;
         let header_bytes = u32::try_from(self.settings.max_header_bytes).unwrap_or(u32::MAX);
         let mut connection = pin!(
             http2::Builder::new(TokioExecutor::new())
@@ -222,13 +223,13 @@ impl Connections {
                 .max_header_list_size(header_bytes)
                 .initial_stream_window_size(STREAM_WINDOW)
                 .initial_connection_window_size(CONNECTION_WINDOW)
-                .keep_alive_interval(patience)
-                .keep_alive_timeout(patience)
+                .keep_alive_interval(timeout)
+                .keep_alive_timeout(timeout)
                 .serve_connection(TokioIo::new(stream), service_fn(answer))
         );
         let mut stopping = pin!(shutdown.cancelled());
         let mut draining = false;
-        let mut looking = tokio::time::interval(patience / 4);
+        let mut stall_checks = tokio::time::interval(timeout / 4);
         let ended = loop {
             tokio::select! {
                 ended = &mut connection => break ended,
@@ -236,18 +237,18 @@ impl Connections {
                     draining = true;
                     connection.as_mut().graceful_shutdown();
                 }
-                _ = looking.tick() => if answers.are_stalled(patience) {
+                _ = stall_checks.tick() => if answers.are_stalled(timeout) {
                     self.metrics.refused(Rejection::Slow);
-                    return tracing::debug!("a client takes nothing of an answer");
+                    return tracing::debug!("a client reads nothing of a response");
                 },
             }
         };
         if let Err(error) = ended {
-            tracing::debug!(%error, "a connection broke off");
+            tracing::debug!(%error, "a connection failed");
         }
     }
 
-    /// The answer to a request, which is in progress as long as there is more of the answer.
+    /// Answers one request, which stays in progress until its response has ended.
     fn answer(
         &self,
         answers: &Answers,
@@ -261,8 +262,8 @@ impl Connections {
         }
     }
 
-    /// Says that the head of a request did not come in time.
-    async fn give_up(&self, mut stream: impl AsyncWrite + Unpin) {
+    /// Answers 408 and closes, because the head of a request did not arrive in time.
+    async fn reject_slow_head(&self, mut stream: impl AsyncWrite + Unpin) {
         self.metrics.refused(Rejection::Slow);
         let _ = stream.write_all(self.too_slow().as_bytes()).await;
         let _ = stream.shutdown().await;
@@ -273,12 +274,12 @@ impl Connections {
             "the head of the request took longer than {} s (server.header_timeout_s); send it at once",
             self.settings.header_timeout.as_secs()
         );
-        bare("408 Request Timeout", "too-slow", "Request timeout", &detail)
+        raw_problem("408 Request Timeout", "too-slow", "Request timeout", &detail)
     }
 }
 
-/// The next connection. Errors of one connection are its own; when files or memory run out, others
-/// have to end first.
+/// Accepts the next connection. Errors of a single connection are skipped; if files or memory have run out,
+/// it retries after a pause, in which others may end.
 async fn accept(listener: &TcpListener) -> TcpStream {
     loop {
         match listener.accept().await {
@@ -288,7 +289,7 @@ async fn accept(listener: &TcpListener) -> TcpStream {
                 | ErrorKind::ConnectionAborted
                 | ErrorKind::ConnectionReset => {}
                 _ => {
-                    tracing::error!(%error, "no connection can be taken");
+                    tracing::error!(%error, "no connection can be accepted");
                     tokio::time::sleep(Duration::from_secs(1)).await;
                 }
             },
@@ -296,19 +297,20 @@ async fn accept(listener: &TcpListener) -> TcpStream {
     }
 }
 
-/// Answers 503 without a task or a buffer of its own.
+/// Answers 503 without spending a task or a buffer on it.
 fn refuse(stream: TcpStream) {
-    let detail = "as many connections are open as may be (server.max_connections), all of them with \
+    let detail = "the limit of open connections is reached (server.max_connections), and all of them have \
                   a request in progress; try again in a moment";
-    let answer = bare("503 Service Unavailable", "unavailable", "Service unavailable", detail);
-    // What does not fit into the socket's empty buffer at once is not worth waiting for.
+    let answer =
+        raw_problem("503 Service Unavailable", "unavailable", "Service unavailable", detail);
+    // The answer fits into the empty buffer of a new socket; otherwise it is dropped.
     if let Ok(mut stream) = stream.into_std() {
         let _ = stream.write_all(answer.as_bytes());
     }
 }
 
-/// A problem from before there is a request.
-fn bare(status: &str, word: &str, title: &str, detail: &str) -> String {
+/// A problem document for a connection whose request was never parsed.
+fn raw_problem(status: &str, word: &str, title: &str, detail: &str) -> String {
     let number = status.split(' ').next().unwrap_or_default();
     let body = serde_json::json!({
         "type": format!("about:blank#{word}"),

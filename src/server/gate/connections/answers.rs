@@ -1,4 +1,4 @@
-//! The answers that a connection is giving: whether there are any, and whether the client takes them.
+//! The responses in progress on a connection: whether there are any, and whether the client reads them.
 
 use std::collections::BTreeMap;
 use std::pin::Pin;
@@ -9,25 +9,24 @@ use std::time::{Duration, Instant};
 use axum::body::{Body, HttpBody};
 use bytes::Bytes;
 use hyper::body::{Frame, SizeHint};
-use parking_lot::{Mutex, MutexGuard};
+use parking_lot::Mutex;
 
 use super::slots::Slot;
 
-/// The largest piece that is handed over at once, in bytes: what comes in one piece could not be seen to
-/// be taken slowly.
-const PIECE: usize = 16 << 10;
+/// Chunk size for response bodies, in bytes. Larger chunks would hide a client that reads slowly.
+const CHUNK: usize = 16 << 10;
 
-/// The answers of one connection. Clones share them.
+/// The responses of one connection. Clones share them.
 #[derive(Debug, Clone)]
 pub(super) struct Answers {
     slot: Arc<Slot>,
-    handed: Arc<Mutex<Handed>>,
+    waiting: Arc<Mutex<Waiting>>,
 }
 
-/// Since when the client is to take the next piece of each answer that has one.
+/// For each response that waits for its client, the time since when.
 #[derive(Debug, Default)]
-struct Handed {
-    next: u64,
+struct Waiting {
+    last_id: u64,
     since: BTreeMap<u64, Instant>,
 }
 
@@ -40,58 +39,55 @@ pub(super) struct InProgress {
 
 impl Answers {
     pub fn new(slot: Arc<Slot>) -> Self {
-        Self { slot, handed: Arc::default() }
+        Self { slot, waiting: Arc::default() }
     }
 
-    /// A request has come.
+    /// Registers a request.
     pub fn begin(&self) -> InProgress {
         self.slot.request_began();
-        let mut handed = self.handed();
-        handed.next += 1;
-        InProgress { answers: self.clone(), id: handed.next }
+        let mut waiting = self.waiting.lock();
+        waiting.last_id += 1;
+        InProgress { answers: self.clone(), id: waiting.last_id }
     }
 
-    /// Whether the client has taken nothing of some answer for so long.
-    pub fn are_stalled(&self, patience: Duration) -> bool {
-        self.handed().since.values().any(|since| since.elapsed() > patience)
-    }
-
-    fn handed(&self) -> MutexGuard<'_, Handed> {
-        self.handed.lock()
+    /// Whether the client has read nothing of some response for longer than `timeout`.
+    pub fn are_stalled(&self, timeout: Duration) -> bool {
+        self.waiting.lock().since.values().any(|since| since.elapsed() > timeout)
     }
 }
 
 impl InProgress {
-    /// The body of the answer to this request, which is in progress as long as there is more of it.
+    /// Wraps the body of the response, so that the request is in progress until the body has ended.
     pub fn over(self, body: Body) -> Body {
         self.wait_for_client();
-        Body::new(Watched { body, rest: Bytes::new(), handed: false, request: self })
+        Body::new(Watched { body, rest: Bytes::new(), started: false, request: self })
     }
 
     fn wait_for_client(&self) {
-        self.answers.handed().since.insert(self.id, Instant::now());
+        self.answers.waiting.lock().since.insert(self.id, Instant::now());
     }
 
-    fn client_asks(&self) {
-        self.answers.handed().since.remove(&self.id);
+    fn client_reads(&self) {
+        self.answers.waiting.lock().since.remove(&self.id);
     }
 }
 
 impl Drop for InProgress {
     fn drop(&mut self) {
-        self.client_asks();
+        self.client_reads();
         self.answers.slot.request_ended();
     }
 }
 
-/// A body that says when the client takes of it.
+/// A body that notes when the client reads from it.
 #[derive(Debug)]
 struct Watched {
     body: Body,
-    /// What is left of the last piece.
+    /// What is left of the last frame.
     rest: Bytes,
-    /// Whether anything was handed over: then the end comes by itself, when the client has room for more.
-    handed: bool,
+    /// Whether the client was given anything: then the end of the body is polled for only once the client has
+    /// room for more.
+    started: bool,
     request: InProgress,
 }
 
@@ -103,7 +99,7 @@ impl HttpBody for Watched {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        self.request.client_asks();
+        self.request.client_reads();
         if self.rest.is_empty() {
             match ready!(Pin::new(&mut self.body).poll_frame(context)) {
                 Some(Ok(frame)) => match frame.into_data() {
@@ -113,15 +109,15 @@ impl HttpBody for Watched {
                 end => return Poll::Ready(end),
             }
         }
-        let piece = PIECE.min(self.rest.len());
-        let piece = self.rest.split_to(piece);
-        self.handed = true;
+        let length = CHUNK.min(self.rest.len());
+        let chunk = self.rest.split_to(length);
+        self.started = true;
         self.request.wait_for_client();
-        Poll::Ready(Some(Ok(Frame::data(piece))))
+        Poll::Ready(Some(Ok(Frame::data(chunk))))
     }
 
     fn is_end_stream(&self) -> bool {
-        !self.handed && self.rest.is_empty() && self.body.is_end_stream()
+        !self.started && self.rest.is_empty() && self.body.is_end_stream()
     }
 
     fn size_hint(&self) -> SizeHint {
@@ -142,22 +138,22 @@ mod tests {
     use futures_util::StreamExt;
 
     #[tokio::test]
-    async fn an_answer_that_nobody_takes_is_seen_and_one_that_waits_for_the_server_is_not() {
+    async fn a_response_stalls_when_its_client_reads_nothing_but_not_when_the_server_is_slow() {
         let slots = Slots::new(1);
         let answers = Answers::new(Arc::new(slots.take().unwrap()));
-        let patience = Duration::from_millis(30);
-        let pieces =
-            futures_util::stream::iter([Ok::<_, axum::Error>(Bytes::from(vec![7; PIECE + 1]))])
+        let timeout = Duration::from_millis(30);
+        let chunks =
+            futures_util::stream::iter([Ok::<_, axum::Error>(Bytes::from(vec![7; CHUNK + 1]))])
                 .chain(futures_util::stream::pending());
-        let mut body = answers.begin().over(Body::from_stream(pieces)).into_data_stream();
-        tokio::time::sleep(2 * patience).await;
-        assert!(answers.are_stalled(patience), "the first piece waits");
-        for length in [PIECE, 1] {
+        let mut body = answers.begin().over(Body::from_stream(chunks)).into_data_stream();
+        tokio::time::sleep(2 * timeout).await;
+        assert!(answers.are_stalled(timeout), "the first chunk waits");
+        for length in [CHUNK, 1] {
             assert_eq!(body.next().await.unwrap().unwrap().len(), length);
-            assert!(!answers.are_stalled(patience));
+            assert!(!answers.are_stalled(timeout));
         }
-        assert!(tokio::time::timeout(2 * patience, body.next()).await.is_err());
-        assert!(!answers.are_stalled(patience), "the server has nothing to give");
+        assert!(tokio::time::timeout(2 * timeout, body.next()).await.is_err());
+        assert!(!answers.are_stalled(timeout), "the server has nothing to give");
         assert!(slots.take().is_none(), "a request is in progress");
         drop(body);
         assert!(slots.take().is_some());

@@ -1,4 +1,4 @@
-//! TLS from two files, which are read again when they change.
+//! TLS with a certificate and key from two files, which are reloaded when they change.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -11,78 +11,78 @@ use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 
-/// How often it is looked whether the files have changed.
-const LOOK: Duration = Duration::from_secs(5);
+/// How often the files are checked for changes.
+const CHECK_INTERVAL: Duration = Duration::from_secs(5);
 
-/// Why there is no TLS.
+/// Why TLS could not be configured.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
-    /// A file cannot be read, or holds something else.
+    /// A file cannot be read, or does not hold what it should.
     #[error("cannot read {what} in {file}: {detail}; it must be PEM")]
     File {
-        /// What was looked for.
+        /// What the file should hold.
         what: &'static str,
-        /// Where.
+        /// The file.
         file: PathBuf,
-        /// What was found.
+        /// Why it cannot be used.
         detail: String,
     },
-    /// The key is not the certificate's, or is of a kind that is not known.
+    /// The key does not belong to the certificate, or its algorithm is not supported.
     #[error("the key in {key} does not go with the certificate in {certificate}: {detail}")]
     Pair {
-        /// The certificates.
+        /// File of the certificates.
         certificate: PathBuf,
-        /// The key.
+        /// File of the key.
         key: PathBuf,
-        /// Why.
+        /// What rustls says.
         detail: rustls::Error,
     },
 }
 
-/// A certificate with its key, as the files have it now.
+/// A certificate and its key, kept as the files are now.
 #[derive(Debug)]
 pub struct Tls {
     certificate: PathBuf,
     key: PathBuf,
-    /// What the files were like before they were first read.
-    seen: Stamp,
+    /// State of the files before they were first read.
+    loaded: Stamp,
     current: RwLock<Arc<ServerConfig>>,
 }
 
-/// What tells one state of the two files from another.
+/// State of the two files: time of the last change, and size.
 type Stamp = [Option<(SystemTime, u64)>; 2];
 
 impl Tls {
-    /// Reads a chain of certificates, the server's first, and its key; both in PEM.
+    /// Reads a certificate chain, the server's certificate first, and its key; both in PEM.
     pub fn load(certificate: &Path, key: &Path) -> Result<Self, TlsError> {
-        let seen = stamp(certificate, key);
+        let loaded = stamp(certificate, key);
         let current = RwLock::new(read(certificate, key)?);
-        Ok(Self { certificate: certificate.to_owned(), key: key.to_owned(), seen, current })
+        Ok(Self { certificate: certificate.to_owned(), key: key.to_owned(), loaded, current })
     }
 
-    /// Takes connections with the certificate of the moment.
+    /// Accepts connections with the current certificate.
     pub(super) fn acceptor(&self) -> TlsAcceptor {
         Arc::clone(&self.current.read()).into()
     }
 
-    /// Reads the files again when they have changed, until `shutdown`. While they cannot be used, as when
-    /// one of them is there and the other is not yet, what was read before stays in use.
-    pub(super) async fn follow(&self, shutdown: CancellationToken) {
-        let (mut seen, mut warned) = (self.seen, None);
-        while shutdown.run_until_cancelled(tokio::time::sleep(LOOK)).await.is_some() {
+    /// Reloads the files when they have changed, until `shutdown`. While they cannot be used, for example
+    /// because only one of them was replaced so far, the previous certificate stays in use.
+    pub(super) async fn reload_until(&self, shutdown: CancellationToken) {
+        let (mut loaded, mut warned) = (self.loaded, None);
+        while shutdown.run_until_cancelled(tokio::time::sleep(CHECK_INTERVAL)).await.is_some() {
             let now = stamp(&self.certificate, &self.key);
-            if now == seen {
+            if now == loaded {
                 continue;
             }
             match read(&self.certificate, &self.key) {
-                Ok(read) => {
-                    *self.current.write() = read;
-                    tracing::info!(certificate = %self.certificate.display(), "read the certificate again");
-                    seen = now;
+                Ok(config) => {
+                    *self.current.write() = config;
+                    tracing::info!(certificate = %self.certificate.display(), "reloaded the certificate");
+                    loaded = now;
                 }
                 Err(error) => {
                     if warned.replace(now) != Some(now) {
-                        tracing::warn!(%error, "the certificate has changed and cannot be used; the one before stays");
+                        tracing::warn!(%error, "the certificate has changed and cannot be used; the previous one stays in use");
                     }
                 }
             }
@@ -92,8 +92,8 @@ impl Tls {
 
 fn stamp(certificate: &Path, key: &Path) -> Stamp {
     [certificate, key].map(|file| {
-        let about = std::fs::metadata(file).ok()?;
-        Some((about.modified().ok()?, about.len()))
+        let metadata = std::fs::metadata(file).ok()?;
+        Some((metadata.modified().ok()?, metadata.len()))
     })
 }
 

@@ -1,4 +1,4 @@
-//! How many connections are open, and which of them makes room.
+//! Bounds the number of open connections, and evicts an idle one for a new one.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -6,26 +6,26 @@ use std::sync::Arc;
 use parking_lot::{Mutex, MutexGuard};
 use tokio_util::sync::CancellationToken;
 
-/// Places for connections. Clones share them.
+/// Slots for connections. Clones share them.
 #[derive(Debug, Clone)]
 pub(super) struct Slots {
     shared: Arc<Shared>,
 }
 
-/// The place of one connection, free again when dropped.
+/// The slot of one connection, free again when dropped.
 #[derive(Debug)]
 pub(super) struct Slot {
     shared: Arc<Shared>,
     evicted: CancellationToken,
-    use_of: Mutex<Use>,
+    activity: Mutex<Activity>,
 }
 
 /// What a connection is doing.
 #[derive(Debug)]
-enum Use {
-    /// Nothing; this is its key among the idle ones.
+enum Activity {
+    /// No request is in progress; this is its key among the idle connections.
     Idle(u64),
-    /// So many requests.
+    /// The number of requests in progress.
     Busy(usize),
 }
 
@@ -37,7 +37,7 @@ struct Shared {
 
 #[derive(Debug, Default)]
 struct State {
-    /// Those that were told to go not counted.
+    /// Connections that were evicted do not count.
     open: usize,
     next_key: u64,
     /// Connections without a request in progress, the longest idle first.
@@ -64,8 +64,8 @@ impl Slots {
         Self { shared: Arc::new(Shared { most, state: Mutex::default() }) }
     }
 
-    /// A place, if need be that of the connection that has been idle for longest; `None` if all are
-    /// busy.
+    /// Returns a free slot, evicting the connection that has been idle longest if there is none; `None` if all
+    /// are busy.
     pub fn take(&self) -> Option<Slot> {
         let mut state = self.shared.lock();
         if state.open < self.shared.most {
@@ -76,37 +76,37 @@ impl Slots {
         }
         let evicted = CancellationToken::new();
         let key = state.add_idle(&evicted);
-        Some(Slot { shared: Arc::clone(&self.shared), evicted, use_of: Mutex::new(Use::Idle(key)) })
+        Some(Slot {
+            shared: Arc::clone(&self.shared),
+            evicted,
+            activity: Mutex::new(Activity::Idle(key)),
+        })
     }
 }
 
 impl Slot {
-    /// Returns when another connection has been given this place.
-    pub async fn taken_away(&self) {
+    /// Returns when this connection is evicted.
+    pub async fn evicted(&self) {
         self.evicted.cancelled().await;
     }
 
     pub fn request_began(&self) {
-        let mut use_of = self.use_of();
-        *use_of = match *use_of {
-            Use::Idle(key) => {
+        let mut activity = self.activity.lock();
+        *activity = match *activity {
+            Activity::Idle(key) => {
                 self.shared.lock().idle.remove(&key);
-                Use::Busy(1)
+                Activity::Busy(1)
             }
-            Use::Busy(requests) => Use::Busy(requests + 1),
+            Activity::Busy(requests) => Activity::Busy(requests + 1),
         };
     }
 
     pub fn request_ended(&self) {
-        let mut use_of = self.use_of();
-        *use_of = match *use_of {
-            Use::Busy(requests) if requests > 1 => Use::Busy(requests - 1),
-            _ => Use::Idle(self.shared.lock().add_idle(&self.evicted)),
+        let mut activity = self.activity.lock();
+        *activity = match *activity {
+            Activity::Busy(requests) if requests > 1 => Activity::Busy(requests - 1),
+            _ => Activity::Idle(self.shared.lock().add_idle(&self.evicted)),
         };
-    }
-
-    fn use_of(&self) -> MutexGuard<'_, Use> {
-        self.use_of.lock()
     }
 }
 
@@ -125,7 +125,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_longest_idle_makes_room() {
+    fn the_connection_that_has_been_idle_longest_is_evicted() {
         let slots = Slots::new(3);
         let (a, b, c) = (slots.take().unwrap(), slots.take().unwrap(), slots.take().unwrap());
         a.request_began();

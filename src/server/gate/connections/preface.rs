@@ -1,4 +1,7 @@
-//! Which version of HTTP a connection speaks, told by its first bytes.
+//! Detects the version of HTTP that a connection speaks, by its first bytes.
+//!
+//! Not `hyper_util::server::conn::auto`: it waits for the preface without a timeout, and does not give the
+//! connection back, so that a client that sends its head too slowly could not be answered 408.
 
 use std::io::{Error, IoSlice};
 use std::pin::Pin;
@@ -6,7 +9,7 @@ use std::task::{Context, Poll};
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf};
 
-/// What a connection of HTTP/2 begins with (RFC 9113, section 3.4).
+/// The first bytes of an HTTP/2 connection (RFC 9113, section 3.4).
 const PREFACE: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 
 /// A version of HTTP.
@@ -16,62 +19,64 @@ pub(super) enum Version {
     Http2,
 }
 
-/// A connection whose first bytes have been looked at, and are read again.
+/// A connection whose first bytes were peeked at, and are replayed to its reader.
 #[derive(Debug)]
-pub(super) struct Looked<S> {
+pub(super) struct Peeked<S> {
     stream: S,
     first: [u8; PREFACE.len()],
-    seen: usize,
-    read_again: usize,
+    /// Length of what was read into `first`.
+    peeked: usize,
+    /// How much of it was read again.
+    replayed: usize,
 }
 
-impl<S> Looked<S> {
+impl<S> Peeked<S> {
     pub fn new(stream: S) -> Self {
-        Self { stream, first: [0; PREFACE.len()], seen: 0, read_again: 0 }
+        Self { stream, first: [0; PREFACE.len()], peeked: 0, replayed: 0 }
     }
 
-    /// Whether any byte has come.
+    /// Whether any byte has arrived.
     pub fn has_begun(&self) -> bool {
-        self.seen > 0
+        self.peeked > 0
     }
 }
 
-impl<S: AsyncRead + Unpin> Looked<S> {
-    /// Reads as much as tells the versions apart: of HTTP/1, whose methods do not begin like the preface
-    /// of HTTP/2, that is a byte or two.
+impl<S: AsyncRead + Unpin> Peeked<S> {
+    /// Reads until the version is certain. For HTTP/1, whose methods do not begin like the preface of HTTP/2,
+    /// a byte or two are enough.
     pub async fn version(&mut self) -> Result<Version, Error> {
-        while self.first[..self.seen] == PREFACE[..self.seen] {
-            if self.seen == PREFACE.len() {
+        while self.first[..self.peeked] == PREFACE[..self.peeked] {
+            if self.peeked == PREFACE.len() {
                 return Ok(Version::Http2);
             }
-            let more = self.stream.read(&mut self.first[self.seen..]).await?;
+            let more = self.stream.read(&mut self.first[self.peeked..]).await?;
             if more == 0 {
                 break;
             }
-            self.seen += more;
+            self.peeked += more;
         }
         Ok(Version::Http1)
     }
 }
 
-impl<S: AsyncRead + Unpin> AsyncRead for Looked<S> {
+impl<S: AsyncRead + Unpin> AsyncRead for Peeked<S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
         into: &mut ReadBuf<'_>,
     ) -> Poll<Result<(), Error>> {
-        let again = &self.first[self.read_again..self.seen];
-        if again.is_empty() {
+        let replay = &self.first[self.replayed..self.peeked];
+        if replay.is_empty() {
             return Pin::new(&mut self.stream).poll_read(context, into);
         }
-        let fits = again.len().min(into.remaining());
-        into.put_slice(&again[..fits]);
-        self.read_again += fits;
+        let fits = replay.len().min(into.remaining());
+        into.put_slice(&replay[..fits]);
+        self.replayed += fits;
         Poll::Ready(Ok(()))
     }
 }
 
-impl<S: AsyncWrite + Unpin> AsyncWrite for Looked<S> {
+impl<S: AsyncWrite + Unpin> AsyncWrite for Peeked<S> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -109,9 +114,9 @@ mod tests {
     use super::*;
     use tokio::io::AsyncWriteExt;
 
-    async fn told(pieces: &[&[u8]]) -> (Version, Vec<u8>) {
+    async fn detect(pieces: &[&[u8]]) -> (Version, Vec<u8>) {
         let (mut client, server) = tokio::io::duplex(1024);
-        let mut looked = Looked::new(server);
+        let mut peeked = Peeked::new(server);
         let pieces: Vec<Vec<u8>> = pieces.iter().map(|piece| piece.to_vec()).collect();
         tokio::spawn(async move {
             for piece in pieces {
@@ -119,23 +124,23 @@ mod tests {
                 tokio::task::yield_now().await;
             }
         });
-        let version = looked.version().await.unwrap();
+        let version = peeked.version().await.unwrap();
         let mut all = Vec::new();
-        looked.read_to_end(&mut all).await.unwrap();
+        peeked.read_to_end(&mut all).await.unwrap();
         (version, all)
     }
 
     #[tokio::test]
-    async fn the_versions_are_told_apart_and_nothing_is_lost() {
+    async fn the_version_is_detected_and_no_byte_is_lost() {
         for piece in [1, 3, 24] {
             let pieces: Vec<&[u8]> = PREFACE.chunks(piece).chain([&b"frames"[..]]).collect();
-            let (version, all) = told(&pieces).await;
+            let (version, all) = detect(&pieces).await;
             assert_eq!((version, &all[24..]), (Version::Http2, &b"frames"[..]));
         }
         for head in
             ["GET / HTTP/1.1\r\n", "POST /x HTTP/1.1\r\n", "PRI * HTTP/2.0\r\n\r\nXX", "P", ""]
         {
-            let (version, all) = told(&[head.as_bytes()]).await;
+            let (version, all) = detect(&[head.as_bytes()]).await;
             assert_eq!((version, all), (Version::Http1, head.as_bytes().to_vec()), "{head:?}");
         }
     }

@@ -1,28 +1,23 @@
-//! `X-Deadline-Ms`: how long a client is willing to wait for an answer.
+//! `X-Deadline-Ms` and `grpc-timeout`: how long a client is willing to wait for an answer.
 
-use std::convert::Infallible;
 use std::time::Duration;
 
-use axum::extract::FromRequestParts;
-use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName};
 
 use super::problem::Problem;
-use super::state::AppState;
 use whereabouts_api::ErrorKind;
-use whereabouts_service::Deadline;
 
 /// Milliseconds from the arrival of the request's head.
-pub(super) const DEADLINE: HeaderName = HeaderName::from_static("x-deadline-ms");
+const DEADLINE: HeaderName = HeaderName::from_static("x-deadline-ms");
 
-/// The longest wait that can be asked for: longer than any request may take.
+/// Longest wait that a client can set; no request may take as long.
 const LONGEST_MS: u64 = 3_600_000;
 
-/// The deadline of a call of gRPC: up to eight digits and a unit.
+/// The timeout of a gRPC call: up to eight digits and a unit.
 const GRPC_TIMEOUT: HeaderName = HeaderName::from_static("grpc-timeout");
 
-/// The wait that the headers allow.
-pub(super) fn allowed(headers: &HeaderMap) -> Result<Option<Duration>, Problem> {
+/// How long the client waits at most, by its headers.
+pub(super) fn requested(headers: &HeaderMap) -> Result<Option<Duration>, Problem> {
     if let Some(value) = headers.get(GRPC_TIMEOUT) {
         let wait = value.to_str().ok().and_then(grpc_timeout);
         return wait.map(Some).ok_or_else(|| {
@@ -62,23 +57,16 @@ fn grpc_timeout(text: &str) -> Option<Duration> {
     })
 }
 
+/// The problem of a request that was abandoned because its deadline passed.
 pub(super) fn passed(wait: Duration) -> Problem {
     Problem::new(
         ErrorKind::DeadlinePassed,
         format!(
-            "the {} ms that the request was given (X-Deadline-Ms, grpc-timeout) have passed, and it was \
-             given up; allow more time, or send a later frame",
+            "the deadline of {} ms (X-Deadline-Ms, grpc-timeout) has passed, and the request was abandoned; \
+             allow more time, or send a newer frame",
             wait.as_millis()
         ),
     )
-}
-
-impl FromRequestParts<AppState> for Deadline {
-    type Rejection = Infallible;
-
-    async fn from_request_parts(parts: &mut Parts, _: &AppState) -> Result<Self, Infallible> {
-        Ok(parts.extensions.get().copied().unwrap_or_default())
-    }
 }
 
 #[cfg(test)]
@@ -86,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_deadline_of_a_call_has_digits_and_a_unit() {
+    fn a_grpc_timeout_has_digits_and_a_unit() {
         assert_eq!(grpc_timeout("250m"), Some(Duration::from_millis(250)));
         assert_eq!(grpc_timeout("99999999H"), Some(Duration::from_secs(99_999_999 * 3600)));
         for bad in ["", "S", "5", "123456789S", "-1S", "+1S", "5s", "5é"] {
