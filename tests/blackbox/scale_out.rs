@@ -3,14 +3,11 @@
 //!
 //! These need WHEREABOUTS_TEST_DEPLOYMENT=scale-out; `make scale-out` runs them with `--include-ignored`.
 
-use std::collections::HashSet;
-use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::deployment;
 use crate::mock_mllm::{MockMllm, Script};
 use crate::support::{Server, frame};
 
@@ -48,113 +45,6 @@ fn serve(dir: &TempDir, settings: &[(&'static str, String)]) -> Server {
 
 fn worker(dir: &TempDir, settings: &[(&'static str, String)]) -> Server {
     Server::start_worker(dir.path(), &with(settings, &[("WHEREABOUTS_JOBS__WORKERS", "2")]))
-}
-
-/// Does something to the PostgreSQL of these tests.
-fn database(what: &str) {
-    let control = std::env::var("WHEREABOUTS_TEST_POSTGRES")
-        .expect("this test stops PostgreSQL and starts it again: run it through tests/postgres.sh");
-    let done = Command::new(control).arg(what).output().unwrap();
-    assert!(done.status.success(), "{done:?}");
-}
-
-async fn ended(server: &Server, jobs: usize) -> Vec<Value> {
-    let mut all = Vec::new();
-    for state in ["succeeded", "degraded", "failed"] {
-        let path = format!("/jobs?state={state}&limit={jobs}&brief=true");
-        let answer = server.get(&path).await;
-        if answer.status == 200 {
-            all.extend(answer.expect(200)["jobs"].as_array().unwrap().clone());
-        }
-    }
-    all
-}
-
-/// Posts a frame until a server takes it; a server that cannot says so, and soon.
-async fn localize(servers: &[Server], number: usize) -> Value {
-    let began = Instant::now();
-    for attempt in 0.. {
-        let server = &servers[(number + attempt) % servers.len()];
-        let asked = Instant::now();
-        let answer = server.post_jpeg("/localize?map=m", frame(number, 0)).await;
-        assert!(asked.elapsed() < Duration::from_secs(8), "an answer took {:?}", asked.elapsed());
-        if answer.status == 200 {
-            return answer.expect(200);
-        }
-        answer.problem(503);
-        assert!(answer.headers.contains_key("retry-after"));
-        assert!(began.elapsed() < Duration::from_secs(60), "no server took the frame");
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
-    unreachable!()
-}
-
-#[tokio::test]
-#[ignore = "needs the scale-out deployment and a PostgreSQL that may be restarted"]
-async fn five_hundred_jobs_survive_the_death_of_processes_and_a_restart_of_the_database() {
-    const JOBS: usize = 500;
-    const KILLS: usize = 4;
-    assert!(deployment::is_scale_out());
-    let dir = TempDir::new().unwrap();
-    let script = Script { latency: Duration::from_millis(20), ..Script::default() };
-    let mock = MockMllm::start(script).await;
-    let settings = settings(&mock);
-    let mut servers = vec![serve(&dir, &settings), serve(&dir, &settings)];
-    let mut workers: Vec<Server> = (0..3).map(|_| worker(&dir, &settings)).collect();
-    servers[0].town("m", 10).await;
-
-    let mut ids = HashSet::new();
-    for number in 0..JOBS {
-        match number {
-            100 | 200 => {
-                workers.remove(0).kill();
-                workers.push(worker(&dir, &settings));
-            }
-            150 => {
-                // The other server goes on.
-                servers.remove(0).kill();
-                localize(&servers, number + JOBS).await;
-                servers.push(serve(&dir, &settings));
-            }
-            250 => {
-                database("kill");
-                let down = servers[0].post_jpeg("/localize?map=m", frame(1, 0)).await;
-                assert!(down.problem(503).contains("database"), "{}", down.problem(503));
-                database("start");
-            }
-            350 => {
-                workers.remove(0).kill();
-                workers.push(worker(&dir, &settings));
-            }
-            _ => {}
-        }
-        let answer = localize(&servers, number).await;
-        ids.insert(answer["job"]["id"].as_str().unwrap().to_owned());
-    }
-    assert_eq!(ids.len(), JOBS);
-    let began = Instant::now();
-    let jobs = loop {
-        let jobs = ended(&servers[0], 2 * JOBS).await;
-        let mine = jobs.iter().filter(|job| ids.contains(job["id"].as_str().unwrap()));
-        if mine.count() == JOBS {
-            break jobs;
-        }
-        assert!(began.elapsed() < Duration::from_secs(180), "{} jobs ended", jobs.len());
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    };
-    let of = |state: &str| jobs.iter().filter(|job| job["state"] == state).count();
-    assert_eq!(of("failed"), 0);
-    // Those that were in the middle of a pair when the database died.
-    assert!(of("degraded") <= JOBS / 50, "{} jobs are degraded", of("degraded"));
-    // A process that dies takes along what it has not yet written down; one that lives buys nothing twice.
-    let again = mock.asked_again();
-    eprintln!(
-        "{JOBS} jobs by 2 servers and 3 workers, {KILLS} of them killed and the database once: {} \
-         describe calls, {again} of them for pairs that had been answered",
-        mock.describe_calls()
-    );
-    assert!(again <= (KILLS + 5) * CONCURRENCY, "{again} answered pairs were asked again");
-    assert_eq!(mock.violations(), [""; 0]);
 }
 
 #[tokio::test]
@@ -242,4 +132,131 @@ fn a_worker_answers_those_who_look_after_it_and_nobody_else() {
         }
     });
     assert!(worker.terminate().success());
+}
+
+/// Tests that disturb every other: `tests/scale_out.sh` runs them on their own.
+mod alone {
+    use std::collections::HashSet;
+    use std::process::Command;
+    use std::time::{Duration, Instant};
+
+    use serde_json::Value;
+    use tempfile::TempDir;
+
+    use super::{CONCURRENCY, serve, settings, worker};
+    use crate::deployment;
+    use crate::mock_mllm::{MockMllm, Script};
+    use crate::support::{Server, frame};
+
+    /// Does something to the PostgreSQL of these tests.
+    fn database(what: &str) {
+        let control = std::env::var("WHEREABOUTS_TEST_POSTGRES").expect(
+            "this test stops PostgreSQL and starts it again: run it through tests/postgres.sh",
+        );
+        let done = Command::new(control).arg(what).output().unwrap();
+        assert!(done.status.success(), "{done:?}");
+    }
+
+    async fn ended(server: &Server, jobs: usize) -> Vec<Value> {
+        let mut all = Vec::new();
+        for state in ["succeeded", "degraded", "failed"] {
+            let path = format!("/jobs?state={state}&limit={jobs}&brief=true");
+            let answer = server.get(&path).await;
+            if answer.status == 200 {
+                all.extend(answer.expect(200)["jobs"].as_array().unwrap().clone());
+            }
+        }
+        all
+    }
+
+    /// Posts a frame until a server takes it; a server that cannot says so, and soon.
+    async fn localize(servers: &[Server], number: usize) -> Value {
+        let began = Instant::now();
+        for attempt in 0.. {
+            let server = &servers[(number + attempt) % servers.len()];
+            let asked = Instant::now();
+            let answer = server.post_jpeg("/localize?map=m", frame(number, 0)).await;
+            assert!(
+                asked.elapsed() < Duration::from_secs(8),
+                "an answer took {:?}",
+                asked.elapsed()
+            );
+            if answer.status == 200 {
+                return answer.expect(200);
+            }
+            answer.problem(503);
+            assert!(answer.headers.contains_key("retry-after"));
+            assert!(began.elapsed() < Duration::from_secs(60), "no server took the frame");
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+        unreachable!()
+    }
+
+    #[tokio::test]
+    #[ignore = "needs the scale-out deployment and a PostgreSQL that may be restarted"]
+    async fn five_hundred_jobs_survive_the_death_of_processes_and_a_restart_of_the_database() {
+        const JOBS: usize = 500;
+        const KILLS: usize = 4;
+        assert!(deployment::is_scale_out());
+        let dir = TempDir::new().unwrap();
+        let script = Script { latency: Duration::from_millis(20), ..Script::default() };
+        let mock = MockMllm::start(script).await;
+        let settings = settings(&mock);
+        let mut servers = vec![serve(&dir, &settings), serve(&dir, &settings)];
+        let mut workers: Vec<Server> = (0..3).map(|_| worker(&dir, &settings)).collect();
+        servers[0].town("m", 10).await;
+
+        let mut ids = HashSet::new();
+        for number in 0..JOBS {
+            match number {
+                100 | 200 => {
+                    workers.remove(0).kill();
+                    workers.push(worker(&dir, &settings));
+                }
+                150 => {
+                    // The other server goes on.
+                    servers.remove(0).kill();
+                    localize(&servers, number + JOBS).await;
+                    servers.push(serve(&dir, &settings));
+                }
+                250 => {
+                    database("kill");
+                    let down = servers[0].post_jpeg("/localize?map=m", frame(1, 0)).await;
+                    assert!(down.problem(503).contains("database"), "{}", down.problem(503));
+                    database("start");
+                }
+                350 => {
+                    workers.remove(0).kill();
+                    workers.push(worker(&dir, &settings));
+                }
+                _ => {}
+            }
+            let answer = localize(&servers, number).await;
+            ids.insert(answer["job"]["id"].as_str().unwrap().to_owned());
+        }
+        assert_eq!(ids.len(), JOBS);
+        let began = Instant::now();
+        let jobs = loop {
+            let jobs = ended(&servers[0], 2 * JOBS).await;
+            let mine = jobs.iter().filter(|job| ids.contains(job["id"].as_str().unwrap()));
+            if mine.count() == JOBS {
+                break jobs;
+            }
+            assert!(began.elapsed() < Duration::from_secs(180), "{} jobs ended", jobs.len());
+            tokio::time::sleep(Duration::from_millis(200)).await;
+        };
+        let of = |state: &str| jobs.iter().filter(|job| job["state"] == state).count();
+        assert_eq!(of("failed"), 0);
+        // Those that were in the middle of a pair when the database died.
+        assert!(of("degraded") <= JOBS / 50, "{} jobs are degraded", of("degraded"));
+        // A process that dies takes along what it has not yet written down; one that lives buys nothing twice.
+        let again = mock.asked_again();
+        eprintln!(
+            "{JOBS} jobs by 2 servers and 3 workers, {KILLS} of them killed and the database once: {} \
+             describe calls, {again} of them for pairs that had been answered",
+            mock.describe_calls()
+        );
+        assert!(again <= (KILLS + 5) * CONCURRENCY, "{again} answered pairs were asked again");
+        assert_eq!(mock.violations(), [""; 0]);
+    }
 }

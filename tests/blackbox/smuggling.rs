@@ -1,6 +1,6 @@
 //! Requests whose end two readers could see in different places, and what the time of an answer tells.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -92,62 +92,73 @@ async fn a_body_with_two_ends_is_no_way_in_for_another_request() {
     assert_eq!(statuses(&got), ["200", "404"], "{got}");
 }
 
-/// The median time of an answer to a key, of each of several keys in turn.
-async fn medians(server: &Server, keys: &[String], rounds: usize) -> Vec<f64> {
-    let mut stream = TcpStream::connect(server.url.trim_start_matches("http://")).await.unwrap();
-    stream.set_nodelay(true).unwrap();
-    let mut times = vec![Vec::with_capacity(rounds); keys.len()];
-    let mut answer = [0; 4096];
-    for round in 0..rounds {
-        for turn in 0..keys.len() {
-            let of = (round + turn) % keys.len();
-            let request = format!(
-                "GET /maps HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {}\r\n\r\n",
-                keys[of]
-            );
-            let begun = Instant::now();
-            stream.write_all(request.as_bytes()).await.unwrap();
-            let read = stream.read(&mut answer).await.unwrap();
-            times[of].push(begun.elapsed().as_secs_f64() * 1e6);
-            assert!(answer[..read].starts_with(b"HTTP/1.1 401 "));
-        }
-    }
-    times
-        .iter_mut()
-        .map(|times| {
-            times.sort_by(f64::total_cmp);
-            times[times.len() / 2]
-        })
-        .collect()
-}
+/// The time of an answer, which must not depend on how much else is going on.
+mod embedded_only {
+    use std::time::Instant;
 
-#[tokio::test]
-async fn the_time_of_a_refusal_does_not_tell_how_much_of_a_key_is_right() {
-    let dir = tempfile::tempdir().unwrap();
-    let output = std::process::Command::new(&*super::support::BINARY)
-        .args(["keys", "create", "--name", "a", "--role", "robot", "--data"])
-        .arg(dir.path())
-        .output()
-        .unwrap();
-    let right = String::from_utf8(output.stdout).unwrap().trim().to_owned();
-    let server = Server::start(dir.path(), &[("WHEREABOUTS_AUTH__KEYS", "required")]);
-    let changed = |at: usize| {
-        let digit = if right.as_bytes()[at] == b'0' { "1" } else { "0" };
-        let mut key = right.clone();
-        key.replace_range(at..=at, digit);
-        key
-    };
-    // Wrong in the last digit, in the first of the secret, and in the id: no such key. The first twice:
-    // what is between those two is noise.
-    let (last, first, id) = (right.len() - 1, 17, 5);
-    let keys = [changed(last), changed(last), changed(first), changed(id)];
-    medians(&server, &keys, 200).await;
-    let medians = medians(&server, &keys, 1500).await;
-    println!(
-        "medians in µs, of a key that is wrong at the end (twice), at the start, and unknown: {medians:.1?}"
-    );
-    let (base, noise) = (medians[0], (medians[0] - medians[1]).abs());
-    for other in &medians[2..] {
-        assert!((other - base).abs() < 0.15 * base + 3.0 * noise, "{medians:?}");
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpStream;
+
+    use crate::support::{BINARY, Server};
+
+    /// The median time of an answer to a key, of each of several keys in turn.
+    async fn medians(server: &Server, keys: &[String], rounds: usize) -> Vec<f64> {
+        let mut stream =
+            TcpStream::connect(server.url.trim_start_matches("http://")).await.unwrap();
+        stream.set_nodelay(true).unwrap();
+        let mut times = vec![Vec::with_capacity(rounds); keys.len()];
+        let mut answer = [0; 4096];
+        for round in 0..rounds {
+            for turn in 0..keys.len() {
+                let of = (round + turn) % keys.len();
+                let request = format!(
+                    "GET /maps HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {}\r\n\r\n",
+                    keys[of]
+                );
+                let begun = Instant::now();
+                stream.write_all(request.as_bytes()).await.unwrap();
+                let read = stream.read(&mut answer).await.unwrap();
+                times[of].push(begun.elapsed().as_secs_f64() * 1e6);
+                assert!(answer[..read].starts_with(b"HTTP/1.1 401 "));
+            }
+        }
+        times
+            .iter_mut()
+            .map(|times| {
+                times.sort_by(f64::total_cmp);
+                times[times.len() / 2]
+            })
+            .collect()
+    }
+
+    #[tokio::test]
+    async fn the_time_of_a_refusal_does_not_tell_how_much_of_a_key_is_right() {
+        let dir = tempfile::tempdir().unwrap();
+        let output = std::process::Command::new(&*BINARY)
+            .args(["keys", "create", "--name", "a", "--role", "robot", "--data"])
+            .arg(dir.path())
+            .output()
+            .unwrap();
+        let right = String::from_utf8(output.stdout).unwrap().trim().to_owned();
+        let server = Server::start(dir.path(), &[("WHEREABOUTS_AUTH__KEYS", "required")]);
+        let changed = |at: usize| {
+            let digit = if right.as_bytes()[at] == b'0' { "1" } else { "0" };
+            let mut key = right.clone();
+            key.replace_range(at..=at, digit);
+            key
+        };
+        // Wrong in the last digit, in the first of the secret, and in the id: no such key. The first twice:
+        // what is between those two is noise.
+        let (last, first, id) = (right.len() - 1, 17, 5);
+        let keys = [changed(last), changed(last), changed(first), changed(id)];
+        medians(&server, &keys, 200).await;
+        let medians = medians(&server, &keys, 1500).await;
+        println!(
+            "medians in µs, of a key that is wrong at the end (twice), at the start, and unknown: {medians:.1?}"
+        );
+        let (base, noise) = (medians[0], (medians[0] - medians[1]).abs());
+        for other in &medians[2..] {
+            assert!((other - base).abs() < 0.15 * base + 3.0 * noise, "{medians:?}");
+        }
     }
 }

@@ -1,5 +1,5 @@
 //! An example of each call, for its description. The tests execute all of them
-//! (`tests/blackbox/documented.rs`), and write the answers of `docs/examples.json`.
+//! (`tests/blackbox/embedded_only/documented.rs`), and write the answers of `docs/examples.json`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

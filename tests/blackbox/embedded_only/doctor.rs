@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server, frame, reference};
+use crate::support::{BINARY, Server, frame, reference};
 
 fn doctor(dir: &Path, args: &[&str]) -> Output {
     Command::new(&*BINARY).arg("doctor").args(args).arg("--data").arg(dir).output().unwrap()

@@ -8,9 +8,9 @@ use exif::{Field, In, Rational, Tag};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::mock_mllm::{MockMllm, Script};
 use super::real_images::data;
-use super::support::{BINARY, frame, reference};
+use crate::mock_mllm::{MockMllm, Script};
+use crate::support::{BINARY, frame, reference};
 
 /// References and queries in folders, and room for what eval writes.
 struct Folders {

@@ -5,7 +5,7 @@ use std::process::Command;
 
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server, frame, reference};
+use crate::support::{BINARY, Server, frame, reference};
 
 #[tokio::test]
 async fn a_folder_without_a_version_is_copied_and_brought_up_to_date() {

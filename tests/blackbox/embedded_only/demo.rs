@@ -7,9 +7,9 @@ use std::process::Command;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::mock_hub::{Hub, Trouble};
 use super::model_files::{Bench, fixture};
-use super::support::BINARY;
+use crate::mock_hub::{Hub, Trouble};
+use crate::support::BINARY;
 
 /// A catalogue whose `dinov2-small` is a tiny model, so that the demo has it at once; and the binary
 /// away from the checkout, whatever is installed there.

@@ -7,7 +7,7 @@ use reqwest::{Method, Response};
 use serde_json::{Value, json};
 use whereabouts_server::http::{Example, ExampleBody, Taken, examples};
 
-use super::support::{Server, frame, reference, server};
+use crate::support::{Server, frame, reference, server};
 
 /// Where the examples are, to be written anew.
 const FILE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/examples.json");

@@ -7,7 +7,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 use tokio::task::JoinSet;
 
-use super::support::{Answer, Server, frame, reference, value_of};
+use crate::support::{Answer, Server, frame, reference, value_of};
 
 /// One picture in work, so that others wait, and time for all of them on any machine.
 const NARROW: &[(&str, &str)] = &[

@@ -9,7 +9,7 @@ use std::process::Command;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server};
+use crate::support::{BINARY, Server};
 
 pub fn data(set: &str) -> Option<PathBuf> {
     let root = std::env::var_os("WHEREABOUTS_DATA").map_or_else(

@@ -7,7 +7,7 @@ use tempfile::TempDir;
 use whereabouts_core::DescriptorKind;
 use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
 
-use super::support::{BINARY, Server, frame, reference};
+use crate::support::{BINARY, Server, frame, reference};
 
 const ONE: Layout = Layout { threads: 1, sessions: 1, max_batch: 1 };
 const EIGHT: Layout = Layout { threads: 1, sessions: 1, max_batch: 8 };

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::mock_hub::{Hub, Trouble};
-use super::support::{BINARY, Server};
+use crate::mock_hub::{Hub, Trouble};
+use crate::support::{BINARY, Server};
 
 const FIXTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/models/tiny-tokens");
 
