@@ -208,7 +208,8 @@ async fn the_whole_is_unbounded_and_each_image_is_not() {
         );
     }
 
-    // It takes longer than a request may, and more slowly than a body may come, but never pauses for long.
+    // Slow clients are what is tested: one takes longer than a request may and sends more slowly than a body may
+    // come, but never pauses for long; the other pauses for too long.
     let whole = archive(&entries[..2]);
     let chunks: Vec<_> = whole.chunks(whole.len() / 6).map(<[u8]>::to_vec).collect();
     let slowly = |chunks: Vec<Vec<u8>>, pause: f64| {

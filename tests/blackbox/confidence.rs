@@ -1,24 +1,20 @@
 //! How sure the service says it is, and what that is worth.
 
-use std::time::Duration;
-
 use serde_json::Value;
 
 use super::support::{Server, frame, server};
+use super::wait::eventually;
 
 const PLACES: usize = 40;
 const ASKED: usize = 20;
 
-/// Waits until a map is measured as it now is.
+/// Waits until the map is calibrated with this many images, and returns its calibration.
 async fn calibrated(server: &Server, images: usize) -> Value {
-    loop {
-        let map = server.get("/maps/m").await.expect(200);
-        let calibration = &map["calibration"];
-        if calibration["images"] == images && calibration["refined"] != 0 {
-            return calibration.clone();
-        }
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
+    eventually(async || {
+        let calibration = server.get("/maps/m").await.expect(200)["calibration"].take();
+        (calibration["images"] == images && calibration["refined"] != 0).then_some(calibration)
+    })
+    .await
 }
 
 /// The confidence at once and after refinement, for frames of these places.

@@ -11,6 +11,7 @@ use super::deployment;
 use super::mllm::start;
 use super::mock_mllm::{MockMllm, Reply, Script};
 use super::support::{Server, frame};
+use super::wait::eventually;
 
 /// Event names and data of a stream that has ended.
 fn events(stream: &[u8]) -> Vec<(String, Value)> {
@@ -76,15 +77,11 @@ async fn streams_are_bounded_and_end_with_the_server() {
     assert!(server.get(&path).await.problem(429).contains("max_streams"));
     drop(chunks);
     // The place is free again once the server has noticed.
-    let deadline = Instant::now() + Duration::from_secs(20);
-    let stream = loop {
+    let stream = eventually(async || {
         let stream = server.request(Method::GET, &path).send().await.unwrap();
-        if stream.status() == 200 {
-            break stream;
-        }
-        assert!(Instant::now() < deadline, "the place was not given back");
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    };
+        (stream.status() == 200).then_some(stream)
+    })
+    .await;
     let began = Instant::now();
     let rest = tokio::spawn(async move { stream.bytes().await.unwrap() });
     assert!(server.terminate().success());
@@ -99,7 +96,7 @@ async fn all_jobs_are_followed_and_those_of_a_map() {
     server.town("m", 3).await;
     server.town("n", 3).await;
     let follow = async |path: &str| server.request(Method::GET, path).send().await.unwrap();
-    let (mut all, of_map) = (follow("/events").await, follow("/events?map=m").await);
+    let (mut all, mut of_map) = (follow("/events").await, follow("/events?map=m").await);
     // Browsers hand a stream to the page with its first bytes.
     let opened = tokio::time::timeout(Duration::from_secs(5), all.chunk()).await;
     assert!(opened.unwrap().unwrap().unwrap().starts_with(b": open"));
@@ -111,14 +108,19 @@ async fn all_jobs_are_followed_and_those_of_a_map() {
         server.get(&format!("{href}?wait=60")).await.expect(200);
         expected.push((id.to_owned(), map));
     }
-    if deployment::is_scale_out() {
-        // Notices of a database take a moment, in which a job may have come further.
-        tokio::time::sleep(Duration::from_millis(500)).await;
+    // Notifications of a database take a moment: the streams are read until every end has come.
+    let mut streams = [Vec::new(), Vec::new()];
+    for (bytes, (stream, ends)) in streams.iter_mut().zip([(&mut all, 3), (&mut of_map, 2)]) {
+        while events(bytes).iter().filter(|(_, job)| job["state"] == "succeeded").count() < ends {
+            let chunk = tokio::time::timeout(Duration::from_secs(20), stream.chunk()).await;
+            bytes.extend(chunk.expect("an end is missing").unwrap().expect("the stream ended"));
+        }
     }
     // A drain ends the streams.
     assert!(server.terminate().success());
-    let (all, of_map) = (all.bytes().await.unwrap(), of_map.bytes().await.unwrap());
-    for (stream, maps) in [(&all, &["m", "n"][..]), (&of_map, &["m"][..])] {
+    streams[0].extend(all.bytes().await.unwrap());
+    streams[1].extend(of_map.bytes().await.unwrap());
+    for (stream, maps) in streams.iter().zip([&["m", "n"][..], &["m"]]) {
         let told = events(stream);
         assert!(told.iter().all(|(name, _)| name == "job"), "{told:?}");
         let ended = told.iter().filter(|(_, job)| job["state"] == "succeeded");

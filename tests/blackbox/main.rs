@@ -37,4 +37,4 @@ mod traces;
 mod track;
 mod webhooks;
 
-use whereabouts_testkit::{deployment, mock_hub, mock_mllm, receiver, server as support};
+use whereabouts_testkit::{deployment, mock_hub, mock_mllm, receiver, server as support, wait};

@@ -2,13 +2,14 @@
 
 use std::path::PathBuf;
 use std::process::Command;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::deployment;
 use super::support::{BINARY, Server, frame, reference};
+use super::wait::eventually_within;
 
 const XFEAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/models/xfeat");
 
@@ -67,19 +68,21 @@ impl Bench {
     /// Waits until there are the descriptors of one model only. A folder is removed at once; a table when nobody
     /// is left who could be at it.
     async fn has_descriptors_of_one_model(&self) {
-        let start = Instant::now();
-        loop {
+        let deadline = match deployment::is_scale_out() {
+            true => Duration::from_secs(20),
+            false => Duration::ZERO,
+        };
+        eventually_within(deadline, async || {
             let found = match deployment::is_scale_out() {
                 true => deployment::descriptor_tables(&self.data()),
                 false => std::fs::read_dir(self.data().join("descriptors")).unwrap().count(),
             };
-            if found == 1 {
-                return;
+            match found {
+                1 => Ok(()),
+                _ => Err(format!("there are the descriptors of {found} models")),
             }
-            let patient = deployment::is_scale_out() && start.elapsed() < Duration::from_secs(20);
-            assert!(patient, "there are the descriptors of {found} models");
-            tokio::time::sleep(Duration::from_millis(50)).await;
-        }
+        })
+        .await;
     }
 }
 
@@ -117,15 +120,11 @@ async fn begin(server: &Server, map: &str, request: Value) -> Value {
 
 /// The map, once its reindex is as far as `far` says.
 async fn until(server: &Server, map: &str, far: impl Fn(&Value) -> bool) -> Value {
-    let start = Instant::now();
-    loop {
+    eventually_within(Duration::from_secs(60), async || {
         let state = server.get(&format!("/maps/{map}")).await.expect(200);
-        if far(&state["reindex"]) {
-            return state;
-        }
-        assert!(start.elapsed() < Duration::from_secs(60), "{state}");
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+        if far(&state["reindex"]) { Ok(state) } else { Err(state) }
+    })
+    .await
 }
 
 async fn ended(server: &Server, map: &str) -> Value {

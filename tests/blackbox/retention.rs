@@ -1,13 +1,12 @@
 //! Jobs that have ended do not stay for ever.
 
-use std::time::{Duration, Instant};
-
 use serde_json::Value;
 use tempfile::TempDir;
 use walkdir::WalkDir;
 
 use super::deployment;
 use super::support::{Server, frame};
+use super::wait::until;
 
 fn files(dir: &TempDir) -> usize {
     let images = WalkDir::new(dir.path().join("images")).into_iter();
@@ -51,15 +50,12 @@ async fn only_so_many_ended_jobs_are_kept_with_their_frames() {
 
     let at_once = [settings[0], settings[1], settings[2], ("WHEREABOUTS_JOBS__MAX_WAIT_S", "0")];
     let server = Server::start(dir.path(), &at_once);
-    let deadline = Instant::now() + Duration::from_secs(60);
     // With a database, frames go later (objects.keep_unneeded_s).
-    while match deployment::is_scale_out() {
-        true => listed(&server).await.len() > 3,
-        false => files(&dir) > 4 + 3,
-    } {
-        assert!(Instant::now() < deadline, "{} files", files(&dir));
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+    until(async || match deployment::is_scale_out() {
+        true => listed(&server).await.len() <= 3,
+        false => files(&dir) <= 4 + 3,
+    })
+    .await;
     made.reverse();
     assert_eq!(listed(&server).await, made[..3]);
     let why = server.get(&format!("/jobs/{}", made[5])).await.problem(404);

@@ -3,13 +3,14 @@
 //!
 //! These need WHEREABOUTS_TEST_DEPLOYMENT=scale-out; `make scale-out` runs them with `--include-ignored`.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use crate::mock_mllm::{MockMllm, Script};
 use crate::support::{Server, frame};
+use crate::wait::eventually_within;
 
 /// Calls of one process to the mock at a time.
 const CONCURRENCY: usize = 8;
@@ -110,11 +111,13 @@ async fn a_key_that_is_revoked_at_one_server_lets_nobody_into_the_other() {
     let revoke = one.request(reqwest::Method::DELETE, &path);
     let revoked = revoke.bearer_auth(admin["token"].as_str().unwrap()).send().await.unwrap();
     assert_eq!(revoked.status(), 200);
-    let began = Instant::now();
-    while get(&other, &robot).await.unwrap().status() != 401 {
-        assert!(began.elapsed() < Duration::from_secs(2), "the other server still lets it in");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
+    eventually_within(Duration::from_secs(2), async || {
+        match get(&other, &robot).await.unwrap().status().as_u16() {
+            401 => Ok(()),
+            status => Err(format!("the other server still answers {status}")),
+        }
+    })
+    .await;
 }
 
 #[test]
@@ -147,6 +150,7 @@ mod alone {
     use crate::deployment;
     use crate::mock_mllm::{MockMllm, Script};
     use crate::support::{Server, frame};
+    use crate::wait::eventually_within;
 
     /// Does something to the PostgreSQL of these tests.
     fn database(what: &str) {
@@ -171,9 +175,9 @@ mod alone {
 
     /// Posts a frame until a server takes it; a server that cannot says so, and soon.
     async fn localize(servers: &[Server], number: usize) -> Value {
-        let began = Instant::now();
-        for attempt in 0.. {
-            let server = &servers[(number + attempt) % servers.len()];
+        let mut attempts = 0..;
+        eventually_within(Duration::from_secs(60), async || {
+            let server = &servers[(number + attempts.next().unwrap()) % servers.len()];
             let asked = Instant::now();
             let answer = server.post_jpeg("/localize?map=m", frame(number, 0)).await;
             assert!(
@@ -182,14 +186,12 @@ mod alone {
                 asked.elapsed()
             );
             if answer.status == 200 {
-                return answer.expect(200);
+                return Ok(answer.expect(200));
             }
-            answer.problem(503);
             assert!(answer.headers.contains_key("retry-after"));
-            assert!(began.elapsed() < Duration::from_secs(60), "no server took the frame");
-            tokio::time::sleep(Duration::from_millis(100)).await;
-        }
-        unreachable!()
+            Err(answer.problem(503))
+        })
+        .await
     }
 
     #[tokio::test]
@@ -235,16 +237,14 @@ mod alone {
             ids.insert(answer["job"]["id"].as_str().unwrap().to_owned());
         }
         assert_eq!(ids.len(), JOBS);
-        let began = Instant::now();
-        let jobs = loop {
-            let jobs = ended(&servers[0], 2 * JOBS).await;
-            let mine = jobs.iter().filter(|job| ids.contains(job["id"].as_str().unwrap()));
-            if mine.count() == JOBS {
-                break jobs;
-            }
-            assert!(began.elapsed() < Duration::from_secs(180), "{} jobs ended", jobs.len());
-            tokio::time::sleep(Duration::from_millis(200)).await;
-        };
+        for id in &ids {
+            eventually_within(Duration::from_secs(180), async || {
+                let job = servers[0].get(&format!("/jobs/{id}?wait=30")).await.expect(200);
+                if job["finished_at"].is_null() { Err(job) } else { Ok(()) }
+            })
+            .await;
+        }
+        let jobs = ended(&servers[0], 2 * JOBS).await;
         let of = |state: &str| jobs.iter().filter(|job| job["state"] == state).count();
         assert_eq!(of("failed"), 0);
         // Those that were in the middle of a pair when the database died.

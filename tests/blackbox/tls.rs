@@ -6,7 +6,8 @@ use std::time::{Duration, Instant};
 use reqwest::{Certificate, Client};
 use tempfile::TempDir;
 
-use super::support::Server;
+use super::support::{Server, value_of};
+use super::wait::until;
 
 fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/tls").join(name)
@@ -38,14 +39,18 @@ impl Encrypted {
 
     /// Whether a client that trusts only this certificate gets an answer.
     async fn is_trusted_by(&self, certificate: &str) -> bool {
-        let pem = std::fs::read(fixture(&format!("{certificate}.pem"))).unwrap();
-        let trusted = [Certificate::from_pem(&pem).unwrap()];
-        let client = Client::builder().tls_certs_only(trusted).build().unwrap();
-        match client.get(format!("{}/readyz", self.url)).send().await {
+        match trusting(certificate).get(format!("{}/readyz", self.url)).send().await {
             Ok(answer) => answer.status() == 200,
             Err(_) => false,
         }
     }
+}
+
+/// A client that trusts only this certificate.
+fn trusting(certificate: &str) -> Client {
+    let pem = std::fs::read(fixture(&format!("{certificate}.pem"))).unwrap();
+    let trusted = [Certificate::from_pem(&pem).unwrap()];
+    Client::builder().tls_certs_only(trusted).build().unwrap()
 }
 
 /// Puts a file of a certificate in place, in one step.
@@ -62,21 +67,13 @@ async fn a_certificate_that_is_replaced_is_taken_up_and_one_that_is_bad_is_not()
     assert!(!encrypted.is_trusted_by("second").await);
 
     std::fs::write(encrypted.files.path().join("server.pem"), "nonsense").unwrap();
-    let end = Instant::now() + Duration::from_secs(30);
-    while !encrypted.server.log().contains("the one before stays") {
-        assert!(Instant::now() < end, "{}", encrypted.server.log());
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    }
+    until(async || encrypted.server.log().contains("the one before stays")).await;
     assert!(encrypted.is_trusted_by("first").await);
 
     for end in ["key", "pem"] {
         put(encrypted.files.path(), "second", end);
     }
-    let end = Instant::now() + Duration::from_secs(30);
-    while !encrypted.is_trusted_by("second").await {
-        assert!(Instant::now() < end, "{}", encrypted.server.log());
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    }
+    until(async || encrypted.is_trusted_by("second").await).await;
     assert!(!encrypted.is_trusted_by("first").await);
 }
 
@@ -92,7 +89,14 @@ async fn a_connection_that_says_nothing_does_not_keep_the_server_from_stopping()
     let Encrypted { files: _files, _data, server, url } = Encrypted::start();
     let address = url.trim_start_matches("https://").to_owned();
     let silent = tokio::net::TcpStream::connect(&address).await.unwrap();
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    // The server has accepted it once it counts two connections: this client keeps one.
+    let client = trusting("first");
+    until(async || {
+        let metrics = client.get(format!("{url}/metrics")).send().await.unwrap();
+        value_of(&metrics.text().await.unwrap(), "whereabouts_connections") == Some(2.0)
+    })
+    .await;
+    drop(client);
     let start = Instant::now();
     assert!(server.terminate().success());
     assert!(start.elapsed() < Duration::from_secs(8), "{:?}", start.elapsed());

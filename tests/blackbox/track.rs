@@ -1,13 +1,12 @@
 //! A robot that drives through the town and names its track.
 
-use std::time::Duration;
-
 use image::{Rgb, RgbImage};
 use jiff::{SignedDuration, Timestamp};
 use serde_json::{Value, json};
 use whereabouts_town::{Town, TownSpec};
 
 use super::support::{Answer, Server, frame, jpeg, server};
+use super::wait::{eventually, until};
 
 const PLACES: usize = 96;
 /// How fast it drives, in metres a second; the service is told no more than the default bound.
@@ -25,10 +24,11 @@ async fn metric_map(server: &Server, town: &Town) {
         let path = format!("/maps/m/images?id={}&x={}&y={}", id(place), shot.x, shot.y);
         server.post_jpeg(&path, jpeg(&shot.image)).await.expect(201);
     }
-    // The gap that chance leaves is measured.
-    while server.get("/maps/m").await.expect(200)["calibration"]["images"] != town.places() {
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
+    // The filter needs the calibration of the map.
+    until(async || {
+        server.get("/maps/m").await.expect(200)["calibration"]["images"] == town.places()
+    })
+    .await;
 }
 
 /// The side of a van that fills nearly all of the picture.
@@ -135,8 +135,13 @@ async fn what_a_track_cannot_be_is_refused_with_what_to_do() {
     let empty = server.post_jpeg(path, frame(0, 0)).await.expect(200);
     assert!(empty["track"]["image_id"].is_null(), "{empty}");
     server.post_jpeg("/maps/bare/images?id=a", frame(0, 0)).await.expect(201);
-    tokio::time::sleep(Duration::from_secs(3)).await;
-    let problem = server.post_jpeg(path, frame(0, 0)).await.problem(422);
+    // The poses of a map are read again after a while.
+    let refused = eventually(async || {
+        let answer = server.post_jpeg(path, frame(0, 0)).await;
+        (answer.status != 200).then_some(answer)
+    })
+    .await;
+    let problem = refused.problem(422);
     assert!(problem.contains("poses"), "{problem}");
 }
 

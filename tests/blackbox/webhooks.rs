@@ -11,6 +11,7 @@ use tempfile::TempDir;
 use super::deployment;
 use super::receiver::{Receiver, Reply};
 use super::support::{Answer, BINARY, Server, frame};
+use super::wait::{eventually, eventually_within, until};
 
 const PRIVATE: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__ALLOW_PRIVATE", "true");
 const NO_RETRY: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[]");
@@ -29,16 +30,15 @@ async fn post(server: &Server, path: &str) -> Answer {
 
 /// The newest delivery of a webhook, once it is in this state.
 async fn newest(server: &Server, id: &str, state: &str, attempts: u32) -> Value {
-    let deadline = Instant::now() + Duration::from_secs(30);
-    loop {
+    eventually_within(Duration::from_secs(30), async || {
         let page = server.get(&format!("/webhooks/{id}/deliveries?limit=1")).await.expect(200);
         let newest = page["deliveries"][0].clone();
-        if newest["state"] == state && newest["attempts"] == attempts {
-            return newest;
+        match newest["state"] == state && newest["attempts"] == attempts {
+            true => Ok(newest),
+            false => Err(newest),
         }
-        assert!(Instant::now() < deadline, "{newest}");
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+    })
+    .await
 }
 
 /// A job that has ended.
@@ -183,13 +183,11 @@ async fn what_was_given_up_is_kept_and_can_be_delivered_again() {
     let (other, _) = hook(&server, json!({"url": receiver.url})).await;
     post(&server, &format!("/webhooks/{other}/test")).await.expect(202);
     newest(&server, &other, "delivered", 1).await;
-    let deadline = Instant::now() + Duration::from_secs(60);
-    while server.get(&format!("/webhooks/{other}/deliveries")).await.expect(200)["deliveries"]
-        != json!([])
-    {
-        assert!(Instant::now() < deadline, "{}", server.log());
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
+    until(async || {
+        let page = server.get(&format!("/webhooks/{other}/deliveries")).await.expect(200);
+        page["deliveries"] == json!([])
+    })
+    .await;
 }
 
 #[tokio::test]
@@ -203,14 +201,11 @@ async fn a_redirect_leads_nowhere() {
     let (id, _) = hook(&server, json!({"url": receiver.url})).await;
     for status in [301, 302, 303, 307, 308] {
         post(&server, &format!("/webhooks/{id}/test")).await.expect(202);
-        let deadline = Instant::now() + Duration::from_secs(30);
-        let dead = loop {
+        let dead = eventually(async || {
             let dead = newest(&server, &id, "dead", 1).await;
-            if dead["last_status"] == status {
-                break dead;
-            }
-            assert!(Instant::now() < deadline, "{dead}");
-        };
+            (dead["last_status"] == status).then_some(dead)
+        })
+        .await;
         assert!(dead["last_error"].as_str().unwrap().contains("redirects are not followed"));
     }
     assert_eq!((receiver.messages().len(), elsewhere.messages().len()), (5, 0));

@@ -1,13 +1,13 @@
 //! Damaged files, a full disk, a read-only one.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use serde_json::Value;
 use tempfile::TempDir;
 
 use super::disk::SmallDisk;
 use super::support::{Server, reference};
+use super::wait::{eventually, until};
 
 const GRAPH: (&str, &str) = ("WHEREABOUTS_INDEX__EXACT_UP_TO", "0");
 
@@ -28,9 +28,7 @@ async fn first_of(server: &Server, place: usize) -> Value {
 }
 
 async fn until_graphed(server: &Server) {
-    while server.get("/maps/m").await.expect(200)["index"] != "hnsw" {
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+    until(async || server.get("/maps/m").await.expect(200)["index"] == "hnsw").await;
 }
 
 #[tokio::test]
@@ -41,12 +39,7 @@ async fn a_torn_or_damaged_graph_file_is_built_again() {
     until_graphed(&server).await;
     let graph = |files: Vec<PathBuf>| files.into_iter().find(|file| file.ends_with("graph"));
     // It is written after it is first used.
-    let file = loop {
-        match graph(files(&dir.path().join("descriptors"))) {
-            Some(file) => break file,
-            None => tokio::time::sleep(Duration::from_millis(20)).await,
-        }
-    };
+    let file = eventually(async || graph(files(&dir.path().join("descriptors")))).await;
     server.kill();
     let whole = std::fs::read(&file).unwrap();
     let mut damaged = whole.clone();

@@ -13,6 +13,7 @@ use whereabouts_core::Digest;
 use super::clients::{Chance, Client, Pictures};
 use super::ledger::{Key, Picture};
 use super::support::{BINARY, Server};
+use super::wait::until;
 
 /// `make crash` sets more.
 const ROUNDS: usize = 20;
@@ -101,7 +102,7 @@ impl Driver {
                 client
             }));
         }
-        // Now and then just after the start, mostly in the middle of things.
+        // The moment is what is tested: now and then just after the start, mostly in the middle of things.
         let moment = if round.is_multiple_of(5) { 50 } else { 900 };
         let moment = Duration::from_millis(self.chance.below(moment) as u64);
         tokio::time::sleep(moment).await;
@@ -120,6 +121,7 @@ impl Driver {
             .stderr(Stdio::null())
             .spawn()
             .unwrap();
+        // Any moment of the start is what is tested.
         std::thread::sleep(Duration::from_millis(self.chance.below(300) as u64));
         child.kill().unwrap();
         child.wait().unwrap();
@@ -189,9 +191,7 @@ impl Driver {
             // Candidates may have been removed meanwhile.
             assert!(["succeeded", "degraded"].contains(&job["state"].as_str().unwrap()), "{job}");
         }
-        while server.get("/maps/shared").await.expect(200)["index"] != "hnsw" {
-            tokio::time::sleep(Duration::from_millis(50)).await;
-        }
+        until(async || server.get("/maps/shared").await.expect(200)["index"] == "hnsw").await;
         let graph = self.answers(&server).await;
         server.kill();
         let server = self.start(EXACT);

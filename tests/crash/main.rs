@@ -9,4 +9,4 @@ mod faults;
 mod kill;
 mod ledger;
 
-use whereabouts_testkit::server as support;
+use whereabouts_testkit::{server as support, wait};

@@ -13,7 +13,7 @@ use whereabouts_store::{
 };
 
 use crate::support::{
-    Fixture, claim, descriptor, eventually, image, odd_texts, record, submit, submit_record,
+    Fixture, claim, descriptor, eventually, image, odd_texts, record, submit, submit_record, until,
 };
 
 contract!(
@@ -129,11 +129,12 @@ async fn a_job_is_taken_by_one_worker_at_a_time(fixture: &Fixture) {
     assert_eq!(taken.into_iter().collect::<HashSet<_>>(), submitted);
 }
 
+const BRIEF_LEASE: SignedDuration = SignedDuration::from_millis(50);
+
 /// Takes a job for a moment.
 async fn claim_briefly(store: &dyn Store) -> JobRecord {
     let now = Timestamp::now();
-    let lease = SignedDuration::from_millis(50);
-    store.claim(now, now + lease).await.unwrap().unwrap()
+    store.claim(now, now + BRIEF_LEASE).await.unwrap().unwrap()
 }
 
 /// Nothing that is done with the claim changes the job.
@@ -165,7 +166,8 @@ async fn a_job_whose_lease_ran_out_is_taken_again_and_nobody_hears_the_first_wor
     // While nobody else has taken it, a worker may end it late.
     let id = submit(&*store, "m", b"frame").await;
     let late = claim_briefly(&*store).await;
-    tokio::time::sleep(std::time::Duration::from_millis(60)).await;
+    let lease_ends = Timestamp::now() + BRIEF_LEASE;
+    until(async || Timestamp::now() > lease_ends).await;
     store.finish(late.claim(), ended(&late, JobState::Succeeded)).await.unwrap();
     assert_eq!(job(&*store, id).await.state, JobState::Succeeded);
     assert!(claim(&*store).await.is_none());

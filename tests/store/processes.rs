@@ -23,14 +23,20 @@ use whereabouts_store::{
 };
 
 use crate::support::{
-    Database, Pictures, SHORT_LIFE, Tuning, add, claim, descriptor, eventually, fill, map, next,
-    record, submit,
+    Database, Pictures, Tuning, add, claim, descriptor, eventually, fill, map, next, record,
+    submit, until,
 };
 
 /// One that is not taken for dead because the machine is busy.
 fn long_lived() -> Tuning {
     Tuning { lifetime: Duration::from_secs(60), ..Tuning::default() }
 }
+
+/// The time of the database, and the first and the last moment at which a process counts as dead unless it sends
+/// another heartbeat; in seconds.
+const NOW: &str = "SELECT extract(epoch FROM now())";
+const EARLIEST_END: &str = "SELECT extract(epoch FROM min(alive_until)) FROM processes";
+const LATEST_END: &str = "SELECT extract(epoch FROM max(alive_until)) FROM processes";
 
 async fn database() -> Database {
     Database::migrated(Pictures::Folder).await
@@ -106,8 +112,9 @@ async fn a_process_that_goes_on_saying_so_is_alive_longer_than_its_lifetime() {
     let working = database.open(tuning).await;
     submit(&working, "m", b"frame").await;
     claim(&working).await.unwrap();
+    let first_end = database.number(LATEST_END).await;
     let other = database.open(Tuning::default()).await;
-    tokio::time::sleep(Duration::from_secs(3)).await;
+    until(async || database.number(NOW).await > first_end).await;
     assert!(claim(&other).await.is_none());
 }
 
@@ -364,14 +371,23 @@ async fn a_map_whose_index_is_being_built_can_be_deleted() {
     let database = database().await;
     let tuning = Tuning { exact_up_to: 50, ..long_lived() };
     let store = database.open(tuning).await;
-    for round in 0..3 {
+    let being_built =
+        "SELECT count(*) FROM pg_stat_progress_create_index WHERE datname = current_database()";
+    for moment in ["before the index is built", "while it is built", "once it is built"] {
         let (map, _) = store.put_map(map("m", 256)).await.unwrap();
         for number in 0..100_u32 {
             add(&store, &map, &number.to_string(), &number.to_le_bytes()).await;
         }
-        // Sometimes before the building begins, sometimes in the middle of it, sometimes after.
-        tokio::time::sleep(Duration::from_millis(400 * round)).await;
-        assert!(store.delete_map(&map.name).await.unwrap());
+        let is_built = async || store.index_state(&map).await.unwrap().graph;
+        match moment {
+            "before the index is built" => {}
+            // It may be over before it is seen.
+            "while it is built" => {
+                until(async || database.number(being_built).await > 0.0 || is_built().await).await;
+            }
+            _ => until(is_built).await,
+        }
+        assert!(store.delete_map(&map.name).await.unwrap(), "{moment}");
     }
 }
 
@@ -433,7 +449,8 @@ async fn right_after_the_database_was_started_everybody_counts_as_alive() {
     // To this one, the database was started a moment ago.
     let age = Duration::from_secs(24 * 3600);
     let other = database.open(Tuning { lifetime: age, ..Tuning::default() }).await;
-    tokio::time::sleep(3 * SHORT_LIFE).await;
+    // By its own account it is dead.
+    until(async || database.number(NOW).await > database.number(EARLIEST_END).await).await;
     assert!(claim(&other).await.is_none());
 }
 

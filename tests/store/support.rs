@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use jiff::{SignedDuration, Timestamp};
@@ -21,6 +21,8 @@ use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
 use whereabouts_store::{
     Added, DescriptionBounds, Draft, JobRecord, KeepJobs, ObjectSettings, Objects, Query, Store,
 };
+
+pub use whereabouts_testkit::wait::{eventually, until};
 
 /// Makes each of these promises a test of both stores.
 macro_rules! contract {
@@ -83,10 +85,7 @@ impl Default for Tuning {
 }
 
 /// A process that says nothing for so long is dead to the others.
-pub const SHORT_LIFE: Duration = Duration::from_millis(300);
-
-/// What has not happened by then does not happen.
-const PATIENCE: Duration = Duration::from_secs(30);
+const SHORT_LIFE: Duration = Duration::from_millis(300);
 
 /// One place where a store keeps its things, which outlives the store.
 pub struct Fixture(Kind);
@@ -211,9 +210,16 @@ impl Database {
         PostgresStore::open(self.settings(tuning), self.objects(), Uuid::now_v7()).await.unwrap()
     }
 
-    /// Runs a statement beside the store.
+    /// Runs a statement on a connection that is not the store's.
     pub async fn run(&self, sql: &str) {
         administer(&self.options(), sql).await;
+    }
+
+    /// Reads one number on a connection that is not the store's.
+    pub async fn number(&self, sql: &str) -> f64 {
+        let mut connection = self.options().connect().await.unwrap();
+        let sql = format!("SELECT ({sql})::float8");
+        sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(&mut connection).await.unwrap()
     }
 }
 
@@ -255,18 +261,6 @@ pub fn s3(prefix: &str, endpoint: &str, timeout: Duration) -> Objects {
     let url = format!("s3://whereabouts-test/{prefix}");
     let (endpoint, region) = (endpoint.to_owned(), "us-east-1".to_owned());
     Objects::open(&ObjectSettings { url, endpoint, region, allow_http: true, timeout }).unwrap()
-}
-
-/// What comes of asking again and again, once something does.
-pub async fn eventually<T>(mut ask: impl AsyncFnMut() -> Option<T>) -> T {
-    let began = Instant::now();
-    loop {
-        if let Some(answer) = ask().await {
-            return answer;
-        }
-        assert!(began.elapsed() < PATIENCE, "it did not happen within {PATIENCE:?}");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
 }
 
 /// A map whose descriptors have so many numbers.

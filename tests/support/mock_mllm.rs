@@ -270,6 +270,7 @@ async fn answer(
         barrier.wait().await;
     }
     if !script.latency.is_zero() {
+        // A slow model is part of the script.
         tokio::time::sleep(script.latency).await;
     }
     {

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use axum::Router;
 use axum::body::to_bytes;
@@ -15,6 +15,8 @@ use base64::engine::general_purpose::STANDARD;
 use reqwest::{Method, StatusCode};
 use ring::hmac;
 use serde_json::Value;
+
+use crate::wait::eventually_within;
 
 /// What a receiver answers.
 #[derive(Clone)]
@@ -104,13 +106,15 @@ impl Receiver {
         self.messages.lock().unwrap().clone()
     }
 
-    /// The messages, once there are so many.
+    /// Waits until at least `count` messages have come, and returns all of them.
     pub async fn wait(&self, count: usize) -> Vec<Message> {
-        let deadline = Instant::now() + Duration::from_secs(30);
-        while self.messages().len() < count {
-            assert!(Instant::now() < deadline, "{} of {count} came", self.messages().len());
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-        self.messages()
+        eventually_within(Duration::from_secs(30), async || {
+            let messages = self.messages();
+            match messages.len() {
+                received if received < count => Err(format!("{received} of {count} messages came")),
+                _ => Ok(messages),
+            }
+        })
+        .await
     }
 }

@@ -11,6 +11,7 @@ use tempfile::TempDir;
 use super::real_images::data;
 use crate::mock_mllm::{MockMllm, Script};
 use crate::support::{BINARY, frame, reference};
+use crate::wait::until;
 
 /// References and queries in folders, and room for what eval writes.
 struct Folders {
@@ -182,11 +183,12 @@ fn a_picture_that_cannot_be_decoded_is_named() {
     assert!(refused.contains("@1000.0@5.0@.jpg"), "{refused}");
 }
 
-fn kill_when(mut child: Child, enough: impl Fn() -> bool) {
-    while !enough() {
+async fn kill_when(mut child: Child, enough: impl Fn() -> bool) {
+    until(async || {
         assert!(child.try_wait().unwrap().is_none(), "it ended before it was killed");
-        std::thread::sleep(Duration::from_millis(5));
-    }
+        enough()
+    })
+    .await;
     child.kill().unwrap();
     child.wait().unwrap();
 }
@@ -200,7 +202,7 @@ async fn a_killed_run_goes_on_and_buys_no_description_twice() {
     let args = ["--refine", "local,mllm", "--mllm-base-url", &url, "-k", "4", "--out", "out"];
     let mut command = folders.command(&args);
     let child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-    kill_when(child, || mock.reason_calls() >= 2);
+    kill_when(child, || mock.reason_calls() >= 2).await;
 
     let summary = folders.eval(&args);
     assert_eq!(names(&summary), ["gem", "gem+local", "gem+mllm"]);

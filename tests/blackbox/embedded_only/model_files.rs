@@ -2,13 +2,13 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
-use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::mock_hub::{Hub, Trouble};
 use crate::support::{BINARY, Server};
+use crate::wait::until;
 
 const FIXTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/models/tiny-tokens");
 
@@ -271,11 +271,7 @@ async fn a_pull_that_is_killed_leaves_nothing_installed_and_is_continued() {
             .unwrap(),
     );
     let partial = bench.models().join(".partial/tiny-model.onnx");
-    let start = Instant::now();
-    while std::fs::metadata(&partial).map_or(0, |file| file.len()) < 12_000 {
-        assert!(start.elapsed() < Duration::from_secs(20), "nothing was downloaded");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
+    until(async || std::fs::metadata(&partial).map_or(0, |file| file.len()) >= 12_000).await;
     // While it is at work, another one does not get in its way.
     pull(&bench, &hub).await.bad(&["another process is installing tiny"]);
     killed.0.kill().unwrap();

@@ -8,6 +8,7 @@ use whereabouts_core::DescriptorKind;
 use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
 
 use crate::support::{BINARY, Server, frame, reference};
+use crate::wait::until;
 
 const ONE: Layout = Layout { threads: 1, sessions: 1, max_batch: 1 };
 const EIGHT: Layout = Layout { threads: 1, sessions: 1, max_batch: 8 };
@@ -141,9 +142,7 @@ async fn another_provider_gives_the_same_descriptors_and_another_precision_is_re
     // As it says, too: the descriptors are made anew.
     assert!(refused.contains("--reindex --map m"), "{refused}");
     server.post("/maps/m/reindex", "application/json", Vec::new()).await.expect(202);
-    while server.get("/maps/m").await.expect(200)["precision"] == "full" {
-        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-    }
+    until(async || server.get("/maps/m").await.expect(200)["precision"] != "full").await;
     assert_eq!(localize(&server).await.len(), 4);
 }
 
