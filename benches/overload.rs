@@ -4,9 +4,6 @@
 //! Robots and server share this machine, so that the figures are worse than those of a server alone.
 //! Ends with exit code 1 if a promise is not kept.
 
-#[path = "support/server.rs"]
-mod server;
-
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -14,9 +11,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use bytes::Bytes;
-use server::Server;
 use tokio::task::JoinSet;
 use whereabouts_server::config::{Config, Overrides};
+use whereabouts_testkit::server::Server;
 use whereabouts_town::{Town, TownSpec};
 use whereabouts_vision::decode::encode_jpeg;
 
@@ -42,7 +39,7 @@ fn main() -> anyhow::Result<ExitCode> {
     let _ = rustls::crypto::ring::default_provider().install_default();
     let town = Town::new(TownSpec { places: PLACES, ..TownSpec::default() });
     let data = tempfile::tempdir()?;
-    let server = Server::start("xfeat", data.path())?;
+    let server = Server::start_for_benchmark("xfeat", data.path(), &[]);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let kept = runtime.block_on(measure(&server, &town))?;
     Ok(if kept { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -62,7 +59,7 @@ async fn measure(server: &Server, town: &Town) -> anyhow::Result<bool> {
     println!("{CLIENTS} clients           {capacity:6.1} frames/s");
 
     let watched = Arc::new(Memory::default());
-    let watching = tokio::spawn(Arc::clone(&watched).watch(server.child.id()));
+    let watching = tokio::spawn(Arc::clone(&watched).watch(server.id()));
     let (asking, sending) = robots.offer(capacity * TIMES_CAPACITY, OVERLOAD_FOR).await;
     watched.end.store(true, Ordering::Relaxed);
     let samples = watching.await??;
@@ -289,7 +286,7 @@ impl Memory {
 }
 
 fn resident(server: &Server) -> anyhow::Result<u64> {
-    resident_of(server.child.id())
+    resident_of(server.id())
 }
 
 /// Bytes.

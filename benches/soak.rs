@@ -4,9 +4,6 @@
 //!
 //! `make soak`, or `cargo bench --bench soak -- MINUTES`
 
-#[path = "support/server.rs"]
-mod server;
-
 use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -15,9 +12,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use bytes::Bytes;
-use server::Server;
 use tokio::sync::Mutex;
 use tokio::task::JoinSet;
+use whereabouts_testkit::server::Server;
 use whereabouts_town::{Town, TownSpec};
 use whereabouts_vision::decode::encode_jpeg;
 
@@ -70,7 +67,7 @@ fn main() -> anyhow::Result<ExitCode> {
     let data = tempfile::tempdir()?;
     let settings =
         [("WHEREABOUTS_JOBS__KEEP_COUNT", KEPT_JOBS), ("WHEREABOUTS_JOBS__SWEEP_S", "2")];
-    let server = Server::start_with("xfeat", data.path(), &settings)?;
+    let server = Server::start_for_benchmark("xfeat", data.path(), &settings);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let kept = runtime.block_on(soak(&server, data.path(), &images, &frames, length))?;
     Ok(if kept { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -203,7 +200,7 @@ impl Notes {
 }
 
 async fn look(server: &Server, data: &Path, at: Duration, notes: &Notes) -> anyhow::Result<Sample> {
-    let process = format!("/proc/{}", server.child.id());
+    let process = format!("/proc/{}", server.id());
     let status = std::fs::read_to_string(format!("{process}/status"))?;
     let line = status.lines().find(|line| line.starts_with("VmRSS:")).context("no VmRSS")?;
     let kilobytes: u64 = line.split_whitespace().nth(1).context("no VmRSS")?.parse()?;

@@ -1,5 +1,6 @@
 //! Starts the real server on a free port and speaks HTTP with it.
 
+use std::ffi::OsStr;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -27,7 +28,7 @@ pub struct Server {
     child: Child,
     pub url: String,
     log: Arc<Mutex<Vec<String>>>,
-    http: reqwest::Client,
+    pub http: reqwest::Client,
 }
 
 /// A server with a data folder of its own.
@@ -57,23 +58,29 @@ impl Server {
     }
 
     fn try_start_as(role: &str, data: &Path, settings: &[(&str, &str)]) -> Result<Self, String> {
-        // reqwest has no cryptography of its own; the binary chooses the same.
-        let _ = rustls::crypto::ring::default_provider().install_default();
-        // Connections are not kept, so that a drain never waits for an idle one.
-        let http = reqwest::Client::builder().pool_max_idle_per_host(0).build().unwrap();
+        let mut command = Command::new(&*BINARY);
+        command.arg(role).args(arguments(data)).envs(test_settings(data)).envs(settings.to_vec());
+        Self::spawn(command, unpooled())
+    }
+
+    /// Starts a server as it is deployed, for a benchmark: with the default number of threads, and a client that
+    /// keeps its connections. `settings` are environment variables.
+    pub fn start_for_benchmark(model: &str, data: &Path, settings: &[(&str, &str)]) -> Self {
+        install_cryptography();
+        let mut command = Command::new(&*BINARY);
+        command.args(["serve", "--model", model]).args(arguments(data)).envs(settings.to_vec());
+        Self::spawn(command, reqwest::Client::new())
+            .unwrap_or_else(|log| panic!("the server did not start: {log}"))
+    }
+
+    /// Runs the command until it says that it is ready; returns the log of one that ends instead.
+    fn spawn(mut command: Command, http: reqwest::Client) -> Result<Self, String> {
         let address_file =
             std::env::temp_dir().join(format!("whereabouts-{}.address", uuid::Uuid::now_v7()));
-        let mut child = Command::new(&*BINARY)
-            .args([role, "--listen", "127.0.0.1:0", "--data"])
-            .arg(data)
+        let mut child = command
             .arg("--address-file")
             .arg(&address_file)
             .env("WHEREABOUTS_LOG__FORMAT", "json")
-            .env("WHEREABOUTS_MODEL__THREADS", "1")
-            // Whatever else is installed in the checkout.
-            .env("WHEREABOUTS_MODEL__NAME", "xfeat")
-            .envs(deployment::settings(data))
-            .envs(settings.iter().copied())
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
@@ -90,13 +97,18 @@ impl Server {
                 break;
             }
         }
-        let kept = Arc::clone(&log);
+        let rest_of_log = Arc::clone(&log);
         thread::spawn(move || {
-            lines.map_while(Result::ok).for_each(|line| kept.lock().unwrap().push(line));
+            lines.map_while(Result::ok).for_each(|line| rest_of_log.lock().unwrap().push(line));
         });
         let address = std::fs::read_to_string(&address_file).unwrap();
         std::fs::remove_file(&address_file).unwrap();
         Ok(Self { child, url: format!("http://{}", address.trim()), log, http })
+    }
+
+    /// The id of the process.
+    pub fn id(&self) -> u32 {
+        self.child.id()
     }
 
     pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
@@ -167,6 +179,29 @@ impl Server {
         let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
         line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() * 1024
     }
+}
+
+fn arguments(data: &Path) -> [&OsStr; 4] {
+    ["--listen".as_ref(), "127.0.0.1:0".as_ref(), "--data".as_ref(), data.as_ref()]
+}
+
+/// One thread, because tests run side by side; and the same model whatever else is installed in the checkout.
+fn test_settings(data: &Path) -> Vec<(String, String)> {
+    let model = [("WHEREABOUTS_MODEL__THREADS", "1"), ("WHEREABOUTS_MODEL__NAME", "xfeat")];
+    let model = model.map(|(name, value)| (name.to_owned(), value.to_owned()));
+    model.into_iter().chain(deployment::settings(data)).collect()
+}
+
+/// A client that keeps no connections, so that a drain never waits for an idle one, and that may be used from
+/// several runtimes.
+fn unpooled() -> reqwest::Client {
+    install_cryptography();
+    reqwest::Client::builder().pool_max_idle_per_host(0).build().unwrap()
+}
+
+/// reqwest has no cryptography of its own; this is the one that the binary has.
+fn install_cryptography() {
+    let _ = rustls::crypto::ring::default_provider().install_default();
 }
 
 impl Drop for Server {
