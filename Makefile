@@ -30,6 +30,7 @@ chromium:
 test: assets nasm chromium ## Set up, build and run every test
 	tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked --workspace
 	tests/scale_out.sh $(CARGO) target/postgres-venv
+	tests/optional.sh $(CARGO)
 	tests/api/conformance.sh $(BINARY) target/api-venv
 	tests/grpc/check.sh $(BINARY) target/grpc-venv
 	tests/console/check.sh $(BINARY) target/console-venv

@@ -1,6 +1,7 @@
 //! Black-box tests: they start the real binary and talk to it as its users do.
 //!
-//! Pictures come from the procedural town. `embedded_only::real_images` uses photographs where they are at hand.
+//! Pictures come from the procedural town. Tests that need an input which not every machine has
+//! are ignored, in modules `needs_INPUT`; `tests/optional.sh` runs them where the input is.
 
 #![allow(
     clippy::expect_used,

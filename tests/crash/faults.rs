@@ -1,11 +1,10 @@
-//! Damaged files, a full disk, a read-only one.
+//! Damaged files.
 
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::disk::SmallDisk;
 use super::support::{Server, reference};
 use super::wait::{eventually, until};
 
@@ -22,7 +21,7 @@ fn files(folder: &Path) -> Vec<PathBuf> {
     found
 }
 
-async fn first_of(server: &Server, place: usize) -> Value {
+pub async fn first_of(server: &Server, place: usize) -> Value {
     let answer = server.post_jpeg("/localize?map=m&refine=off", reference(place)).await;
     answer.expect(200)["candidates"][0]["image_id"].clone()
 }
@@ -105,58 +104,4 @@ async fn a_damaged_database_loses_nothing_in_silence() {
     let images = server.get("/maps/m").await.expect(200)["images"].as_u64().unwrap();
     assert!((1..IMAGES as u64).contains(&images), "{images}");
     assert_eq!(first_of(&server, 0).await, "place-0");
-}
-
-#[tokio::test]
-async fn a_full_disk_is_said_and_what_was_acknowledged_is_kept() {
-    let Some(disk) = SmallDisk::mount(16) else { return };
-    let little = ("WHEREABOUTS_DATA__MIN_FREE_BYTES", "4000000");
-    let server = Server::start(&disk.data(), &[little]);
-    server.put("/maps/m", serde_json::json!({})).await.expect(201);
-    let mut stored = 0;
-    let why = loop {
-        let mut bytes = reference(stored);
-        // What follows the end of a JPEG is part of the file, not of the picture.
-        bytes.resize(bytes.len() + 200_000, stored as u8);
-        let answer = server.post_jpeg(&format!("/maps/m/images?id=place-{stored}"), bytes).await;
-        if answer.status != 201 {
-            break answer.problem(507);
-        }
-        stored += 1;
-        assert!(stored < 200, "the disk is never full");
-    };
-    assert!(why.contains("disk") && stored > 3, "{stored}: {why}");
-    // It still answers.
-    assert_eq!(first_of(&server, 2).await, "place-2");
-    let mut frame = reference(1);
-    frame.resize(200_000, 0);
-    let answer = server.post_jpeg("/localize?map=m", frame).await.expect(200);
-    assert_eq!(answer["no_job"]["reason"], "disk_full", "{answer}");
-    server.kill();
-    let server = Server::start(&disk.data(), &[little]);
-    assert_eq!(server.get("/maps/m").await.expect(200)["images"], stored);
-    for place in 0..stored {
-        assert_eq!(server.get(&format!("/maps/m/images/place-{place}/content")).await.status, 200);
-    }
-    // Room is made by deleting.
-    for place in 0..stored / 2 {
-        server.delete(&format!("/maps/m/images/place-{place}")).await.expect(204);
-    }
-    server.post_jpeg("/maps/m/images?id=late", reference(90)).await.expect(201);
-}
-
-#[tokio::test]
-async fn a_read_only_folder_is_refused_with_the_reason() {
-    let Some(disk) = SmallDisk::mount(64) else { return };
-    let settings = [("WHEREABOUTS_DATA__MIN_FREE_BYTES", "0")];
-    let server = Server::start(&disk.data(), &settings);
-    server.town("m", 3).await;
-    server.kill();
-    disk.read_only(true);
-    let Err(said) = Server::try_start(&disk.data(), &settings) else { panic!("it cannot write") };
-    assert!(said.contains("ead-only"), "{said}");
-    disk.read_only(false);
-    let server = Server::start(&disk.data(), &settings);
-    assert_eq!(server.get("/maps/m").await.expect(200)["images"], 3);
-    server.post_jpeg("/maps/m/images?id=late", reference(9)).await.expect(201);
 }

@@ -8,5 +8,6 @@ mod disk;
 mod faults;
 mod kill;
 mod ledger;
+mod needs_mount;
 
 use whereabouts_testkit::{server as support, wait};

@@ -8,7 +8,6 @@ use exif::{Field, In, Rational, Tag};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::real_images::data;
 use crate::mock_mllm::{MockMllm, Script};
 use crate::support::{BINARY, frame, reference};
 use crate::wait::until;
@@ -72,13 +71,13 @@ impl Folders {
     }
 }
 
-fn json(output: &Output) -> Value {
+pub fn json(output: &Output) -> Value {
     let error = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{error}");
     serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{error}"))
 }
 
-fn recalls(summary: &Value) -> Vec<[f64; 3]> {
+pub fn recalls(summary: &Value) -> Vec<[f64; 3]> {
     let methods = summary["methods"].as_array().unwrap();
     let of = |method: &Value, k: &str| method["recall"][k].as_f64().unwrap();
     methods.iter().map(|method| ["1", "5", "10"].map(|k| of(method, k))).collect()
@@ -314,37 +313,4 @@ fn what_is_held_out_is_unknown() {
     let refused = folders.command(&["--hold-out", "1"]).output().unwrap();
     assert_eq!(refused.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&refused.stderr).contains("from 0 to below 1"));
-}
-
-/// Corridor or tower, where the photographs are at hand.
-fn photographs(set: &str, [database, queries]: [&str; 2], args: &[&str]) -> Option<Value> {
-    let folder = data(set)?;
-    let work = TempDir::new().unwrap();
-    let output = Command::new(&*BINARY)
-        .args(["eval", "--json", "--scene", "indoor", "--model", "xfeat", "--work"])
-        .args([work.path(), Path::new("--database"), &folder.join(database)])
-        .args([Path::new("--queries"), &folder.join(queries)])
-        .args(args)
-        // Each run has a folder of its own, and would choose for itself who runs the model.
-        .env("WHEREABOUTS_MODEL__PROVIDER", "cpu")
-        .env("WHEREABOUTS_MODEL__PRECISION", "full")
-        // A graph, however small the map.
-        .env("WHEREABOUTS_INDEX__EXACT_UP_TO", "0")
-        .env("WHEREABOUTS_MODEL__THREADS", "1")
-        .output()
-        .unwrap();
-    Some(json(&output))
-}
-
-#[test]
-fn the_graph_and_the_exact_search_have_the_same_recall() {
-    for (set, folders) in [("corridor", ["ref", "query"]), ("tower", ["database", "queries"])] {
-        let Some(graph) = photographs(set, folders, &["--refine", "off"]) else { return };
-        let Some(exact) = photographs(set, folders, &["--refine", "off", "--exact"]) else {
-            return;
-        };
-        assert_eq!((&graph["search"], &exact["search"]), (&"fast".into(), &"exact".into()));
-        assert_eq!(graph["skipped"], 0);
-        assert_eq!(recalls(&graph), recalls(&exact), "{set}");
-    }
 }

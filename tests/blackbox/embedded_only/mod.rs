@@ -9,6 +9,7 @@ mod documented;
 mod eval;
 mod model_files;
 mod models;
+mod needs_openvino;
+mod needs_photographs;
 mod overload;
-mod real_images;
 mod schema;

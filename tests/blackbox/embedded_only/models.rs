@@ -7,8 +7,7 @@ use tempfile::TempDir;
 use whereabouts_core::DescriptorKind;
 use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
 
-use crate::support::{BINARY, Server, frame, reference};
-use crate::wait::until;
+use crate::support::{BINARY, reference};
 
 const ONE: Layout = Layout { threads: 1, sessions: 1, max_batch: 1 };
 const EIGHT: Layout = Layout { threads: 1, sessions: 1, max_batch: 8 };
@@ -95,55 +94,6 @@ fn a_damaged_model_is_refused_by_its_digest() {
     let settings = ExtractorSettings::plain("tiny-tokens", 1, ImageLimits { max_pixels: 1 });
     let error = Extractor::load(&Assets::locate(Some(root.path())), &settings).unwrap_err();
     assert!(error.to_string().contains("pins"), "{error}");
-}
-
-/// Whether `make openvino` has been run.
-fn has_openvino() -> bool {
-    let library = "assets/onnxruntime-openvino/libonnxruntime.so";
-    Path::new(env!("CARGO_MANIFEST_DIR")).join(library).is_file()
-}
-
-#[tokio::test]
-async fn another_provider_gives_the_same_descriptors_and_another_precision_is_refused() {
-    if !has_openvino() {
-        eprintln!("not run: `make openvino` gets the library that this needs");
-        return;
-    }
-    let dir = TempDir::new().unwrap();
-    let start = |provider, precision| {
-        let settings = [
-            ("WHEREABOUTS_MODEL__PROVIDER", provider),
-            ("WHEREABOUTS_MODEL__PRECISION", precision),
-        ];
-        Server::start(dir.path(), &settings)
-    };
-    let localize = async |server: &Server| {
-        let answer = server.post_jpeg("/localize?map=m&refine=off", frame(1, 0)).await.expect(200);
-        let candidates = answer["candidates"].as_array().unwrap().clone();
-        candidates.iter().map(|one| one["similarity"].as_f64().unwrap()).collect::<Vec<_>>()
-    };
-    let server = start("cpu", "auto");
-    server.town("m", 4).await;
-    assert_eq!(server.get("/maps/m").await.expect(200)["precision"], "full");
-    let by_cpu = localize(&server).await;
-    server.terminate();
-    // auto keeps to the precision of the maps.
-    let server = start("openvino", "auto");
-    assert!(server.log().contains("openvino at full precision"), "{}", server.log());
-    for (one, other) in localize(&server).await.iter().zip(&by_cpu) {
-        assert!((one - other).abs() < 1e-4, "{one} is not {other}");
-    }
-    server.terminate();
-    let server = start("openvino", "bf16");
-    let refused = server.post_jpeg("/localize?map=m&refine=off", frame(1, 0)).await.problem(409);
-    assert!(refused.contains("model.precision"), "{refused}");
-    server.town("b", 2).await;
-    assert_eq!(server.get("/maps/b").await.expect(200)["precision"], "bf16");
-    // As it says, too: the descriptors are made anew.
-    assert!(refused.contains("--reindex --map m"), "{refused}");
-    server.post("/maps/m/reindex", "application/json", Vec::new()).await.expect(202);
-    until(async || server.get("/maps/m").await.expect(200)["precision"] != "full").await;
-    assert_eq!(localize(&server).await.len(), 4);
 }
 
 #[test]
