@@ -6,7 +6,7 @@ use std::process::{Command, Output, Stdio};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server, frame, reference, server};
+use super::support::{BINARY, Server, frame, reference, server, shared_server};
 
 fn run(server: &Server, args: &[&str]) -> Output {
     command(server, args).output().unwrap()
@@ -193,9 +193,9 @@ async fn import(
 
 #[tokio::test]
 async fn an_import_that_contradicts_itself_is_refused() {
-    let (_dir, server) = server();
-    server.town("m", 2).await;
-    let page = server.get("/maps/m/export").await.expect(200);
+    let (server, map) = shared_server();
+    server.town(&map, 2).await;
+    let page = server.get(&format!("/maps/{map}/export")).await.expect(200);
     let of = |image: Value| json!({"map": page["map"], "image": image}).to_string();
     let with = |field: &str, value: Value| {
         let mut image = page["images"][0].clone();
@@ -203,7 +203,7 @@ async fn an_import_that_contradicts_itself_is_refused() {
         image["image"][field] = value;
         of(image)
     };
-    import(&server, "m", reference(1), with("id", "new".into())).await.problem(422);
+    import(server, &map, reference(1), with("id", "new".into())).await.problem(422);
     let cases = [
         (with("id", "..".into()), 400),
         (with("media_type", "image/png".into()), 422),
@@ -214,20 +214,20 @@ async fn an_import_that_contradicts_itself_is_refused() {
         ("{".into(), 400),
     ];
     for (meta, status) in cases {
-        import(&server, "m", reference(0), meta).await.problem(status);
+        import(server, &map, reference(0), meta).await.problem(status);
     }
     let mut short = page["images"][0].clone();
     short["image"]["id"] = "new".into();
     short["descriptor"] = "AACAPwAAAAA=".into();
-    let why = import(&server, "m", reference(0), of(short)).await.problem(422);
+    let why = import(server, &map, reference(0), of(short)).await.problem(422);
     assert!(why.contains("2 numbers"), "{why}");
     for (field, value) in [("dim", json!(0)), ("model", json!("../../etc"))] {
-        let mut map = page["map"].clone();
-        map[field] = value;
-        server.put("/maps/new/import", map).await.problem(422);
+        let mut wrong = page["map"].clone();
+        wrong[field] = value;
+        server.put(&format!("/maps/{map}-new/import"), wrong).await.problem(422);
     }
-    assert_eq!(server.get("/maps/m").await.expect(200)["images"], 2);
-    server.get("/maps/new").await.problem(404);
+    assert_eq!(server.get(&format!("/maps/{map}")).await.expect(200)["images"], 2);
+    server.get(&format!("/maps/{map}-new")).await.problem(404);
 }
 
 #[tokio::test]

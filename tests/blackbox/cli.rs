@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server, frame, reference, server};
+use super::support::{BINARY, Server, frame, reference, server, shared_server};
 
 fn whereabouts(args: &[&str]) -> Output {
     // Whatever else is installed in the checkout, or could be.
@@ -37,32 +37,35 @@ fn index(server: &Server, dir: &Path, map: &str) -> Output {
 
 #[tokio::test]
 async fn a_folder_is_indexed_once_however_often_it_is_sent() {
-    let (_dir, server) = server();
+    let (server, map) = shared_server();
     let folder = TempDir::new().unwrap();
     let names = ["@0100.50@0200.25@.jpg", "north/@0110.50@0200.25@.jpg"];
     write_places(folder.path(), &names);
-    let first = json(&index(&server, folder.path(), "m"));
+    let first = json(&index(server, folder.path(), &map));
     assert_eq!((&first["added"], &first["present"]), (&2.into(), &0.into()));
-    let again = json(&index(&server, folder.path(), "m"));
+    let again = json(&index(server, folder.path(), &map));
     assert_eq!((&again["added"], &again["present"]), (&0.into(), &2.into()));
-    assert_eq!(server.get("/maps/m").await.expect(200)["frame"], "metric");
-    let image = server.get("/maps/m/images/north%2F%400110.50%400200.25%40.jpg").await.expect(200);
+    assert_eq!(server.get(&format!("/maps/{map}")).await.expect(200)["frame"], "metric");
+    let image = server
+        .get(&format!("/maps/{map}/images/north%2F%400110.50%400200.25%40.jpg"))
+        .await
+        .expect(200);
     assert_eq!(image["pose"], serde_json::json!({"x": 110.5, "y": 200.25}));
 }
 
 #[tokio::test]
 async fn poses_come_from_a_csv_and_a_bad_file_fails_alone() {
-    let (_dir, server) = server();
+    let (server, map) = shared_server();
     let folder = TempDir::new().unwrap();
     write_places(folder.path(), &["a.jpg", "b.jpg"]);
     std::fs::write(folder.path().join("c.jpg"), "text").unwrap();
     std::fs::write(folder.path().join("poses.csv"), "file,lat,lon\na.jpg,45.5,7.25\n").unwrap();
-    let output = index(&server, folder.path(), "m");
+    let output = index(server, folder.path(), &map);
     assert_eq!(output.status.code(), Some(1));
     assert!(error(&output).contains("c.jpg"), "{}", error(&output));
     let outcome = json(&output);
     assert_eq!((&outcome["added"], &outcome["without_pose"]), (&2.into(), &1.into()));
-    let image = server.get("/maps/m/images/a.jpg").await.expect(200);
+    let image = server.get(&format!("/maps/{map}/images/a.jpg")).await.expect(200);
     assert_eq!(image["pose"], serde_json::json!({"lat": 45.5, "lon": 7.25}));
 }
 

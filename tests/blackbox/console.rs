@@ -4,11 +4,11 @@ use reqwest::header::{CONTENT_SECURITY_POLICY, ETAG, IF_NONE_MATCH};
 use reqwest::{Method, StatusCode};
 
 use super::deployment;
-use super::support::{Answer, Server, frame, server};
+use super::support::{Answer, Server, frame, shared_server};
 
 #[tokio::test]
 async fn the_page_comes_with_a_policy_and_is_not_sent_again_unchanged() {
-    let (_dir, server) = server();
+    let (server, _) = shared_server();
     for (path, kind) in
         [("/", "text/html; charset=utf-8"), ("/console/app.js", "text/javascript; charset=utf-8")]
     {
@@ -30,11 +30,12 @@ async fn the_page_comes_with_a_policy_and_is_not_sent_again_unchanged() {
 
 #[tokio::test]
 async fn jobs_can_be_listed_without_what_was_found_out() {
-    let (_dir, server) = server();
-    server.town("m", 3).await;
-    server.post_jpeg("/localize?map=m&refine=wait", frame(0, 0)).await.expect(200);
-    let whole = server.get("/jobs").await.expect(200)["jobs"][0].clone();
-    let mut brief = server.get("/jobs?brief=true").await.expect(200)["jobs"][0].clone();
+    let (server, map) = shared_server();
+    server.town(&map, 3).await;
+    server.post_jpeg(&format!("/localize?map={map}&refine=wait"), frame(0, 0)).await.expect(200);
+    let whole = server.get(&format!("/jobs?map={map}")).await.expect(200)["jobs"][0].clone();
+    let mut brief =
+        server.get(&format!("/jobs?map={map}&brief=true")).await.expect(200)["jobs"][0].clone();
     assert_eq!(brief["descriptions"], serde_json::json!([]));
     assert!(brief["ranking"].is_null() && brief["reasoning"].is_null());
     for field in ["descriptions", "ranking", "reasoning"] {
@@ -67,10 +68,13 @@ async fn tiles_are_of_a_configured_server_alone() {
 
 #[tokio::test]
 async fn a_job_shows_its_frame_and_what_it_shares_with_a_candidate() {
-    let (_dir, server) = server();
-    server.town("m", 4).await;
+    let (server, map) = shared_server();
+    server.town(&map, 4).await;
     let sent = frame(1, 0);
-    let answer = server.post_jpeg("/localize?map=m&refine=wait", sent.clone()).await.expect(200);
+    let answer = server
+        .post_jpeg(&format!("/localize?map={map}&refine=wait"), sent.clone())
+        .await
+        .expect(200);
     let job = answer["job"]["id"].as_str().unwrap();
     let shown = server.get(&format!("/jobs/{job}/frame")).await;
     assert_eq!((shown.status, shown.bytes), (StatusCode::OK, sent));
@@ -97,7 +101,7 @@ async fn a_job_shows_its_frame_and_what_it_shares_with_a_candidate() {
     let nobody = uuid::Uuid::nil();
     server.get(&format!("/jobs/{nobody}/frame")).await.problem(404);
     server.get(&format!("/jobs/{nobody}/matches/{first}")).await.problem(404);
-    server.delete("/maps/m").await;
+    server.delete(&format!("/maps/{map}")).await;
     server.get(&format!("/jobs/{job}/matches/{first}")).await.problem(404);
 }
 

@@ -6,7 +6,7 @@ use reqwest::Method;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::support::{Answer, Server, frame, reference, server};
+use super::support::{Answer, Server, frame, reference, shared_server};
 use super::wait::eventually;
 
 async fn post(server: &Server, path: &str, key: &str, picture: Vec<u8>) -> Answer {
@@ -18,8 +18,8 @@ fn is_replay(answer: &Answer) -> bool {
     answer.headers.get("idempotent-replayed").is_some_and(|value| value == "true")
 }
 
-async fn jobs(server: &Server) -> usize {
-    server.get("/jobs?map=m").await.expect(200)["jobs"].as_array().unwrap().len()
+async fn jobs(server: &Server, map: &str) -> usize {
+    server.get(&format!("/jobs?map={map}")).await.expect(200)["jobs"].as_array().unwrap().len()
 }
 
 #[tokio::test]
@@ -33,7 +33,7 @@ async fn a_frame_that_is_sent_again_is_answered_once_and_after_a_kill_too() {
     assert!(!is_replay(&first) && is_replay(&again));
     assert_eq!(again.headers["content-type"], "application/json");
     assert_ne!(first.headers["x-request-id"], again.headers["x-request-id"]);
-    assert_eq!(jobs(&server).await, 1);
+    assert_eq!(jobs(&server, "m").await, 1);
     let other = post(&server, "/localize?map=m", "frame-2", frame(0, 0)).await.expect(200);
     assert_ne!(other["query_id"], first.expect(200)["query_id"]);
 
@@ -41,23 +41,23 @@ async fn a_frame_that_is_sent_again_is_answered_once_and_after_a_kill_too() {
     let problem = post(&server, "/localize?map=m", "frame-1", frame(1, 0)).await.problem(422);
     assert!(problem.contains("another request"), "{problem}");
     post(&server, "/localize?map=m&k=2", "frame-1", frame(0, 0)).await.problem(422);
-    assert_eq!(jobs(&server).await, 2);
+    assert_eq!(jobs(&server, "m").await, 2);
 
     server.kill();
     let server = Server::start(dir.path(), &[]);
     let again = post(&server, "/localize?map=m", "frame-1", frame(0, 0)).await;
     assert!(is_replay(&again));
     assert_eq!(first.expect(200), again.expect(200));
-    assert_eq!(jobs(&server).await, 2);
+    assert_eq!(jobs(&server, "m").await, 2);
 }
 
 #[tokio::test]
 async fn while_it_is_being_done_it_is_not_begun_again_and_it_is_done_though_its_sender_has_gone() {
-    let (_dir, server) = server();
-    server.town("m", 12).await;
+    let (server, map) = shared_server();
+    server.town(&map, 12).await;
     let ask = || {
         server
-            .request(Method::POST, "/localize?map=m&refine=wait")
+            .request(Method::POST, &format!("/localize?map={map}&refine=wait"))
             .header("content-type", "image/jpeg")
             .header("idempotency-key", "slow")
             .body(frame(0, 0))
@@ -79,29 +79,29 @@ async fn while_it_is_being_done_it_is_not_begun_again_and_it_is_done_though_its_
     if impatient.is_err() && statuses.len() > 1 {
         assert!(is_replay(&done), "{statuses:?}");
     }
-    assert_eq!(jobs(&server).await, 1, "{statuses:?}");
+    assert_eq!(jobs(server, &map).await, 1, "{statuses:?}");
 }
 
 #[tokio::test]
 async fn an_error_is_not_kept_and_keys_that_are_none_are_refused() {
-    let (_dir, server) = server();
-    let path = "/maps/m/images?id=a";
-    post(&server, path, "image-1", reference(0)).await.problem(404);
-    server.put("/maps/m", json!({"scene": "outdoor"})).await.expect(201);
-    post(&server, path, "image-1", reference(0)).await.expect(201);
-    let again = post(&server, path, "image-1", reference(0)).await;
+    let (server, map) = shared_server();
+    let path = &format!("/maps/{map}/images?id=a");
+    post(server, path, "image-1", reference(0)).await.problem(404);
+    server.put(&format!("/maps/{map}"), json!({"scene": "outdoor"})).await.expect(201);
+    post(server, path, "image-1", reference(0)).await.expect(201);
+    let again = post(server, path, "image-1", reference(0)).await;
     assert!(is_replay(&again));
     // Without the key it would have been 200, for it is there already.
     again.expect(201);
     for key in ["", "a b", &"x".repeat(256)] {
-        let problem = post(&server, path, key, reference(0)).await.problem(400);
+        let problem = post(server, path, key, reference(0)).await.problem(400);
         assert!(problem.contains("Idempotency-Key"), "{problem}");
     }
     let new_key = server.request(Method::POST, "/keys").header("idempotency-key", "k");
     let new_key = new_key.json(&json!({"name": "n", "role": "robot"}));
     assert!(Answer::of(new_key).await.problem(400).contains("leave the header out"));
     // A GET is the same however often it is sent.
-    let get = server.request(Method::GET, "/maps/m").header("idempotency-key", "a b");
+    let get = server.request(Method::GET, &format!("/maps/{map}")).header("idempotency-key", "a b");
     Answer::of(get).await.expect(200);
 }
 

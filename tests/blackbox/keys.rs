@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::deployment;
-use super::support::{Answer, BINARY, Server, frame, reference};
+use super::support::{Answer, BINARY, Server, frame, reference, shared_server};
 use super::wait::eventually_within;
 
 const REQUIRED: [(&str, &str); 2] =
@@ -422,7 +422,7 @@ async fn the_commands_take_the_key_from_the_environment() {
 
 #[tokio::test]
 async fn no_other_page_is_let_in() {
-    let (_dir, server) = super::support::server();
+    let (server, _) = shared_server();
     for method in [Method::OPTIONS, Method::GET, Method::DELETE] {
         let request =
             server.request(method.clone(), "/maps/yard").header("origin", "https://other.example");

@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use super::deployment;
-use super::support::{frame, reference, server};
+use super::support::{frame, reference, server, shared_server};
 
 #[tokio::test]
 async fn a_map_is_created_changed_listed_and_removed() {
@@ -32,22 +32,23 @@ async fn a_map_is_created_changed_listed_and_removed() {
 
 #[tokio::test]
 async fn frame_and_descriptor_are_fixed_once_there_are_images() {
-    let (_dir, server) = server();
-    server.put("/maps/m", json!({"frame": "metric"})).await.expect(201);
-    server.put("/maps/m", json!({"frame": "wgs84"})).await.expect(200);
-    server.post_jpeg("/maps/m/images?lat=1&lon=2", reference(0)).await.expect(201);
-    let why = server.put("/maps/m", json!({"frame": "metric"})).await.problem(409);
+    let (server, map) = shared_server();
+    server.put(&format!("/maps/{map}"), json!({"frame": "metric"})).await.expect(201);
+    server.put(&format!("/maps/{map}"), json!({"frame": "wgs84"})).await.expect(200);
+    server.post_jpeg(&format!("/maps/{map}/images?lat=1&lon=2"), reference(0)).await.expect(201);
+    let why = server.put(&format!("/maps/{map}"), json!({"frame": "metric"})).await.problem(409);
     assert!(why.contains("fixed"), "{why}");
-    server.put("/maps/m", json!({"scene": "indoor"})).await.expect(200);
-    assert_eq!(server.get("/maps/m").await.expect(200)["frame"], "wgs84");
+    server.put(&format!("/maps/{map}"), json!({"scene": "indoor"})).await.expect(200);
+    assert_eq!(server.get(&format!("/maps/{map}")).await.expect(200)["frame"], "wgs84");
 }
 
 #[tokio::test]
 async fn a_map_says_what_this_model_cannot_do() {
-    let (_dir, server) = server();
-    let why = server.put("/maps/m", json!({"descriptor": "cls"})).await.problem(422);
+    let (server, map) = shared_server();
+    let why = server.put(&format!("/maps/{map}"), json!({"descriptor": "cls"})).await.problem(422);
     assert!(why.contains("[CLS]") && why.contains("gem"), "{why}");
-    let why = server.put("/maps/m", json!({"model": "dinov2-small"})).await.problem(422);
+    let why =
+        server.put(&format!("/maps/{map}"), json!({"model": "dinov2-small"})).await.problem(422);
     assert!(why.contains("model pull dinov2-small"), "{why}");
 }
 

@@ -4,11 +4,11 @@ use reqwest::Method;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::support::{Answer, BINARY, Server, frame, server};
+use super::support::{Answer, BINARY, Server, frame, server, shared_server};
 
 #[tokio::test]
 async fn a_ready_server_says_so_and_shows_its_docs() {
-    let (_dir, server) = server();
+    let (server, _) = shared_server();
     server.get("/livez").await.expect(200);
     server.get("/readyz").await.expect(200);
     let docs = server.get("/docs").await;
@@ -17,7 +17,7 @@ async fn a_ready_server_says_so_and_shows_its_docs() {
 
 #[tokio::test]
 async fn the_committed_description_is_the_one_the_handlers_give() {
-    let (_dir, server) = server();
+    let (server, _) = shared_server();
     let served = server.get("/openapi.json").await.expect(200);
     let committed = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/openapi.json");
     let committed: Value =
@@ -49,7 +49,7 @@ async fn metrics_count_requests_jobs_and_images() {
 
 #[tokio::test]
 async fn a_request_keeps_the_id_it_came_with() {
-    let (_dir, server) = server();
+    let (server, _) = shared_server();
     let request = server.request(Method::GET, "/maps/none").header("x-request-id", "robot-7/42");
     let answer = Answer::of(request).await;
     answer.problem(404);

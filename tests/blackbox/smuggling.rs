@@ -5,7 +5,7 @@ use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-use super::support::{Server, server};
+use super::support::{Server, shared_server};
 
 /// All that comes back on a connection of its own, which the client keeps open.
 async fn answers(server: &Server, request: &str) -> String {
@@ -28,7 +28,7 @@ fn statuses(answers: &str) -> Vec<&str> {
 
 #[tokio::test]
 async fn a_body_with_two_ends_is_no_way_in_for_another_request() {
-    let (_dir, server) = server();
+    let (server, _) = shared_server();
     let smuggled = "GET /smuggled HTTP/1.1\r\nhost: x\r\n\r\n";
     let post = |framing: &str, body: &str| {
         format!(
@@ -66,7 +66,7 @@ async fn a_body_with_two_ends_is_no_way_in_for_another_request() {
         "x: y\rcontent-length: 5".into(),
         "x: y\0\r\ncontent-length: 5".into(),
     ] {
-        let got = answers(&server, &post(&framing, &chunked)).await;
+        let got = answers(server, &post(&framing, &chunked)).await;
         let statuses = statuses(&got);
         assert_eq!(statuses.len(), 1, "{framing:?}: {got}");
         assert!(statuses[0].starts_with('4') || statuses[0].starts_with('5'), "{framing:?}: {got}");
@@ -82,13 +82,13 @@ async fn a_body_with_two_ends_is_no_way_in_for_another_request() {
         "\r\n5\r\nabcde\r\n0\r\n\r\n",
     ] {
         let got =
-            answers(&server, &post("transfer-encoding: chunked", &format!("{chunks}{smuggled}")))
+            answers(server, &post("transfer-encoding: chunked", &format!("{chunks}{smuggled}")))
                 .await;
         assert!(statuses(&got).len() <= 1 && !got.contains("/smuggled"), "{chunks:?}: {got}");
     }
     // Two requests in one go are two requests.
     let two = format!("GET /livez HTTP/1.1\r\nhost: x\r\n\r\n{smuggled}");
-    let got = answers(&server, &two).await;
+    let got = answers(server, &two).await;
     assert_eq!(statuses(&got), ["200", "404"], "{got}");
 }
 

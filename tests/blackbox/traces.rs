@@ -16,7 +16,7 @@ use tempfile::TempDir;
 use tokio::net::TcpListener;
 
 use super::mock_mllm::{MockMllm, Script};
-use super::support::{Answer, Server, frame};
+use super::support::{Answer, Server, frame, shared_server};
 
 type Collected = Arc<Mutex<Vec<Span>>>;
 
@@ -104,10 +104,9 @@ async fn a_collector_that_is_away_holds_up_nobody() {
 
 #[tokio::test]
 async fn nothing_is_traced_unless_somebody_wants_it() {
-    let dir = TempDir::new().unwrap();
-    let server = Server::start(dir.path(), &[]);
-    server.town("m", 3).await;
-    let answer = server.post_jpeg("/localize?map=m", frame(0, 0)).await.expect(200);
+    let (server, map) = shared_server();
+    server.town(&map, 3).await;
+    let answer = server.post_jpeg(&format!("/localize?map={map}"), frame(0, 0)).await.expect(200);
     let job = server.get(answer["job"]["href"].as_str().unwrap()).await.expect(200);
     assert_eq!(job["trace_id"], Value::Null);
 }

@@ -5,7 +5,7 @@ use jiff::{SignedDuration, Timestamp};
 use serde_json::{Value, json};
 use whereabouts_town::{Town, TownSpec};
 
-use super::support::{Answer, Server, frame, jpeg, server};
+use super::support::{Answer, Server, frame, jpeg, shared_server};
 use super::wait::{eventually, until};
 
 const PLACES: usize = 96;
@@ -17,16 +17,20 @@ fn id(place: usize) -> String {
     format!("place-{place}")
 }
 
-async fn metric_map(server: &Server, town: &Town) {
-    server.put("/maps/m", json!({"scene": "outdoor", "frame": "metric"})).await.expect(201);
+async fn metric_map(server: &Server, map: &str, town: &Town) {
+    server
+        .put(&format!("/maps/{map}"), json!({"scene": "outdoor", "frame": "metric"}))
+        .await
+        .expect(201);
     for place in 0..town.places() {
         let shot = town.reference(place);
-        let path = format!("/maps/m/images?id={}&x={}&y={}", id(place), shot.x, shot.y);
+        let path = format!("/maps/{map}/images?id={}&x={}&y={}", id(place), shot.x, shot.y);
         server.post_jpeg(&path, jpeg(&shot.image)).await.expect(201);
     }
     // The filter needs the calibration of the map.
     until(async || {
-        server.get("/maps/m").await.expect(200)["calibration"]["images"] == town.places()
+        server.get(&format!("/maps/{map}")).await.expect(200)["calibration"]["images"]
+            == town.places()
     })
     .await;
 }
@@ -54,8 +58,8 @@ fn is_occluded(place: usize) -> bool {
 #[tokio::test]
 async fn a_drive_is_located_better_than_its_frames() {
     let town = Town::new(TownSpec { seed: 11, places: PLACES, width: 320, height: 240 });
-    let (_dir, server) = server();
-    metric_map(&server, &town).await;
+    let (server, map) = shared_server();
+    metric_map(server, &map, &town).await;
     let (mut single, mut filtered, mut with_odometry) = (0, 0, 0);
     let mut at: Timestamp = "2026-03-01T12:00:00Z".parse().unwrap();
     let mut before: Option<[f64; 2]> = None;
@@ -67,7 +71,7 @@ async fn a_drive_is_located_better_than_its_frames() {
         at += SignedDuration::from_secs_f64(way / SPEED);
         let picture = if is_occluded(place) { occluded(shot.image, place) } else { shot.image };
         let bytes = jpeg(&picture);
-        let path = format!("/localize?map=m&refine=off&captured_at={at}&track=");
+        let path = format!("/localize?map={map}&refine=off&captured_at={at}&track=");
         let plain = server.post_jpeg(&format!("{path}a"), bytes.clone()).await.expect(200);
         // Five metres more than it was.
         let moved = format!("{path}b&moved_m={}", way + 5.0);
@@ -90,17 +94,19 @@ async fn a_drive_is_located_better_than_its_frames() {
 
 #[tokio::test]
 async fn a_track_says_nothing_of_images_that_are_gone() {
-    let (_dir, server) = server();
-    server.town("m", 6).await;
+    let (server, map) = shared_server();
+    server.town(&map, 6).await;
     let localize = async || -> Value {
-        let answer = server.post_jpeg("/localize?map=m&refine=off&track=r1", frame(2, 0)).await;
+        let answer = server
+            .post_jpeg(&format!("/localize?map={map}&refine=off&track=r1"), frame(2, 0))
+            .await;
         answer.expect(200)["track"].clone()
     };
     for _ in 0..3 {
         localize().await;
     }
     assert_eq!(localize().await["image_id"], "place-2");
-    server.delete("/maps/m/images/place-2").await.expect(204);
+    server.delete(&format!("/maps/{map}/images/place-2")).await.expect(204);
     for frames in 5..8 {
         let track = localize().await;
         assert_eq!(track["frames"], frames);
@@ -111,10 +117,10 @@ async fn a_track_says_nothing_of_images_that_are_gone() {
 
 #[tokio::test]
 async fn what_a_track_cannot_be_is_refused_with_what_to_do() {
-    let (_dir, server) = server();
-    server.town("m", 2).await;
+    let (server, map) = shared_server();
+    server.town(&map, 2).await;
     let ask = async |query: &str| -> Answer {
-        server.post_jpeg(&format!("/localize?map=m&refine=off{query}"), frame(0, 0)).await
+        server.post_jpeg(&format!("/localize?map={map}&refine=off{query}"), frame(0, 0)).await
     };
     for (query, named) in [
         ("&track=", "1 to 64"),
@@ -130,11 +136,11 @@ async fn what_a_track_cannot_be_is_refused_with_what_to_do() {
     ask("&track=a&captured_at=yesterday").await.problem(400);
     assert!(ask("").await.expect(200)["track"].is_null());
 
-    server.put("/maps/bare", json!({"scene": "indoor"})).await.expect(201);
-    let path = "/localize?map=bare&refine=off&track=a";
+    server.put(&format!("/maps/{map}-bare"), json!({"scene": "indoor"})).await.expect(201);
+    let path = &format!("/localize?map={map}-bare&refine=off&track=a");
     let empty = server.post_jpeg(path, frame(0, 0)).await.expect(200);
     assert!(empty["track"]["image_id"].is_null(), "{empty}");
-    server.post_jpeg("/maps/bare/images?id=a", frame(0, 0)).await.expect(201);
+    server.post_jpeg(&format!("/maps/{map}-bare/images?id=a"), frame(0, 0)).await.expect(201);
     // The poses of a map are read again after a while.
     let refused = eventually(async || {
         let answer = server.post_jpeg(path, frame(0, 0)).await;

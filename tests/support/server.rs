@@ -4,6 +4,7 @@ use std::ffi::OsStr;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, LazyLock, Mutex};
 use std::thread;
 
@@ -38,6 +39,20 @@ pub fn server() -> (TempDir, Server) {
     (dir, server)
 }
 
+/// The server that all tests of this process share, and the name of a map of the caller's own, which is yet to be
+/// created. For tests that look at nothing but their map: not at the list of maps, nor at all jobs, metrics, the log,
+/// or the files.
+pub fn shared_server() -> (&'static Server, String) {
+    static SHARED: LazyLock<Server> = LazyLock::new(Server::start_shared);
+    static MAPS: AtomicUsize = AtomicUsize::new(0);
+    (&SHARED, format!("map-{}", MAPS.fetch_add(1, Ordering::Relaxed)))
+}
+
+/// Runs the command in its arguments until its standard input is closed, and then removes the folder `$DATA`: nobody
+/// drops what is static, but the pipe is closed when the process of the tests ends.
+const UNTIL_THE_TESTS_END: &str =
+    r#""$0" "$@" </dev/null & server=$!; exec 2>&-; cat; kill -9 "$server"; wait; rm -rf "$DATA""#;
+
 impl Server {
     /// Starts a server and waits until it says that it is ready. `settings` are environment
     /// variables, such as `("WHEREABOUTS_JOBS__QUEUE", "1")`.
@@ -61,6 +76,24 @@ impl Server {
         let mut command = Command::new(&*BINARY);
         command.arg(role).args(arguments(data)).envs(test_settings(data)).envs(settings.to_vec());
         Self::spawn(command, unpooled())
+    }
+
+    fn start_shared() -> Self {
+        let data = TempDir::new().unwrap().keep();
+        let mut command = Command::new("sh");
+        command
+            .args([
+                OsStr::new("-c"),
+                UNTIL_THE_TESTS_END.as_ref(),
+                BINARY.as_ref(),
+                "serve".as_ref(),
+            ])
+            .args(arguments(&data))
+            .envs(test_settings(&data))
+            .env("DATA", &data)
+            .stdin(Stdio::piped());
+        Self::spawn(command, unpooled())
+            .unwrap_or_else(|log| panic!("the shared server did not start: {log}"))
     }
 
     /// Starts a server as it is deployed, for a benchmark: with the default number of threads, and a client that
