@@ -53,7 +53,7 @@ examples: build ## Test the clients, curl examples and load tests against the se
 	examples/check.sh $(BINARY) target/examples-venv
 
 crash: assets nasm ## Kill the server at 200 random moments and check that nothing acknowledged is lost
-	WHEREABOUTS_CRASH_ROUNDS=200 $(CARGO) test --release --locked --test crash what_was -- --nocapture
+	WHEREABOUTS_CRASH_ROUNDS=200 $(CARGO) test --release --locked --test crash kill:: -- --nocapture
 
 fuzz: assets nasm ## Feed a million mutated inputs to every parser of untrusted data
 	WHEREABOUTS_FUZZ_RUNS=120000 $(CARGO) test --release --locked --test fuzz -- --nocapture

@@ -104,7 +104,7 @@ async fn another_server_answers_as_the_first_without_running_the_model() {
 }
 
 #[tokio::test]
-async fn a_map_whose_model_is_missing_is_restored_and_says_what_it_needs() {
+async fn a_map_is_restored_without_its_model_and_names_the_missing_model() {
     let ((_a, from), (_b, to)) = (server(), server());
     from.town("m", 1).await;
     let mut page = from.get("/maps/m/export").await.expect(200);
@@ -159,7 +159,7 @@ async fn restoring_again_adds_only_what_is_missing() {
 }
 
 #[tokio::test]
-async fn a_map_of_another_model_is_not_mixed_with_the_archives() {
+async fn a_restore_does_not_mix_descriptors_of_two_models() {
     let ((_a, from), (b, to)) = (server(), server());
     from.town("m", 2).await;
     let file = backup(&from, b.path());
@@ -192,7 +192,7 @@ async fn import(
 }
 
 #[tokio::test]
-async fn an_import_that_contradicts_itself_is_refused() {
+async fn an_inconsistent_import_is_rejected() {
     let (server, map) = shared_server();
     server.town(&map, 2).await;
     let page = server.get(&format!("/maps/{map}/export")).await.expect(200);
@@ -231,7 +231,7 @@ async fn an_import_that_contradicts_itself_is_refused() {
 }
 
 #[tokio::test]
-async fn a_damaged_or_cut_archive_is_refused_before_anything_changes() {
+async fn a_damaged_or_truncated_archive_is_rejected_before_anything_changes() {
     let ((_a, from), (b, to)) = (server(), server());
     from.town("m", 3).await;
     let file = backup(&from, b.path());
@@ -259,7 +259,7 @@ async fn a_damaged_or_cut_archive_is_refused_before_anything_changes() {
 }
 
 #[tokio::test]
-async fn an_interrupted_backup_goes_on() {
+async fn an_interrupted_backup_is_resumed() {
     let ((a, from), (b, to)) = (server(), server());
     from.town("m", 6).await;
     from.town("n", 2).await;
@@ -294,7 +294,7 @@ async fn an_interrupted_backup_goes_on() {
 }
 
 #[tokio::test]
-async fn a_restore_whose_server_dies_goes_on_when_it_is_back() {
+async fn a_restore_is_resumed_after_the_server_was_killed() {
     let (b, from) = server();
     from.town("m", 24).await;
     let (file, before) = (backup(&from, b.path()), answers(&from, "m").await);
@@ -329,7 +329,7 @@ async fn a_restore_whose_server_dies_goes_on_when_it_is_back() {
 }
 
 #[tokio::test]
-async fn an_image_that_is_damaged_on_the_server_is_left_out_and_said() {
+async fn a_backup_omits_and_reports_an_image_that_is_damaged_on_the_server() {
     let dir = TempDir::new().unwrap();
     let from = Server::start(dir.path(), &[]);
     from.town("m", 3).await;

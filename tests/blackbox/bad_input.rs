@@ -14,7 +14,7 @@ async fn still_works(server: &Server, map: &str) {
 }
 
 #[tokio::test]
-async fn what_is_no_picture_is_refused_and_the_next_frame_is_answered() {
+async fn a_body_that_is_not_an_image_is_rejected_and_the_next_frame_is_answered() {
     let (server, map) = shared_server();
     server.town(&map, 2).await;
     let whole = reference(1);
@@ -38,7 +38,7 @@ async fn what_is_no_picture_is_refused_and_the_next_frame_is_answered() {
 }
 
 #[tokio::test]
-async fn a_bomb_of_a_hundred_megapixels_is_refused_by_its_header() {
+async fn a_decompression_bomb_is_rejected_by_its_header() {
     let (_dir, server) = server();
     server.town("m", 1).await;
     let mut bomb = std::io::Cursor::new(Vec::new());
@@ -56,7 +56,7 @@ async fn a_bomb_of_a_hundred_megapixels_is_refused_by_its_header() {
 }
 
 #[tokio::test]
-async fn a_body_of_a_gigabyte_is_refused_without_being_kept() {
+async fn a_body_of_a_gigabyte_is_rejected_without_being_buffered() {
     let (_dir, server) = server();
     server.town("m", 1).await;
     let before = server.resident_bytes();
@@ -83,7 +83,7 @@ async fn a_body_of_a_gigabyte_is_refused_without_being_kept() {
 }
 
 #[tokio::test]
-async fn numbers_out_of_range_are_named() {
+async fn a_parameter_out_of_range_is_named_in_the_error() {
     let (server, map) = shared_server();
     server.town(&map, 1).await;
     for (path, status, named) in [
@@ -110,7 +110,7 @@ async fn numbers_out_of_range_are_named() {
 }
 
 #[tokio::test]
-async fn json_that_is_not_what_is_asked_for_is_refused() {
+async fn json_of_another_schema_is_rejected() {
     let (server, map) = shared_server();
     for body in [json!({"scene": "underwater"}), json!({"seen": 1}), json!([1]), json!("x")] {
         server.put(&format!("/maps/{map}"), body).await.problem(400);
@@ -121,14 +121,14 @@ async fn json_that_is_not_what_is_asked_for_is_refused() {
 }
 
 #[tokio::test]
-async fn a_path_or_method_that_is_not_there_points_to_the_docs() {
+async fn an_unknown_path_or_method_points_to_the_docs() {
     let (server, _) = shared_server();
     assert!(server.get("/nothing").await.problem(404).contains("/docs"));
     assert!(server.delete("/localize").await.problem(405).contains("/docs"));
 }
 
 #[tokio::test]
-async fn a_picture_without_any_texture_is_answered_or_refused_but_breaks_nothing() {
+async fn a_picture_without_texture_is_answered_or_rejected_and_breaks_nothing() {
     let (server, map) = shared_server();
     server.town(&map, 2).await;
     for pixels in [RgbImage::new(64, 64), RgbImage::new(1, 1), RgbImage::new(4000, 1)] {

@@ -45,7 +45,7 @@ fn archive(entries: &[(&str, &[u8])]) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn each_image_of_a_form_has_a_result_and_what_is_wrong_with_one_spares_the_others() {
+async fn each_image_of_a_form_has_its_own_result_and_errors_are_isolated() {
     let (server, map) = shared_server();
     server.put(&format!("/maps/{map}"), json!({})).await.expect(201);
     let meta = |text: &str| text.to_owned();
@@ -91,7 +91,7 @@ async fn each_image_of_a_form_has_a_result_and_what_is_wrong_with_one_spares_the
 }
 
 #[tokio::test]
-async fn an_archive_has_pictures_and_what_is_said_about_them_beside() {
+async fn an_archive_holds_pictures_and_their_metadata_in_sidecar_files() {
     let (server, map) = shared_server();
     server.put(&format!("/maps/{map}"), json!({"frame": "metric"})).await.expect(201);
     let long = format!("{}/long.jpg", "d".repeat(150));
@@ -132,7 +132,7 @@ async fn an_archive_has_pictures_and_what_is_said_about_them_beside() {
 }
 
 #[tokio::test]
-async fn a_request_that_is_wrong_as_a_whole_says_so_and_keeps_what_came_before() {
+async fn a_malformed_batch_is_rejected_and_keeps_the_images_before_the_error() {
     let (server, map) = shared_server();
     server.put(&format!("/maps/{map}"), json!({})).await.expect(201);
     let problem = server
@@ -166,7 +166,7 @@ async fn a_request_that_is_wrong_as_a_whole_says_so_and_keeps_what_came_before()
 }
 
 #[tokio::test]
-async fn the_whole_is_unbounded_and_each_image_is_not() {
+async fn a_batch_is_unbounded_but_each_of_its_images_is_bounded() {
     let dir = tempfile::tempdir().unwrap();
     let one = reference(0).len();
     let limit = (2 * one).to_string();
@@ -236,7 +236,7 @@ async fn the_whole_is_unbounded_and_each_image_is_not() {
 }
 
 #[tokio::test]
-async fn a_body_in_which_nothing_ends_is_not_kept() {
+async fn a_batch_without_an_end_of_a_part_is_not_buffered() {
     let (_dir, server) = server();
     server.put("/maps/m", json!({})).await.expect(201);
     let before = server.resident_bytes();

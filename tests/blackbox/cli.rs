@@ -36,7 +36,7 @@ fn index(server: &Server, dir: &Path, map: &str) -> Output {
 }
 
 #[tokio::test]
-async fn a_folder_is_indexed_once_however_often_it_is_sent() {
+async fn indexing_a_folder_again_adds_nothing() {
     let (server, map) = shared_server();
     let folder = TempDir::new().unwrap();
     let names = ["@0100.50@0200.25@.jpg", "north/@0110.50@0200.25@.jpg"];
@@ -94,7 +94,7 @@ async fn a_picture_is_localized_and_its_job_is_shown() {
 }
 
 #[test]
-fn a_server_that_is_not_there_is_named_with_what_to_do() {
+fn an_unreachable_server_is_named_with_a_hint() {
     // Port 9 (discard) of this machine has no listener.
     let url = "http://127.0.0.1:9";
     for args in [&["healthcheck", "--server", url][..], &["jobs", "--server", url]] {
@@ -105,7 +105,7 @@ fn a_server_that_is_not_there_is_named_with_what_to_do() {
 }
 
 #[test]
-fn wrong_usage_is_2_and_every_command_explains_itself() {
+fn wrong_usage_exits_with_2_and_every_command_has_help() {
     assert_eq!(whereabouts(&["serve", "--no-such-flag"]).status.code(), Some(2));
     assert_eq!(whereabouts(&[]).status.code(), Some(2));
     for command in [
@@ -127,7 +127,7 @@ fn wrong_usage_is_2_and_every_command_explains_itself() {
 }
 
 #[test]
-fn what_is_missing_at_the_start_is_said_with_what_to_do() {
+fn a_missing_prerequisite_is_reported_at_startup_with_a_hint() {
     let dir = TempDir::new().unwrap();
     let start = |name: &str, value: &str| {
         let output = Command::new(&*BINARY)

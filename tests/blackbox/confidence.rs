@@ -36,7 +36,7 @@ async fn confidences(server: &Server, map: &str, places: std::ops::Range<usize>)
 }
 
 #[tokio::test]
-async fn frames_of_the_map_are_known_and_those_from_elsewhere_are_not() {
+async fn frames_of_mapped_places_are_known_and_others_are_not() {
     let (server, map) = shared_server();
     server.town(&map, PLACES).await;
     let calibration = calibrated(server, &map, PLACES).await;
@@ -54,7 +54,7 @@ async fn frames_of_the_map_are_known_and_those_from_elsewhere_are_not() {
 }
 
 #[tokio::test]
-async fn confidence_is_0_before_anything_is_measured_and_is_measured_again_when_a_map_grows() {
+async fn confidence_is_0_before_calibration_and_is_calibrated_again_when_a_map_grows() {
     let (server, map) = shared_server();
     server.town(&map, 1).await;
     let answer =

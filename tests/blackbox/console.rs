@@ -7,7 +7,7 @@ use super::deployment;
 use super::support::{Answer, Server, frame, shared_server};
 
 #[tokio::test]
-async fn the_page_comes_with_a_policy_and_is_not_sent_again_unchanged() {
+async fn the_console_has_a_content_security_policy_and_is_cached_by_its_etag() {
     let (server, _) = shared_server();
     for (path, kind) in
         [("/", "text/html; charset=utf-8"), ("/console/app.js", "text/javascript; charset=utf-8")]
@@ -29,7 +29,7 @@ async fn the_page_comes_with_a_policy_and_is_not_sent_again_unchanged() {
 }
 
 #[tokio::test]
-async fn jobs_can_be_listed_without_what_was_found_out() {
+async fn jobs_can_be_listed_without_descriptions_and_ranking() {
     let (server, map) = shared_server();
     server.town(&map, 3).await;
     server.post_jpeg(&format!("/localize?map={map}&refine=wait"), frame(0, 0)).await.expect(200);
@@ -46,7 +46,7 @@ async fn jobs_can_be_listed_without_what_was_found_out() {
 }
 
 #[tokio::test]
-async fn tiles_are_of_a_configured_server_alone() {
+async fn map_tiles_come_only_from_the_configured_server() {
     let dir = tempfile::tempdir().unwrap();
     let url = "https://tiles.example/{z}/{x}/{y}.png";
     let server = Server::start(dir.path(), &[("WHEREABOUTS_CONSOLE__TILES_URL", url)]);
@@ -67,7 +67,7 @@ async fn tiles_are_of_a_configured_server_alone() {
 }
 
 #[tokio::test]
-async fn a_job_shows_its_frame_and_what_it_shares_with_a_candidate() {
+async fn a_job_shows_its_frame_and_the_regions_that_match_a_candidate() {
     let (server, map) = shared_server();
     server.town(&map, 4).await;
     let sent = frame(1, 0);
@@ -106,7 +106,7 @@ async fn a_job_shows_its_frame_and_what_it_shares_with_a_candidate() {
 }
 
 #[tokio::test]
-async fn the_status_tells_of_the_last_hour_and_keeps_secrets() {
+async fn the_status_covers_the_last_hour_and_hides_secrets() {
     let dir = tempfile::tempdir().unwrap();
     let server = Server::start(dir.path(), &[("WHEREABOUTS_MLLM__API_KEY", "sk-very-secret")]);
     server.town("m", 2).await;

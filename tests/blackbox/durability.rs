@@ -41,7 +41,7 @@ fn same_candidates(a: &Value, b: &Value) {
 }
 
 #[tokio::test]
-async fn images_go_on_being_added_after_a_restart() {
+async fn images_can_be_added_after_a_restart() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     server.town("m", 3).await;
@@ -75,7 +75,7 @@ mod embedded_only {
     use crate::support::{BINARY, Server, reference};
 
     #[tokio::test]
-    async fn a_second_server_on_the_same_folder_is_refused_with_the_reason() {
+    async fn a_second_server_on_the_same_data_folder_does_not_start() {
         let dir = TempDir::new().unwrap();
         let _server = Server::start(dir.path(), &[]);
         let second = std::process::Command::new(&*BINARY)
@@ -89,7 +89,7 @@ mod embedded_only {
     }
 
     #[tokio::test]
-    async fn a_damaged_descriptor_is_left_out_and_reported_and_the_rest_is_found() {
+    async fn a_damaged_descriptor_is_skipped_and_reported_and_the_rest_is_found() {
         let dir = TempDir::new().unwrap();
         let server = Server::start(dir.path(), &[]);
         server.town("m", 3).await;

@@ -34,7 +34,7 @@ async fn queue(server: &Server) -> String {
 }
 
 #[tokio::test]
-async fn a_job_is_followed_pair_by_pair_and_can_be_followed_again() {
+async fn a_job_streams_one_event_for_each_pair_and_can_be_replayed() {
     let dir = TempDir::new().unwrap();
     let mock =
         MockMllm::start(Script { latency: Duration::from_millis(40), ..Script::default() }).await;
@@ -62,7 +62,7 @@ async fn a_job_is_followed_pair_by_pair_and_can_be_followed_again() {
 }
 
 #[tokio::test]
-async fn streams_are_bounded_and_end_with_the_server() {
+async fn event_streams_are_limited_in_number_and_end_with_the_server() {
     let dir = TempDir::new().unwrap();
     let mock =
         MockMllm::start(Script { describe: Box::new(|_| Reply::Hang), ..Script::default() }).await;
@@ -90,7 +90,7 @@ async fn streams_are_bounded_and_end_with_the_server() {
 }
 
 #[tokio::test]
-async fn all_jobs_are_followed_and_those_of_a_map() {
+async fn the_event_stream_covers_all_jobs_or_those_of_one_map() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     server.town("m", 3).await;

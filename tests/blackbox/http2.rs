@@ -129,7 +129,7 @@ async fn refused(server: &Server, reason: &str) -> u64 {
 }
 
 #[tokio::test]
-async fn a_client_that_takes_nothing_of_one_answer_is_given_up() {
+async fn a_client_that_does_not_read_a_response_is_disconnected() {
     let (_dir, server) = server(&[]);
     let mut client = Client::connect(&server, 1).await;
     let begun = Instant::now();
@@ -150,7 +150,7 @@ async fn a_client_that_takes_nothing_of_one_answer_is_given_up() {
 }
 
 #[tokio::test]
-async fn a_preface_that_stops_halfway_is_not_waited_for() {
+async fn an_incomplete_preface_times_out() {
     let (_dir, server) = server(&[]);
     let mut client = Client::silent(&server).await;
     client.send(&PREFACE[..10]).await;
@@ -161,7 +161,7 @@ async fn a_preface_that_stops_halfway_is_not_waited_for() {
 }
 
 #[tokio::test]
-async fn an_idle_connection_makes_room_and_a_busy_one_does_not() {
+async fn an_idle_connection_is_evicted_and_a_busy_one_is_not() {
     let (_dir, server) = server(&[("WHEREABOUTS_SERVER__MAX_CONNECTIONS", "2")]);
     let mut idle = Client::connect(&server, LARGE).await;
     idle.request(1, "/openapi.json").await;
@@ -179,7 +179,7 @@ async fn an_idle_connection_makes_room_and_a_busy_one_does_not() {
 }
 
 #[tokio::test]
-async fn a_head_that_is_too_large_is_refused_and_others_are_answered() {
+async fn a_head_that_is_too_large_is_rejected_and_others_are_answered() {
     let (_dir, server) = server(&[("WHEREABOUTS_SERVER__MAX_HEADER_BYTES", "8192")]);
     let mut client = Client::connect(&server, LARGE).await;
     let mut head = get("/livez");
@@ -207,7 +207,7 @@ async fn a_head_that_is_too_large_is_refused_and_others_are_answered() {
 }
 
 #[tokio::test]
-async fn requests_that_are_taken_back_by_the_thousand_cost_the_client_its_connection() {
+async fn a_rapid_reset_flood_closes_the_connection() {
     let (_dir, server) = server(&[]);
     let mut client = Client::connect(&server, LARGE).await;
     let (mut reader, mut writer) = client.0.into_split();

@@ -23,7 +23,7 @@ async fn jobs(server: &Server, map: &str) -> usize {
 }
 
 #[tokio::test]
-async fn a_frame_that_is_sent_again_is_answered_once_and_after_a_kill_too() {
+async fn a_repeated_request_gets_the_stored_response_even_after_a_kill() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     server.town("m", 3).await;
@@ -52,7 +52,7 @@ async fn a_frame_that_is_sent_again_is_answered_once_and_after_a_kill_too() {
 }
 
 #[tokio::test]
-async fn while_it_is_being_done_it_is_not_begun_again_and_it_is_done_though_its_sender_has_gone() {
+async fn a_repeated_request_conflicts_with_the_one_in_progress_which_outlives_its_client() {
     let (server, map) = shared_server();
     server.town(&map, 12).await;
     let ask = || {
@@ -83,7 +83,7 @@ async fn while_it_is_being_done_it_is_not_begun_again_and_it_is_done_though_its_
 }
 
 #[tokio::test]
-async fn an_error_is_not_kept_and_keys_that_are_none_are_refused() {
+async fn an_error_is_not_stored_and_a_malformed_key_is_rejected() {
     let (server, map) = shared_server();
     let path = &format!("/maps/{map}/images?id=a");
     post(server, path, "image-1", reference(0)).await.problem(404);
@@ -106,7 +106,7 @@ async fn an_error_is_not_kept_and_keys_that_are_none_are_refused() {
 }
 
 #[tokio::test]
-async fn answers_are_bounded_in_number() {
+async fn stored_responses_are_bounded_in_number() {
     let dir = TempDir::new().unwrap();
     let settings = [("WHEREABOUTS_IDEMPOTENCY__MAX", "1"), ("WHEREABOUTS_JOBS__SWEEP_S", "2")];
     let server = Server::start(dir.path(), &settings);

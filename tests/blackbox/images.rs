@@ -12,7 +12,7 @@ async fn post_form(server: &Server, path: &str, picture: Vec<u8>, meta: &str) ->
 }
 
 #[tokio::test]
-async fn an_image_comes_as_a_form_or_raw_with_its_pose_in_the_query() {
+async fn an_image_is_posted_as_a_form_or_raw_with_its_pose_in_the_query() {
     let (server, map) = shared_server();
     server.put(&format!("/maps/{map}"), json!({"frame": "metric"})).await.expect(201);
     let meta = r#"{"id": "a/1.jpg", "pose": {"x": 1.5, "y": -2}, "tags": ["east"],
@@ -48,7 +48,7 @@ async fn the_same_image_again_is_200_and_other_bytes_are_409() {
 }
 
 #[tokio::test]
-async fn a_list_is_read_page_by_page() {
+async fn images_are_listed_page_by_page() {
     let (server, map) = shared_server();
     server.town(&map, 5).await;
     let mut seen = Vec::new();
@@ -65,7 +65,7 @@ async fn a_list_is_read_page_by_page() {
 }
 
 #[tokio::test]
-async fn the_picture_comes_back_as_sent_or_smaller() {
+async fn a_picture_is_returned_as_sent_or_scaled_down() {
     let (server, map) = shared_server();
     server.town(&map, 1).await;
     let sent = server.get(&format!("/maps/{map}/images/place-0/content")).await;
@@ -78,7 +78,7 @@ async fn the_picture_comes_back_as_sent_or_smaller() {
 }
 
 #[tokio::test]
-async fn a_deleted_image_is_in_no_later_answer() {
+async fn a_deleted_image_is_never_a_candidate_again() {
     let (server, map) = shared_server();
     server.town(&map, 3).await;
     server.delete(&format!("/maps/{map}/images/place-1")).await.expect(204);

@@ -79,7 +79,7 @@ async fn jobs_are_listed_newest_first_by_map_and_state() {
 }
 
 #[tokio::test]
-async fn jobs_are_searched_for_a_text_in_whatever_case() {
+async fn jobs_are_searched_for_a_text_ignoring_case() {
     let (_dir, server) = server();
     server.town("m", 3).await;
     server.town("backyard", 1).await;
@@ -120,7 +120,7 @@ async fn jobs_are_searched_for_a_text_in_whatever_case() {
 }
 
 #[tokio::test]
-async fn a_full_job_queue_leaves_frames_without_a_job_and_refuses_who_waits_for_one() {
+async fn a_full_job_queue_answers_without_a_job_or_429_to_a_client_that_waits_for_one() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     server.town("m", 3).await;
@@ -145,7 +145,7 @@ async fn a_full_job_queue_leaves_frames_without_a_job_and_refuses_who_waits_for_
 }
 
 #[tokio::test]
-async fn a_job_whose_map_was_removed_ends_with_the_reason() {
+async fn a_job_whose_map_was_deleted_ends_with_the_reason() {
     let (server, map) = shared_server();
     server.town(&map, 3).await;
     let jobs: Vec<Value> =
@@ -161,7 +161,7 @@ async fn a_job_whose_map_was_removed_ends_with_the_reason() {
 }
 
 #[tokio::test]
-async fn an_ended_job_is_not_cancelled_and_a_success_is_not_retried() {
+async fn an_ended_job_is_not_cancelled_and_a_succeeded_one_is_not_retried() {
     let (server, map) = shared_server();
     server.town(&map, 2).await;
     let answer = server
@@ -175,7 +175,7 @@ async fn an_ended_job_is_not_cancelled_and_a_success_is_not_retried() {
 }
 
 #[tokio::test]
-async fn what_is_no_job_says_so() {
+async fn an_unknown_job_id_is_404() {
     let (server, _) = shared_server();
     server.get("/jobs/not-a-uuid").await.problem(400);
     let unknown = "/jobs/01900000-0000-7000-8000-000000000000";

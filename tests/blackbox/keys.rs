@@ -87,7 +87,7 @@ impl Guarded {
 }
 
 #[tokio::test]
-async fn a_server_that_needs_keys_and_has_none_does_not_start_and_says_how_to_make_one() {
+async fn a_server_that_requires_keys_and_has_none_does_not_start() {
     let dir = TempDir::new().unwrap();
     let log = Server::try_start(dir.path(), &REQUIRED).err().unwrap();
     assert!(log.contains("keys create") && log.contains("--no-keys"), "{log}");
@@ -107,7 +107,7 @@ async fn a_server_that_needs_keys_and_has_none_does_not_start_and_says_how_to_ma
 }
 
 #[tokio::test]
-async fn nobody_gets_in_without_a_key_that_is_known() {
+async fn a_request_without_a_valid_key_is_401() {
     let Guarded { server, robot, .. } = &Guarded::start().await;
     for path in ["/livez", "/readyz", "/docs", "/openapi.json"] {
         assert_eq!(server.get(path).await.status, 200, "{path}");
@@ -148,7 +148,7 @@ async fn nobody_gets_in_without_a_key_that_is_known() {
 }
 
 #[tokio::test]
-async fn each_role_may_do_what_it_is_for() {
+async fn each_role_has_its_permissions() {
     let Guarded { dir, server, admin, operator, robot } = Guarded::start().await;
     let localized = post_jpeg(&server, &robot, "/localize?map=yard", frame(0, 0)).await.expect(200);
     let job = localized["job"]["href"].as_str().unwrap().to_owned();
@@ -202,7 +202,7 @@ async fn each_role_may_do_what_it_is_for() {
 }
 
 #[tokio::test]
-async fn a_key_for_one_map_opens_no_other() {
+async fn a_key_for_one_map_grants_no_access_to_another() {
     let Guarded { server, robot, operator, admin, .. } = &Guarded::start().await;
     let listed = get(server, robot, "/maps").await.expect(200);
     assert_eq!(listed["maps"].as_array().unwrap().len(), 1);
@@ -250,7 +250,7 @@ async fn a_key_for_one_map_opens_no_other() {
 }
 
 #[tokio::test]
-async fn a_key_that_was_revoked_opens_nothing_from_that_moment_on_and_after_a_kill() {
+async fn a_revoked_key_is_rejected_at_once_and_after_a_kill() {
     let Guarded { dir, server, admin, robot, .. } = Guarded::start().await;
     let id = &robot[4..16];
     get(&server, &robot, "/maps").await.expect(200);
@@ -277,7 +277,7 @@ async fn a_key_that_was_revoked_opens_nothing_from_that_moment_on_and_after_a_ki
 }
 
 #[tokio::test]
-async fn what_an_admin_has_begun_is_done_and_written_down_though_the_admin_hangs_up() {
+async fn a_revocation_is_completed_and_audited_though_the_client_hangs_up() {
     let Guarded { dir: _dir, server, admin, .. } = Guarded::start().await;
     let mut keys = Vec::new();
     for number in 0..20 {
@@ -313,7 +313,7 @@ async fn what_an_admin_has_begun_is_done_and_written_down_though_the_admin_hangs
 }
 
 #[tokio::test]
-async fn streams_end_with_the_key_that_opened_them_and_tracks_belong_to_a_key() {
+async fn an_event_stream_ends_with_its_key_and_a_track_belongs_to_a_key() {
     let Guarded { dir: _dir, server, admin, operator, robot } = Guarded::start().await;
     let stream = server.request(Method::GET, "/events").bearer_auth(&operator);
     let stream = stream.send().await.unwrap();
@@ -342,7 +342,7 @@ async fn streams_end_with_the_key_that_opened_them_and_tracks_belong_to_a_key() 
 }
 
 #[tokio::test]
-async fn a_key_is_bounded_in_requests_and_bytes_and_hears_what_is_left() {
+async fn a_key_has_rate_limits_and_responses_report_the_rest() {
     let dir = TempDir::new().unwrap();
     let few = create(dir.path(), &["--role", "robot", "--requests-per-minute", "3"]);
     let small = create(dir.path(), &["--role", "admin", "--bytes-per-minute", "20000"]);
@@ -421,7 +421,7 @@ async fn the_commands_take_the_key_from_the_environment() {
 }
 
 #[tokio::test]
-async fn no_other_page_is_let_in() {
+async fn no_cross_origin_request_is_allowed() {
     let (server, _) = shared_server();
     for method in [Method::OPTIONS, Method::GET, Method::DELETE] {
         let request =

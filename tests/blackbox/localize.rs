@@ -10,7 +10,7 @@ use tempfile::TempDir;
 use super::support::{Answer, Server, frame, reference, shared_server, value_of};
 
 #[tokio::test]
-async fn a_map_image_finds_itself_and_all_fields_are_there() {
+async fn a_map_image_finds_itself_and_the_response_is_complete() {
     let (server, map) = shared_server();
     server.town(&map, 12).await;
     let answer =
@@ -38,7 +38,7 @@ async fn a_map_image_finds_itself_and_all_fields_are_there() {
 }
 
 #[tokio::test]
-async fn searches_by_a_graph_are_checked_and_counted() {
+async fn graph_searches_are_sampled_against_exact_search() {
     let dir = TempDir::new().unwrap();
     let settings = [("WHEREABOUTS_INDEX__EXACT_UP_TO", "0"), ("WHEREABOUTS_INDEX__CHECK_S", "1")];
     let server = Server::start(dir.path(), &settings);
@@ -66,7 +66,7 @@ async fn searches_by_a_graph_are_checked_and_counted() {
 }
 
 #[tokio::test]
-async fn png_webp_and_forms_are_taken_too() {
+async fn png_webp_and_forms_are_accepted() {
     let (server, map) = shared_server();
     server.town(&map, 4).await;
     let pixels = image::load_from_memory(&reference(2)).unwrap();
@@ -89,7 +89,7 @@ async fn png_webp_and_forms_are_taken_too() {
 }
 
 #[tokio::test]
-async fn waiting_for_the_refinement_returns_an_ended_job() {
+async fn refine_wait_returns_an_ended_job() {
     let (server, map) = shared_server();
     server.town(&map, 12).await;
     let answer = server

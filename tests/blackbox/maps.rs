@@ -6,7 +6,7 @@ use super::deployment;
 use super::support::{frame, reference, server, shared_server};
 
 #[tokio::test]
-async fn a_map_is_created_changed_listed_and_removed() {
+async fn a_map_is_created_changed_listed_and_deleted() {
     let (_dir, server) = server();
     let made =
         server.put("/maps/yard", json!({"scene": "indoor", "frame": "metric"})).await.expect(201);
@@ -43,7 +43,7 @@ async fn frame_and_descriptor_are_fixed_once_there_are_images() {
 }
 
 #[tokio::test]
-async fn a_map_says_what_this_model_cannot_do() {
+async fn an_unsupported_descriptor_or_model_is_rejected_with_a_hint() {
     let (server, map) = shared_server();
     let why = server.put(&format!("/maps/{map}"), json!({"descriptor": "cls"})).await.problem(422);
     assert!(why.contains("[CLS]") && why.contains("gem"), "{why}");
@@ -53,7 +53,7 @@ async fn a_map_says_what_this_model_cannot_do() {
 }
 
 #[tokio::test]
-async fn a_removed_map_leaves_nothing_to_a_new_one_of_its_name() {
+async fn a_map_created_again_under_the_name_of_a_deleted_one_is_empty() {
     let (dir, server) = server();
     server.town("m", 3).await;
     server.delete("/maps/m").await.expect(204);

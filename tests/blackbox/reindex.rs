@@ -136,7 +136,7 @@ async fn in_the_middle(server: &Server, map: &str) -> Value {
 }
 
 #[tokio::test]
-async fn maps_of_several_models_are_served_side_by_side_within_the_bound() {
+async fn maps_of_several_models_are_served_with_a_bounded_number_loaded() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);
     bench.install("middle", (240, 160), 2);
@@ -171,7 +171,7 @@ async fn maps_of_several_models_are_served_side_by_side_within_the_bound() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed() {
+async fn a_map_can_be_searched_and_changed_while_it_is_reindexed() {
     let bench = Bench::new();
     bench.install_slow();
     // Such a small map with a graph stands for a large one.
@@ -233,7 +233,7 @@ async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed()
 }
 
 #[tokio::test]
-async fn images_that_are_sent_all_the_time_are_neither_lost_nor_refused() {
+async fn images_added_during_a_reindex_are_neither_lost_nor_rejected() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);
     let server = bench.server(&[]);
@@ -251,7 +251,7 @@ async fn images_that_are_sent_all_the_time_are_neither_lost_nor_refused() {
 }
 
 #[tokio::test]
-async fn kill_9_in_the_middle_loses_nothing_and_it_can_be_run_again() {
+async fn a_reindex_interrupted_by_kill_9_loses_nothing_and_can_be_run_again() {
     let bench = Bench::new();
     bench.install_slow();
     let soon = [
@@ -280,7 +280,7 @@ async fn kill_9_in_the_middle_loses_nothing_and_it_can_be_run_again() {
 }
 
 #[tokio::test]
-async fn a_map_whose_model_is_gone_says_so_and_can_move_to_another() {
+async fn a_map_whose_model_was_uninstalled_can_move_to_another() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);
     let server = bench.server(&[]);
@@ -308,7 +308,7 @@ async fn a_map_whose_model_is_gone_says_so_and_can_move_to_another() {
 }
 
 #[tokio::test]
-async fn a_model_that_is_installed_anew_is_taken_up_by_a_reindex() {
+async fn a_reindex_uses_a_model_that_was_reinstalled() {
     let bench = Bench::new();
     bench.install("mine", (160, 120), 2);
     let server = bench.server(&[]);
@@ -343,7 +343,7 @@ async fn a_model_that_is_installed_anew_is_taken_up_by_a_reindex() {
 }
 
 #[tokio::test]
-async fn an_image_that_cannot_be_taken_over_stops_the_reindex_and_nothing_else() {
+async fn an_unreadable_image_fails_the_reindex_and_nothing_else() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);
     let server = bench.server(&[]);
@@ -365,7 +365,7 @@ async fn an_image_that_cannot_be_taken_over_stops_the_reindex_and_nothing_else()
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_command_waits_for_the_end_and_says_how_it_went() {
+async fn the_reindex_command_waits_and_reports_the_result() {
     let bench = Bench::new();
     bench.install_slow();
     let server = bench.server(&[]);

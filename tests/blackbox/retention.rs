@@ -28,7 +28,7 @@ async fn listed(server: &Server) -> Vec<String> {
 }
 
 #[tokio::test]
-async fn only_so_many_ended_jobs_are_kept_with_their_frames() {
+async fn ended_jobs_are_removed_with_their_frames_beyond_a_number() {
     let dir = TempDir::new().unwrap();
     let settings = [
         ("WHEREABOUTS_JOBS__KEEP_COUNT", "3"),

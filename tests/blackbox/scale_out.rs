@@ -50,7 +50,7 @@ fn worker(dir: &TempDir, settings: &[(&'static str, String)]) -> Server {
 
 #[tokio::test]
 #[ignore = "needs the scale-out deployment"]
-async fn two_workers_that_want_the_same_pair_buy_it_once() {
+async fn two_workers_that_need_the_same_pair_pay_for_it_once() {
     let dir = TempDir::new().unwrap();
     let script = Script { latency: Duration::from_millis(300), ..Script::default() };
     let mock = MockMllm::start(script).await;
@@ -72,7 +72,7 @@ async fn two_workers_that_want_the_same_pair_buy_it_once() {
 
 #[tokio::test]
 #[ignore = "needs the scale-out deployment"]
-async fn what_one_server_is_told_the_other_knows() {
+async fn a_change_at_one_server_is_visible_at_the_other() {
     let dir = TempDir::new().unwrap();
     let (one, other) = (Server::start(dir.path(), &[]), Server::start(dir.path(), &[]));
     one.town("m", 5).await;
@@ -90,7 +90,7 @@ async fn what_one_server_is_told_the_other_knows() {
 
 #[tokio::test]
 #[ignore = "needs the scale-out deployment"]
-async fn a_key_that_is_revoked_at_one_server_lets_nobody_into_the_other() {
+async fn a_key_revoked_at_one_server_is_rejected_by_the_other() {
     let dir = TempDir::new().unwrap();
     let make = |server: &Server, role: &str| {
         let request = server.request(reqwest::Method::POST, "/keys");
@@ -122,7 +122,7 @@ async fn a_key_that_is_revoked_at_one_server_lets_nobody_into_the_other() {
 
 #[test]
 #[ignore = "needs the scale-out deployment"]
-fn a_worker_answers_those_who_look_after_it_and_nobody_else() {
+fn a_worker_serves_health_and_metrics_only() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let dir = TempDir::new().unwrap();
     let worker = Server::start_worker(dir.path(), &[]);

@@ -7,7 +7,7 @@ use tempfile::TempDir;
 use super::support::{Answer, BINARY, Server, frame, server, shared_server};
 
 #[tokio::test]
-async fn a_ready_server_says_so_and_shows_its_docs() {
+async fn a_ready_server_is_healthy_and_serves_its_docs() {
     let (server, _) = shared_server();
     server.get("/livez").await.expect(200);
     server.get("/readyz").await.expect(200);
@@ -16,7 +16,7 @@ async fn a_ready_server_says_so_and_shows_its_docs() {
 }
 
 #[tokio::test]
-async fn the_committed_description_is_the_one_the_handlers_give() {
+async fn the_committed_openapi_file_matches_the_handlers() {
     let (server, _) = shared_server();
     let served = server.get("/openapi.json").await.expect(200);
     let committed = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/openapi.json");
@@ -48,7 +48,7 @@ async fn metrics_count_requests_jobs_and_images() {
 }
 
 #[tokio::test]
-async fn a_request_keeps_the_id_it_came_with() {
+async fn a_request_keeps_its_x_request_id() {
     let (server, _) = shared_server();
     let request = server.request(Method::GET, "/maps/none").header("x-request-id", "robot-7/42");
     let answer = Answer::of(request).await;
@@ -59,7 +59,7 @@ async fn a_request_keeps_the_id_it_came_with() {
 }
 
 #[tokio::test]
-async fn more_requests_than_the_bound_are_refused_while_health_is_answered() {
+async fn requests_beyond_the_limit_are_429_while_health_is_answered() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[("WHEREABOUTS_SERVER__MAX_REQUESTS", "1")]);
     server.town("m", 1).await;

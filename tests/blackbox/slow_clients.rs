@@ -90,7 +90,7 @@ fn problem(answer: &str, status: u16) -> String {
 }
 
 #[tokio::test]
-async fn a_head_that_trickles_gets_408_and_silence_is_hung_up_on() {
+async fn a_trickling_head_gets_408_and_a_silent_connection_is_closed() {
     let (_dir, server) = strict(&[]);
     let start = Instant::now();
     let mut silent = Vec::new();
@@ -137,7 +137,7 @@ async fn a_body_that_pauses_or_trickles_gets_408() {
 }
 
 #[tokio::test]
-async fn chunks_without_end_get_413() {
+async fn an_endless_chunked_body_gets_413() {
     let (_dir, server) = strict(&[]);
     server.town("m", 1).await;
     let stream = sent(&server, head("transfer-encoding: chunked").as_bytes()).await;
@@ -148,7 +148,7 @@ async fn chunks_without_end_get_413() {
 }
 
 #[tokio::test]
-async fn bodies_that_together_take_too_much_memory_get_429() {
+async fn bodies_beyond_the_shared_memory_budget_get_429() {
     // Neither is cut off for its slowness while this goes on.
     let (_dir, server) = strict(&[
         ("WHEREABOUTS_SERVER__BODY_PAUSE_S", "29"),
@@ -169,7 +169,7 @@ async fn bodies_that_together_take_too_much_memory_get_429() {
 }
 
 #[tokio::test]
-async fn a_client_that_hangs_up_half_way_is_forgotten_at_once() {
+async fn a_client_that_disconnects_halfway_frees_its_slot_at_once() {
     let (_dir, server) = strict(&[
         ("WHEREABOUTS_SERVER__MAX_REQUESTS", "2"),
         ("WHEREABOUTS_SERVER__BODY_PAUSE_S", "29"),
@@ -225,7 +225,7 @@ async fn heads_that_are_too_large_get_431() {
 }
 
 #[tokio::test]
-async fn a_client_that_takes_no_answer_is_given_up() {
+async fn a_client_that_reads_no_response_is_disconnected() {
     let (_dir, server) = strict(&[]);
     let (from, mut to) = connect(&server).await.into_split();
     let request = b"GET /openapi.json HTTP/1.1\r\nhost: x\r\n\r\n".repeat(100);
@@ -236,7 +236,7 @@ async fn a_client_that_takes_no_answer_is_given_up() {
 }
 
 #[tokio::test]
-async fn idle_connections_make_room_and_busy_ones_do_not() {
+async fn idle_connections_are_evicted_and_busy_ones_are_not() {
     let dir = TempDir::new().unwrap();
     let settings = [("WHEREABOUTS_SERVER__MAX_CONNECTIONS", "4")];
     let server = Server::start(dir.path(), &settings);

@@ -27,7 +27,7 @@ fn statuses(answers: &str) -> Vec<&str> {
 }
 
 #[tokio::test]
-async fn a_body_with_two_ends_is_no_way_in_for_another_request() {
+async fn an_ambiguous_body_length_smuggles_no_request() {
     let (server, _) = shared_server();
     let smuggled = "GET /smuggled HTTP/1.1\r\nhost: x\r\n\r\n";
     let post = |framing: &str, body: &str| {
@@ -132,7 +132,7 @@ mod embedded_only {
     }
 
     #[tokio::test]
-    async fn the_time_of_a_refusal_does_not_tell_how_much_of_a_key_is_right() {
+    async fn a_401_takes_the_same_time_however_much_of_the_key_is_right() {
         let dir = tempfile::tempdir().unwrap();
         let output = std::process::Command::new(&*BINARY)
             .args(["keys", "create", "--name", "a", "--role", "robot", "--data"])

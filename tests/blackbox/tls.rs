@@ -61,7 +61,7 @@ fn put(folder: &Path, certificate: &str, end: &str) {
 }
 
 #[tokio::test]
-async fn a_certificate_that_is_replaced_is_taken_up_and_one_that_is_bad_is_not() {
+async fn a_replaced_certificate_is_reloaded_and_an_invalid_one_is_not() {
     let encrypted = Encrypted::start();
     assert!(encrypted.is_trusted_by("first").await);
     assert!(!encrypted.is_trusted_by("second").await);
@@ -78,14 +78,14 @@ async fn a_certificate_that_is_replaced_is_taken_up_and_one_that_is_bad_is_not()
 }
 
 #[tokio::test]
-async fn who_speaks_without_tls_is_told_so() {
+async fn a_plain_http_request_to_the_https_port_is_explained() {
     let encrypted = Encrypted::start();
     let plain = encrypted.server.get("/readyz").await.expect(400);
     assert!(plain["detail"].as_str().unwrap().contains("https://"), "{plain}");
 }
 
 #[tokio::test]
-async fn a_connection_that_says_nothing_does_not_keep_the_server_from_stopping() {
+async fn a_silent_connection_does_not_delay_shutdown() {
     let Encrypted { files: _files, _data, server, url } = Encrypted::start();
     let address = url.trim_start_matches("https://").to_owned();
     let silent = tokio::net::TcpStream::connect(&address).await.unwrap();
@@ -106,7 +106,7 @@ async fn a_connection_that_says_nothing_does_not_keep_the_server_from_stopping()
 }
 
 #[test]
-fn files_that_cannot_be_used_are_named_at_the_start() {
+fn unusable_certificate_files_are_named_at_startup() {
     let data = TempDir::new().unwrap();
     let start = |certificate: &Path, key: &Path| {
         let settings = [

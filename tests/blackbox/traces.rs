@@ -40,7 +40,7 @@ fn hex(bytes: &[u8]) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_trace_goes_from_the_caller_through_the_job_to_each_call_of_the_model() {
+async fn a_trace_spans_the_request_the_job_and_each_model_call() {
     const TRACE: &str = "4bf92f3577b34da6a3ce929d0e0e4736";
     let dir = TempDir::new().unwrap();
     let (url, collected) = collector().await;
@@ -89,7 +89,7 @@ async fn a_trace_goes_from_the_caller_through_the_job_to_each_call_of_the_model(
 }
 
 #[tokio::test]
-async fn a_collector_that_is_away_holds_up_nobody() {
+async fn an_unreachable_collector_delays_nothing() {
     let dir = TempDir::new().unwrap();
     let settings = [
         ("WHEREABOUTS_TRACES__URL", "http://127.0.0.1:9"),
@@ -103,7 +103,7 @@ async fn a_collector_that_is_away_holds_up_nobody() {
 }
 
 #[tokio::test]
-async fn nothing_is_traced_unless_somebody_wants_it() {
+async fn nothing_is_traced_by_default() {
     let (server, map) = shared_server();
     server.town(&map, 3).await;
     let answer = server.post_jpeg(&format!("/localize?map={map}"), frame(0, 0)).await.expect(200);

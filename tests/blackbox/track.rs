@@ -56,7 +56,7 @@ fn is_occluded(place: usize) -> bool {
 }
 
 #[tokio::test]
-async fn a_drive_is_located_better_than_its_frames() {
+async fn a_track_is_located_better_than_its_frames() {
     let town = Town::new(TownSpec { seed: 11, places: PLACES, width: 320, height: 240 });
     let (server, map) = shared_server();
     metric_map(server, &map, &town).await;
@@ -93,7 +93,7 @@ async fn a_drive_is_located_better_than_its_frames() {
 }
 
 #[tokio::test]
-async fn a_track_says_nothing_of_images_that_are_gone() {
+async fn a_track_never_returns_a_deleted_image() {
     let (server, map) = shared_server();
     server.town(&map, 6).await;
     let localize = async || -> Value {
@@ -116,7 +116,7 @@ async fn a_track_says_nothing_of_images_that_are_gone() {
 }
 
 #[tokio::test]
-async fn what_a_track_cannot_be_is_refused_with_what_to_do() {
+async fn an_invalid_track_is_rejected_with_a_hint() {
     let (server, map) = shared_server();
     server.town(&map, 2).await;
     let ask = async |query: &str| -> Answer {
@@ -152,7 +152,7 @@ async fn what_a_track_cannot_be_is_refused_with_what_to_do() {
 }
 
 #[tokio::test]
-async fn the_track_used_least_recently_makes_room() {
+async fn the_least_recently_used_track_is_evicted() {
     let dir = tempfile::TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[("WHEREABOUTS_TRACK__MAX", "2")]);
     server.town("m", 2).await;

@@ -49,7 +49,7 @@ async fn job(server: &Server, map: &str) -> Value {
 }
 
 #[tokio::test]
-async fn the_end_of_a_job_is_told_to_whom_it_concerns_signed_and_whole() {
+async fn the_end_of_a_job_is_delivered_signed_to_the_subscribed_webhooks() {
     let dir = TempDir::new().unwrap();
     // A proxy would go where the server itself must not.
     let proxy = ("HTTP_PROXY", "http://127.0.0.1:9");
@@ -112,7 +112,7 @@ async fn the_end_of_a_job_is_told_to_whom_it_concerns_signed_and_whole() {
 }
 
 #[tokio::test]
-async fn a_message_that_is_not_taken_comes_again_as_the_same() {
+async fn a_failed_delivery_is_retried_with_the_same_id_and_body() {
     let dir = TempDir::new().unwrap();
     let retry = ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[0, 0, 5]");
     let server =
@@ -139,7 +139,7 @@ async fn a_message_that_is_not_taken_comes_again_as_the_same() {
 }
 
 #[tokio::test]
-async fn what_was_given_up_is_kept_and_can_be_delivered_again() {
+async fn a_dead_delivery_is_kept_and_can_be_redelivered() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[0]")]);
     let (nobody, _) = hook(&server, json!({"url": "http://127.0.0.1:1/"})).await;
@@ -191,7 +191,7 @@ async fn what_was_given_up_is_kept_and_can_be_delivered_again() {
 }
 
 #[tokio::test]
-async fn a_redirect_leads_nowhere() {
+async fn redirects_are_not_followed() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, NO_RETRY]);
     let elsewhere = Receiver::start([]).await;
@@ -212,7 +212,7 @@ async fn a_redirect_leads_nowhere() {
 }
 
 #[tokio::test]
-async fn addresses_that_are_not_public_are_refused_unless_the_operator_allows_them() {
+async fn private_addresses_are_rejected_unless_allowed() {
     let dir = TempDir::new().unwrap();
     let receiver = Receiver::start([]).await;
     let server = Server::start(dir.path(), &[PRIVATE]);
@@ -279,7 +279,7 @@ async fn addresses_that_are_not_public_are_refused_unless_the_operator_allows_th
 }
 
 #[tokio::test]
-async fn who_is_gone_is_told_nothing_more() {
+async fn a_receiver_that_answers_410_is_disabled() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__MAX", "1")]);
     let receiver = Receiver::start([Reply::Status(410)]).await;
@@ -300,7 +300,7 @@ async fn who_is_gone_is_told_nothing_more() {
 }
 
 #[tokio::test]
-async fn no_end_of_a_job_is_lost_when_the_server_is_killed() {
+async fn no_delivery_is_lost_when_the_server_is_killed() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE]);
     server.town("m", 2).await;
@@ -329,7 +329,7 @@ async fn no_end_of_a_job_is_lost_when_the_server_is_killed() {
 }
 
 #[tokio::test]
-async fn one_that_is_slow_holds_up_no_other_and_no_end() {
+async fn a_slow_receiver_delays_neither_others_nor_shutdown() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__TIMEOUT_S", "120")]);
     let slow = Receiver::start(vec![Reply::Silence; 100]).await;
@@ -361,7 +361,7 @@ fn key(data: &Path, role: &str) -> String {
 }
 
 #[tokio::test]
-async fn webhooks_are_for_admins() {
+async fn only_admins_manage_webhooks() {
     let dir = TempDir::new().unwrap();
     let (admin, operator) = (key(dir.path(), "admin"), key(dir.path(), "operator"));
     let settings = [PRIVATE, ("WHEREABOUTS_AUTH__KEYS", "required")];

@@ -31,7 +31,7 @@ async fn until_graphed(server: &Server) {
 }
 
 #[tokio::test]
-async fn a_torn_or_damaged_graph_file_is_built_again() {
+async fn a_truncated_or_damaged_graph_file_is_rebuilt() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[GRAPH]);
     server.town("m", 30).await;
@@ -56,7 +56,7 @@ async fn a_torn_or_damaged_graph_file_is_built_again() {
 }
 
 #[tokio::test]
-async fn a_damaged_database_loses_nothing_in_silence() {
+async fn a_damaged_database_loses_nothing_silently() {
     const IMAGES: usize = 24;
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);

@@ -30,7 +30,7 @@ fn number(name: &str, default: usize) -> usize {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_was_acknowledged_survives_kill_9_at_any_moment() {
+async fn acknowledged_changes_survive_kill_9_at_any_moment() {
     let rounds = number("WHEREABOUTS_CRASH_ROUNDS", ROUNDS);
     let seed = number("WHEREABOUTS_CRASH_SEED", 1) as u64;
     let mut driver = Driver::new(seed);

@@ -6,7 +6,7 @@ use super::support::{Server, reference};
 
 #[tokio::test]
 #[ignore = "needs the right to mount a file system"]
-async fn a_full_disk_is_said_and_what_was_acknowledged_is_kept() {
+async fn a_full_disk_is_reported_and_acknowledged_changes_are_kept() {
     let disk = SmallDisk::mount(16);
     let little = ("WHEREABOUTS_DATA__MIN_FREE_BYTES", "4000000");
     let server = Server::start(&disk.data(), &[little]);
@@ -45,7 +45,7 @@ async fn a_full_disk_is_said_and_what_was_acknowledged_is_kept() {
 
 #[tokio::test]
 #[ignore = "needs the right to mount a file system"]
-async fn a_read_only_folder_is_refused_with_the_reason() {
+async fn a_read_only_folder_is_rejected_with_the_reason() {
     let disk = SmallDisk::mount(64);
     let settings = [("WHEREABOUTS_DATA__MIN_FREE_BYTES", "0")];
     let server = Server::start(&disk.data(), &settings);

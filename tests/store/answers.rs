@@ -11,12 +11,12 @@ use whereabouts_store::{IdempotencyRecord, Progress, Store, StoredResponse};
 use crate::support::{Fixture, eventually, odd_texts};
 
 contract!(
-    a_request_is_reserved_once_and_its_answer_kept,
-    of_many_who_reserve_a_request_one_does_it,
-    an_answer_that_is_too_old_is_none,
-    a_forgotten_request_may_be_done_again,
-    the_oldest_answers_are_forgotten_by_age_and_by_number,
-    a_request_of_a_process_that_ended_may_be_done_again,
+    a_request_is_reserved_once_and_its_response_stored,
+    of_concurrent_reservations_of_a_request_one_succeeds,
+    an_expired_response_is_not_found,
+    a_forgotten_request_may_be_reserved_again,
+    the_oldest_responses_are_evicted_by_age_and_by_number,
+    a_request_of_a_process_that_ended_may_be_reserved_again,
 );
 
 fn running(process: Uuid) -> IdempotencyRecord {
@@ -35,7 +35,7 @@ async fn reserve(store: &dyn Store, id: &str, process: Uuid) -> Option<Idempoten
     store.reserve_answer(id, running(process), Timestamp::UNIX_EPOCH).await.unwrap()
 }
 
-async fn a_request_is_reserved_once_and_its_answer_kept(fixture: &Fixture) {
+async fn a_request_is_reserved_once_and_its_response_stored(fixture: &Fixture) {
     let store = fixture.open().await;
     let process = Uuid::now_v7();
     for (number, text) in odd_texts().into_iter().enumerate() {
@@ -51,7 +51,7 @@ async fn a_request_is_reserved_once_and_its_answer_kept(fixture: &Fixture) {
     }
 }
 
-async fn of_many_who_reserve_a_request_one_does_it(fixture: &Fixture) {
+async fn of_concurrent_reservations_of_a_request_one_succeeds(fixture: &Fixture) {
     let store = fixture.open().await;
     let process = Uuid::now_v7();
     let reserving = (0..8).map(|_| {
@@ -62,7 +62,7 @@ async fn of_many_who_reserve_a_request_one_does_it(fixture: &Fixture) {
     assert_eq!(known.filter(Option::is_none).count(), 1);
 }
 
-async fn an_answer_that_is_too_old_is_none(fixture: &Fixture) {
+async fn an_expired_response_is_not_found(fixture: &Fixture) {
     let store = fixture.open().await;
     let (now, process) = (Timestamp::now(), Uuid::now_v7());
     let hour = SignedDuration::from_hours(1);
@@ -76,7 +76,7 @@ async fn an_answer_that_is_too_old_is_none(fixture: &Fixture) {
     assert!(matches!(known.unwrap().progress, Progress::Running { .. }));
 }
 
-async fn a_forgotten_request_may_be_done_again(fixture: &Fixture) {
+async fn a_forgotten_request_may_be_reserved_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let process = Uuid::now_v7();
     store.forget_answer("key").await.unwrap();
@@ -88,7 +88,7 @@ async fn a_forgotten_request_may_be_done_again(fixture: &Fixture) {
     assert_eq!(reserve(&*store, "key", process).await, None);
 }
 
-async fn the_oldest_answers_are_forgotten_by_age_and_by_number(fixture: &Fixture) {
+async fn the_oldest_responses_are_evicted_by_age_and_by_number(fixture: &Fixture) {
     let store = fixture.open().await;
     let (now, process) = (Timestamp::now(), Uuid::now_v7());
     let hours_ago = |hours| now - SignedDuration::from_hours(hours);
@@ -110,7 +110,7 @@ async fn the_oldest_answers_are_forgotten_by_age_and_by_number(fixture: &Fixture
     assert_eq!(store.forget_answers(now + SignedDuration::from_hours(1), 9).await.unwrap(), 4);
 }
 
-async fn a_request_of_a_process_that_ended_may_be_done_again(fixture: &Fixture) {
+async fn a_request_of_a_process_that_ended_may_be_reserved_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let (first, second) = (Uuid::now_v7(), Uuid::now_v7());
     assert_eq!(reserve(&*store, "running", first).await, None);

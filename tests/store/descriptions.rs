@@ -11,13 +11,13 @@ use whereabouts_store::{DescriptionBounds, Store};
 use crate::support::{Fixture, Random, Tuning, add, eventually, fill, map, next, odd_texts};
 
 contract!(
-    a_description_is_kept_word_for_word,
-    a_description_that_is_too_old_is_not_used,
-    the_oldest_descriptions_make_room,
+    a_description_is_cached_verbatim,
+    an_expired_description_is_not_used,
+    the_oldest_descriptions_are_evicted,
     a_purchase_is_begun_and_ended,
     earlier_frames_are_found_by_their_similarity,
-    the_oldest_frames_are_forgotten,
-    frames_go_with_their_map_and_with_its_descriptors,
+    the_oldest_frames_are_evicted,
+    frames_are_removed_with_their_map_and_with_its_descriptors,
 );
 
 fn description(text: &str) -> CachedDescription {
@@ -34,7 +34,7 @@ async fn tidy(store: &dyn Store) {
     store.clear_left().await.unwrap();
 }
 
-async fn a_description_is_kept_word_for_word(fixture: &Fixture) {
+async fn a_description_is_cached_verbatim(fixture: &Fixture) {
     let store = fixture.open().await;
     assert_eq!(store.description(&key(0)).await.unwrap(), None);
     let texts: Vec<_> = odd_texts().iter().map(|text| description(text)).collect();
@@ -54,7 +54,7 @@ async fn a_description_is_kept_word_for_word(fixture: &Fixture) {
     assert!(store.levels().bytes > bytes as u64);
 }
 
-async fn a_description_that_is_too_old_is_not_used(fixture: &Fixture) {
+async fn an_expired_description_is_not_used(fixture: &Fixture) {
     let max_age = Duration::from_millis(200);
     let descriptions = DescriptionBounds { max_bytes: 1 << 20, max_age };
     let store = fixture.open_with(Tuning { descriptions, ..Tuning::default() }).await;
@@ -67,7 +67,7 @@ async fn a_description_that_is_too_old_is_not_used(fixture: &Fixture) {
     store.keep_description(key(0), description("text")).await.unwrap();
 }
 
-async fn the_oldest_descriptions_make_room(fixture: &Fixture) {
+async fn the_oldest_descriptions_are_evicted(fixture: &Fixture) {
     let descriptions = DescriptionBounds { max_bytes: 20_000, max_age: Duration::from_secs(3600) };
     let store = fixture.open_with(Tuning { descriptions, ..Tuning::default() }).await;
     let text = "x".repeat(3000);
@@ -148,7 +148,7 @@ async fn earlier_frames_are_found_by_their_similarity(fixture: &Fixture) {
     assert_eq!(similar(&*store, one, &at(0.0), 0.9).await, [1, 3]);
 }
 
-async fn the_oldest_frames_are_forgotten(fixture: &Fixture) {
+async fn the_oldest_frames_are_evicted(fixture: &Fixture) {
     let store = fixture.open().await;
     let (one, other) = (Uuid::now_v7(), Uuid::now_v7());
     store.keep_frame(other, frame(9, &at(0.0)), 3).await.unwrap();
@@ -159,7 +159,7 @@ async fn the_oldest_frames_are_forgotten(fixture: &Fixture) {
     assert_eq!(similar(&*store, other, &at(0.0), 0.9).await, [9]);
 }
 
-async fn frames_go_with_their_map_and_with_its_descriptors(fixture: &Fixture) {
+async fn frames_are_removed_with_their_map_and_with_its_descriptors(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     add(&*store, &map, "a", b"a").await;

@@ -7,11 +7,11 @@ use whereabouts_store::{Store, StoreError};
 use crate::support::{Fixture, Tuning, add, descriptor, eventually, fill, image, map, next};
 
 contract!(
-    what_is_added_and_removed_meanwhile_is_carried_over_and_left_out,
-    a_draft_that_is_given_up_leaves_the_map_as_it_was_and_another_may_begin,
-    a_draft_of_a_process_that_ended_is_nothing_to_the_next_one,
+    changes_made_during_a_draft_are_carried_over,
+    a_discarded_draft_leaves_the_map_unchanged_and_another_may_begin,
+    a_draft_of_a_process_that_ended_does_not_block_the_next_one,
     a_large_map_is_searched_by_its_graph_from_the_moment_it_is_replaced,
-    scene_and_description_that_changed_meanwhile_stay,
+    scene_and_description_changed_during_a_draft_are_kept,
 );
 
 /// Small enough that some of these maps have graphs.
@@ -42,7 +42,7 @@ async fn old_map(store: &dyn Store) -> Map {
     store.put_map(map("m", 3)).await.unwrap().0
 }
 
-async fn what_is_added_and_removed_meanwhile_is_carried_over_and_left_out(fixture: &Fixture) {
+async fn changes_made_during_a_draft_are_carried_over(fixture: &Fixture) {
     let store = fixture.open_with(tuning()).await;
     let map = old_map(&*store).await;
     let mut images = Vec::new();
@@ -98,9 +98,7 @@ async fn what_is_added_and_removed_meanwhile_is_carried_over_and_left_out(fixtur
     finds(&*store, &all[..5]).await;
 }
 
-async fn a_draft_that_is_given_up_leaves_the_map_as_it_was_and_another_may_begin(
-    fixture: &Fixture,
-) {
+async fn a_discarded_draft_leaves_the_map_unchanged_and_another_may_begin(fixture: &Fixture) {
     let store = fixture.open_with(tuning()).await;
     let map = old_map(&*store).await;
     let image = add(&*store, &map, "a", b"a").await;
@@ -118,7 +116,7 @@ async fn a_draft_that_is_given_up_leaves_the_map_as_it_was_and_another_may_begin
     draft.discard().await;
 }
 
-async fn a_draft_of_a_process_that_ended_is_nothing_to_the_next_one(fixture: &Fixture) {
+async fn a_draft_of_a_process_that_ended_does_not_block_the_next_one(fixture: &Fixture) {
     let store = fixture.open_with(tuning()).await;
     let map = old_map(&*store).await;
     let image = add(&*store, &map, "a", b"a").await;
@@ -148,7 +146,7 @@ async fn a_large_map_is_searched_by_its_graph_from_the_moment_it_is_replaced(fix
     assert_eq!((state.images, state.graph, state.behind), (50, true, false));
 }
 
-async fn scene_and_description_that_changed_meanwhile_stay(fixture: &Fixture) {
+async fn scene_and_description_changed_during_a_draft_are_kept(fixture: &Fixture) {
     let store = fixture.open_with(tuning()).await;
     let map = old_map(&*store).await;
     let mut draft = store.draft(next(&map, 5)).await.unwrap();

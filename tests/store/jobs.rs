@@ -17,22 +17,22 @@ use crate::support::{
 };
 
 contract!(
-    a_job_comes_back_as_it_was_given,
-    jobs_are_taken_by_priority_and_then_by_age,
-    a_job_is_taken_by_one_worker_at_a_time,
-    a_job_whose_lease_ran_out_is_taken_again_and_nobody_hears_the_first_worker,
-    a_released_job_waits_for_its_time,
-    a_release_that_does_not_count_takes_the_attempt_back,
+    a_job_is_returned_as_submitted,
+    jobs_are_claimed_by_priority_and_then_by_age,
+    a_job_is_claimed_by_one_worker_at_a_time,
+    a_job_with_an_expired_lease_is_claimed_again_and_the_first_worker_is_fenced_off,
+    a_released_job_waits_until_it_is_due,
+    a_deferred_release_does_not_count_as_an_attempt,
     steps_add_up_and_a_description_replaces_that_of_the_same_image,
-    a_cancelled_job_is_nobodys,
-    a_job_that_ended_without_success_may_be_queued_again,
-    the_queue_holds_exactly_so_many,
-    every_change_is_told,
+    a_cancelled_job_is_held_by_no_worker,
+    an_unsuccessful_job_may_be_queued_again,
+    the_queue_limit_is_exact,
+    every_change_of_a_job_is_notified,
     jobs_are_listed_newest_first_by_map_and_state_a_page_at_a_time,
     jobs_are_searched_for_a_text,
-    a_request_that_is_done_again_finds_its_job,
-    a_job_that_is_not_there_is_not_found,
-    a_job_outlives_a_restart_and_is_free_of_the_worker_that_did_not,
+    a_repeated_request_finds_its_job,
+    an_unknown_job_is_not_found,
+    a_job_survives_a_restart_and_is_released_by_the_worker_that_died,
     odd_texts_in_a_job_survive,
 );
 
@@ -48,7 +48,7 @@ async fn job(store: &dyn Store, id: Uuid) -> Job {
     store.job(id).await.unwrap().unwrap().job
 }
 
-async fn a_job_comes_back_as_it_was_given(fixture: &Fixture) {
+async fn a_job_is_returned_as_submitted(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut given = record("m", b"frame");
     let frame = image("frame", b"frame");
@@ -74,7 +74,7 @@ async fn a_job_comes_back_as_it_was_given(fixture: &Fixture) {
     same(&JobRecord { job: given.job.clone(), claims: 0, ..taken });
 }
 
-async fn jobs_are_taken_by_priority_and_then_by_age(fixture: &Fixture) {
+async fn jobs_are_claimed_by_priority_and_then_by_age(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut jobs = Vec::new();
     for priority in [
@@ -108,7 +108,7 @@ async fn jobs_are_taken_by_priority_and_then_by_age(fixture: &Fixture) {
     assert_eq!(store.queued().await.unwrap(), 0);
 }
 
-async fn a_job_is_taken_by_one_worker_at_a_time(fixture: &Fixture) {
+async fn a_job_is_claimed_by_one_worker_at_a_time(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut submitted = HashSet::new();
     for _ in 0..30 {
@@ -148,7 +148,7 @@ async fn is_void(store: &dyn Store, old: &JobRecord, claim: Claim) {
     assert_eq!(before, after);
 }
 
-async fn a_job_whose_lease_ran_out_is_taken_again_and_nobody_hears_the_first_worker(
+async fn a_job_with_an_expired_lease_is_claimed_again_and_the_first_worker_is_fenced_off(
     fixture: &Fixture,
 ) {
     let store = fixture.open().await;
@@ -173,7 +173,7 @@ async fn a_job_whose_lease_ran_out_is_taken_again_and_nobody_hears_the_first_wor
     assert!(claim(&*store).await.is_none());
 }
 
-async fn a_released_job_waits_for_its_time(fixture: &Fixture) {
+async fn a_released_job_waits_until_it_is_due(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = submit(&*store, "m", b"frame").await;
     let first = claim(&*store).await.unwrap();
@@ -195,7 +195,7 @@ async fn a_released_job_waits_for_its_time(fixture: &Fixture) {
     assert!(Timestamp::now() >= not_before);
 }
 
-async fn a_release_that_does_not_count_takes_the_attempt_back(fixture: &Fixture) {
+async fn a_deferred_release_does_not_count_as_an_attempt(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = submit(&*store, "m", b"frame").await;
     for _ in 0..3 {
@@ -244,7 +244,7 @@ async fn steps_add_up_and_a_description_replaces_that_of_the_same_image(fixture:
     assert_eq!(known.descriptions[0].stands_in, stands_in);
 }
 
-async fn a_cancelled_job_is_nobodys(fixture: &Fixture) {
+async fn a_cancelled_job_is_held_by_no_worker(fixture: &Fixture) {
     let store = fixture.open().await;
     let waiting = submit(&*store, "m", b"frame").await;
     let cancelled = store.cancel(waiting).await.unwrap();
@@ -260,7 +260,7 @@ async fn a_cancelled_job_is_nobodys(fixture: &Fixture) {
     assert_eq!(store.cancel(waiting).await.unwrap(), cancelled);
 }
 
-async fn a_job_that_ended_without_success_may_be_queued_again(fixture: &Fixture) {
+async fn an_unsuccessful_job_may_be_queued_again(fixture: &Fixture) {
     let store = fixture.open().await;
     for state in [JobState::Failed, JobState::Degraded, JobState::Cancelled] {
         let id = submit(&*store, "m", b"frame").await;
@@ -287,7 +287,7 @@ async fn a_job_that_ended_without_success_may_be_queued_again(fixture: &Fixture)
     }
 }
 
-async fn the_queue_holds_exactly_so_many(fixture: &Fixture) {
+async fn the_queue_limit_is_exact(fixture: &Fixture) {
     let store = fixture.open().await;
     const LIMIT: usize = 10;
     // One runs, which counts as well.
@@ -324,7 +324,7 @@ async fn told(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
         .unwrap();
 }
 
-async fn every_change_is_told(fixture: &Fixture) {
+async fn every_change_of_a_job_is_notified(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut changes = store.changes();
     let id = submit(&*store, "m", b"frame").await;
@@ -375,7 +375,7 @@ async fn jobs_are_listed_newest_first_by_map_and_state_a_page_at_a_time(fixture:
     assert_eq!(listed(None, Some(JobState::Running), None, 9).await, [2]);
 }
 
-async fn a_job_that_is_not_there_is_not_found(fixture: &Fixture) {
+async fn an_unknown_job_is_not_found(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = submit(&*store, "m", b"frame").await;
     let taken = claim(&*store).await.unwrap();
@@ -388,7 +388,7 @@ async fn a_job_that_is_not_there_is_not_found(fixture: &Fixture) {
     assert_eq!(taken.job.id, id);
 }
 
-async fn a_job_outlives_a_restart_and_is_free_of_the_worker_that_did_not(fixture: &Fixture) {
+async fn a_job_survives_a_restart_and_is_released_by_the_worker_that_died(fixture: &Fixture) {
     let store = fixture.open().await;
     let running = submit(&*store, "m", b"frame").await;
     let waiting = submit(&*store, "m", b"frame").await;
@@ -458,7 +458,7 @@ async fn jobs_are_searched_for_a_text(fixture: &Fixture) {
     }
 }
 
-async fn a_request_that_is_done_again_finds_its_job(fixture: &Fixture) {
+async fn a_repeated_request_finds_its_job(fixture: &Fixture) {
     let store = fixture.open().await;
     let running = || {
         let progress = Progress::Running { process: Uuid::now_v7(), job: None };

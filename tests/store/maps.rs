@@ -13,18 +13,18 @@ use whereabouts_store::{IndexState, Store, StoreError};
 use crate::support::{Fixture, add, descriptor, fill, image, is_kept, map, next, odd_texts};
 
 contract!(
-    a_map_is_made_once_and_its_scene_and_description_change,
-    what_shapes_the_descriptors_changes_only_while_there_are_no_images,
+    a_map_is_created_once_and_its_scene_and_description_can_change,
+    descriptor_settings_are_fixed_once_there_are_images,
     maps_are_listed_by_the_bytes_of_their_names,
-    a_map_that_is_put_by_many_at_once_is_made_by_one,
+    of_concurrent_creations_of_a_map_one_succeeds,
     a_deleted_map_is_gone_for_good_and_its_name_is_free,
-    a_deleted_map_takes_its_bytes_along,
+    a_deleted_map_is_deleted_with_its_bytes,
     a_map_may_be_deleted_while_images_are_added,
-    a_map_and_all_in_it_is_there_after_a_restart,
-    what_was_measured_is_kept_for_its_revision,
+    a_map_with_its_images_survives_a_restart,
+    a_calibration_is_kept_for_its_revision,
 );
 
-async fn a_map_is_made_once_and_its_scene_and_description_change(fixture: &Fixture) {
+async fn a_map_is_created_once_and_its_scene_and_description_can_change(fixture: &Fixture) {
     let store = fixture.open().await;
     let wanted = map("m", 3);
     assert_eq!(store.map(&wanted.name).await.unwrap(), None);
@@ -43,7 +43,7 @@ async fn a_map_is_made_once_and_its_scene_and_description_change(fixture: &Fixtu
     assert_eq!(store.index_state(&wanted).await.unwrap().images, 1);
 }
 
-async fn what_shapes_the_descriptors_changes_only_while_there_are_no_images(fixture: &Fixture) {
+async fn descriptor_settings_are_fixed_once_there_are_images(fixture: &Fixture) {
     let store = fixture.open().await;
     let (mut known, _) = store.put_map(map("m", 3)).await.unwrap();
     let others: [fn(Map) -> Map; 5] = [
@@ -87,7 +87,7 @@ async fn maps_are_listed_by_the_bytes_of_their_names(fixture: &Fixture) {
     assert_eq!(maps.iter().map(|map| map.name.as_str()).collect::<Vec<_>>(), names);
 }
 
-async fn a_map_that_is_put_by_many_at_once_is_made_by_one(fixture: &Fixture) {
+async fn of_concurrent_creations_of_a_map_one_succeeds(fixture: &Fixture) {
     let store = fixture.open().await;
     let put = join_all((0..8).map(|_| store.put_map(map("m", 3)))).await;
     let put: Vec<_> = put.into_iter().map(Result::unwrap).collect();
@@ -138,7 +138,7 @@ async fn is_gone(store: &dyn Store, map: &Map) {
     assert!(store.images(map, None, 9).await.unwrap().is_empty());
 }
 
-async fn a_deleted_map_takes_its_bytes_along(fixture: &Fixture) {
+async fn a_deleted_map_is_deleted_with_its_bytes(fixture: &Fixture) {
     let store = fixture.open().await;
     let (gone, _) = store.put_map(map("gone", 3)).await.unwrap();
     let (stays, _) = store.put_map(map("stays", 3)).await.unwrap();
@@ -190,7 +190,7 @@ async fn a_map_may_be_deleted_while_images_are_added(fixture: &Fixture) {
     drop(pins);
 }
 
-async fn a_map_and_all_in_it_is_there_after_a_restart(fixture: &Fixture) {
+async fn a_map_with_its_images_survives_a_restart(fixture: &Fixture) {
     let store = fixture.open().await;
     let (known, _) = store.put_map(map("m", 16)).await.unwrap();
     let mut images = Vec::new();
@@ -213,7 +213,7 @@ async fn a_map_and_all_in_it_is_there_after_a_restart(fixture: &Fixture) {
     add(&*store, &known, "d", b"d").await;
 }
 
-async fn what_was_measured_is_kept_for_its_revision(fixture: &Fixture) {
+async fn a_calibration_is_kept_for_its_revision(fixture: &Fixture) {
     let store = fixture.open().await;
     let (known, _) = store.put_map(map("m", 3)).await.unwrap();
     assert_eq!(store.calibration(&known).await.unwrap(), None);

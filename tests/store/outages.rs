@@ -168,7 +168,7 @@ async fn is_back(store: &PostgresStore, beside: &dyn Store) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_silent_database_is_unavailable_in_time_and_works_again_when_it_speaks() {
+async fn a_hanging_database_is_unavailable_within_the_timeout_and_recovers() {
     let database = Database::migrated(Pictures::Folder).await;
     let beside = database.open(Tuning::default()).await;
     let (wire, store) = wired(&database).await;
@@ -183,7 +183,7 @@ async fn a_silent_database_is_unavailable_in_time_and_works_again_when_it_speaks
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn connections_that_died_in_silence_are_replaced() {
+async fn connections_that_died_silently_are_replaced() {
     let database = Database::migrated(Pictures::Folder).await;
     let beside = database.open(Tuning::default()).await;
     let (wire, store) = wired(&database).await;
@@ -195,7 +195,7 @@ async fn connections_that_died_in_silence_are_replaced() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_database_that_breaks_off_is_spoken_to_again() {
+async fn a_broken_connection_to_the_database_is_opened_again() {
     let database = Database::migrated(Pictures::Folder).await;
     let beside = database.open(Tuning::default()).await;
     let (wire, store) = wired(&database).await;
@@ -215,7 +215,7 @@ async fn nobody() -> SocketAddr {
 }
 
 #[tokio::test]
-async fn a_database_that_is_not_there_is_unavailable_in_time() {
+async fn an_absent_database_is_unavailable_within_the_timeout() {
     let database = Database::empty(Pictures::Folder).await;
     let settings = settings_at(&database, nobody().await);
     let began = Instant::now();
@@ -227,7 +227,7 @@ async fn a_database_that_is_not_there_is_unavailable_in_time() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_object_store_that_is_away_is_unavailable_in_time() {
+async fn an_absent_object_store_is_unavailable_within_the_timeout() {
     let database = Database::migrated(Pictures::Folder).await;
     // Nobody is there, or somebody who never answers.
     let silent = TcpListener::bind("127.0.0.1:0").await.unwrap();

@@ -47,7 +47,7 @@ fn in_a_minute() -> Timestamp {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn each_job_is_taken_by_one_worker_of_all_processes() {
+async fn each_job_is_claimed_by_one_worker_across_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
     let mut submitted = HashSet::new();
@@ -73,7 +73,7 @@ async fn each_job_is_taken_by_one_worker_of_all_processes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_queue_of_all_processes_holds_exactly_so_many() {
+async fn the_queue_limit_holds_across_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
     submit(&processes[0], "m", b"frame").await;
@@ -87,7 +87,7 @@ async fn the_queue_of_all_processes_holds_exactly_so_many() {
 }
 
 #[tokio::test]
-async fn a_job_of_a_dead_process_is_free_and_one_of_a_live_process_is_not() {
+async fn a_job_of_a_dead_process_can_be_claimed_and_one_of_a_live_process_cannot() {
     let database = database().await;
     let (dying, alive) =
         (database.open(Tuning::default()).await, database.open(long_lived()).await);
@@ -105,7 +105,7 @@ async fn a_job_of_a_dead_process_is_free_and_one_of_a_live_process_is_not() {
 }
 
 #[tokio::test]
-async fn a_process_that_goes_on_saying_so_is_alive_longer_than_its_lifetime() {
+async fn a_process_that_sends_heartbeats_keeps_its_jobs() {
     let database = database().await;
     // Long enough for a busy machine, short enough to wait for.
     let tuning = Tuning { lifetime: Duration::from_secs(2), ..Tuning::default() };
@@ -119,7 +119,7 @@ async fn a_process_that_goes_on_saying_so_is_alive_longer_than_its_lifetime() {
 }
 
 #[tokio::test]
-async fn a_draft_of_a_dead_process_is_nothing_to_the_next_one() {
+async fn a_draft_of_a_dead_process_does_not_block_the_next_one() {
     let database = database().await;
     let (dying, other) =
         (database.open(Tuning::default()).await, database.open(Tuning::default()).await);
@@ -139,7 +139,7 @@ async fn a_draft_of_a_dead_process_is_nothing_to_the_next_one() {
 }
 
 #[tokio::test]
-async fn a_draft_that_was_taken_from_a_process_replaces_nothing() {
+async fn a_draft_taken_over_by_another_process_replaces_nothing() {
     let database = database().await;
     let (silent, other) =
         (database.open(long_lived()).await, database.open(Tuning::default()).await);
@@ -161,7 +161,7 @@ async fn a_draft_that_was_taken_from_a_process_replaces_nothing() {
 }
 
 #[tokio::test]
-async fn the_draft_of_a_deleted_map_goes_with_it_though_its_process_is_dead() {
+async fn the_draft_of_a_deleted_map_is_removed_though_its_process_is_dead() {
     let database = database().await;
     let (dying, other) =
         (database.open(Tuning::default()).await, database.open(Tuning::default()).await);
@@ -188,7 +188,7 @@ async fn tables(database: &Database) -> i64 {
 }
 
 #[tokio::test]
-async fn what_one_process_replaces_the_others_are_told_of_when_they_ask() {
+async fn a_map_replaced_by_one_process_is_superseded_at_the_others() {
     let database = database().await;
     let tuning = Tuning { exact_up_to: 4, ..long_lived() };
     let (one, other) = (database.open(tuning).await, database.open(tuning).await);
@@ -221,7 +221,7 @@ fn running(process: Uuid) -> IdempotencyRecord {
 }
 
 #[tokio::test]
-async fn a_request_is_done_by_one_process_and_by_another_once_that_is_dead() {
+async fn a_request_is_reserved_by_one_process_until_that_is_dead() {
     let database = database().await;
     let (dying, alive) =
         (database.open(Tuning::default()).await, database.open(long_lived()).await);
@@ -264,7 +264,7 @@ async fn queue_ping(store: &PostgresStore, webhook: Uuid) -> Uuid {
 }
 
 #[tokio::test]
-async fn a_delivery_is_made_by_one_process_and_by_another_once_that_is_dead() {
+async fn a_delivery_is_due_to_one_process_until_that_is_dead() {
     let database = database().await;
     let (dying, alive) =
         (database.open(Tuning::default()).await, database.open(long_lived()).await);
@@ -289,7 +289,7 @@ async fn a_delivery_is_made_by_one_process_and_by_another_once_that_is_dead() {
 }
 
 #[tokio::test]
-async fn a_description_is_bought_by_one_process_and_by_another_if_nothing_comes_of_it() {
+async fn a_description_is_computed_by_one_process_until_its_lease_ends() {
     let database = database().await;
     let (dying, alive) =
         (database.open(Tuning::default()).await, database.open(long_lived()).await);
@@ -331,7 +331,7 @@ async fn told(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
 }
 
 #[tokio::test]
-async fn every_process_hears_what_another_changes_from_the_moment_it_is_open() {
+async fn an_open_process_is_notified_of_the_changes_of_others() {
     let database = database().await;
     let one = database.open(long_lived()).await;
     let hook = webhook(&one).await;
@@ -392,7 +392,7 @@ async fn a_map_whose_index_is_being_built_can_be_deleted() {
 }
 
 #[tokio::test]
-async fn a_store_is_not_opened_before_its_schema_is_there() {
+async fn a_store_is_not_opened_without_its_schema() {
     let database = Database::empty(Pictures::Folder).await;
     let settings = database.settings(Tuning::default());
     let open =
@@ -405,7 +405,7 @@ async fn a_store_is_not_opened_before_its_schema_is_there() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_schema_is_migrated_once_however_many_do_it() {
+async fn concurrent_migrations_apply_each_step_once() {
     let database = Database::empty(Pictures::Folder).await;
     let settings = database.settings(Tuning::default());
     let migrating = join_all((0..4).map(|_| migrate(&settings))).await;
@@ -416,7 +416,7 @@ async fn the_schema_is_migrated_once_however_many_do_it() {
 }
 
 #[tokio::test]
-async fn a_schema_that_is_later_by_one_step_is_borne_and_by_more_refused() {
+async fn a_schema_one_step_ahead_is_tolerated_and_two_steps_are_rejected() {
     let database = database().await;
     let step = async |version: u32| {
         let step = format!(
@@ -440,7 +440,7 @@ async fn a_schema_that_is_later_by_one_step_is_borne_and_by_more_refused() {
 }
 
 #[tokio::test]
-async fn right_after_the_database_was_started_everybody_counts_as_alive() {
+async fn all_processes_count_as_alive_right_after_a_start_of_the_database() {
     let database = database().await;
     let dying = database.open(Tuning::default()).await;
     submit(&dying, "m", b"frame").await;
@@ -455,7 +455,7 @@ async fn right_after_the_database_was_started_everybody_counts_as_alive() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_limit_by_the_minute_is_that_of_all_processes() {
+async fn a_rate_limit_is_shared_by_all_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
     // As good as nothing comes back while this runs.
@@ -476,7 +476,7 @@ async fn a_limit_by_the_minute_is_that_of_all_processes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_budget_of_a_day_is_that_of_all_processes() {
+async fn the_daily_budget_is_shared_by_all_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
     let (day, limit) = (date(2026, 5, 1), Spent { tokens: 1000, money: 0.0 });

@@ -8,11 +8,11 @@ use whereabouts_store::{JobFilter, KeepJobs, RemovedJobs, Store};
 use crate::support::{Fixture, claim, submit};
 
 contract!(
-    old_jobs_go_with_frames_that_nothing_else_needs,
-    the_first_to_end_go_while_there_are_too_many_a_batch_at_a_time,
-    a_job_that_is_retried_is_kept_until_it_has_ended_again,
-    jobs_go_by_their_age_before_they_go_by_their_number,
-    nothing_goes_where_nothing_is_bounded,
+    old_jobs_are_removed_with_frames_that_nothing_else_needs,
+    excess_jobs_are_removed_oldest_end_first_in_batches,
+    a_retried_job_is_kept_until_it_ends_again,
+    jobs_are_removed_by_age_before_they_are_removed_by_number,
+    nothing_is_removed_without_a_bound,
     the_size_of_the_database_is_known,
 );
 
@@ -44,7 +44,7 @@ async fn listed(store: &dyn Store, before: Option<Uuid>) -> Vec<Uuid> {
     jobs.iter().map(|job| job.id).collect()
 }
 
-async fn old_jobs_go_with_frames_that_nothing_else_needs(fixture: &Fixture) {
+async fn old_jobs_are_removed_with_frames_that_nothing_else_needs(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     let old = job(store, "old", Some(40)).await;
@@ -65,7 +65,7 @@ async fn old_jobs_go_with_frames_that_nothing_else_needs(fixture: &Fixture) {
     assert_eq!(again, RemovedJobs::default());
 }
 
-async fn the_first_to_end_go_while_there_are_too_many_a_batch_at_a_time(fixture: &Fixture) {
+async fn excess_jobs_are_removed_oldest_end_first_in_batches(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     let mut jobs = Vec::new();
@@ -82,7 +82,7 @@ async fn the_first_to_end_go_while_there_are_too_many_a_batch_at_a_time(fixture:
     assert_eq!(store.remove_ended(unsettled, 2).await.unwrap().jobs(), 0);
 }
 
-async fn a_job_that_is_retried_is_kept_until_it_has_ended_again(fixture: &Fixture) {
+async fn a_retried_job_is_kept_until_it_ends_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     let id = job(store, "a", Some(40)).await;
@@ -93,7 +93,7 @@ async fn a_job_that_is_retried_is_kept_until_it_has_ended_again(fixture: &Fixtur
     assert_eq!((removed.by_count, removed.bytes), (1, 1));
 }
 
-async fn jobs_go_by_their_age_before_they_go_by_their_number(fixture: &Fixture) {
+async fn jobs_are_removed_by_age_before_they_are_removed_by_number(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     for days in [50, 40, 3, 2, 1] {
@@ -110,7 +110,7 @@ async fn jobs_go_by_their_age_before_they_go_by_their_number(fixture: &Fixture) 
     assert_eq!((removed.by_age, removed.by_count, removed.bytes), (0, 1, 5));
 }
 
-async fn nothing_goes_where_nothing_is_bounded(fixture: &Fixture) {
+async fn nothing_is_removed_without_a_bound(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = job(&*store, "a", Some(4000)).await;
     let all = KeepJobs { since: None, most: None, settled: Timestamp::now() };

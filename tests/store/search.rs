@@ -14,15 +14,15 @@ use whereabouts_store::{Store, StoreError};
 use crate::support::{Fixture, Random, Tuning, add, descriptor, eventually, image, map};
 
 contract!(
-    exact_search_finds_what_comparing_with_all_finds,
-    a_graph_finds_nearly_all_of_that_and_nothing_that_was_removed,
-    a_search_for_more_than_there_are_finds_all,
-    equal_images_come_in_the_order_of_addition,
+    exact_search_equals_brute_force,
+    a_graph_has_high_recall_and_finds_no_removed_image,
+    a_search_for_more_images_than_there_are_returns_all,
+    equal_images_are_ranked_in_the_order_of_addition,
     the_similarity_is_the_cosine_from_one_to_minus_one,
-    an_image_that_was_removed_is_not_found_again,
-    a_query_of_another_dimension_is_refused,
-    long_descriptors_are_searched_too,
-    look_alikes_are_the_most_similar_images_of_other_places,
+    a_removed_image_is_not_found,
+    a_query_of_another_dimension_is_rejected,
+    long_descriptors_are_searched,
+    hard_negatives_are_the_most_similar_images_of_other_places,
 );
 
 const BOTH: [SearchMode; 2] = [SearchMode::Fast, SearchMode::Exact];
@@ -54,7 +54,7 @@ fn brute_force(descriptors: &[Descriptor], query: &Descriptor, k: usize) -> Vec<
     all
 }
 
-async fn exact_search_finds_what_comparing_with_all_finds(fixture: &Fixture) {
+async fn exact_search_equals_brute_force(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 64)).await.unwrap();
     let mut random = Random(1);
@@ -89,7 +89,7 @@ async fn graph_is_ready(store: &dyn Store, map: &Map) {
     .await;
 }
 
-async fn a_graph_finds_nearly_all_of_that_and_nothing_that_was_removed(fixture: &Fixture) {
+async fn a_graph_has_high_recall_and_finds_no_removed_image(fixture: &Fixture) {
     let tuning = Tuning { exact_up_to: 100, ..Tuning::default() };
     let store = fixture.open_with(tuning).await;
     let (map, _) = store.put_map(map("m", 48)).await.unwrap();
@@ -150,7 +150,7 @@ async fn a_graph_finds_nearly_all_of_that_and_nothing_that_was_removed(fixture: 
     assert!(found >= 0.95, "{found}");
 }
 
-async fn a_search_for_more_than_there_are_finds_all(fixture: &Fixture) {
+async fn a_search_for_more_images_than_there_are_returns_all(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 8)).await.unwrap();
     let mut random = Random(5);
@@ -168,7 +168,7 @@ async fn a_search_for_more_than_there_are_finds_all(fixture: &Fixture) {
     }
 }
 
-async fn equal_images_come_in_the_order_of_addition(fixture: &Fixture) {
+async fn equal_images_are_ranked_in_the_order_of_addition(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 8)).await.unwrap();
     let ids = ["z", "a", "m", "b", "y", "0"];
@@ -202,7 +202,7 @@ async fn the_similarity_is_the_cosine_from_one_to_minus_one(fixture: &Fixture) {
     }
 }
 
-async fn an_image_that_was_removed_is_not_found_again(fixture: &Fixture) {
+async fn a_removed_image_is_not_found(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 8)).await.unwrap();
     let first = add(&*store, &map, "a", b"first").await;
@@ -224,7 +224,7 @@ async fn an_image_that_was_removed_is_not_found_again(fixture: &Fixture) {
     assert!(found(&*store, &first).await.iter().all(|(_, same)| !same));
 }
 
-async fn a_query_of_another_dimension_is_refused(fixture: &Fixture) {
+async fn a_query_of_another_dimension_is_rejected(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 8)).await.unwrap();
     add(&*store, &map, "a", b"a").await;
@@ -237,7 +237,7 @@ async fn a_query_of_another_dimension_is_refused(fixture: &Fixture) {
     }
 }
 
-async fn long_descriptors_are_searched_too(fixture: &Fixture) {
+async fn long_descriptors_are_searched(fixture: &Fixture) {
     let store = fixture.open_with(Tuning { exact_up_to: 4, ..Tuning::default() }).await;
     for (name, dim) in [("long", 2048), ("longer", 8192)] {
         let (map, _) = store.put_map(map(name, dim)).await.unwrap();
@@ -258,7 +258,7 @@ async fn long_descriptors_are_searched_too(fixture: &Fixture) {
     }
 }
 
-async fn look_alikes_are_the_most_similar_images_of_other_places(fixture: &Fixture) {
+async fn hard_negatives_are_the_most_similar_images_of_other_places(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 16)).await.unwrap();
     let mut random = Random(11);

@@ -14,15 +14,15 @@ use whereabouts_store::{ForgottenDeliveries, KeepDeliveries, Store, StoreError, 
 use crate::support::{Fixture, claim, eventually, odd_texts, submit};
 
 contract!(
-    webhooks_are_kept_oldest_first_and_no_more_than_so_many,
-    the_end_of_a_job_is_queued_for_whom_it_concerns_and_for_nobody_who_came_later,
+    webhooks_are_listed_oldest_first_and_bounded_in_number,
+    the_end_of_a_job_is_queued_for_the_webhooks_subscribed_at_that_time,
     a_delivery_is_due_at_its_time_until_it_has_ended,
-    a_delivery_that_is_tried_again_is_due_again_when_its_time_has_come,
-    a_webhook_goes_with_its_deliveries_and_a_disabled_one_takes_none,
-    the_first_to_end_are_forgotten_and_what_waits_only_if_there_is_no_other_way,
-    what_is_queued_is_told,
-    a_delivery_of_a_process_that_ended_is_due_for_the_next_one,
-    what_is_not_there_is_not_found,
+    a_retried_delivery_is_due_at_its_next_attempt,
+    a_webhook_is_deleted_with_its_deliveries_and_a_disabled_one_gets_none,
+    ended_deliveries_are_evicted_before_waiting_ones,
+    a_queued_delivery_is_notified,
+    a_delivery_of_a_process_that_ended_is_due_again,
+    an_unknown_webhook_or_delivery_is_not_found,
     odd_texts_in_a_delivery_survive,
 );
 
@@ -89,7 +89,7 @@ async fn pinged(store: &dyn Store, pings: usize) -> (Uuid, Vec<Uuid>) {
     (id, ids)
 }
 
-async fn webhooks_are_kept_oldest_first_and_no_more_than_so_many(fixture: &Fixture) {
+async fn webhooks_are_listed_oldest_first_and_bounded_in_number(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut known: Vec<_> = (0..3).map(|_| new_webhook(&[WebhookEvent::JobFailed], None)).collect();
     for webhook in [1, 0, 2] {
@@ -119,9 +119,7 @@ async fn webhooks_are_kept_oldest_first_and_no_more_than_so_many(fixture: &Fixtu
     assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
 }
 
-async fn the_end_of_a_job_is_queued_for_whom_it_concerns_and_for_nobody_who_came_later(
-    fixture: &Fixture,
-) {
+async fn the_end_of_a_job_is_queued_for_the_webhooks_subscribed_at_that_time(fixture: &Fixture) {
     let store = fixture.open().await;
     let early = ended(&*store, "yard", JobState::Failed).await;
     let all = webhook(&*store, &WebhookEvent::ENDS, None).await;
@@ -189,7 +187,7 @@ async fn a_delivery_is_due_at_its_time_until_it_has_ended(fixture: &Fixture) {
     assert_eq!((after.state, after.attempts), (DeliveryState::Delivered, 2));
 }
 
-async fn a_delivery_that_is_tried_again_is_due_again_when_its_time_has_come(fixture: &Fixture) {
+async fn a_retried_delivery_is_due_at_its_next_attempt(fixture: &Fixture) {
     let store = fixture.open().await;
     let (id, pings) = pinged(&*store, 1).await;
     for tries in 1..4 {
@@ -212,7 +210,7 @@ async fn a_delivery_that_is_tried_again_is_due_again_when_its_time_has_come(fixt
     }
 }
 
-async fn a_webhook_goes_with_its_deliveries_and_a_disabled_one_takes_none(fixture: &Fixture) {
+async fn a_webhook_is_deleted_with_its_deliveries_and_a_disabled_one_gets_none(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     // More than are removed in one step.
@@ -239,9 +237,7 @@ async fn a_webhook_goes_with_its_deliveries_and_a_disabled_one_takes_none(fixtur
     assert!(refused.contains("disabled (gone)"), "{refused}");
 }
 
-async fn the_first_to_end_are_forgotten_and_what_waits_only_if_there_is_no_other_way(
-    fixture: &Fixture,
-) {
+async fn ended_deliveries_are_evicted_before_waiting_ones(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     let (id, pings) = pinged(store, 6).await;
@@ -271,7 +267,7 @@ async fn the_first_to_end_are_forgotten_and_what_waits_only_if_there_is_no_other
     assert_eq!(store.forget_deliveries(keep, 9).await.unwrap(), ForgottenDeliveries::default());
 }
 
-async fn what_is_queued_is_told(fixture: &Fixture) {
+async fn a_queued_delivery_is_notified(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = webhook(&*store, &WebhookEvent::ENDS, None).await;
     let mut queued = store.queued_deliveries();
@@ -291,7 +287,7 @@ async fn what_is_queued_is_told(fixture: &Fixture) {
     told().await;
 }
 
-async fn a_delivery_of_a_process_that_ended_is_due_for_the_next_one(fixture: &Fixture) {
+async fn a_delivery_of_a_process_that_ended_is_due_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let (id, pings) = pinged(&*store, 2).await;
     assert_eq!(due(&*store, id, Timestamp::now()).await, pings);
@@ -308,7 +304,7 @@ async fn a_delivery_of_a_process_that_ended_is_due_for_the_next_one(fixture: &Fi
     assert_eq!(taken, pings);
 }
 
-async fn what_is_not_there_is_not_found(fixture: &Fixture) {
+async fn an_unknown_webhook_or_delivery_is_not_found(fixture: &Fixture) {
     let store = fixture.open().await;
     let (id, _) = pinged(&*store, 1).await;
     let (gone, now) = (Uuid::now_v7(), Timestamp::now());

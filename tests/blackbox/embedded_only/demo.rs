@@ -60,7 +60,7 @@ fn uses(outcome: &Value, model: &str, why: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn it_installs_dinov2_where_the_hub_answers_and_finds_it_the_next_time() {
+async fn dinov2_is_installed_if_the_hub_answers_and_found_the_next_time() {
     let (bench, hub) = (bench(), hub(&[]).await);
     let (outcome, said) = demo(&bench, &hub.url, &[]).await;
     uses(&outcome, "dinov2-small", "installed from");
@@ -72,7 +72,7 @@ async fn it_installs_dinov2_where_the_hub_answers_and_finds_it_the_next_time() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_flag_decides_and_asks_nobody() {
+async fn a_flag_overrides_the_choice_and_the_hub_is_not_contacted() {
     let (bench, hub) = (bench(), hub(&[]).await);
     let (outcome, _) = demo(&bench, &hub.url, &["--offline"]).await;
     uses(&outcome, "xfeat", "--offline");
@@ -82,7 +82,7 @@ async fn a_flag_decides_and_asks_nobody() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_hub_that_cannot_be_reached_or_breaks_off_is_not_waited_for() {
+async fn an_unreachable_or_failing_hub_falls_back_to_the_built_in_model() {
     let (outcome, _) = demo(&bench(), "http://127.0.0.1:9", &[]).await;
     uses(&outcome, "xfeat", "no connection");
     for (trouble, why) in [

@@ -130,17 +130,17 @@ fn cosine(a: &[f32], b: &[f32]) -> f64 {
 }
 
 #[test]
-fn the_small_model_is_the_original() {
+fn the_small_model_equals_the_original() {
     check("dinov2-small", &[], SAME);
 }
 
 #[test]
-fn the_base_model_is_the_original() {
+fn the_base_model_equals_the_original() {
     check("dinov2-base", &[], SAME);
 }
 
 #[test]
-fn the_small_model_with_registers_is_the_original() {
+fn the_small_model_with_registers_equals_the_original() {
     check("dinov2-with-registers-small", &[], SAME);
 }
 

@@ -175,7 +175,7 @@ fn compare(at: &str, shown: &Value, real: &Value) {
 }
 
 #[tokio::test]
-async fn the_examples_are_answered_as_they_say() {
+async fn the_documented_examples_are_answered_as_documented() {
     let recording = std::env::var_os("WHEREABOUTS_RECORD_EXAMPLES").is_some();
     let (_dir, server) = server();
     let (mut all, mut taken, mut exported) = (examples().unwrap(), Taken::new(), Value::Null);

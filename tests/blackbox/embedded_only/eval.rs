@@ -89,7 +89,7 @@ fn names(summary: &Value) -> Vec<&str> {
 }
 
 #[test]
-fn a_town_is_evaluated_and_told_in_a_table_a_csv_and_a_page() {
+fn a_town_is_evaluated_and_reported_as_json_csv_and_html() {
     let folders = Folders::town(12);
     // A query far from every reference, with a name that must not become markup.
     folders.write("queries/@1.0@90000.0@<b>@.jpg", frame(13, 0));
@@ -122,7 +122,7 @@ fn a_town_is_evaluated_and_told_in_a_table_a_csv_and_a_page() {
 }
 
 #[test]
-fn a_sample_is_of_the_size_that_was_asked_for() {
+fn a_sample_has_the_requested_size() {
     let folders = Folders::town(6);
     let summary = folders.eval(&["--sample", "4", "--seed", "3", "--refine", "off"]);
     assert_eq!(summary["queries"], 4);
@@ -130,7 +130,7 @@ fn a_sample_is_of_the_size_that_was_asked_for() {
 }
 
 #[test]
-fn every_layout_gives_the_same_recall() {
+fn every_dataset_layout_gives_the_same_recall() {
     let folders = Folders::town(6);
     let expected = recalls(&folders.eval(&["--refine", "off"]));
     // Names in the order of the places.
@@ -161,7 +161,7 @@ fn every_layout_gives_the_same_recall() {
 }
 
 #[test]
-fn what_has_changed_in_the_folder_has_changed_in_the_map() {
+fn a_changed_folder_is_indexed_again() {
     let folders = Folders::town(4);
     assert_eq!(recalls(&folders.eval(&["--refine", "off"]))[0][2], 100.0);
     // One reference is gone, and another shows something else.
@@ -193,7 +193,7 @@ async fn kill_when(mut child: Child, enough: impl Fn() -> bool) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_killed_run_goes_on_and_buys_no_description_twice() {
+async fn a_killed_run_is_resumed_and_pays_for_no_description_twice() {
     let folders = Folders::town(6);
     let script = Script { latency: Duration::from_millis(20), ..Script::default() };
     let mock = MockMllm::start(script).await;
@@ -223,7 +223,7 @@ async fn a_killed_run_goes_on_and_buys_no_description_twice() {
 }
 
 #[test]
-fn places_that_are_not_in_the_map_say_what_known_is_worth() {
+fn queries_of_unmapped_places_measure_the_known_flag() {
     let folders = Folders::town(8);
     std::fs::create_dir(folders.path("elsewhere")).unwrap();
     for place in 20..26 {
@@ -265,7 +265,7 @@ fn with_gps(jpeg: &[u8], lat: f64, lon: f64) -> Vec<u8> {
 }
 
 #[test]
-fn positions_come_from_the_pictures_themselves() {
+fn positions_are_read_from_exif() {
     let folders = Folders::new();
     for place in 0..6 {
         // 0.001° of latitude are 111 m.
@@ -302,7 +302,7 @@ fn both_descriptors_of_a_transformer_are_evaluated() {
 }
 
 #[test]
-fn what_is_held_out_is_unknown() {
+fn held_out_references_are_unknown_places() {
     let folders = Folders::town(12);
     let summary = folders.eval(&["--refine", "off", "--hold-out", "0.25"]);
     let counts = ["queries", "unknown", "references"].map(|name| summary[name].clone());

@@ -162,7 +162,7 @@ async fn a_model_is_pulled_once_and_then_served() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn weights_in_a_file_of_their_own_come_with_the_model() {
+async fn an_external_weights_file_is_pulled_with_the_model() {
     let data = "[model.manifest.data]\nfile = \"weights.bin\"\n[input]";
     let bench = Bench::with(|manifest| manifest.replace("[input]", data));
     let cut = Trouble::CutAfter(1000);
@@ -179,7 +179,7 @@ async fn weights_in_a_file_of_their_own_come_with_the_model() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_line_that_breaks_is_continued_and_no_byte_is_sent_twice() {
+async fn a_broken_download_is_resumed_and_no_byte_is_sent_twice() {
     let bench = Bench::new();
     let hub =
         hub(&[Trouble::CutAfter(6_000), Trouble::CutAfter(6_000), Trouble::CutAfter(6_000)]).await;
@@ -193,7 +193,7 @@ async fn a_line_that_breaks_is_continued_and_no_byte_is_sent_twice() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn passing_troubles_pass() {
+async fn transient_errors_of_the_hub_are_retried() {
     for trouble in
         [Trouble::Status(500), Trouble::Status(429), Trouble::Hang, Trouble::StallAfter(5_000)]
     {
@@ -214,7 +214,7 @@ async fn passing_troubles_pass() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_file_that_changes_in_between_is_begun_anew() {
+async fn a_file_that_changes_during_a_download_is_downloaded_again() {
     let bench = Bench::unpinned();
     let hub = hub(&[Trouble::CutAfter(9_000), Trouble::Change]).await;
     pull(&bench, &hub).await.good();
@@ -223,7 +223,7 @@ async fn a_file_that_changes_in_between_is_begun_anew() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn corrupt_bytes_are_refused_and_removed() {
+async fn corrupt_bytes_are_rejected_and_removed() {
     let (bench, hub) = (Bench::new(), hub(&[Trouble::Corrupt]).await);
     pull(&bench, &hub).await.bad(&["is pinned", "removed", "again", "model.hub"]);
     bench.nothing_is_installed();
@@ -233,7 +233,7 @@ async fn corrupt_bytes_are_refused_and_removed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_hub_that_refuses_or_stays_away_is_named_with_what_to_do() {
+async fn a_failing_hub_is_named_with_a_hint() {
     let (bench, hub) = (Bench::new(), hub(&[Trouble::Status(404)]).await);
     pull(&bench, &hub).await.bad(&["404", "/lab/tiny/resolve/v1/model.onnx", "model add"]);
     assert_eq!(hub.asked().len(), 1, "a 404 is not asked again");
@@ -246,7 +246,7 @@ async fn a_hub_that_refuses_or_stays_away_is_named_with_what_to_do() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_file_above_the_bound_is_refused_and_not_kept() {
+async fn a_file_above_the_size_limit_is_rejected_and_removed() {
     for trouble in [Trouble::None, Trouble::NoLength] {
         let (bench, hub) = (Bench::new(), hub(&[trouble]).await);
         let mut command = bench.command(&hub.url, &["pull", "tiny"]);
@@ -259,7 +259,7 @@ async fn a_file_above_the_bound_is_refused_and_not_kept() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_pull_that_is_killed_leaves_nothing_installed_and_is_continued() {
+async fn a_killed_pull_installs_nothing_and_is_resumed() {
     let bench = Bench::new();
     let hub = hub(&[Trouble::StallAfter(12_000)]).await;
     let mut killed = Killed(
@@ -295,7 +295,7 @@ impl Drop for Killed {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_a_pin_the_first_digest_is_recorded_and_holds() {
+async fn without_a_pin_the_first_digest_is_recorded_and_enforced() {
     let (bench, hub) = (Bench::unpinned(), hub(&[]).await);
     let said = pull(&bench, &hub).await.good();
     assert!(said.contains("recorded in its manifest"), "{said}");
@@ -318,7 +318,7 @@ async fn without_a_pin_the_first_digest_is_recorded_and_holds() {
 }
 
 #[test]
-fn a_file_is_added_without_a_hub_and_chosen() {
+fn a_local_file_is_added_and_selected_without_a_hub() {
     let bench = Bench::new();
     let run = |args: &[&str]| bench.run("http://127.0.0.1:9", args);
     let (file, manifest) = (fixture("model.onnx"), fixture("manifest.toml"));

@@ -38,7 +38,7 @@ fn cosine(a: &[f32], b: &[f32]) -> f64 {
 }
 
 #[test]
-fn a_token_model_gives_the_descriptors_that_numpy_worked_out() {
+fn a_token_model_gives_the_descriptors_computed_with_numpy() {
     let extractor = load("tiny-tokens", ONE);
     let file =
         concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/models/tiny-tokens/expected.json");
@@ -81,7 +81,7 @@ fn a_batch_gives_what_single_runs_give() {
 }
 
 #[test]
-fn a_damaged_model_is_refused_by_its_digest() {
+fn a_damaged_model_is_rejected_by_its_digest() {
     let root = tempfile::tempdir().unwrap();
     let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/models/tiny-tokens");
     let to = root.path().join("models/tiny-tokens");
@@ -97,7 +97,7 @@ fn a_damaged_model_is_refused_by_its_digest() {
 }
 
 #[test]
-fn a_provider_that_is_not_there_is_named_at_the_start() {
+fn a_missing_provider_is_named_at_startup() {
     let dir = TempDir::new().unwrap();
     let output = std::process::Command::new(&*BINARY)
         .args(["serve", "--listen", "127.0.0.1:0", "--data"])

@@ -7,7 +7,7 @@ use crate::wait::until;
 
 #[tokio::test]
 #[ignore = "needs OpenVINO: run `make openvino`"]
-async fn another_provider_gives_the_same_descriptors_and_another_precision_is_refused() {
+async fn another_provider_gives_the_same_descriptors_and_another_precision_is_a_conflict() {
     let dir = TempDir::new().unwrap();
     let start = |provider, precision| {
         let settings = [

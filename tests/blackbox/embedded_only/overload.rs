@@ -50,7 +50,7 @@ fn retry_after(answer: &Answer) -> u64 {
 }
 
 #[tokio::test]
-async fn frames_beyond_the_queue_get_429_and_are_told_when_to_come_back() {
+async fn a_full_queue_answers_429_with_retry_after() {
     let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "2")]);
     server.town("m", 2).await;
     let answers = post_all(&server, "/localize?map=m&refine=off", 60).join_all().await;
@@ -69,7 +69,7 @@ async fn frames_beyond_the_queue_get_429_and_are_told_when_to_come_back() {
 }
 
 #[tokio::test]
-async fn a_deadline_that_cannot_be_met_is_refused_at_once_and_who_has_gone_is_not_served() {
+async fn a_hopeless_deadline_is_rejected_at_once_and_abandoned_requests_are_not_served() {
     const FRAMES: usize = 400;
     let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "500")]);
     server.town("m", 2).await;
@@ -90,7 +90,7 @@ async fn a_deadline_that_cannot_be_met_is_refused_at_once_and_who_has_gone_is_no
 }
 
 #[tokio::test]
-async fn a_deadline_that_passes_answers_504_and_one_that_is_none_400() {
+async fn a_missed_deadline_is_504_and_a_malformed_one_400() {
     let (_dir, server) = narrow(&[]);
     server.town("m", 2).await;
     let post = |deadline: &str| {
@@ -111,7 +111,7 @@ async fn a_deadline_that_passes_answers_504_and_one_that_is_none_400() {
 }
 
 #[tokio::test]
-async fn waiting_for_a_refinement_ends_in_time_for_the_deadline() {
+async fn waiting_for_a_refinement_ends_before_the_deadline() {
     // Nobody refines: the endpoint of the model is not there, and the job waits for it.
     let (_dir, server) = narrow(&[
         ("WHEREABOUTS_REFINE__REFINER", "mllm"),
@@ -130,7 +130,7 @@ async fn waiting_for_a_refinement_ends_in_time_for_the_deadline() {
 }
 
 #[tokio::test]
-async fn frames_go_without_jobs_before_any_is_refused() {
+async fn under_load_jobs_are_shed_before_frames() {
     let settings = [("WHEREABOUTS_IMAGE__QUEUE", "200"), ("WHEREABOUTS_JOBS__SHED_AT", "0.05")];
     let (_dir, server) = narrow(&settings);
     server.town("m", 2).await;
@@ -152,7 +152,7 @@ async fn frames_go_without_jobs_before_any_is_refused() {
 }
 
 #[tokio::test]
-async fn indexing_makes_room_for_frames() {
+async fn indexing_yields_to_localization() {
     let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "4")]);
     server.town("m", 1).await;
     let picture = reference(2);
