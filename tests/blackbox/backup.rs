@@ -1,4 +1,4 @@
-//! Maps go into one file and come back, on this server or another.
+//! Backup to one file, and restore on this server or another.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -44,7 +44,7 @@ fn restore(server: &Server, file: &Path) -> Output {
     run(server, &["restore", file.to_str().unwrap(), "--json"])
 }
 
-/// The candidates of some frames: which images, and how similar.
+/// The candidates of three frames, each with its similarity.
 async fn answers(server: &Server, map: &str) -> Vec<(String, f64)> {
     let mut answers = Vec::new();
     for place in 0..3 {
@@ -94,7 +94,7 @@ async fn another_server_answers_as_the_first_without_running_the_model() {
     let state = |map: Value| json!([map["scene"], map["model_digest"], map["created_at"]]);
     let (there, here) = (to.get("/maps/indoors").await, from.get("/maps/indoors").await);
     assert_eq!(state(there.expect(200)), state(here.expect(200)));
-    // What the model did is counted: nothing, before the frames above.
+    // The model ran only for the three frames above.
     let metrics = to.metrics().await;
     let runs = metrics
         .lines()
@@ -140,7 +140,7 @@ async fn restoring_again_adds_only_what_is_missing() {
     same(&answers(&server, "m").await, &before);
     assert_eq!(images(&server, "m").await, listed);
 
-    // An id that has other bytes by now is left alone, and said.
+    // An id that has other bytes by now is left alone and reported.
     server.delete("/maps/m/images/place-0").await.expect(204);
     server.post_jpeg("/maps/m/images?id=place-0", reference(70)).await.expect(201);
     let output = restore(&server, &file);
@@ -148,7 +148,7 @@ async fn restoring_again_adds_only_what_is_missing() {
     let outcome: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(outcome["maps"][0]["conflicts"][0]["id"], "place-0");
 
-    // Under another name nothing is in the way.
+    // Under another name nothing conflicts.
     let file = file.to_str().unwrap();
     let outcome = ok(&run(&server, &["restore", file, "--as", "m2", "--json"]));
     assert_eq!(
@@ -173,7 +173,7 @@ async fn a_restore_does_not_mix_descriptors_of_two_models() {
     let why = refused(&restore(&to, &file));
     assert!(why.contains("restore under another name"), "{why}");
     assert_eq!(to.get("/maps/m").await.expect(200)["images"], 1);
-    // The map is there and says what it needs, as any whose model was replaced.
+    // The map names the model that it needs, like any map whose model was replaced.
     let why = to.post_jpeg("/localize?map=m", frame(0, 0)).await.problem(409);
     assert!(why.contains("install the former again"), "{why}");
 }
@@ -268,7 +268,7 @@ async fn an_interrupted_backup_is_resumed() {
     let again = a.path().join("again.tar");
     let partial = a.path().join("again.tar.partial");
     std::fs::write(&partial, &bytes[..bytes.len() / 2]).unwrap();
-    // Added behind the place where it broke off: it is in the archive.
+    // Its id sorts after the point of the interruption, so it is in the archive.
     from.post_jpeg("/maps/m/images?id=place-9", reference(9)).await.expect(201);
     let outcome = ok(&run(&from, &["backup", again.to_str().unwrap(), "--json"]));
     let continued = outcome["continued"].as_u64().unwrap();
@@ -283,7 +283,7 @@ async fn an_interrupted_backup_is_resumed() {
     let why = refused(&run(&from, &["backup", again.to_str().unwrap()]));
     assert!(why.contains("is there already"), "{why}");
 
-    // One of a map that was made anew meanwhile does not go on with the old images.
+    // If the map was created again meanwhile, the backup starts from the beginning.
     std::fs::write(&partial, &bytes[..bytes.len() / 2]).unwrap();
     std::fs::remove_file(&again).unwrap();
     from.delete("/maps/m").await.expect(204);
@@ -305,7 +305,7 @@ async fn a_restore_is_resumed_after_the_server_was_killed() {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    // As soon as some are there.
+    // Kill the server as soon as a few images have been restored.
     loop {
         let map = to.get("/maps/m").await;
         if map.status == 200 && map.expect(200)["images"].as_u64().unwrap() > 2 {

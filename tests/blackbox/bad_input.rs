@@ -1,4 +1,4 @@
-//! Bad input gets a clear answer, costs little, and spoils nothing.
+//! Bad input gets a clear error, costs little, and leaves the server working.
 
 use futures_util::StreamExt;
 use image::RgbImage;
@@ -65,7 +65,7 @@ async fn a_body_of_a_gigabyte_is_rejected_without_being_buffered() {
         let chunk = chunk.clone();
         futures_util::stream::iter(0..1024).map(move |_| Ok::<_, std::io::Error>(chunk.clone()))
     };
-    // With its length said in advance, and without.
+    // With a content-length, and chunked.
     for length in [Some(1_u64 << 30), None] {
         let mut request = server
             .request(Method::POST, "/localize?map=m")

@@ -22,7 +22,7 @@ async fn send_tar(server: &Server, map: &str, archive: Vec<u8>) -> Answer {
     server.post(&format!("/maps/{map}/images:batch"), "application/x-tar", archive).await
 }
 
-/// Id and outcome of each image.
+/// The id and the outcome of each image.
 fn outcomes(answer: &Value) -> Vec<(String, String)> {
     let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
     let results = answer["results"].as_array().unwrap();
@@ -240,7 +240,7 @@ async fn a_batch_without_an_end_of_a_part_is_not_buffered() {
     let (_dir, server) = server();
     server.put("/maps/m", json!({})).await.expect(201);
     let before = server.resident_bytes();
-    // A name of a gigabyte, in an archive; and a form without a part.
+    // An archive with a name of a gigabyte, and forms whose first part never begins or ends.
     let mut long_name = tar::Header::new_gnu();
     long_name.set_entry_type(tar::EntryType::GNULongName);
     long_name.set_path("././@LongLink").unwrap();
@@ -257,7 +257,7 @@ async fn a_batch_without_an_end_of_a_part_is_not_buffered() {
         let body = futures_util::stream::iter(chunks.map(Ok::<_, std::io::Error>));
         let request =
             server.request(Method::POST, "/maps/m/images:batch").header("content-type", kind);
-        // The server hangs up; whether the answer is seen before is a matter of luck.
+        // The server closes the connection, possibly before the client has read the response.
         if let Ok(response) = request.body(reqwest::Body::wrap_stream(body)).send().await {
             assert_eq!(response.status(), 400, "{kind}");
         }

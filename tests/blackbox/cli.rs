@@ -1,4 +1,4 @@
-//! The commands, as a user types them.
+//! The commands as a user types them.
 
 use std::path::Path;
 use std::process::{Command, Output};
@@ -9,7 +9,7 @@ use tempfile::TempDir;
 use super::support::{BINARY, Server, frame, reference, server, shared_server};
 
 fn whereabouts(args: &[&str]) -> Output {
-    // Whatever else is installed in the checkout, or could be.
+    // The built-in model, whatever else is installed in the checkout.
     Command::new(&*BINARY).args(args).env("WHEREABOUTS_MODEL__NAME", "xfeat").output().unwrap()
 }
 
@@ -162,7 +162,7 @@ fn the_demo_runs_and_refinement_helps() {
     assert!(recall("after") >= recall("before"), "{outcome}");
     let pictures = std::fs::read_dir(out.join("pictures")).unwrap().count();
     assert_eq!(pictures, 24);
-    // What is not a demo's folder is left alone.
+    // A folder that no demo has written is left alone.
     let other = dir.path().join("other");
     std::fs::create_dir(&other).unwrap();
     std::fs::write(other.join("thesis.tex"), "years of work").unwrap();

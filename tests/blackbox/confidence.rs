@@ -1,4 +1,4 @@
-//! How sure the service says it is, and what that is worth.
+//! Confidence: calibration, and how well `known` separates mapped places from others.
 
 use serde_json::Value;
 
@@ -18,7 +18,7 @@ async fn calibrated(server: &Server, map: &str, images: usize) -> Value {
     .await
 }
 
-/// The confidence at once and after refinement, for frames of these places.
+/// The confidence of the coarse estimate and of the refined one, for frames of these places.
 async fn confidences(server: &Server, map: &str, places: std::ops::Range<usize>) -> Vec<[f64; 2]> {
     let mut found = Vec::new();
     for place in places {
@@ -46,7 +46,7 @@ async fn frames_of_mapped_places_are_known_and_others_are_not() {
     };
     let mapped = confidences(server, &map, 0..ASKED).await;
     let unmapped = confidences(server, &map, 500..500 + ASKED).await;
-    // The promise is a tenth; twenty frames can be unlucky.
+    // At most a tenth is expected; a sample of twenty frames may exceed it.
     for which in [0, 1] {
         assert!(known(&unmapped, which) <= 5, "{unmapped:?}");
     }

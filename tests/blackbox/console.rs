@@ -1,4 +1,4 @@
-//! What the operator's console asks for, and how it is served.
+//! The calls of the operator console, and how its files are served.
 
 use reqwest::header::{CONTENT_SECURITY_POLICY, ETAG, IF_NONE_MATCH};
 use reqwest::{Method, StatusCode};
@@ -124,7 +124,7 @@ async fn the_status_covers_the_last_hour_and_hides_secrets() {
         (Some("local"), Some(false))
     );
     assert_eq!(status["models"][0]["name"], "xfeat");
-    // An object store does not say how much room it has.
+    // An object store does not report its free space.
     assert!(deployment::is_scale_out() || status["free_bytes"].as_u64().unwrap() > 0);
     assert!(status["db_bytes"].as_u64().unwrap() > 0);
     let settings = status["settings"].as_str().unwrap();

@@ -1,4 +1,4 @@
-//! What was acknowledged is there after a restart, whether the server was asked to end or not.
+//! Acknowledged changes survive a restart, after a clean shutdown as after a kill.
 
 use serde_json::Value;
 use tempfile::TempDir;
@@ -20,7 +20,7 @@ async fn everything_is_there_after_kill_9() {
     assert_eq!(server.get("/maps/m").await.expect(200)["images"], 7);
     let after = server.post_jpeg("/localize?map=m&refine=off", frame(2, 0)).await.expect(200);
     same_candidates(&after["candidates"], &before["candidates"]);
-    // The job was acknowledged, so it ends, by whichever of the two processes.
+    // The job was acknowledged, so one of the two processes finishes it.
     let href = before["job"]["href"].as_str().unwrap();
     let job = server.get(&format!("{href}?wait=30")).await.expect(200);
     assert_eq!(job["state"], "succeeded", "{job}");
@@ -67,7 +67,7 @@ async fn sigterm_drains_and_exits_with_0() {
     assert_eq!(job["state"], "succeeded", "{job}");
 }
 
-/// What becomes of the files in a data folder.
+/// The files of a data folder.
 mod embedded_only {
     use serde_json::json;
     use tempfile::TempDir;

@@ -1,4 +1,4 @@
-//! A job as it goes on, as server-sent events.
+//! The progress of jobs as server-sent events.
 
 use std::time::{Duration, Instant};
 
@@ -55,7 +55,7 @@ async fn a_job_streams_one_event_for_each_pair_and_can_be_replayed() {
     assert!(!described[0]["description"]["text"].as_str().unwrap().is_empty());
     assert_eq!(live.last().unwrap().1["state"], "succeeded");
 
-    // Afterwards it is all told at once.
+    // An ended job is replayed at once.
     let again = events(&server.get(&path).await.bytes);
     assert_eq!(again.len(), 6);
     assert_eq!(again[5], *live.last().unwrap());
@@ -76,7 +76,7 @@ async fn event_streams_are_limited_in_number_and_end_with_the_server() {
     assert!(first.starts_with(b"event: state"), "{first:?}");
     assert!(server.get(&path).await.problem(429).contains("max_streams"));
     drop(chunks);
-    // The place is free again once the server has noticed.
+    // The slot is free once the server has noticed that the client is gone.
     let stream = eventually(async || {
         let stream = server.request(Method::GET, &path).send().await.unwrap();
         (stream.status() == 200).then_some(stream)
@@ -97,7 +97,7 @@ async fn the_event_stream_covers_all_jobs_or_those_of_one_map() {
     server.town("n", 3).await;
     let follow = async |path: &str| server.request(Method::GET, path).send().await.unwrap();
     let (mut all, mut of_map) = (follow("/events").await, follow("/events?map=m").await);
-    // Browsers hand a stream to the page with its first bytes.
+    // A browser opens a stream with its first bytes, so they are sent at once.
     let opened = tokio::time::timeout(Duration::from_secs(5), all.chunk()).await;
     assert!(opened.unwrap().unwrap().unwrap().starts_with(b": open"));
     let mut expected = Vec::new();

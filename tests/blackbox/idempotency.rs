@@ -1,4 +1,4 @@
-//! Requests that are sent again with the key they had.
+//! Requests with an `Idempotency-Key` that are sent again.
 
 use std::time::Duration;
 
@@ -37,7 +37,7 @@ async fn a_repeated_request_gets_the_stored_response_even_after_a_kill() {
     let other = post(&server, "/localize?map=m", "frame-2", frame(0, 0)).await.expect(200);
     assert_ne!(other["query_id"], first.expect(200)["query_id"]);
 
-    // The same key with another picture, another address, another type.
+    // The same key with another picture, and with another query.
     let problem = post(&server, "/localize?map=m", "frame-1", frame(1, 0)).await.problem(422);
     assert!(problem.contains("another request"), "{problem}");
     post(&server, "/localize?map=m&k=2", "frame-1", frame(0, 0)).await.problem(422);
@@ -62,7 +62,7 @@ async fn a_repeated_request_conflicts_with_the_one_in_progress_which_outlives_it
             .header("idempotency-key", "slow")
             .body(frame(0, 0))
     };
-    // Gone before the job can have ended.
+    // The client gives up before the job can have ended.
     let impatient = ask().timeout(Duration::from_millis(15)).send().await;
     let mut statuses = Vec::new();
     let done = eventually(async || {
@@ -91,7 +91,7 @@ async fn an_error_is_not_stored_and_a_malformed_key_is_rejected() {
     post(server, path, "image-1", reference(0)).await.expect(201);
     let again = post(server, path, "image-1", reference(0)).await;
     assert!(is_replay(&again));
-    // Without the key it would have been 200, for it is there already.
+    // Without the key it would be 200, because the image exists already.
     again.expect(201);
     for key in ["", "a b", &"x".repeat(256)] {
         let problem = post(server, path, key, reference(0)).await.problem(400);
@@ -100,7 +100,7 @@ async fn an_error_is_not_stored_and_a_malformed_key_is_rejected() {
     let new_key = server.request(Method::POST, "/keys").header("idempotency-key", "k");
     let new_key = new_key.json(&json!({"name": "n", "role": "robot"}));
     assert!(Answer::of(new_key).await.problem(400).contains("leave the header out"));
-    // A GET is the same however often it is sent.
+    // The key of a GET, which is idempotent anyway, is ignored.
     let get = server.request(Method::GET, &format!("/maps/{map}")).header("idempotency-key", "a b");
     Answer::of(get).await.expect(200);
 }

@@ -93,6 +93,6 @@ async fn a_deleted_image_is_never_a_candidate_again() {
     server.get(&format!("/maps/{map}/images/place-1")).await.problem(404);
     server.get(&format!("/maps/{map}/images/place-1/content")).await.problem(404);
     server.delete(&format!("/maps/{map}/images/place-1")).await.problem(404);
-    // Its id is free for other bytes.
+    // The id may be used for other bytes.
     server.post_jpeg(&format!("/maps/{map}/images?id=place-1"), reference(7)).await.expect(201);
 }

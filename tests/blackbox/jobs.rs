@@ -25,7 +25,7 @@ async fn a_job_describes_every_pair_and_ranks_every_candidate_once() {
         let of = |item: &Value| item["image_id"].as_str().unwrap().to_owned();
         list.as_array().unwrap().iter().map(of).collect()
     };
-    // The job compares all fifteen, more than are answered.
+    // The job compares all fifteen candidates, of which the response lists ten.
     let compared =
         server.post_jpeg(&format!("/localize?map={map}&k=15&refine=off"), frame(3, 0)).await;
     let candidates = ids(&compared.expect(200)["candidates"]);
@@ -105,7 +105,7 @@ async fn jobs_are_searched_for_a_text_ignoring_case() {
     let another = only_in_m.map(|one| one["image_id"].as_str().unwrap()).find(|of| *of != first);
     let another = another.unwrap().to_uppercase();
     assert_eq!(search(format!("q={another}")).await, [id(2), id(0)]);
-    // Words of a description, beside the other filters.
+    // Words of a description, combined with the other filters.
     assert_eq!(search("q=Regions+Of+The&brief=true".into()).await, [id(2), id(1), id(0)]);
     assert_eq!(search("q=regions+of+the&map=backyard&state=succeeded".into()).await, [id(1)]);
     assert_eq!(search("q=regions+of+the&state=failed".into()).await, [""; 0]);

@@ -1,4 +1,4 @@
-//! API keys from outside: who gets in, who does not, and what nobody gets to see.
+//! API keys: authentication, roles, scopes, rate limits, and secrecy.
 
 use std::path::Path;
 use std::process::Command;
@@ -15,7 +15,7 @@ use super::wait::eventually_within;
 const REQUIRED: [(&str, &str); 2] =
     [("WHEREABOUTS_AUTH__KEYS", "required"), ("WHEREABOUTS_LOG__FILTER", "debug")];
 
-/// A key made in the folder of a server that does not run.
+/// Creates a key in the data folder of a server that is not running.
 fn create(data: &Path, args: &[&str]) -> String {
     let output = Command::new(&*BINARY)
         .args(["keys", "create", "--name", "test", "--data"])
@@ -28,7 +28,7 @@ fn create(data: &Path, args: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap().trim().to_owned()
 }
 
-/// Asks with a key.
+/// Sends a request with a key.
 async fn ask(
     server: &Server,
     key: &str,
@@ -53,7 +53,7 @@ async fn post_jpeg(server: &Server, key: &str, path: &str, picture: Vec<u8>) -> 
     Answer::of(request.bearer_auth(key).body(picture)).await
 }
 
-/// A server with two maps of two images, and a key of each role, the robot's for the first map only.
+/// A server with two maps of two images and a key for each role; that of the robot is limited to the first map.
 struct Guarded {
     dir: TempDir,
     server: Server,
@@ -142,7 +142,7 @@ async fn a_request_without_a_valid_key_is_401() {
     }
     let twice = server.request(Method::GET, "/maps").bearer_auth(robot).bearer_auth(robot);
     Answer::of(twice).await.problem(401);
-    // A key in the address is none: addresses are logged.
+    // A key in the URL is not accepted, because URLs are logged.
     server.get(&format!("/maps?key={robot}")).await.problem(401);
     get(server, robot, "/maps").await.expect(200);
 }
@@ -180,7 +180,7 @@ async fn each_role_has_its_permissions() {
         let made = json!({"name": "more", "role": "admin"});
         ask(&server, key, Method::POST, "/keys", Some(made)).await.problem(403);
     }
-    // The audit log has who did what; no log has a key.
+    // The audit log names the key by its id; no log contains a token.
     ask(&server, &admin, Method::DELETE, "/maps/vault", None).await.expect(204);
     let log = server.log();
     let audited = log.lines().find(|line| line.contains("\"audit\"") && line.contains("vault"));
@@ -191,7 +191,7 @@ async fn each_role_has_its_permissions() {
     }
     server.kill();
     if deployment::is_scale_out() {
-        // There is no folder to look into.
+        // There is no data folder to search.
         return;
     }
     let kept = std::fs::read(dir.path().join("db/db")).unwrap();
@@ -226,7 +226,7 @@ async fn a_key_for_one_map_grants_no_access_to_another() {
         let path = format!("/localize?{query}");
         post_jpeg(server, robot, &path, frame(0, 0)).await.problem(403);
     }
-    // What is no path to a map leads nowhere.
+    // Malformed paths reach no map.
     for path in [
         "/maps/yard/../vault",
         "/maps/yard%2f..%2fvault",
@@ -396,7 +396,7 @@ async fn the_commands_take_the_key_from_the_environment() {
     let (ok, _, said) = run(Some(&admin), &["keys", "revoke", &key[4..16]]);
     assert!(ok, "{said}");
     get(&server, key.trim(), "/maps/yard").await.problem(401);
-    // The whole key instead of its id is what people have at hand; nothing else gets into an address.
+    // The whole token is accepted instead of the id; anything else must not get into a URL.
     let (_, other, _) = run(Some(&admin), &create);
     let (ok, _, said) = run(Some(&admin), &["keys", "revoke", other.trim()]);
     assert!(ok, "{said}");
@@ -408,13 +408,13 @@ async fn the_commands_take_the_key_from_the_environment() {
     assert!(whole.status.is_client_error());
     assert!(!server.log().contains(&other[20..70]), "a key is in the log");
     if deployment::is_scale_out() {
-        // A database belongs to nobody.
+        // A database is not locked by a server.
         return;
     }
     let absent = dir.path().join("absent");
     let (ok, _, said) = run(None, &["keys", "list", "--data", absent.to_str().unwrap()]);
     assert!(!ok && said.contains("no data folder") && !absent.exists(), "{said}");
-    // The folder belongs to the server while it runs.
+    // A running server locks its data folder.
     let data = dir.path().to_str().unwrap();
     let (ok, _, said) = run(None, &["keys", "list", "--data", data]);
     assert!(!ok && said.contains("leave --data out"), "{said}");

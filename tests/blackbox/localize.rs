@@ -46,7 +46,7 @@ async fn graph_searches_are_sampled_against_exact_search() {
     let checked =
         |found| format!("whereabouts_neighbours_checked_total{{map=\"m\",found=\"{found}\"}}");
     let deadline = Instant::now() + Duration::from_secs(60);
-    // The first ones may come before the graph.
+    // The first searches may come before the graph is built.
     let metrics = loop {
         server.post_jpeg("/localize?map=m&refine=off", reference(4)).await.expect(200);
         let metrics = server.metrics().await;
@@ -58,7 +58,7 @@ async fn graph_searches_are_sampled_against_exact_search() {
     let value =
         |name: &str| value_of(&metrics, name).unwrap_or_else(|| panic!("{name}: {metrics}"));
     assert!(value(&checked("yes")) >= 10.0, "{metrics}");
-    // In a map as small as this a graph misses nothing.
+    // In a map this small a graph misses nothing.
     assert_eq!(value(&checked("no")), 0.0);
     assert!(value("whereabouts_index_bytes{map=\"m\"}") > 12.0 * 576.0 * 4.0);
     assert!(value("whereabouts_batch_pictures_count") >= 13.0);

@@ -63,7 +63,7 @@ async fn a_map_created_again_under_the_name_of_a_deleted_one_is_empty() {
     assert_eq!(answer["candidates"], json!([]));
     assert!(answer["estimate"].is_null() && answer["job"].is_null());
     if deployment::is_scale_out() {
-        // They are kept for a while (objects.keep_unneeded_s), which the tests of the stores look at.
+        // They are kept for a while (objects.keep_unneeded_s); the tests of the stores cover that.
         return;
     }
     let files = walk(&dir.path().join("images"));

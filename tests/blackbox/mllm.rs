@@ -80,7 +80,7 @@ async fn no_answered_pair_is_paid_for_twice_across_kill_9() {
     let server = start(&dir, &mock, &[]);
     server.town("m", 10).await;
     let answer = server.post_jpeg("/localize?map=m", frame(3, 0)).await.expect(200);
-    // Six are answered and kept once the mock has seen all ten and only four are in flight.
+    // Six answers have been stored once the mock has seen all ten calls and only four are in flight.
     until(async || mock.describe_calls() >= 10 && mock.in_flight() <= 4).await;
     server.kill();
     let kept = mock.pairs().values().filter(|(_, answered)| *answered > 0).count();
@@ -92,7 +92,7 @@ async fn no_answered_pair_is_paid_for_twice_across_kill_9() {
     assert_eq!(job["state"], "succeeded", "{job}");
     assert_eq!(job["attempts"], 2);
     let cached = job["usage"]["cached"].as_u64().unwrap();
-    // What was answered in the instant of the kill may not have reached the disk.
+    // An answer at the moment of the kill may not have reached the disk.
     assert!(cached >= 5, "{cached} of 6 answers were kept");
 }
 
@@ -156,7 +156,7 @@ async fn a_job_is_cancelled_while_its_calls_hang_and_can_be_retried() {
     let href = answer["job"]["href"].as_str().unwrap();
     let cancelled = server.post(&format!("{href}/cancel"), "text/plain", vec![]).await.expect(200);
     assert_eq!(cancelled["state"], "cancelled");
-    // The calls are broken off: the mock's hanging answers are dropped with their connections.
+    // Cancelling aborts the calls: the mock drops its hanging responses with their connections.
     let job = server.post(&format!("{href}/retry"), "text/plain", vec![]).await.expect(200);
     assert_eq!(job["state"], "queued");
     let job = server.get(&format!("{href}?wait=30")).await.expect(200);
@@ -186,7 +186,7 @@ async fn spend_is_reported_by_day_and_map_and_survives_kill_9() {
     let after = server.get("/usage?days=1&map=m").await.expect(200);
     assert_eq!(after["days"], before["days"]);
     assert_eq!(after["today"]["tokens"], before["today"]["tokens"]);
-    // Added up in another order.
+    // The sums may differ in the order of addition.
     let money = |usage: &Value| usage["today"]["money"].as_f64().unwrap();
     assert!((money(&after) - money(&before)).abs() < 1e-9, "{after} is not {before}");
     assert_eq!(server.get("/usage?map=other").await.expect(200)["days"], json!([]));
@@ -207,7 +207,7 @@ async fn spend_is_reported_by_day_and_map_and_survives_kill_9() {
 #[tokio::test]
 async fn jobs_of_higher_priority_run_first() {
     let dir = TempDir::new().unwrap();
-    // The first job has to wait, and occupies the only worker while the others queue up.
+    // The first job is rate limited and occupies the only worker while the others queue up.
     let mock = MockMllm::start(Script {
         describe: Box::new(|call| match call.number {
             1..=2 => Reply::Busy("4".into()),
@@ -288,7 +288,7 @@ async fn descriptions_of_a_near_duplicate_frame_are_reused_and_marked() {
     server.town("m", 4).await;
     let first = refine(&server, 0).await;
     assert_eq!(mock.describe_calls(), 4);
-    // The same view once more, compressed harder.
+    // The same view, compressed harder.
     let pixels = image::load_from_memory(&frame(0, 0)).unwrap().into_rgb8();
     let mut again = Vec::new();
     image::codecs::jpeg::JpegEncoder::new_with_quality(&mut again, 60)
@@ -301,13 +301,13 @@ async fn descriptions_of_a_near_duplicate_frame_are_reused_and_marked() {
         assert_eq!(description["stands_in"]["query_id"], first["query_id"]);
         assert!(description["stands_in"]["similarity"].as_f64().unwrap() >= 0.98);
     }
-    // Another place is another frame.
+    // A frame of another place is described.
     let other = refine(&server, 2).await;
     assert!(other["descriptions"].as_array().unwrap().iter().all(|d| d["stands_in"].is_null()));
     assert_eq!(mock.describe_calls(), 8);
 }
 
-/// Every fifth call meets a fault, each kind in its turn.
+/// Every fifth call meets a fault, each kind in turn.
 fn faulty(call: &DescribeCall) -> Reply {
     match call.number {
         number if number % 5 > 0 => Reply::Text(format!("notes number {number}.")),
@@ -359,7 +359,7 @@ async fn two_hundred_jobs_survive_kill_9_with_a_fifth_of_the_calls_failing() {
         assert!(job["state"] == "succeeded" || job["state"] == "degraded", "{job}");
         degraded += usize::from(job["state"] == "degraded");
     }
-    // What was answered in the instant of the kill may not have reached the disk.
+    // An answer at the moment of the kill may not have reached the disk.
     let again = mock.asked_again();
     assert!(again <= CONCURRENCY, "{again} answered pairs were asked again");
     eprintln!(

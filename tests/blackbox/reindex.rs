@@ -1,4 +1,4 @@
-//! Several models in one server, and maps that move from one to another.
+//! Several models in one server, and maps that are reindexed from one to another.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -13,7 +13,7 @@ use super::wait::eventually_within;
 
 const XFEAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/models/xfeat");
 
-/// Models beside the built-in one, and a data folder.
+/// Models in addition to the built-in one, and a data folder.
 struct Bench {
     dir: TempDir,
 }
@@ -31,7 +31,7 @@ impl Bench {
         self.dir.path().join("data")
     }
 
-    /// XFeat with another input and another grid, which makes other descriptors.
+    /// Installs XFeat with another input size and grid, which gives other descriptors.
     fn install(&self, name: &str, (width, height): (u32, u32), grid: usize) {
         let manifest = std::fs::read_to_string(format!("{XFEAT}/manifest.toml")).unwrap();
         let manifest = manifest
@@ -54,7 +54,7 @@ impl Bench {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
 
-    /// A model that takes its time.
+    /// Installs a slow model.
     fn install_slow(&self) {
         self.install("slow", (960, 720), 1);
     }
@@ -65,8 +65,8 @@ impl Bench {
         Server::start(&self.data(), &[&ours, settings].concat())
     }
 
-    /// Waits until there are the descriptors of one model only. A folder is removed at once; a table when nobody
-    /// is left who could be at it.
+    /// Waits until the descriptors of only one model are left. A folder is removed at once; a table once no process
+    /// can be using it.
     async fn has_descriptors_of_one_model(&self) {
         let deadline = match deployment::is_scale_out() {
             true => Duration::from_secs(20),
@@ -86,7 +86,7 @@ impl Bench {
     }
 }
 
-/// A map of the first `places` places, of that model.
+/// Creates a map of this model with the first `places` places.
 async fn town(server: &Server, map: &str, model: &str, places: usize) {
     server.put(&format!("/maps/{map}"), json!({ "model": model })).await.expect(201);
     for place in 0..places {
@@ -99,7 +99,7 @@ async fn add(server: &Server, map: &str, place: usize) {
     server.post_jpeg(&path, reference(place)).await.expect(201);
 }
 
-/// The ids of the candidates for the picture of a place itself, and the model that found them.
+/// The ids of the candidates for the map image of a place, and the model that found them.
 async fn look(server: &Server, map: &str, place: usize) -> (Vec<String>, String) {
     let path = format!("/localize?map={map}&refine=off&k=3");
     let answer = server.post_jpeg(&path, reference(place)).await.expect(200);
@@ -118,7 +118,7 @@ async fn begin(server: &Server, map: &str, request: Value) -> Value {
     server.post(&format!("/maps/{map}/reindex"), "application/json", body).await.expect(202)
 }
 
-/// The map, once its reindex is as far as `far` says.
+/// Waits until the reindex of a map has reached the state that `far` describes, and returns the map.
 async fn until(server: &Server, map: &str, far: impl Fn(&Value) -> bool) -> Value {
     eventually_within(Duration::from_secs(60), async || {
         let state = server.get(&format!("/maps/{map}")).await.expect(200);
@@ -153,7 +153,7 @@ async fn maps_of_several_models_are_served_with_a_bounded_number_loaded() {
         }
     }
     assert!(server.log().contains("model dropped to make room"), "{}", server.log());
-    // The refiner, too, looks with the model of the map.
+    // The refiner uses the model of the map, too.
     for (map, model) in [("a", "xfeat"), ("b", "small")] {
         let path = format!("/localize?map={map}&refine=wait");
         let answer = server.post_jpeg(&path, frame(1, 0)).await.expect(200);
@@ -162,7 +162,7 @@ async fn maps_of_several_models_are_served_with_a_bounded_number_loaded() {
             (&"succeeded".into(), &model.into())
         );
     }
-    // What has images keeps its model, and says how to change it.
+    // A map with images keeps its model, and the error says how to change it.
     server.put("/maps/b", json!({"description": "b"})).await.expect(200);
     let why = server.put("/maps/b", json!({"model": "xfeat"})).await.problem(409);
     assert!(why.contains("--reindex"), "{why}");
@@ -174,7 +174,7 @@ async fn maps_of_several_models_are_served_with_a_bounded_number_loaded() {
 async fn a_map_can_be_searched_and_changed_while_it_is_reindexed() {
     let bench = Bench::new();
     bench.install_slow();
-    // Such a small map with a graph stands for a large one.
+    // A small map with a graph stands for a large one.
     let graph = [("WHEREABOUTS_INDEX__EXACT_UP_TO", "4")];
     let server = bench.server(&graph);
     town(&server, "m", "xfeat", 24).await;
@@ -187,7 +187,7 @@ async fn a_map_can_be_searched_and_changed_while_it_is_reindexed() {
     assert!(twice.contains("GET /maps/m"), "{twice}");
 
     in_the_middle(&server, "m").await;
-    // One that has its new descriptor already, one that does not, and both sent again.
+    // Remove images with and without their new descriptor, and add others.
     for place in [0, 9, 23] {
         server.delete(&format!("/maps/m/images/place-{place}")).await.expect(204);
     }
@@ -314,7 +314,7 @@ async fn a_reindex_uses_a_model_that_was_reinstalled() {
     let server = bench.server(&[]);
     town(&server, "m", "mine", 4).await;
     let before = server.get("/maps/m").await.expect(200);
-    // The same graph with a word in its description, as an export on another day has it.
+    // The same graph with other metadata, as a later export would have.
     let file = bench.assets().join("models/mine/model.onnx");
     let bytes = [std::fs::read(&file).unwrap(), b"\x32\x05again".to_vec()].concat();
     std::fs::write(&file, &bytes).unwrap();
@@ -323,7 +323,7 @@ async fn a_reindex_uses_a_model_that_was_reinstalled() {
     let unpinned: Vec<_> = text.lines().filter(|line| !line.starts_with("sha256")).collect();
     std::fs::write(&manifest, unpinned.join("\n")).unwrap();
 
-    // The one in memory serves; after a restart there is only the other.
+    // The loaded model still serves; after a restart only the new one exists.
     first(&look(&server, "m", 2).await, 2, "mine");
     server.terminate();
     let server = bench.server(&[]);
@@ -335,7 +335,7 @@ async fn a_reindex_uses_a_model_that_was_reinstalled() {
     assert_ne!(after["model_digest"], before["model_digest"]);
     first(&look(&server, "m", 2).await, 2, "mine");
 
-    // The same again without a restart.
+    // The same without a restart.
     std::fs::write(&file, [&bytes[..], b"\x32\x07further"].concat()).unwrap();
     begin(&server, "m", json!({"model": "mine"})).await;
     assert_ne!(ended(&server, "m").await["model_digest"], after["model_digest"]);
@@ -358,7 +358,7 @@ async fn an_unreadable_image_fails_the_reindex_and_nothing_else() {
     assert!(why.contains("place-2") && why.contains("delete it"), "{why}");
     bench.has_descriptors_of_one_model().await;
     first(&look(&server, "m", 2).await, 2, "xfeat");
-    // As it says.
+    // As the error advises.
     server.delete("/maps/m/images/place-2").await.expect(204);
     begin(&server, "m", json!({"model": "small"})).await;
     assert_eq!(ended(&server, "m").await["model"], "small");

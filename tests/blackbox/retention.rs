@@ -1,4 +1,4 @@
-//! Jobs that have ended do not stay for ever.
+//! Retention of ended jobs.
 
 use serde_json::Value;
 use tempfile::TempDir;

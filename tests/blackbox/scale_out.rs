@@ -1,5 +1,4 @@
-//! Several servers and workers share a database: what happens when processes die, and when the database
-//! does.
+//! Several servers and workers share a database: what happens when processes die, and when the database dies.
 //!
 //! These need WHEREABOUTS_TEST_DEPLOYMENT=scale-out; `make scale-out` runs them with `--include-ignored`.
 
@@ -12,10 +11,10 @@ use crate::mock_mllm::{MockMllm, Script};
 use crate::support::{Server, frame};
 use crate::wait::eventually_within;
 
-/// Calls of one process to the mock at a time.
+/// Concurrent calls of one process to the mock.
 const CONCURRENCY: usize = 8;
 
-/// Settings that every process has; a process that gives no sign of life is soon dead.
+/// Settings of every process; a process without heartbeats is soon considered dead.
 fn settings(mock: &MockMllm) -> Vec<(&'static str, String)> {
     let given = [
         ("WHEREABOUTS_REFINE__REFINER", "mllm"),
@@ -137,7 +136,7 @@ fn a_worker_serves_health_and_metrics_only() {
     assert!(worker.terminate().success());
 }
 
-/// Tests that disturb every other: `tests/scale_out.sh` runs them on their own.
+/// Tests that disturb all others: `tests/scale_out.sh` runs them on their own.
 mod alone {
     use std::collections::HashSet;
     use std::process::Command;
@@ -152,7 +151,7 @@ mod alone {
     use crate::support::{Server, frame};
     use crate::wait::eventually_within;
 
-    /// Does something to the PostgreSQL of these tests.
+    /// Stops, kills or starts the PostgreSQL of these tests.
     fn database(what: &str) {
         let control = std::env::var("WHEREABOUTS_TEST_POSTGRES").expect(
             "this test stops PostgreSQL and starts it again: run it through tests/postgres.sh",
@@ -173,7 +172,7 @@ mod alone {
         all
     }
 
-    /// Posts a frame until a server takes it; a server that cannot says so, and soon.
+    /// Posts a frame until a server accepts it; a server that cannot must answer 503 soon.
     async fn localize(servers: &[Server], number: usize) -> Value {
         let mut attempts = 0..;
         eventually_within(Duration::from_secs(60), async || {
@@ -216,7 +215,7 @@ mod alone {
                     workers.push(worker(&dir, &settings));
                 }
                 150 => {
-                    // The other server goes on.
+                    // The other server still accepts frames.
                     servers.remove(0).kill();
                     localize(&servers, number + JOBS).await;
                     servers.push(serve(&dir, &settings));
@@ -247,9 +246,9 @@ mod alone {
         let jobs = ended(&servers[0], 2 * JOBS).await;
         let of = |state: &str| jobs.iter().filter(|job| job["state"] == state).count();
         assert_eq!(of("failed"), 0);
-        // Those that were in the middle of a pair when the database died.
+        // Jobs that were describing a pair when the database died.
         assert!(of("degraded") <= JOBS / 50, "{} jobs are degraded", of("degraded"));
-        // A process that dies takes along what it has not yet written down; one that lives buys nothing twice.
+        // A process that dies loses the answers it has not stored yet; one that lives pays for nothing twice.
         let again = mock.asked_again();
         eprintln!(
             "{JOBS} jobs by 2 servers and 3 workers, {KILLS} of them killed and the database once: {} \

@@ -1,4 +1,4 @@
-//! Health, metrics, the description of the API, and what guards every request.
+//! Health, metrics, the OpenAPI description, and the limits of every request.
 
 use reqwest::Method;
 use serde_json::Value;
@@ -63,7 +63,7 @@ async fn requests_beyond_the_limit_are_429_while_health_is_answered() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[("WHEREABOUTS_SERVER__MAX_REQUESTS", "1")]);
     server.town("m", 1).await;
-    // A body that never ends holds the only place.
+    // A body that never ends occupies the only slot.
     let hold = || {
         let (sender, body) = tokio::sync::mpsc::channel::<Result<Vec<u8>, std::io::Error>>(1);
         let body = futures_util::stream::unfold(body, |mut body| async {
@@ -83,7 +83,7 @@ async fn requests_beyond_the_limit_are_429_while_health_is_answered() {
         if answer.status == 429 {
             break answer;
         }
-        // It met a look at the maps, which had the place, and was itself refused.
+        // The request for the maps had the slot, so that this one was rejected.
         if held.is_finished() {
             (sender, held) = hold();
             sender.send(Ok(vec![0xFF])).await.unwrap();

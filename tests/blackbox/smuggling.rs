@@ -1,4 +1,4 @@
-//! Requests whose end two readers could see in different places, and what the time of an answer tells.
+//! Request smuggling: bodies whose end two readers could see in different places; and the timing of a 401.
 
 use std::time::Duration;
 
@@ -7,12 +7,12 @@ use tokio::net::TcpStream;
 
 use super::support::{Server, shared_server};
 
-/// All that comes back on a connection of its own, which the client keeps open.
+/// Sends a request on a connection of its own, which stays open, and returns all that comes back.
 async fn answers(server: &Server, request: &str) -> String {
     let mut stream = TcpStream::connect(server.url.trim_start_matches("http://")).await.unwrap();
     stream.write_all(request.as_bytes()).await.unwrap();
     let mut bytes = Vec::new();
-    // What a reader has taken for another request is answered at once.
+    // A smuggled request would be answered at once.
     let quiet = Duration::from_millis(400);
     let mut chunk = [0; 4096];
     while let Ok(Ok(read @ 1..)) = tokio::time::timeout(quiet, stream.read(&mut chunk)).await {
@@ -38,14 +38,14 @@ async fn an_ambiguous_body_length_smuggles_no_request() {
     let chunked = format!("0\r\n\r\n{smuggled}");
     let all = chunked.len();
     for framing in [
-        // Both kinds of length: a reader in front that goes by the other one sees one request.
+        // Both kinds of length: a proxy that uses the other one sees one request.
         format!("content-length: {all}\r\ntransfer-encoding: chunked"),
         format!("transfer-encoding: chunked\r\ncontent-length: {all}"),
         // Two lengths.
         format!("content-length: {all}\r\ncontent-length: 5"),
         format!("content-length: 5\r\ncontent-length: {all}"),
         format!("content-length: 5, {all}"),
-        // What one reader takes for a length and another does not.
+        // Lengths that some parsers accept.
         "content-length: +5".into(),
         "content-length: 0x5".into(),
         "content-length: -1".into(),
@@ -53,14 +53,14 @@ async fn an_ambiguous_body_length_smuggles_no_request() {
         "content-length:".into(),
         "content-length : 5".into(),
         "content-length\t: 5".into(),
-        // An encoding that one reader knows and another does not.
+        // Encodings that some parsers accept.
         "transfer-encoding: xchunked".into(),
         "transfer-encoding: chunked, identity".into(),
         "transfer-encoding: identity".into(),
         "transfer-encoding : chunked".into(),
         "transfer-encoding: chunked\r\ntransfer-encoding: identity".into(),
         "transfer-encoding: \x0bchunked".into(),
-        // A header that goes on in the next line, and lines that end with half an end.
+        // Folded headers, and bare line endings.
         " continued: yes\r\ncontent-length: 5".into(),
         "x: y\r\n content-length: 5".into(),
         "x: y\rcontent-length: 5".into(),
@@ -86,13 +86,13 @@ async fn an_ambiguous_body_length_smuggles_no_request() {
                 .await;
         assert!(statuses(&got).len() <= 1 && !got.contains("/smuggled"), "{chunks:?}: {got}");
     }
-    // Two requests in one go are two requests.
+    // Two pipelined requests get two responses.
     let two = format!("GET /livez HTTP/1.1\r\nhost: x\r\n\r\n{smuggled}");
     let got = answers(server, &two).await;
     assert_eq!(statuses(&got), ["200", "404"], "{got}");
 }
 
-/// The time of an answer, which must not depend on how much else is going on.
+/// Timing, which must not depend on how busy a database is.
 mod embedded_only {
     use std::time::Instant;
 
@@ -101,7 +101,7 @@ mod embedded_only {
 
     use crate::support::{BINARY, Server};
 
-    /// The median time of an answer to a key, of each of several keys in turn.
+    /// The median response time for each of several keys, measured in turn.
     async fn medians(server: &Server, keys: &[String], rounds: usize) -> Vec<f64> {
         let mut stream =
             TcpStream::connect(server.url.trim_start_matches("http://")).await.unwrap();
@@ -147,8 +147,8 @@ mod embedded_only {
             key.replace_range(at..=at, digit);
             key
         };
-        // Wrong in the last digit, in the first of the secret, and in the id: no such key. The first twice:
-        // what is between those two is noise.
+        // Wrong in the last digit (twice: their difference is the noise), in the first digit of the secret, and in the
+        // id, so that there is no such key.
         let (last, first, id) = (right.len() - 1, 17, 5);
         let keys = [changed(last), changed(last), changed(first), changed(id)];
         medians(&server, &keys, 200).await;

@@ -1,4 +1,4 @@
-//! HTTPS: from two files, which may change.
+//! HTTPS with a certificate and a key from files, which are reloaded.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -13,7 +13,7 @@ fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/tls").join(name)
 }
 
-/// A folder with a certificate and its key, and a server that has them.
+/// A folder with a certificate and its key, and a server that uses them.
 struct Encrypted {
     files: TempDir,
     _data: TempDir,
@@ -53,7 +53,7 @@ fn trusting(certificate: &str) -> Client {
     Client::builder().tls_certs_only(trusted).build().unwrap()
 }
 
-/// Puts a file of a certificate in place, in one step.
+/// Puts a certificate or key in place atomically.
 fn put(folder: &Path, certificate: &str, end: &str) {
     let beside = folder.join("beside");
     std::fs::copy(fixture(&format!("{certificate}.{end}")), &beside).unwrap();

@@ -1,4 +1,4 @@
-//! Traces, as a collector gets them.
+//! Traces as a collector receives them.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
@@ -20,7 +20,7 @@ use super::support::{Answer, Server, frame, shared_server};
 
 type Collected = Arc<Mutex<Vec<Span>>>;
 
-/// A collector of traces: its address, and what it was sent.
+/// Starts a trace collector; returns its URL and the spans that it receives.
 async fn collector() -> (String, Collected) {
     async fn take(State(collected): State<Collected>, body: Bytes) {
         let sent = ExportTraceServiceRequest::decode(body).unwrap();
@@ -84,7 +84,7 @@ async fn a_trace_spans_the_request_the_job_and_each_model_call() {
         assert_eq!(call.parent_span_id, job.span_id);
         assert!(call.attributes.iter().any(|about| about.key == "gen_ai.usage.input_tokens"));
     }
-    // The images of the map were added without a trace of their caller's, and have one each.
+    // The requests that added the images had no trace context, so each has a trace of its own.
     assert!(spans.iter().any(|span| span.name == "POST /maps/{map}/images"));
 }
 

@@ -1,4 +1,4 @@
-//! A robot that drives through the town and names its track.
+//! Tracks: a robot that drives through the town.
 
 use image::{Rgb, RgbImage};
 use jiff::{SignedDuration, Timestamp};
@@ -9,10 +9,10 @@ use super::support::{Answer, Server, frame, jpeg, shared_server};
 use super::wait::{eventually, until};
 
 const PLACES: usize = 96;
-/// How fast it drives, in metres a second; the service is told no more than the default bound.
+/// Speed of the robot in metres per second; the service knows only the default bound.
 const SPEED: f64 = 8.0;
 
-/// The map image of a place has the number of the place in its id.
+/// The id of the map image of a place.
 fn id(place: usize) -> String {
     format!("place-{place}")
 }
@@ -50,7 +50,7 @@ fn occluded(mut picture: RgbImage, number: usize) -> RgbImage {
     picture
 }
 
-/// Three frames in ten, spread so that they come alone and in a row.
+/// Three frames in ten, both isolated and in a row.
 fn is_occluded(place: usize) -> bool {
     matches!(place % 20, 3 | 4 | 8 | 12 | 13 | 17)
 }
@@ -73,7 +73,7 @@ async fn a_track_is_located_better_than_its_frames() {
         let bytes = jpeg(&picture);
         let path = format!("/localize?map={map}&refine=off&captured_at={at}&track=");
         let plain = server.post_jpeg(&format!("{path}a"), bytes.clone()).await.expect(200);
-        // Five metres more than it was.
+        // Odometry with an error of five metres.
         let moved = format!("{path}b&moved_m={}", way + 5.0);
         let moved = server.post_jpeg(&moved, bytes).await.expect(200);
         single += usize::from(plain["candidates"][0]["image_id"] == id(place));

@@ -1,4 +1,4 @@
-//! Webhooks from outside: what a receiver is told, and what becomes of it when it does not listen.
+//! Webhooks: deliveries, signatures, retries, and addresses that are rejected.
 
 use std::path::Path;
 use std::process::Command;
@@ -16,7 +16,7 @@ use super::wait::{eventually, eventually_within, until};
 const PRIVATE: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__ALLOW_PRIVATE", "true");
 const NO_RETRY: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[]");
 
-/// Makes a webhook; its id and its secret.
+/// Creates a webhook; returns its id and its secret.
 async fn hook(server: &Server, wanted: Value) -> (String, String) {
     let request = server.request(Method::POST, "/webhooks").json(&wanted);
     let made = Answer::of(request).await.expect(201);
@@ -28,7 +28,7 @@ async fn post(server: &Server, path: &str) -> Answer {
     Answer::of(server.request(Method::POST, path)).await
 }
 
-/// The newest delivery of a webhook, once it is in this state.
+/// Waits until the newest delivery of a webhook is in this state, and returns it.
 async fn newest(server: &Server, id: &str, state: &str, attempts: u32) -> Value {
     eventually_within(Duration::from_secs(30), async || {
         let page = server.get(&format!("/webhooks/{id}/deliveries?limit=1")).await.expect(200);
@@ -51,7 +51,7 @@ async fn job(server: &Server, map: &str) -> Value {
 #[tokio::test]
 async fn the_end_of_a_job_is_delivered_signed_to_the_subscribed_webhooks() {
     let dir = TempDir::new().unwrap();
-    // A proxy would go where the server itself must not.
+    // A proxy could reach addresses that the server must not.
     let proxy = ("HTTP_PROXY", "http://127.0.0.1:9");
     let settings = [PRIVATE, proxy, ("http_proxy", proxy.1), ("WHEREABOUTS_LOG__FILTER", "debug")];
     let server = Server::start(dir.path(), &settings);
@@ -168,7 +168,7 @@ async fn a_dead_delivery_is_kept_and_can_be_redelivered() {
     assert!(post(&server, &wrong).await.problem(404).contains("webhooks.keep_days"));
     server.kill();
 
-    // One that waits anyway is not queued again.
+    // A waiting delivery is not queued again.
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[3600]")]);
     receiver.replies.lock().unwrap().push_back(Reply::Status(500));
     post(&server, &path).await.expect(202);
@@ -177,7 +177,7 @@ async fn a_dead_delivery_is_kept_and_can_be_redelivered() {
     assert!(post(&server, &path).await.problem(409).contains("waits anyway"));
     server.kill();
 
-    // Only so many are kept.
+    // The number of deliveries is bounded.
     let few = [PRIVATE, ("WHEREABOUTS_WEBHOOKS__MAX_DELIVERIES", "1")];
     let server = Server::start(dir.path(), &few);
     let (other, _) = hook(&server, json!({"url": receiver.url})).await;
@@ -216,7 +216,7 @@ async fn private_addresses_are_rejected_unless_allowed() {
     let dir = TempDir::new().unwrap();
     let receiver = Receiver::start([]).await;
     let server = Server::start(dir.path(), &[PRIVATE]);
-    // A name, and an address in the URL itself: both were allowed once.
+    // A host name and a literal address, both created while private addresses were allowed.
     let named = receiver.url.replace("127.0.0.1", "localhost");
     let (by_name, _) = hook(&server, json!({"url": named})).await;
     let (by_address, _) = hook(&server, json!({"url": receiver.url})).await;
@@ -272,7 +272,7 @@ async fn private_addresses_are_rejected_unless_allowed() {
     let shown = server.get(&format!("/webhooks/{public}")).await.expect(200);
     let ends = json!(["job.succeeded", "job.degraded", "job.failed", "job.cancelled"]);
     assert_eq!((&shown["events"], &shown["map"]), (&ends, &Value::Null));
-    // Its answer holds a secret, and is not kept.
+    // The response holds a secret, so it is not stored.
     let keyed = server.request(Method::POST, "/webhooks").header("idempotency-key", "one");
     let keyed = keyed.json(&json!({"url": "https://example.com/"}));
     Answer::of(keyed).await.problem(400);
@@ -310,7 +310,7 @@ async fn no_delivery_is_lost_when_the_server_is_killed() {
     for _ in 0..3 {
         jobs.push(job(&server, "m").await["id"].as_str().unwrap().to_owned());
     }
-    // The first are on their way and unanswered; whether the last is makes no difference.
+    // The first deliveries are in flight and unanswered; the last one may be.
     server.kill();
     receiver.replies.lock().unwrap().clear();
     let before = receiver.messages().len();
@@ -350,7 +350,7 @@ async fn a_slow_receiver_delays_neither_others_nor_shutdown() {
     assert!(asked.elapsed() < Duration::from_secs(15), "the end took {:?}", asked.elapsed());
 }
 
-/// A key made in the folder of a server that does not run.
+/// Creates a key in the data folder of a server that is not running.
 fn key(data: &Path, role: &str) -> String {
     let mut command = Command::new(&*BINARY);
     command.args(["keys", "create", "--name", "test", "--role", role, "--data"]).arg(data);

@@ -1,4 +1,4 @@
-//! Clients that change images of their own, and note what they were told.
+//! Clients that change images of their own and record what the server acknowledged.
 
 use std::sync::Arc;
 
@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::ledger::{Fact, Key, Ledger, Picture};
 use super::support::{frame, reference};
 
-/// Numbers that look random and can be had again: SplitMix64 (Steele, Lea and Flood, 2014).
+/// A seeded random number generator: SplitMix64 (Steele, Lea and Flood, 2014).
 #[derive(Debug, Clone)]
 pub struct Chance(pub u64);
 
@@ -25,7 +25,7 @@ impl Chance {
     }
 }
 
-/// What is sent: map images, and frames near them.
+/// Map images, and frames near them.
 pub struct Pictures {
     pub images: Vec<Vec<u8>>,
     pub frames: Vec<Vec<u8>>,
@@ -39,14 +39,14 @@ impl Pictures {
     }
 }
 
-/// One client; its work ends when the server does.
+/// A client that works until the server is killed.
 pub struct Client {
     pub number: usize,
     pub chance: Chance,
     pub pictures: Arc<Pictures>,
     pub http: reqwest::Client,
     pub ledger: Ledger,
-    /// Ids are never used twice, but by a replacement.
+    /// Number of ids in use so far; only a replacement uses an id twice.
     pub ids: usize,
 }
 
@@ -70,7 +70,7 @@ impl Client {
         ["shared".into(), format!("own-{}", self.number)]
     }
 
-    /// Goes on until the server is gone.
+    /// Works until the server is killed.
     pub async fn work(&mut self, url: &str) {
         while self.step(url).await.is_ok() {}
     }
@@ -147,7 +147,7 @@ impl Client {
         for candidate in answer["candidates"].as_array().unwrap() {
             let id = candidate["image_id"].as_str().unwrap();
             let key = (map.clone(), id.to_owned());
-            // Of its own images this client knows whether they are there.
+            // A client knows which of its own images exist.
             let own = id.starts_with(&format!("c{}-", self.number));
             assert!(
                 !own || matches!(self.ledger.images.get(&key), Some(Fact::Told(Some(_)))),
@@ -170,7 +170,7 @@ impl Client {
     }
 }
 
-/// What the server answers; it must be one of `statuses`.
+/// Sends a request; returns its response, which must have one of these statuses.
 async fn told(request: reqwest::RequestBuilder, statuses: &[u16]) -> Result<Value, Killed> {
     let response = request.send().await.map_err(|_| Killed)?;
     let status = response.status().as_u16();

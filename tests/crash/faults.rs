@@ -37,7 +37,7 @@ async fn a_truncated_or_damaged_graph_file_is_rebuilt() {
     server.town("m", 30).await;
     until_graphed(&server).await;
     let graph = |files: Vec<PathBuf>| files.into_iter().find(|file| file.ends_with("graph"));
-    // It is written after it is first used.
+    // The graph is written after its first use.
     let file = eventually(async || graph(files(&dir.path().join("descriptors")))).await;
     server.kill();
     let whole = std::fs::read(&file).unwrap();
@@ -47,7 +47,7 @@ async fn a_truncated_or_damaged_graph_file_is_rebuilt() {
         std::fs::write(&file, bytes).unwrap();
         let server = Server::start(dir.path(), &[GRAPH]);
         assert!(server.log().contains("the graph is built again"), "{}", server.log());
-        // At once, while it is built, and afterwards.
+        // While the graph is being built, and afterwards.
         assert_eq!(first_of(&server, 7).await, "place-7");
         until_graphed(&server).await;
         assert_eq!(first_of(&server, 7).await, "place-7");
@@ -65,7 +65,7 @@ async fn a_damaged_database_loses_nothing_silently() {
     let db = dir.path().join("db");
     let original: Vec<(PathBuf, Vec<u8>)> =
         files(&db).into_iter().map(|file| (file.clone(), std::fs::read(file).unwrap())).collect();
-    // A start writes files of its own.
+    // A server writes further files when it starts.
     let restore = || {
         std::fs::remove_dir_all(&db).unwrap();
         for (file, bytes) in &original {
@@ -95,7 +95,7 @@ async fn a_damaged_database_loses_nothing_silently() {
             Err(said) => assert!(said.contains("estore a backup"), "{said}"),
         }
     }
-    // What is left can be had by one who says so.
+    // An operator can accept the loss and start with what is left.
     restore();
     std::fs::write(&log, &whole[..written / 2]).unwrap();
     assert!(Server::try_start(dir.path(), &[]).is_err());

@@ -1,5 +1,5 @@
-//! The driver: several clients change things, the server is killed, and what they were told is held
-//! against what the next server says.
+//! The driver: several clients make changes, the server is killed, and what it acknowledged is compared with
+//! what the next server returns.
 
 use std::collections::BTreeMap;
 use std::process::{Command, Stdio};
@@ -15,13 +15,13 @@ use super::ledger::{Key, Picture};
 use super::support::{BINARY, Server};
 use super::wait::until;
 
-/// `make crash` sets more.
+/// Default number of rounds; `make crash` runs more.
 const ROUNDS: usize = 20;
 const CLIENTS: usize = 4;
 const PICTURES: usize = 240;
-/// From asking for the server to its being ready, on a machine that does other things too.
+/// Maximum time from the start of the process until it is ready, on a busy machine.
 const QUICK: Duration = Duration::from_secs(10);
-/// Every map has a graph, which has to catch up.
+/// Every map has a graph, which has to catch up after a kill.
 const GRAPH: (&str, &str) = ("WHEREABOUTS_INDEX__EXACT_UP_TO", "0");
 const EXACT: (&str, &str) = ("WHEREABOUTS_INDEX__EXACT_UP_TO", "1000000");
 
@@ -79,7 +79,7 @@ impl Driver {
 
     fn start(&mut self, index: (&str, &str)) -> Server {
         let start = Instant::now();
-        // Graphs are built again often, and segments of descriptors have little room.
+        // Graphs are rebuilt often, and segments are compacted often.
         let settings = [index, ("WHEREABOUTS_INDEX__MAX_DEAD_SHARE", "0.1")];
         let server = Server::start(self.dir.path(), &settings);
         self.slowest = self.slowest.max(start.elapsed());
@@ -127,7 +127,7 @@ impl Driver {
         child.wait().unwrap();
     }
 
-    /// Holds what the server has against what the clients were told; looks closely at `closely` images.
+    /// Compares what the server has with what it acknowledged; checks the bytes of `closely` images.
     async fn check(&mut self, server: &Server, closely: usize) {
         let found = self.found(server).await;
         for client in &mut self.clients {
@@ -146,7 +146,7 @@ impl Driver {
         }
     }
 
-    /// Every image that is listed.
+    /// All images that the server lists.
     async fn found(&self, server: &Server) -> BTreeMap<Key, Picture> {
         let mut found = BTreeMap::new();
         for map in server.get("/maps").await.expect(200)["maps"].as_array().unwrap() {
@@ -166,7 +166,7 @@ impl Driver {
         found
     }
 
-    /// Its bytes are there, and it is found by them.
+    /// Asserts that the bytes of an image are there and that it is found by them.
     async fn look_closely(&self, server: &Server, key: &Key, picture: Picture) {
         let (map, id) = key;
         let bytes = &self.pictures.images[picture];
@@ -180,7 +180,7 @@ impl Driver {
         assert!(similarity.is_some_and(|s| s > 0.999), "{key:?} is not found: {similarity:?}");
     }
 
-    /// All is there, every job ends, and the graph finds what the exact search finds.
+    /// Asserts that everything is there, that every job ends, and that the graph finds what exact search finds.
     async fn end(&mut self) {
         let server = self.start(GRAPH);
         self.check(&server, usize::MAX).await;
@@ -188,7 +188,7 @@ impl Driver {
             self.clients.iter().flat_map(|client| client.ledger.jobs.clone()).collect();
         for id in jobs {
             let job = server.get(&format!("/jobs/{id}?wait=60")).await.expect(200);
-            // Candidates may have been removed meanwhile.
+            // Its candidates may have been removed since.
             assert!(["succeeded", "degraded"].contains(&job["state"].as_str().unwrap()), "{job}");
         }
         until(async || server.get("/maps/shared").await.expect(200)["index"] == "hnsw").await;

@@ -1,4 +1,4 @@
-//! What the clients were told, and what may be true besides.
+//! What the server acknowledged to the clients, and which states are possible after a kill.
 
 use std::collections::BTreeMap;
 
@@ -13,9 +13,9 @@ pub type Picture = usize;
 /// What is known of one image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fact {
-    /// The server said so: it has this picture, or none.
+    /// Acknowledged: the image has this picture, or does not exist.
     Told(Option<Picture>),
-    /// A change was on its way when the server was killed: it may have been made, or not.
+    /// A change was in flight at the kill: it may have been made or not.
     Either(Option<Picture>, Option<Picture>),
 }
 
@@ -28,17 +28,17 @@ impl Fact {
     }
 }
 
-/// What one client was told. Clients change images of their own only.
+/// The record of one client. Clients change only images of their own.
 #[derive(Debug, Default)]
 pub struct Ledger {
     pub images: BTreeMap<Key, Fact>,
     pub jobs: Vec<String>,
-    /// Changes that were acknowledged.
+    /// Number of acknowledged changes.
     pub acknowledged: usize,
 }
 
 impl Ledger {
-    /// Some image that is there, for certain.
+    /// An image that certainly exists.
     pub fn some_present(&self, chance: &mut Chance) -> Option<Key> {
         let present: Vec<&Key> = self
             .images
@@ -49,7 +49,7 @@ impl Ledger {
         (!present.is_empty()).then(|| present[chance.below(present.len())].clone())
     }
 
-    /// A change begins: until it is acknowledged, both may be true.
+    /// Records that a change begins: until it is acknowledged, both states are possible.
     pub fn begin(&mut self, key: &Key, after: Option<Picture>) {
         let before = match self.images.get(key) {
             None => None,
@@ -59,7 +59,7 @@ impl Ledger {
         self.images.insert(key.clone(), Fact::Either(before, after));
     }
 
-    /// The server has said that the change is made.
+    /// Records that the server acknowledged a change.
     pub fn acknowledged(&mut self, key: &Key) {
         if let Some(Fact::Either(_, after)) = self.images.get(key).copied() {
             self.images.insert(key.clone(), Fact::Told(after));
@@ -67,7 +67,7 @@ impl Ledger {
         }
     }
 
-    /// A map is gone with all its images.
+    /// Records that a map is deleted with all its images.
     pub fn map_deleted(&mut self, map: &str, acknowledged: bool) {
         for (_, fact) in self.images.iter_mut().filter(|((of, _), _)| of == map) {
             match *fact {
@@ -78,7 +78,7 @@ impl Ledger {
         }
     }
 
-    /// After a restart: what was found is allowed, and is what is known from now on.
+    /// After a restart: asserts that the state found is possible, and records it.
     pub fn settle(&mut self, found: &BTreeMap<Key, Picture>) {
         for (key, fact) in &mut self.images {
             let found = found.get(key).copied();

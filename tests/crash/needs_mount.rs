@@ -14,7 +14,7 @@ async fn a_full_disk_is_reported_and_acknowledged_changes_are_kept() {
     let mut stored = 0;
     let why = loop {
         let mut bytes = reference(stored);
-        // What follows the end of a JPEG is part of the file, not of the picture.
+        // Bytes after the end of a JPEG belong to the file, not to the picture.
         bytes.resize(bytes.len() + 200_000, stored as u8);
         let answer = server.post_jpeg(&format!("/maps/m/images?id=place-{stored}"), bytes).await;
         if answer.status != 201 {
@@ -36,7 +36,7 @@ async fn a_full_disk_is_reported_and_acknowledged_changes_are_kept() {
     for place in 0..stored {
         assert_eq!(server.get(&format!("/maps/m/images/place-{place}/content")).await.status, 200);
     }
-    // Room is made by deleting.
+    // Deleting images frees space.
     for place in 0..stored / 2 {
         server.delete(&format!("/maps/m/images/place-{place}")).await.expect(204);
     }

@@ -1,4 +1,4 @@
-//! First answers to requests that may be sent again.
+//! Stored responses of requests with an idempotency key.
 
 use std::sync::Arc;
 
@@ -30,7 +30,7 @@ fn answered(at: Timestamp, body: &str) -> IdempotencyRecord {
     IdempotencyRecord { fingerprint: Digest::of(b"request"), at, progress }
 }
 
-/// What is known of a request, whatever its age; if that is nothing, it is reserved.
+/// Reserves a request, or returns its record whatever its age.
 async fn reserve(store: &dyn Store, id: &str, process: Uuid) -> Option<IdempotencyRecord> {
     store.reserve_answer(id, running(process), Timestamp::UNIX_EPOCH).await.unwrap()
 }
@@ -71,7 +71,7 @@ async fn an_expired_response_is_not_found(fixture: &Fixture) {
     assert!(known.is_some());
     let known = store.reserve_answer("key", running(process), now - hour / 2).await.unwrap();
     assert_eq!(known, None);
-    // What is being done is not too old.
+    // A request in progress does not expire.
     let known = store.reserve_answer("key", running(process), now + hour).await.unwrap();
     assert!(matches!(known.unwrap().progress, Progress::Running { .. }));
 }
@@ -104,7 +104,7 @@ async fn the_oldest_responses_are_evicted_by_age_and_by_number(fixture: &Fixture
         let known = reserve(&*store, &hours.to_string(), process).await;
         assert_eq!(known.is_some(), kept, "{hours}");
     }
-    // Both at once: one is too old, and one too many.
+    // By age and by number at once.
     store.keep_answer("old", answered(hours_ago(9), "")).await.unwrap();
     assert_eq!(store.forget_answers(hours_ago(8), 4).await.unwrap(), 2);
     assert_eq!(store.forget_answers(now + SignedDuration::from_hours(1), 9).await.unwrap(), 4);

@@ -1,4 +1,4 @@
-//! The bytes of pictures: put, read, and gone with the last that needs them, once the janitor has called.
+//! The bytes of pictures: written, read, and removed by the sweep once nothing refers to them.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -52,7 +52,7 @@ async fn bytes_are_removed_with_the_last_image_that_needs_them(fixture: &Fixture
         assert_eq!(is_kept(&*store, b"bytes").await, kept);
     }
     assert!(is_kept(&*store, b"others").await);
-    // They may come again.
+    // They may be stored again.
     add(&*store, &one, "a", b"bytes").await;
     assert!(is_kept(&*store, b"bytes").await);
 }
@@ -107,7 +107,7 @@ async fn bytes_put_during_their_removal_are_kept(fixture: &Fixture) {
                     let descriptor = descriptor(&image, 3);
                     match store.add_image(&map, image.clone(), descriptor).await {
                         Ok(added) => break assert!(matches!(added, Added::Created(_))),
-                        // So slow that the bytes were forgotten meanwhile, and it is said so.
+                        // So slow that the bytes were removed meanwhile, which is reported.
                         Err(StoreError::Failed(why)) => assert!(why.contains("send them again")),
                         Err(error) => panic!("{error}"),
                     }

@@ -1,4 +1,4 @@
-//! Descriptions that were paid for, and the frames they are of.
+//! Cached descriptions, and the frames that they describe.
 
 use std::time::Duration;
 
@@ -29,7 +29,7 @@ fn key(number: usize) -> Digest {
     Digest::of(&number.to_le_bytes())
 }
 
-/// What the janitor does now and then.
+/// The periodic sweep.
 async fn tidy(store: &dyn Store) {
     store.clear_left().await.unwrap();
 }
@@ -63,7 +63,7 @@ async fn an_expired_description_is_not_used(fixture: &Fixture) {
     eventually(async || store.description(&key(0)).await.unwrap().is_none().then_some(())).await;
     assert!(Timestamp::now().duration_since(made) > SignedDuration::from_millis(200));
     tidy(&*store).await;
-    // It may be bought again.
+    // It may be computed again.
     store.keep_description(key(0), description("text")).await.unwrap();
 }
 
@@ -90,7 +90,7 @@ async fn the_oldest_descriptions_are_evicted(fixture: &Fixture) {
 async fn a_purchase_is_begun_and_ended(fixture: &Fixture) {
     let store = fixture.open().await;
     let until = Timestamp::now() + SignedDuration::from_secs(60);
-    // A process does not keep itself from buying.
+    // A process does not block itself.
     for _ in 0..2 {
         assert!(store.begin_purchase(&key(0), until).await.unwrap());
     }
@@ -106,7 +106,7 @@ fn frame(number: u8, descriptor: &Descriptor) -> DescribedFrame {
     DescribedFrame { query_id, digest: Digest::of(&[number]), descriptor }
 }
 
-/// The numbers of the frames that are as similar.
+/// The numbers of the frames that are at least this similar.
 async fn similar(store: &dyn Store, map: Uuid, to: &Descriptor, at_least: f32) -> Vec<u8> {
     let found = store.similar_frames(map, to, at_least).await.unwrap();
     let number = |digest| (0..100).find(|number| Digest::of(&[*number]) == digest).unwrap();
@@ -136,14 +136,14 @@ async fn earlier_frames_are_found_by_their_similarity(fixture: &Fixture) {
     let long = Random(1).descriptor(5);
     store.keep_frame(one, frame(60, &long), 100).await.unwrap();
     assert_eq!(similar(&*store, one, &at(0.0), 0.9).await, [1, 3]);
-    // No more than a few.
+    // The number of results is bounded.
     assert_eq!(similar(&*store, one, &at(0.0), -1.0).await, [1, 3, 4, 0]);
     assert_eq!(similar(&*store, one, &long, 0.9).await, [60]);
     assert_eq!(similar(&*store, other, &at(0.0), 0.9).await, [50]);
     let found = store.similar_frames(one, &at(0.0), 0.9).await.unwrap();
     assert_eq!(found[0].stand_in.query_id, frames[1].query_id);
     assert!((found[0].stand_in.similarity - 10_f32.to_radians().cos()).abs() < 1e-6);
-    // The same frame again is the same frame.
+    // Storing a frame again does not duplicate it.
     store.keep_frame(one, frames[1].clone(), 100).await.unwrap();
     assert_eq!(similar(&*store, one, &at(0.0), 0.9).await, [1, 3]);
 }

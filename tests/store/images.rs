@@ -183,7 +183,7 @@ async fn the_count_and_the_changes_follow_every_addition_and_removal(fixture: &F
     assert_eq!(fixture.open().await.index_state(&map).await.unwrap().images, 2);
 }
 
-/// Adds images at once; how many were created, and how many refused.
+/// Adds images concurrently; returns how many were created, and how many were rejected.
 async fn add_at_once(store: &Arc<dyn Store>, map: &Map, images: Vec<Image>) -> (usize, usize) {
     let adding = images.into_iter().map(|image| {
         let (store, map) = (Arc::clone(store), map.clone());

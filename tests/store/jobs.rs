@@ -1,4 +1,4 @@
-//! Jobs: who takes which, for how long, and what becomes of them.
+//! Jobs: claims, leases, releases, cancellation, lists and search.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -95,7 +95,7 @@ async fn jobs_are_claimed_by_priority_and_then_by_age(fixture: &Fixture) {
         let (seconds, nanoseconds) = id.get_timestamp().unwrap().to_unix();
         Timestamp::new(seconds as i64, nanoseconds as i32).unwrap()
     };
-    // What is left then, the oldest first.
+    // The open jobs after each step, oldest first.
     let left = [&[0, 1, 3, 4, 5][..], &[0, 1, 3, 5], &[0, 3, 5], &[0, 3], &[3], &[]];
     for (expected, left) in [2, 4, 1, 5, 0, 3].into_iter().zip(left) {
         let taken = claim(&*store).await.unwrap();
@@ -131,13 +131,13 @@ async fn a_job_is_claimed_by_one_worker_at_a_time(fixture: &Fixture) {
 
 const BRIEF_LEASE: SignedDuration = SignedDuration::from_millis(50);
 
-/// Takes a job for a moment.
+/// Claims a job with a lease of a moment.
 async fn claim_briefly(store: &dyn Store) -> JobRecord {
     let now = Timestamp::now();
     store.claim(now, now + BRIEF_LEASE).await.unwrap().unwrap()
 }
 
-/// Nothing that is done with the claim changes the job.
+/// Asserts that the claim can no longer change the job.
 async fn is_void(store: &dyn Store, old: &JobRecord, claim: Claim) {
     let before = serde_json::to_value(store.job(claim.job).await.unwrap().unwrap()).unwrap();
     let usage = Usage { calls: 99, ..Usage::default() };
@@ -163,7 +163,7 @@ async fn a_job_with_an_expired_lease_is_claimed_again_and_the_first_worker_is_fe
     store.finish(second.claim(), ended(&second, JobState::Failed)).await.unwrap();
     assert_eq!(job(&*store, id).await.state, JobState::Failed);
     is_void(&*store, &second, second.claim()).await;
-    // While nobody else has taken it, a worker may end it late.
+    // As long as no other worker has claimed it, a worker may finish it late.
     let id = submit(&*store, "m", b"frame").await;
     let late = claim_briefly(&*store).await;
     let lease_ends = Timestamp::now() + BRIEF_LEASE;
@@ -188,7 +188,7 @@ async fn a_released_job_waits_until_it_is_due(fixture: &Fixture) {
     store.release(second.claim(), later).await.unwrap();
     assert!(claim(&*store).await.is_none());
     assert_eq!(store.queued().await.unwrap(), 1);
-    // Others pass it.
+    // Other jobs overtake it.
     let other = submit(&*store, "m", b"frame").await;
     assert_eq!(claim(&*store).await.unwrap().job.id, other);
     assert_eq!(eventually(async || claim(&*store).await).await.job.id, id);
@@ -256,7 +256,7 @@ async fn a_cancelled_job_is_held_by_no_worker(fixture: &Fixture) {
     store.cancel(running).await.unwrap();
     is_void(&*store, &taken, taken.claim()).await;
     assert_eq!(store.queued().await.unwrap(), 0);
-    // One that has ended stays as it ended.
+    // An ended job does not change.
     assert_eq!(store.cancel(waiting).await.unwrap(), cancelled);
 }
 
@@ -290,7 +290,7 @@ async fn an_unsuccessful_job_may_be_queued_again(fixture: &Fixture) {
 async fn the_queue_limit_is_exact(fixture: &Fixture) {
     let store = fixture.open().await;
     const LIMIT: usize = 10;
-    // One runs, which counts as well.
+    // A running job counts, too.
     submit(&*store, "m", b"frame").await;
     let running = claim(&*store).await.unwrap();
     let submitting = (0..30).map(|_| {
@@ -310,13 +310,13 @@ async fn the_queue_limit_is_exact(fixture: &Fixture) {
     assert_eq!(store.queued().await.unwrap(), LIMIT);
     store.finish(running.claim(), ended(&running, JobState::Failed)).await.unwrap();
     store.submit(record("m", b"frame"), LIMIT).await.unwrap();
-    // One that is queued again is not refused.
+    // A job that is queued again is not rejected.
     store.retry(running.job.id).await.unwrap();
     assert_eq!(store.queued().await.unwrap(), LIMIT + 1);
     assert!(store.submit(record("m", b"frame"), LIMIT).await.is_err());
 }
 
-/// The next change of a job that is told.
+/// Waits for the next notification about a job.
 async fn told(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
     let patience = std::time::Duration::from_secs(20);
     tokio::time::timeout(patience, async { while changes.recv().await.unwrap() != of {} })
@@ -475,7 +475,7 @@ async fn a_repeated_request_finds_its_job(fixture: &Fixture) {
     let again = store.submit_once(record("m", b"frame"), 10, "r").await.unwrap();
     assert_eq!(again.unwrap().id, id);
     assert_eq!(store.queued().await.unwrap(), 1);
-    // Another request has a job of its own; so has one that nobody remembers.
+    // Another request has a job of its own; so has one without a record.
     assert_eq!(store.submit_once(record("m", b"frame"), 10, "other").await.unwrap(), None);
     store.forget_answer("r").await.unwrap();
     reserve().await;

@@ -1,4 +1,4 @@
-//! Maps: made, changed, deleted, and what was measured in them.
+//! Maps: created, changed, deleted, and calibrated.
 
 use std::sync::Arc;
 
@@ -30,7 +30,7 @@ async fn a_map_is_created_once_and_its_scene_and_description_can_change(fixture:
     assert_eq!(store.map(&wanted.name).await.unwrap(), None);
     assert_eq!(store.put_map(wanted.clone()).await.unwrap(), (wanted.clone(), true));
     assert_eq!(store.map(&wanted.name).await.unwrap(), Some(wanted.clone()));
-    // The same again, by one who knows no uid.
+    // The same again, with another uid.
     assert_eq!(store.put_map(map("m", 3)).await.unwrap(), (wanted.clone(), false));
     add(&*store, &wanted, "a", b"a").await;
     for text in odd_texts() {
@@ -54,7 +54,7 @@ async fn descriptor_settings_are_fixed_once_there_are_images(fixture: &Fixture) 
         |map| Map { dim: 5, ..map },
     ];
     for other in others {
-        // Also where an image was, and is no more.
+        // Also after an image was added and removed.
         let gone = add(&*store, &known, "a", b"a").await;
         let wanted = other(Map { uid: map("m", 3).uid, ..known.clone() });
         let refused = store.put_map(wanted.clone()).await.unwrap_err();
@@ -63,7 +63,7 @@ async fn descriptor_settings_are_fixed_once_there_are_images(fixture: &Fixture) 
         assert!(store.delete_image(&known, &gone.id).await.unwrap());
         let (changed, new) = store.put_map(wanted.clone()).await.unwrap();
         assert_eq!((&changed, new), (&wanted, false));
-        // Who knew it as it was is told that it is gone.
+        // The former revision is superseded.
         let query = descriptor(&gone, known.dim);
         let refused = store.search(&known, query, 1, SearchMode::Fast).await.unwrap_err();
         assert!(matches!(refused, StoreError::NotFound(_)), "{refused}");
@@ -113,7 +113,7 @@ async fn a_deleted_map_is_gone_for_good_and_its_name_is_free(fixture: &Fixture) 
     add(&*store, &new, "a", b"other").await;
 }
 
-/// Nobody can do anything with a map that was deleted.
+/// Asserts that every operation on a deleted map fails.
 async fn is_gone(store: &dyn Store, map: &Map) {
     let image = image("a", b"a");
     let query = descriptor(&image, map.dim);
@@ -142,7 +142,7 @@ async fn a_deleted_map_is_deleted_with_its_bytes(fixture: &Fixture) {
     let store = fixture.open().await;
     let (gone, _) = store.put_map(map("gone", 3)).await.unwrap();
     let (stays, _) = store.put_map(map("stays", 3)).await.unwrap();
-    // More than are cleared away in one step.
+    // More than one step of the sweep removes.
     let frames: Vec<_> = (0..300).map(|number| format!("frame {number}")).collect();
     join_all(frames.iter().map(|frame| add(&*store, &gone, frame, frame.as_bytes()))).await;
     add(&*store, &stays, "a", frames[7].as_bytes()).await;
@@ -177,7 +177,7 @@ async fn a_map_may_be_deleted_while_images_are_added(fixture: &Fixture) {
             })
         });
         let adding: Vec<_> = adding.collect();
-        // Not before there is something to delete.
+        // Wait until there is something to delete.
         crate::support::eventually(async || {
             let state = store.index_state(&map).await.unwrap();
             (state.images > 20).then_some(())

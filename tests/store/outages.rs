@@ -1,4 +1,4 @@
-//! A database and an object store that are away, silent, or back again.
+//! A database and an object store that are unreachable, hanging, or back again.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
@@ -20,17 +20,17 @@ use whereabouts_store::{BlobStore, JobStore, MapStore, Store, StoreError};
 
 use crate::support::{Database, Pictures, Tuning, eventually, map, record, s3, submit};
 
-/// What stands between the store and a server, and lets bytes through or keeps them.
+/// A proxy between the store and a server that can hold back bytes and cut connections.
 struct Wire {
     address: SocketAddr,
-    /// The connections that there are, and will be.
+    /// Current and future connections.
     now: Mutex<Connections>,
     _end: DropGuard,
 }
 
 #[derive(Clone)]
 struct Connections {
-    /// Whether bytes come through.
+    /// Whether bytes are forwarded.
     flow: watch::Sender<bool>,
     /// Ends them.
     cut: CancellationToken,
@@ -69,7 +69,7 @@ impl Wire {
         wire
     }
 
-    /// From now on nothing comes through, and nobody is told.
+    /// From now on no bytes are forwarded, and no connection is closed.
     fn freeze(&self) {
         self.now.lock().unwrap().flow.send_replace(false);
     }
@@ -78,12 +78,12 @@ impl Wire {
         self.now.lock().unwrap().flow.send_replace(true);
     }
 
-    /// Leaves the connections that there are as they are; later ones flow.
+    /// Later connections are forwarded; current ones stay as they are.
     fn abandon(&self) {
         *self.now.lock().unwrap() = Connections::new();
     }
 
-    /// Ends the connections that there are; later ones flow.
+    /// Cuts the current connections; later ones are forwarded.
     fn cut(&self) {
         std::mem::replace(&mut *self.now.lock().unwrap(), Connections::new()).cut.cancel();
     }
@@ -101,14 +101,14 @@ async fn carry(mut from: OwnedReadHalf, mut to: OwnedWriteHalf, flow: &watch::Se
 
 const TIMEOUT: Duration = Duration::from_millis(700);
 
-/// As soon as a busy machine gets there.
+/// Long enough for a busy machine.
 const SOON: Duration = Duration::from_millis(700 + 1500);
 
 fn hasty() -> Tuning {
     Tuning { timeout: TIMEOUT, lifetime: Duration::from_secs(60), ..Tuning::default() }
 }
 
-/// A store that speaks to its database through a wire.
+/// A store that reaches its database through the proxy.
 async fn wired(database: &Database) -> (Arc<Wire>, PostgresStore) {
     let options = database.options();
     let wire = Wire::to(options.get_host().to_owned(), options.get_port()).await;
@@ -122,7 +122,7 @@ fn settings_at(database: &Database, address: SocketAddr) -> PostgresSettings {
     PostgresSettings { url: options.to_url_lossy().to_string(), ..database.settings(hasty()) }
 }
 
-/// Every kind of call says in time that the database is away.
+/// Asserts that every kind of call reports within the timeout that the database is unavailable.
 async fn is_away(store: &PostgresStore) {
     let (now, began) = (Timestamp::now(), Instant::now());
     let lease = now + SignedDuration::from_secs(60);
@@ -152,10 +152,10 @@ async fn is_away(store: &PostgresStore) {
     assert!(began.elapsed() < SOON, "{:?}", began.elapsed());
 }
 
-/// It works again, and hears again.
+/// Waits until calls succeed and notifications arrive again.
 async fn is_back(store: &PostgresStore, beside: &dyn Store) {
     eventually(async || store.maps().await.ok()).await;
-    // As many calls at once as there are connections.
+    // As many concurrent calls as there are connections.
     let asking = || join_all((0..16).map(|_| store.maps()));
     eventually(async || asking().await.into_iter().all(|maps| maps.is_ok()).then_some(())).await;
     let mut changes = store.changes();
@@ -202,14 +202,14 @@ async fn a_broken_connection_to_the_database_is_opened_again() {
     let mut changes = store.changes();
     submit(&store, "m", b"frame").await;
     wire.cut();
-    // What changes while nobody listens is told of afterwards.
+    // A change that was missed while the listener was away is notified afterwards.
     let id = submit(&beside, "m", b"frame").await;
     let told = async { while changes.recv().await.unwrap() != id {} };
     tokio::time::timeout(Duration::from_secs(20), told).await.unwrap();
     is_back(&store, &beside).await;
 }
 
-/// An address where nobody listens.
+/// An address without a listener.
 async fn nobody() -> SocketAddr {
     TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap()
 }
@@ -229,7 +229,7 @@ async fn an_absent_database_is_unavailable_within_the_timeout() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_absent_object_store_is_unavailable_within_the_timeout() {
     let database = Database::migrated(Pictures::Folder).await;
-    // Nobody is there, or somebody who never answers.
+    // An address without a listener, and one that never answers.
     let silent = TcpListener::bind("127.0.0.1:0").await.unwrap();
     for address in [nobody().await, silent.local_addr().unwrap()] {
         let objects = s3("away", &format!("http://{address}"), TIMEOUT);

@@ -1,4 +1,4 @@
-//! What several processes that share a PostgreSQL promise each other.
+//! What several processes that share a PostgreSQL can rely on.
 
 use std::collections::HashSet;
 use std::time::Duration;
@@ -27,7 +27,7 @@ use crate::support::{
     submit, until,
 };
 
-/// One that is not taken for dead because the machine is busy.
+/// A lifetime that no process misses because the machine is busy.
 fn long_lived() -> Tuning {
     Tuning { lifetime: Duration::from_secs(60), ..Tuning::default() }
 }
@@ -147,7 +147,7 @@ async fn a_draft_taken_over_by_another_process_replaces_nothing() {
     let image = add(&silent, &map, "a", b"a").await;
     let mut draft = silent.draft(next(&map, 5)).await.unwrap();
     fill(draft.as_mut(), 5).await;
-    // It could not say that it is alive.
+    // It could not send heartbeats.
     database.run("UPDATE processes SET alive_until = now() - interval '1 hour'").await;
     let mut taken = other.draft(next(&map, 5)).await.unwrap();
     draft.write(&image, descriptor(&image, 5)).await.unwrap();
@@ -178,7 +178,7 @@ async fn the_draft_of_a_deleted_map_is_removed_though_its_process_is_dead() {
     .await;
 }
 
-/// Tables of descriptors.
+/// The number of descriptor tables.
 async fn tables(database: &Database) -> i64 {
     let mut connection = database.options().connect().await.unwrap();
     sqlx::query_scalar("SELECT count(*) FROM pg_tables WHERE tablename LIKE 'descriptors\\_%'")
@@ -314,7 +314,7 @@ async fn a_description_is_computed_by_one_process_until_its_lease_ends() {
     alive.keep_description(key("kept"), description.clone()).await.unwrap();
     assert_eq!(other.description(&key("kept")).await.unwrap(), Some(description));
     assert!(begins(&other, "kept").await);
-    // Its time runs out, or its process dies.
+    // Its lease expires, or its process dies.
     let soon = Timestamp::now() + SignedDuration::from_millis(100);
     assert!(alive.begin_purchase(&key("late"), soon).await.unwrap());
     assert!(begins(&dying, "dying").await);
@@ -324,7 +324,7 @@ async fn a_description_is_computed_by_one_process_until_its_lease_ends() {
     eventually(async || begins(&other, "dying").await.then_some(())).await;
 }
 
-/// Waits for the news of a job.
+/// Waits for a notification about a job.
 async fn told(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
     let waiting = async { while changes.recv().await.unwrap() != of {} };
     tokio::time::timeout(Duration::from_secs(20), waiting).await.unwrap();
@@ -428,7 +428,7 @@ async fn a_schema_one_step_ahead_is_tolerated_and_two_steps_are_rejected() {
     let settings = database.settings(Tuning::default());
     let open =
         async || PostgresStore::open(settings.clone(), database.objects(), Uuid::now_v7()).await;
-    // While servers are replaced one after another, the old ones may have to start again.
+    // During a rolling upgrade an old server may have to restart.
     step(9000).await;
     open().await.unwrap();
     assert_eq!(migrate(&settings).await.unwrap(), 0);
@@ -446,7 +446,7 @@ async fn all_processes_count_as_alive_right_after_a_start_of_the_database() {
     submit(&dying, "m", b"frame").await;
     claim(&dying).await.unwrap();
     drop(dying);
-    // To this one, the database was started a moment ago.
+    // Compared with its lifetime, the database was started a moment ago.
     let age = Duration::from_secs(24 * 3600);
     let other = database.open(Tuning { lifetime: age, ..Tuning::default() }).await;
     // By its own account it is dead.
@@ -458,7 +458,7 @@ async fn all_processes_count_as_alive_right_after_a_start_of_the_database() {
 async fn a_rate_limit_is_shared_by_all_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
-    // As good as nothing comes back while this runs.
+    // Next to nothing is refilled while this runs.
     let draw = TokenRequest { per_minute: 0.01, needed: 0.001, taken: 0.001 };
     let mut taken = 0;
     for number in 0..30 {
@@ -468,7 +468,7 @@ async fn a_rate_limit_is_shared_by_all_processes() {
         assert!(drawn.taken || drawn.left[0] < 0.002);
     }
     assert!((9..=12).contains(&taken), "{taken}");
-    // What is given back is there for others, and no more than a minute's worth.
+    // Tokens that are returned are available to others, up to those of a minute.
     let back = TokenRequest { needed: f64::MIN, taken: -1.0, ..draw };
     processes[0].draw("key", [back, TokenRequest::UNLIMITED]).await.unwrap();
     let drawn = processes[1].draw("key", [draw, TokenRequest::UNLIMITED]).await.unwrap();
@@ -483,7 +483,7 @@ async fn the_daily_budget_is_shared_by_all_processes() {
     let tokens = |tokens| Spent { tokens, money: 0.0 };
     assert!(processes[0].set_aside(day, tokens(600), limit).await.unwrap());
     assert!(!processes[1].set_aside(day, tokens(600), limit).await.unwrap());
-    // The call took 100 tokens: 500 go back, and the rest is spent when it is written down.
+    // The call used 100 tokens: 500 are released, and 100 are recorded as usage.
     processes[0].give_back(day, tokens(500)).await.unwrap();
     let usage = Usage { calls: 1, prompt_tokens: 80, completion_tokens: 20, ..Usage::default() };
     let spent = DayUsage { date: day, map: "m".parse().unwrap(), usage, money: 0.0 };

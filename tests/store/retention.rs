@@ -1,4 +1,4 @@
-//! Forgetting: jobs that have ended go with their frames, accounts by their day.
+//! Retention: ended jobs are removed with their frames, and usage by day.
 
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
@@ -16,7 +16,7 @@ contract!(
     the_size_of_the_database_is_known,
 );
 
-/// A job with a frame of its own, which failed so many days ago unless it waits.
+/// A job with a frame of its own, which failed this many days ago, or is queued.
 async fn job(store: &dyn Store, frame: &str, days_ago: Option<i64>) -> Uuid {
     let id = submit(store, "m", frame.as_bytes()).await;
     if let Some(days) = days_ago {
@@ -55,7 +55,7 @@ async fn old_jobs_are_removed_with_frames_that_nothing_else_needs(fixture: &Fixt
     assert_eq!(removed, RemovedJobs { by_age: 2, by_count: 0, bytes: 3 });
     assert!(!has(store, "old").await);
     assert!(has(store, "shared").await && has(store, "waiting").await);
-    // A cursor may stand on a job that has gone.
+    // A cursor may refer to a removed job.
     assert_eq!(listed(store, None).await, [waiting, young]);
     assert!(listed(store, Some(shared)).await.is_empty());
     assert_eq!(listed(store, Some(waiting)).await, [young]);
@@ -77,7 +77,7 @@ async fn excess_jobs_are_removed_oldest_end_first_in_batches(fixture: &Fixture) 
     assert_eq!(listed(store, None).await, [jobs[2], jobs[0]]);
     assert_eq!(store.remove_ended(keep(30, 1), 2).await.unwrap().by_count, 1);
     assert_eq!(listed(store, None).await, [jobs[0]]);
-    // Whoever waits for it has not seen its end yet.
+    // A client that long-polls may not have seen its end yet.
     let unsettled = KeepJobs { settled: Timestamp::UNIX_EPOCH, ..keep(0, 0) };
     assert_eq!(store.remove_ended(unsettled, 2).await.unwrap().jobs(), 0);
 }

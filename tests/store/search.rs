@@ -1,4 +1,4 @@
-//! Searches: exactly, by a graph, and for images that look like those of other places.
+//! Search: exact, by a graph, and for hard negatives.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -27,7 +27,7 @@ contract!(
 
 const BOTH: [SearchMode; 2] = [SearchMode::Fast, SearchMode::Exact];
 
-/// Adds images named by their number, some at once.
+/// Adds images named by their number, some concurrently.
 async fn add_all(store: &Arc<dyn Store>, map: &Map, descriptors: &[Descriptor]) {
     let mut pins = Vec::new();
     for bytes in 0..16_u8 {
@@ -45,7 +45,7 @@ fn numbers(found: &[Candidate]) -> Vec<usize> {
     found.iter().map(|found| found.image_id.as_str().parse().unwrap()).collect()
 }
 
-/// The best of all, by comparing with each.
+/// The best matches by brute force.
 fn brute_force(descriptors: &[Descriptor], query: &Descriptor, k: usize) -> Vec<(usize, f32)> {
     let all = descriptors.iter().map(|descriptor| descriptor.similarity(query));
     let mut all: Vec<_> = all.enumerate().collect();
@@ -119,14 +119,14 @@ async fn a_graph_has_high_recall_and_finds_no_removed_image(fixture: &Fixture) {
         let similarity = found[0].similarity;
         assert!((similarity - 1.0).abs() < 1e-3, "{number}: {similarity}");
     }
-    // More than one search of the graph finds.
+    // More than one graph search returns.
     for k in [150, 2000, 2100] {
         let query = descriptors[0].clone();
         let found = store.search(&map, query, k, SearchMode::Fast).await.unwrap();
         assert_eq!(found.len(), k.min(2000));
     }
 
-    // What is added later is found at once.
+    // An image that is added later is found at once.
     let late = image("2000", &[0]);
     let query = Random(3).descriptor(48);
     store.add_image(&map, late.clone(), query.clone()).await.unwrap();
@@ -312,7 +312,7 @@ async fn hard_negatives_are_the_most_similar_images_of_other_places(fixture: &Fi
         assert_eq!((&found.image_id, ids(&found.others)), (&image.id, others));
         assert!(found.others.iter().map(|other| other.rank).eq(1..=5));
     }
-    // Fewer, where there are not so many.
+    // Fewer, if there are fewer.
     let wide = CalibrationSettings { place_m: 38.0, ..settings };
     let found = store.look_alikes(&map, wide, 50).await.unwrap();
     assert!(found.iter().any(|found| (1..50).contains(&found.others.len())));

@@ -1,4 +1,4 @@
-//! Stores to hold the contract against, each in a folder or a database of its own, and what is put into them.
+//! Stores under test, each in a folder or a database of its own, and test data.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -24,7 +24,7 @@ use whereabouts_store::{
 
 pub use whereabouts_testkit::wait::{eventually, until};
 
-/// Makes each of these promises a test of both stores.
+/// Turns each of these functions into a test of both stores.
 macro_rules! contract {
     ($($promise:ident),+ $(,)?) => {
         mod embedded {
@@ -42,7 +42,7 @@ macro_rules! contract {
     };
 }
 
-/// Makes each of these promises a test of PostgreSQL with its bytes in a server that speaks S3.
+/// Turns each of these functions into a test of PostgreSQL with its bytes in an S3-compatible store.
 macro_rules! contract_over_s3 {
     ($($promise:ident),+ $(,)?) => {
         mod s3 {
@@ -54,16 +54,16 @@ macro_rules! contract_over_s3 {
     };
 }
 
-/// How a store is opened, where a test cares.
+/// Settings of a store that tests vary.
 #[derive(Debug, Clone, Copy)]
 pub struct Tuning {
     /// Maps with at most this many images have no graph.
     pub exact_up_to: usize,
-    /// How long fresh bytes stay that nothing refers to, where that is a time.
+    /// How long unreferenced new bytes are kept, in stores that keep them for a time.
     pub pin: Duration,
-    /// After so long without a sign of life a process counts as dead.
+    /// A process without a heartbeat for this long is considered dead.
     pub lifetime: Duration,
-    /// The longest a call may take.
+    /// Timeout of a call.
     pub timeout: Duration,
     /// Bounds of the cache of descriptions.
     pub descriptions: DescriptionBounds,
@@ -84,10 +84,10 @@ impl Default for Tuning {
     }
 }
 
-/// A process that says nothing for so long is dead to the others.
+/// A lifetime after which tests can wait for a process to be considered dead.
 const SHORT_LIFE: Duration = Duration::from_millis(300);
 
-/// One place where a store keeps its things, which outlives the store.
+/// The storage of a store, which outlives the store.
 pub struct Fixture(Kind);
 
 enum Kind {
@@ -117,7 +117,7 @@ impl Fixture {
         match &self.0 {
             Kind::Embedded(dir) => {
                 let settings = embedded_settings(dir.path(), tuning);
-                // The threads of the store that was dropped may take a moment to end.
+                // The threads of the dropped store may take a moment to end.
                 let open = async || EmbeddedStore::open(&settings).ok();
                 Arc::new(eventually(open).await)
             }
@@ -148,14 +148,14 @@ fn embedded_settings(dir: &Path, tuning: Tuning) -> EmbeddedSettings {
     }
 }
 
-/// Where a store in PostgreSQL has its bytes.
+/// Where a PostgreSQL store keeps its bytes.
 #[derive(Clone, Copy)]
 pub enum Pictures {
     Folder,
     S3,
 }
 
-/// A database of its own in the server for tests, which goes when this does; and a place for bytes.
+/// A database of its own in the test server, which is removed when this is dropped; and a place for bytes.
 pub struct Database {
     server: PgConnectOptions,
     name: String,
@@ -205,7 +205,7 @@ impl Database {
         }
     }
 
-    /// A process of its own.
+    /// Opens the store as another process would.
     pub async fn open(&self, tuning: Tuning) -> PostgresStore {
         PostgresStore::open(self.settings(tuning), self.objects(), Uuid::now_v7()).await.unwrap()
     }
@@ -226,7 +226,7 @@ impl Database {
 impl Drop for Database {
     fn drop(&mut self) {
         let (server, name) = (self.server.clone(), self.name.clone());
-        // The test's own runtime is in the middle of something.
+        // The runtime of the test cannot be blocked.
         let dropping = std::thread::spawn(move || {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
             let sql = format!("DROP DATABASE {name} WITH (FORCE)");
@@ -256,14 +256,14 @@ fn s3_server() -> String {
     })
 }
 
-/// Part of the bucket for tests.
+/// A prefix in the test bucket.
 pub fn s3(prefix: &str, endpoint: &str, timeout: Duration) -> Objects {
     let url = format!("s3://whereabouts-test/{prefix}");
     let (endpoint, region) = (endpoint.to_owned(), "us-east-1".to_owned());
     Objects::open(&ObjectSettings { url, endpoint, region, allow_http: true, timeout }).unwrap()
 }
 
-/// A map whose descriptors have so many numbers.
+/// A map whose descriptors have this many dimensions.
 pub fn map(name: &str, dim: usize) -> Map {
     Map {
         uid: Uuid::now_v7(),
@@ -281,7 +281,7 @@ pub fn map(name: &str, dim: usize) -> Map {
     }
 }
 
-/// The map as another model would have it.
+/// The map with another model.
 pub fn next(map: &Map, dim: usize) -> Map {
     Map {
         model: "new".into(),
@@ -306,7 +306,7 @@ pub fn image(id: &str, bytes: &[u8]) -> Image {
     }
 }
 
-/// Another direction for each picture.
+/// A descriptor that differs from picture to picture.
 pub fn descriptor(image: &Image, dim: usize) -> Descriptor {
     let seed = image.digest.as_bytes().first_chunk().unwrap();
     Random(u64::from_le_bytes(*seed) | 1).descriptor(dim)
@@ -322,7 +322,7 @@ pub async fn add(store: &dyn Store, map: &Map, id: &str, bytes: &[u8]) -> Image 
     image
 }
 
-/// Gives all that is missing in a draft its descriptor; returns how many that were.
+/// Writes all missing descriptors of a draft; returns how many were missing.
 pub async fn fill(draft: &mut dyn Draft, dim: usize) -> usize {
     let mut written = 0;
     loop {
@@ -337,7 +337,7 @@ pub async fn fill(draft: &mut dyn Draft, dim: usize) -> usize {
     }
 }
 
-/// A job of the map that waits, with the bytes of its frame.
+/// Submits a job of the map, with the bytes of its frame.
 pub async fn submit(store: &dyn Store, map: &str, frame: &[u8]) -> Uuid {
     let record = record(map, frame);
     let id = record.job.id;
@@ -368,20 +368,20 @@ pub fn record(map: &str, frame: &[u8]) -> JobRecord {
     }
 }
 
-/// Takes a job for a minute.
+/// Claims a job with a lease of a minute.
 pub async fn claim(store: &dyn Store) -> Option<JobRecord> {
     let now = Timestamp::now();
     store.claim(now, now + SignedDuration::from_secs(60)).await.unwrap()
 }
 
-/// Whether the bytes are there once the janitor has called.
+/// Whether the bytes are still there after a sweep.
 pub async fn is_kept(store: &dyn Store, bytes: &[u8]) -> bool {
     let all = KeepJobs { since: None, most: None, settled: Timestamp::now() };
     store.remove_ended(all, 64).await.unwrap();
     store.blob(&Digest::of(bytes)).await.unwrap().is_some()
 }
 
-/// Text that is hard to keep.
+/// Texts that are hard to store.
 pub fn odd_texts() -> Vec<String> {
     vec![
         String::new(),

@@ -1,4 +1,4 @@
-//! Accounts: what was spent, by day and map.
+//! Usage: spend by day and map.
 
 use futures_util::future::join_all;
 use jiff::civil::{Date, date};

@@ -1,4 +1,4 @@
-//! Webhooks: what they are told, and what becomes of telling them.
+//! Webhooks and their deliveries.
 
 use std::sync::Arc;
 
@@ -46,7 +46,7 @@ fn new_webhook(events: &[WebhookEvent], map: Option<&str>) -> StoredWebhook {
     StoredWebhook { webhook, secret: WebhookSecret::new(&[1; 32]) }
 }
 
-/// A job that ended so.
+/// A job that ended in this state.
 async fn ended(store: &dyn Store, map: &str, state: JobState) -> Uuid {
     submit(store, map, b"frame").await;
     end(store, state).await
@@ -77,7 +77,7 @@ fn ping(webhook: Uuid) -> StoredDelivery {
     StoredDelivery { delivery, body: b"{}".to_vec() }
 }
 
-/// A webhook of which so many pings wait.
+/// A webhook with this many waiting pings.
 async fn pinged(store: &dyn Store, pings: usize) -> (Uuid, Vec<Uuid>) {
     let id = webhook(store, &WebhookEvent::ENDS, None).await;
     let mut ids = Vec::new();
@@ -136,7 +136,7 @@ async fn the_end_of_a_job_is_queued_for_the_webhooks_subscribed_at_that_time(fix
     assert_eq!(jobs(listed(&*store, all).await), [bad, good]);
     assert_eq!(jobs(listed(&*store, failures).await), [bad]);
     assert!(listed(&*store, elsewhere).await.is_empty());
-    // One that ends again is news again.
+    // A job that ends again is delivered again.
     store.retry(early).await.unwrap();
     assert_eq!(end(&*store, JobState::Degraded).await, early);
     assert_eq!(jobs(listed(&*store, all).await), [early, bad, good]);
@@ -148,7 +148,7 @@ async fn the_end_of_a_job_is_queued_for_the_webhooks_subscribed_at_that_time(fix
     );
     let job = store.job(early).await.unwrap().unwrap().job;
     assert_eq!(message["data"], serde_json::to_value(job).unwrap());
-    // A cancelled one is told once, however often it is cancelled.
+    // A job is delivered once, however often it is cancelled.
     store.retry(bad).await.unwrap();
     store.cancel(bad).await.unwrap();
     store.cancel(bad).await.unwrap();
@@ -170,7 +170,7 @@ async fn a_delivery_is_due_at_its_time_until_it_has_ended(fixture: &Fixture) {
     assert_eq!(due(&*store, id, now).await, [pings[2]]);
     assert_eq!(due(&*store, id, later).await, [pings[2], pings[0]]);
     assert_eq!(store.waiting_deliveries().await.unwrap(), 2);
-    // It has been delivered; what comes late changes nothing.
+    // It has been delivered; a late outcome changes nothing.
     assert_eq!(note(1, Then::Dead).await.unwrap(), None);
     let again = store.queue_again(id, pings[0], now).await.unwrap_err().to_string();
     assert!(again.contains("waits anyway"), "{again}");
@@ -181,7 +181,7 @@ async fn a_delivery_is_due_at_its_time_until_it_has_ended(fixture: &Fixture) {
     let page = store.deliveries(id, waiting, Some(pings[1]), 9).await.unwrap();
     assert_eq!(page.iter().map(|delivery| delivery.id).collect::<Vec<_>>(), [pings[0]]);
     assert_eq!(store.deliveries(id, None, None, 1).await.unwrap()[0].id, pings[2]);
-    // What was given up has been delivered all the same.
+    // A delivery that was given up may have arrived all the same.
     note(2, Then::Dead).await.unwrap().unwrap();
     let after = note(2, Then::Delivered).await.unwrap().unwrap();
     assert_eq!((after.state, after.attempts), (DeliveryState::Delivered, 2));
@@ -213,7 +213,7 @@ async fn a_retried_delivery_is_due_at_its_next_attempt(fixture: &Fixture) {
 async fn a_webhook_is_deleted_with_its_deliveries_and_a_disabled_one_gets_none(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
-    // More than are removed in one step.
+    // More than one step of the sweep removes.
     let (gone, pings) = pinged(store, 259).await;
     let (stays, _) = pinged(store, 2).await;
     let now = Timestamp::now();

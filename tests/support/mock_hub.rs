@@ -1,4 +1,4 @@
-//! A model hub with one file, on a free port, that misbehaves as it is told.
+//! A mock of a model hub with one file, on a free port, with faults on demand.
 
 use std::collections::VecDeque;
 use std::io;
@@ -15,25 +15,25 @@ use bytes::Bytes;
 use futures_util::{Stream, StreamExt, stream};
 use tokio::net::TcpListener;
 
-/// What goes wrong with one request.
+/// The fault that one request meets.
 #[derive(Debug, Clone, Copy)]
 pub enum Trouble {
     None,
-    /// The connection breaks after so many bytes of the body.
+    /// The connection breaks after this many bytes of the body.
     CutAfter(usize),
-    /// No more bytes come after so many, but the connection stays.
+    /// The body stalls after this many bytes, with the connection open.
     StallAfter(usize),
-    /// No answer comes.
+    /// No response is sent.
     Hang,
-    /// One byte is another one.
+    /// One byte is corrupted.
     Corrupt,
-    /// This answer instead.
+    /// A response with this status.
     Status(u16),
-    /// The whole file, whatever was asked for.
+    /// The whole file, whatever range was requested.
     IgnoreRange,
-    /// The body's length is not told.
+    /// No `Content-Length`.
     NoLength,
-    /// From this request on, the file is another one.
+    /// From this request on, the file has other contents.
     Change,
 }
 
@@ -53,7 +53,7 @@ struct Shared {
 }
 
 impl Hub {
-    /// Serves `file` under every path; the first requests meet `troubles`, one each.
+    /// Serves `file` under every path; the first requests meet one of `troubles` each.
     pub async fn start(file: Vec<u8>, troubles: &[Trouble]) -> Self {
         let shared = Arc::new(Mutex::new(Shared {
             file: file.into(),
@@ -70,22 +70,22 @@ impl Hub {
         Self { url, shared }
     }
 
-    /// The paths that were asked for.
+    /// The requested paths.
     pub fn asked(&self) -> Vec<String> {
         self.shared.lock().unwrap().asked.clone()
     }
 
-    /// The `Range` of each request.
+    /// The `Range` header of each request.
     pub fn ranges(&self) -> Vec<Option<String>> {
         self.shared.lock().unwrap().ranges.clone()
     }
 
-    /// Bytes of bodies that were sent.
+    /// Number of body bytes sent.
     pub fn sent(&self) -> u64 {
         self.shared.lock().unwrap().sent
     }
 
-    /// The file as it is now.
+    /// The current contents of the file.
     pub fn file(&self) -> Bytes {
         self.shared.lock().unwrap().file.clone()
     }
@@ -134,7 +134,7 @@ async fn answer(State(shared): State<Arc<Mutex<Shared>>>, request: Request) -> R
     response.body(Body::from_stream(sent_in_parts(body, trouble, shared))).unwrap()
 }
 
-/// Where a range begins; a tag that is out of date asks for everything.
+/// The offset at which a range begins; 0 with an `If-Range` that is out of date.
 fn asked_from(headers: &HeaderMap, etag: &str) -> usize {
     let current = text(headers, IF_RANGE.as_str()).is_none_or(|asked| asked == etag);
     let range = text(headers, RANGE.as_str()).filter(|_| current);
@@ -143,7 +143,7 @@ fn asked_from(headers: &HeaderMap, etag: &str) -> usize {
     })
 }
 
-/// The body in parts, so that what went over the line before the trouble has arrived.
+/// The body in chunks, with pauses, so that the bytes before a fault have arrived.
 fn sent_in_parts(
     body: Bytes,
     trouble: Trouble,
@@ -164,7 +164,7 @@ fn sent_in_parts(
     let end = stream::once(async move {
         match trouble {
             Trouble::CutAfter(_) => {
-                // A network that takes its time: what was sent before reaches the client.
+                // A pause as of a slow network, so that the bytes before the cut have arrived.
                 tokio::time::sleep(Duration::from_millis(50)).await;
                 Some(Err(io::Error::other("cut")))
             }

@@ -1,5 +1,5 @@
-//! A receiver of webhooks: it keeps what comes, checks signatures as its own code would have to, and answers
-//! as it is told.
+//! A webhook receiver: it keeps the messages, verifies their signatures with code of its own, and answers from a
+//! script.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
@@ -18,17 +18,17 @@ use serde_json::Value;
 
 use crate::wait::eventually_within;
 
-/// What a receiver answers.
+/// How a receiver answers.
 #[derive(Clone)]
 pub enum Reply {
     Status(u16),
     /// A status with a header.
     With(u16, &'static str, String),
-    /// Nothing, for ever.
+    /// No response.
     Silence,
 }
 
-/// What came.
+/// A received message.
 #[derive(Clone)]
 pub struct Message {
     pub path: String,
@@ -45,7 +45,7 @@ impl Message {
         serde_json::from_slice(&self.body).unwrap()
     }
 
-    /// Checks the signature as a receiver does.
+    /// Verifies the signature as a receiver does.
     #[track_caller]
     pub fn verify(&self, secret: &str) {
         let key = STANDARD.decode(secret.strip_prefix("whsec_").unwrap()).unwrap();
@@ -61,12 +61,12 @@ impl Message {
     }
 }
 
-/// Somebody who is told.
+/// A running receiver.
 #[derive(Clone)]
 pub struct Receiver {
     pub url: String,
     messages: Arc<Mutex<Vec<Message>>>,
-    /// What it answers next; 200 when there is nothing left.
+    /// The next responses; 200 when there are none left.
     pub replies: Arc<Mutex<VecDeque<Reply>>>,
 }
 

@@ -48,8 +48,8 @@ pub fn shared_server() -> (&'static Server, String) {
     (&SHARED, format!("map-{}", MAPS.fetch_add(1, Ordering::Relaxed)))
 }
 
-/// Runs the command in its arguments until its standard input is closed, and then removes the folder `$DATA`: nobody
-/// drops what is static, but the pipe is closed when the process of the tests ends.
+/// Runs the command in its arguments until its standard input is closed, and then removes the folder `$DATA`: a static
+/// is never dropped, but the pipe is closed when the test process ends.
 const UNTIL_THE_TESTS_END: &str =
     r#""$0" "$@" </dev/null & server=$!; exec 2>&-; cat; kill -9 "$server"; wait; rm -rf "$DATA""#;
 
@@ -61,12 +61,12 @@ impl Server {
             .unwrap_or_else(|log| panic!("the server did not start: {log}"))
     }
 
-    /// The same; gives the log of a server that does not start.
+    /// Like [`Server::start`], but returns the log of a server that does not start.
     pub fn try_start(data: &Path, settings: &[(&str, &str)]) -> Result<Self, String> {
         Self::try_start_as("serve", data, settings)
     }
 
-    /// Starts a process that refines and does nothing else, for the servers of that data folder.
+    /// Starts a worker for the servers of that data folder.
     pub fn start_worker(data: &Path, settings: &[(&str, &str)]) -> Self {
         Self::try_start_as("worker", data, settings)
             .unwrap_or_else(|log| panic!("the worker did not start: {log}"))
@@ -165,7 +165,7 @@ impl Server {
         Answer::of(self.request(Method::PUT, path).json(&body)).await
     }
 
-    /// Posts a body with its type.
+    /// Posts a body of a media type.
     pub async fn post(&self, path: &str, media_type: &str, body: Vec<u8>) -> Answer {
         let request = self.request(Method::POST, path).header("content-type", media_type);
         Answer::of(request.body(body)).await
@@ -175,13 +175,13 @@ impl Server {
         self.post(path, "image/jpeg", body).await
     }
 
-    /// A map of the first `places` places of the town.
+    /// Creates a map of the first `places` places of the town.
     pub async fn town(&self, map: &str, places: usize) {
         self.put(&format!("/maps/{map}"), json!({"scene": "outdoor"})).await.expect(201);
         self.town_more(map, 0..places).await;
     }
 
-    /// More places of the town.
+    /// Adds places of the town to a map.
     pub async fn town_more(&self, map: &str, places: std::ops::Range<usize>) {
         for place in places {
             let path =
@@ -190,13 +190,13 @@ impl Server {
         }
     }
 
-    /// Asks the server to end, and waits until it has.
+    /// Sends SIGTERM and waits until the server has ended.
     pub fn terminate(mut self) -> std::process::ExitStatus {
         signal(&self.child, "TERM");
         self.child.wait().unwrap()
     }
 
-    /// Ends the server as a power cut would.
+    /// Kills the server.
     pub fn kill(mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
@@ -249,7 +249,7 @@ fn signal(child: &Child, name: &str) {
     assert!(status.unwrap().success());
 }
 
-/// An answer, read to its end.
+/// A response, read to its end.
 #[derive(Debug)]
 pub struct Answer {
     pub status: StatusCode,
@@ -264,14 +264,14 @@ impl Answer {
         Self { status, headers, bytes: response.bytes().await.unwrap().to_vec() }
     }
 
-    /// The JSON of an answer that must have this status.
+    /// Asserts the status; returns the JSON body.
     #[track_caller]
     pub fn expect(&self, status: u16) -> Value {
         assert_eq!(self.status.as_u16(), status, "{}", String::from_utf8_lossy(&self.bytes));
         serde_json::from_slice(&self.bytes).unwrap_or(Value::Null)
     }
 
-    /// A problem of this status: it has all its fields. Returns what it says.
+    /// Asserts that the response is a complete problem with this status; returns its detail.
     #[track_caller]
     pub fn problem(&self, status: u16) -> String {
         let problem = self.expect(status);

@@ -1,4 +1,4 @@
-//! `whereabouts demo`: which model it uses, and why.
+//! Which model `whereabouts demo` uses, and why.
 
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
@@ -11,8 +11,8 @@ use super::model_files::{Bench, fixture};
 use crate::mock_hub::{Hub, Trouble};
 use crate::support::BINARY;
 
-/// A catalogue whose `dinov2-small` is a tiny model, so that the demo has it at once; and the binary
-/// away from the checkout, whatever is installed there.
+/// A catalogue whose `dinov2-small` is a tiny model, so that it is downloaded at once; and a copy of the binary
+/// outside the checkout, so that the models installed there do not matter.
 fn bench() -> Bench {
     let bench =
         Bench::with(|manifest| manifest.replace("name = \"tiny\"", "name = \"dinov2-small\""));
@@ -33,7 +33,7 @@ async fn hub(troubles: &[Trouble]) -> Hub {
     Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), troubles).await
 }
 
-/// The outcome of a demo, and what it wrote to the standard error.
+/// Runs the demo; returns its summary and its standard error.
 async fn demo(bench: &Bench, hub: &str, more: &[&str]) -> (Value, String) {
     let out = TempDir::new().unwrap();
     let mut command = Command::new(binary(bench));

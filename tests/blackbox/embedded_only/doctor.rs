@@ -1,4 +1,4 @@
-//! What `whereabouts doctor` says about data folders that are in order, and about others.
+//! `whereabouts doctor` on healthy and on damaged data folders.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -20,7 +20,7 @@ fn report(dir: &Path, args: &[&str]) -> (Value, i32) {
     (serde_json::from_slice(&output.stdout).expect(&error), output.status.code().unwrap())
 }
 
-/// What is found, one line each.
+/// The findings, one line each.
 fn findings(report: &Value) -> Vec<String> {
     let findings = report["findings"].as_array().unwrap().iter();
     findings.map(|finding| format!("{} ({})", finding["what"], finding["advice"])).collect()

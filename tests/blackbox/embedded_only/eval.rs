@@ -1,4 +1,4 @@
-//! `whereabouts eval`, as a user types it.
+//! `whereabouts eval` as a user types it.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -12,7 +12,7 @@ use crate::mock_mllm::{MockMllm, Script};
 use crate::support::{BINARY, frame, reference};
 use crate::wait::until;
 
-/// References and queries in folders, and room for what eval writes.
+/// Folders with references and queries, and room for the output.
 struct Folders {
     dir: TempDir,
 }
@@ -33,7 +33,7 @@ impl Folders {
         std::fs::write(self.path(name), bytes).unwrap();
     }
 
-    /// A town of `places` with positions in the names, 100 m apart, and a query of each.
+    /// A town whose `places` are 100 m apart, with positions in the file names, and a query of each.
     fn town(places: usize) -> Self {
         let folders = Self::new();
         for place in 0..places {
@@ -91,7 +91,7 @@ fn names(summary: &Value) -> Vec<&str> {
 #[test]
 fn a_town_is_evaluated_and_reported_as_json_csv_and_html() {
     let folders = Folders::town(12);
-    // A query far from every reference, with a name that must not become markup.
+    // A query far from every reference, with a name that must be escaped.
     folders.write("queries/@1.0@90000.0@<b>@.jpg", frame(13, 0));
     let summary = folders.eval(&["--out", "out"]);
     assert_eq!((&summary["queries"], &summary["skipped"]), (&12.into(), &1.into()));
@@ -105,7 +105,7 @@ fn a_town_is_evaluated_and_reported_as_json_csv_and_html() {
     assert_eq!(sum, 12);
 
     let csv = std::fs::read_to_string(folders.path("out/predictions.csv")).unwrap();
-    // 13 queries, two methods, an answer for each reference, and a header.
+    // 13 queries, two methods, a line for each reference, and a header.
     assert_eq!(csv.lines().count(), 1 + 13 * 2 * 12);
     let first = csv.lines().filter(|line| line.contains(",gem+local,1,") && line.contains(",yes,"));
     let share = 100.0 * first.count() as f64 / 12.0;
@@ -154,7 +154,7 @@ fn every_dataset_layout_gives_the_same_recall() {
     other.write("queries/poses.csv", &queries);
     let posed = ["--refine", "off", "--database-poses", "database.csv", "--threshold-m", "30"];
     assert_eq!(recalls(&other.eval(&posed)), expected);
-    // Beside the folders it is found without being named.
+    // Next to the folders it is found without being named.
     std::fs::remove_file(other.path("queries/poses.csv")).unwrap();
     other.write("ground_truth.csv", &truth);
     assert_eq!(recalls(&other.eval(&["--refine", "off"])), expected);
@@ -164,7 +164,7 @@ fn every_dataset_layout_gives_the_same_recall() {
 fn a_changed_folder_is_indexed_again() {
     let folders = Folders::town(4);
     assert_eq!(recalls(&folders.eval(&["--refine", "off"]))[0][2], 100.0);
-    // One reference is gone, and another shows something else.
+    // One reference is removed, and another is replaced.
     std::fs::remove_file(folders.path("database/@1000.0@5.0@.jpg")).unwrap();
     folders.write("database/@1100.0@5.0@.jpg", reference(40));
     let summary = folders.eval(&["--refine", "off"]);
@@ -206,7 +206,7 @@ async fn a_killed_run_is_resumed_and_pays_for_no_description_twice() {
     let summary = folders.eval(&args);
     assert_eq!(names(&summary), ["gem", "gem+local", "gem+mllm"]);
     assert_eq!(mock.pairs().len(), 6 * 4);
-    // Only pairs that were on their way when the process was killed are asked again.
+    // Only pairs that were in flight at the kill are described again.
     assert!(mock.asked_again() <= 8, "{}", mock.asked_again());
     let [before, _, after] = recalls(&summary)[..] else { panic!("{summary}") };
     assert_eq!(before[1], after[1], "the same four, in another order");
@@ -236,7 +236,7 @@ fn queries_of_unmapped_places_measure_the_known_flag() {
     assert!((0.0..=1.0).contains(&auc) && known["at_95"]["recall"].as_f64().unwrap() >= 0.95);
 }
 
-/// A JPEG that says in its EXIF block where it was taken.
+/// Inserts a position into the EXIF block of a JPEG.
 fn with_gps(jpeg: &[u8], lat: f64, lon: f64) -> Vec<u8> {
     let degrees = |angle: f64| {
         let part =
@@ -297,7 +297,7 @@ fn both_descriptors_of_a_transformer_are_evaluated() {
     command.env("WHEREABOUTS_MODEL__ASSETS", folders.path("assets"));
     let summary = json(&command.output().unwrap());
     assert_eq!(names(&summary), ["gem", "gem+local", "cls", "cls+local"]);
-    // Weights by chance describe badly, but five places leave no more than five answers.
+    // Random weights describe badly, but with five places R@5 is always 100 %.
     assert!(recalls(&summary).iter().all(|at| at[1] == 100.0), "{summary}");
 }
 

@@ -16,7 +16,7 @@ pub fn fixture(file: &str) -> PathBuf {
     Path::new(FIXTURE).join(file)
 }
 
-/// Assets of their own and a catalogue with one model, `tiny`.
+/// An assets folder, and a catalogue with one model, `tiny`.
 pub struct Bench {
     dir: TempDir,
 }
@@ -26,7 +26,7 @@ impl Bench {
         Self::with(|manifest| manifest)
     }
 
-    /// The catalogue's manifest is what `change` makes of the fixture's.
+    /// A catalogue with the manifest of the fixture, changed by `change`.
     pub fn with(change: impl FnOnce(String) -> String) -> Self {
         let dir = TempDir::new().unwrap();
         let manifest = std::fs::read_to_string(fixture("manifest.toml")).unwrap();
@@ -44,7 +44,7 @@ impl Bench {
         self.dir.path().join("catalogue.toml")
     }
 
-    /// Without a pin, the first download is believed.
+    /// A catalogue without a pinned digest: the first download is trusted.
     fn unpinned() -> Self {
         Self::with(|manifest| {
             let lines: Vec<_> = manifest.lines().filter(|l| !l.starts_with("sha256")).collect();
@@ -78,7 +78,7 @@ impl Bench {
         Outcome::of(&self.command(hub, args).output().unwrap())
     }
 
-    /// Nothing is installed, not even in part.
+    /// Asserts that nothing is installed, not even partially.
     #[track_caller]
     fn nothing_is_installed(&self) {
         assert!(!self.models().join("tiny").exists());
@@ -114,7 +114,7 @@ impl Outcome {
         self.out
     }
 
-    /// It failed and says all of these words.
+    /// Asserts that the command failed and that its error contains all of these words.
     #[track_caller]
     fn bad(self, words: &[&str]) {
         assert_eq!(self.code, Some(1), "{}{}", self.out, self.err);
@@ -128,7 +128,7 @@ async fn hub(troubles: &[Trouble]) -> Hub {
     Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), troubles).await
 }
 
-/// Off the async threads, on which the hub runs.
+/// Runs `model pull` off the async threads, which the hub needs.
 async fn pull(bench: &Bench, hub: &Hub) -> Outcome {
     let mut command = bench.command(&hub.url, &["pull", "tiny"]);
     let run = tokio::task::spawn_blocking(move || command.output().unwrap());
@@ -187,7 +187,7 @@ async fn a_broken_download_is_resumed_and_no_byte_is_sent_twice() {
     bench.tiny_is_installed();
     assert_eq!(hub.asked().len(), 4);
     let whole = std::fs::metadata(fixture("model.onnx")).unwrap().len();
-    // What was on the line when it was cut may be lost, but the rest is not asked for again.
+    // Bytes in flight at a cut may be lost, but the rest is not requested again.
     assert!(hub.sent() >= whole && hub.sent() <= whole + 3 * 6_000, "{} bytes", hub.sent());
     assert!(hub.ranges()[1..].iter().any(Option::is_some), "{:?}", hub.ranges());
 }
@@ -201,12 +201,12 @@ async fn transient_errors_of_the_hub_are_retried() {
         pull(&bench, &hub).await.good();
         bench.tiny_is_installed();
     }
-    // A server that has never heard of ranges sends everything again.
+    // A server without range support sends everything again.
     let bench = Bench::new();
     let hub = hub(&[Trouble::CutAfter(9_000), Trouble::IgnoreRange]).await;
     pull(&bench, &hub).await.good();
     bench.tiny_is_installed();
-    // 416: what is there cannot be continued.
+    // 416: the partial file cannot be resumed.
     let bench = Bench::new();
     let hub = self::hub(&[Trouble::CutAfter(9_000), Trouble::Status(416)]).await;
     pull(&bench, &hub).await.good();
@@ -272,7 +272,7 @@ async fn a_killed_pull_installs_nothing_and_is_resumed() {
     );
     let partial = bench.models().join(".partial/tiny-model.onnx");
     until(async || std::fs::metadata(&partial).map_or(0, |file| file.len()) >= 12_000).await;
-    // While it is at work, another one does not get in its way.
+    // A second pull does not interfere with it.
     pull(&bench, &hub).await.bad(&["another process is installing tiny"]);
     killed.0.kill().unwrap();
     killed.0.wait().unwrap();
@@ -284,7 +284,7 @@ async fn a_killed_pull_installs_nothing_and_is_resumed() {
     assert_eq!(hub.sent(), whole);
 }
 
-/// Ends with the test.
+/// Kills the process when dropped.
 struct Killed(Child);
 
 impl Drop for Killed {

@@ -1,4 +1,4 @@
-//! Models of both layouts, from the bytes of a picture to the descriptor.
+//! Models with both output layouts, from the bytes of a picture to the descriptor.
 
 use std::path::Path;
 
@@ -14,14 +14,14 @@ const EIGHT: Layout = Layout { threads: 1, sessions: 1, max_batch: 8 };
 const SIDE_BY_SIDE: Layout = Layout { threads: 4, sessions: 2, max_batch: 2 };
 
 fn load(model: &str, layout: Layout) -> Extractor {
-    // The fixtures first, then what `make build` installed.
+    // The fixtures, and then the models that `make build` installed.
     let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures");
     let limits = ImageLimits { max_pixels: 10_000_000 };
     let settings = ExtractorSettings { layout, ..ExtractorSettings::plain(model, 1, limits) };
     Extractor::load(&Assets::locate(Some(&fixtures)), &settings).unwrap()
 }
 
-/// The picture that the fixture's script describes, as a PNG.
+/// The test pattern of the script that generated the fixture, as a PNG.
 fn pattern() -> Vec<u8> {
     let pixels = image::RgbImage::from_fn(56, 42, |x, y| {
         let byte = |value: u32| (value % 256) as u8;
@@ -67,7 +67,7 @@ fn a_batch_gives_what_single_runs_give() {
             let extract = move |place| {
                 shared.extract(&reference(place), DescriptorKind::Gem).unwrap().descriptor
             };
-            // Several rounds, so that pictures come both alone and while others are in progress.
+            // Several rounds, so that pictures arrive both alone and during other batches.
             let threads: Vec<_> =
                 (0..8).map(|place| scope.spawn(move || [(); 5].map(|()| extract(place)))).collect();
             for (thread, alone) in threads.into_iter().zip(&alone) {

@@ -26,7 +26,7 @@ async fn another_provider_gives_the_same_descriptors_and_another_precision_is_a_
     assert_eq!(server.get("/maps/m").await.expect(200)["precision"], "full");
     let by_cpu = localize(&server).await;
     server.terminate();
-    // auto keeps to the precision of the maps.
+    // auto keeps the precision of the maps.
     let server = start("openvino", "auto");
     assert!(server.log().contains("openvino at full precision"), "{}", server.log());
     for (one, other) in localize(&server).await.iter().zip(&by_cpu) {
@@ -38,7 +38,7 @@ async fn another_provider_gives_the_same_descriptors_and_another_precision_is_a_
     assert!(refused.contains("model.precision"), "{refused}");
     server.town("b", 2).await;
     assert_eq!(server.get("/maps/b").await.expect(200)["precision"], "bf16");
-    // As it says, too: the descriptors are made anew.
+    // As the error advises: a reindex computes the descriptors again.
     assert!(refused.contains("--reindex --map m"), "{refused}");
     server.post("/maps/m/reindex", "application/json", Vec::new()).await.expect(202);
     until(async || server.get("/maps/m").await.expect(200)["precision"] != "full").await;

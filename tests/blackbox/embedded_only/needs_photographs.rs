@@ -36,7 +36,7 @@ fn ground_truth(folder: &Path) -> HashMap<String, HashSet<String>> {
     .collect()
 }
 
-/// Percent of queries with a true image among the first 1, 5 and 10.
+/// Percentage of queries with a correct image among the first 1, 5 and 10.
 #[derive(Debug, Default)]
 struct Recall {
     at: [f64; 3],
@@ -60,7 +60,7 @@ fn ids(list: &Value) -> Vec<String> {
     list.as_array().unwrap().iter().map(of).collect()
 }
 
-/// Indexes, restarts, localizes and refines a set; the recall before and after.
+/// Indexes a set, restarts, localizes and refines; returns the recall before and after refinement.
 async fn evaluate(set: &str, references: &str, queries: &str) -> (Recall, Recall) {
     let folder = data(set);
     let truth = ground_truth(&folder);

@@ -1,4 +1,4 @@
-//! More than the server can do: frames are refused at once, jobs and indexing before frames.
+//! Overload: excess frames are rejected at once, and jobs and indexing are shed before frames.
 
 use std::time::{Duration, Instant};
 
@@ -9,7 +9,7 @@ use tokio::task::JoinSet;
 
 use crate::support::{Answer, Server, frame, reference, value_of};
 
-/// One picture in work, so that others wait, and time for all of them on any machine.
+/// One permit, so that other pictures wait, and timeouts that no machine reaches.
 const NARROW: &[(&str, &str)] = &[
     ("WHEREABOUTS_IMAGE__PERMITS", "1"),
     ("WHEREABOUTS_IMAGE__MAX_WAIT_MS", "600000"),
@@ -22,7 +22,7 @@ fn narrow(more: &[(&str, &str)]) -> (TempDir, Server) {
     (dir, server)
 }
 
-/// Posts so many frames at once.
+/// Posts this many frames at once.
 fn post_all(server: &Server, path: &str, frames: usize) -> JoinSet<Answer> {
     let bytes = frame(0, 0);
     let requests = (0..frames).map(|_| {
@@ -36,7 +36,7 @@ async fn metric(server: &Server, name: &str) -> f64 {
     value_of(&server.metrics().await, name).unwrap_or(0.0)
 }
 
-/// Waits until so many frames wait.
+/// Waits until this many frames are queued.
 async fn wait_for_line(server: &Server, length: f64) {
     let start = Instant::now();
     while metric(server, r#"whereabouts_pictures_waiting{class="localize"}"#).await < length {
@@ -103,7 +103,7 @@ async fn a_missed_deadline_is_504_and_a_malformed_one_400() {
         let answer = Answer::of(post(rubbish).body(frame(0, 0))).await;
         assert!(answer.problem(400).contains("X-Deadline-Ms"), "{rubbish}");
     }
-    // A body that never comes cannot be answered in time.
+    // A body that never comes misses the deadline.
     let never = futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>();
     let answer = Answer::of(post("200").body(reqwest::Body::wrap_stream(never))).await;
     assert!(answer.problem(504).contains("200 ms"));
@@ -112,7 +112,7 @@ async fn a_missed_deadline_is_504_and_a_malformed_one_400() {
 
 #[tokio::test]
 async fn waiting_for_a_refinement_ends_before_the_deadline() {
-    // Nobody refines: the endpoint of the model is not there, and the job waits for it.
+    // The endpoint of the model is unreachable, so the job waits for it.
     let (_dir, server) = narrow(&[
         ("WHEREABOUTS_REFINE__REFINER", "mllm"),
         ("WHEREABOUTS_MLLM__BASE_URL", "http://127.0.0.1:1/v1"),

@@ -1,4 +1,4 @@
-//! What the mock MLLM takes, as strictly as the real API.
+//! Checks the requests to the mock MLLM as strictly as the real API.
 
 use axum::http::{HeaderMap, Uri};
 use base64::Engine;
@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 
 use super::Script;
 
-/// What a request that obeys the rules asks for.
+/// A valid request.
 pub struct Asked {
     /// The hashes of its pictures.
     pub pictures: Vec<String>,
