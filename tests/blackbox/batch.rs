@@ -65,7 +65,7 @@ async fn each_image_of_a_form_has_its_own_result_and_errors_are_isolated() {
     let answer = send(server, &map, form).await.expect(200);
     let digest = answer["results"][3]["id"].as_str().unwrap().to_owned();
     assert_eq!(digest.len(), 16, "without a name it is the head of the digest");
-    let wanted = [
+    let expected_results = [
         ("a", "stored"),
         ("two.jpg", "stored"),
         ("broken.jpg", "failed"),
@@ -75,7 +75,7 @@ async fn each_image_of_a_form_has_its_own_result_and_errors_are_isolated() {
         ("a", "present"),
         ("a", "failed"),
     ];
-    assert_eq!(outcomes(&answer), expected(&wanted));
+    assert_eq!(outcomes(&answer), expected(&expected_results));
     assert_eq!(
         [&answer["stored"], &answer["present"], &answer["failed"]],
         [&json!(3), &json!(1), &json!(4)]
@@ -109,7 +109,7 @@ async fn an_archive_holds_pictures_and_their_metadata_in_sidecar_files() {
         ("e.jpg", &pictures[4]),
     ]);
     let answer = send_tar(server, &map, sent.clone()).await.expect(200);
-    let wanted = [
+    let expected_results = [
         ("a.jpg", "stored"),
         ("b", "stored"),
         ("", "failed"),
@@ -118,7 +118,7 @@ async fn an_archive_holds_pictures_and_their_metadata_in_sidecar_files() {
         ("d.txt", "failed"),
         ("e.jpg", "stored"),
     ];
-    assert_eq!(outcomes(&answer), expected(&wanted));
+    assert_eq!(outcomes(&answer), expected(&expected_results));
     let detail = |index: usize| answer["results"][index]["problem"]["detail"].as_str().unwrap();
     assert!(detail(2).contains("lost.jpg") && detail(4).contains("c.jpg"), "{answer}");
     let image = server.get(&format!("/maps/{map}/images/a.jpg")).await.expect(200);

@@ -6,6 +6,8 @@ use std::process::{Command, Output};
 use serde_json::Value;
 use tempfile::TempDir;
 
+use super::deployment;
+use super::keys::{Guarded, get};
 use super::support::{BINARY, Server, frame, reference, server, shared_server};
 
 fn whereabouts(args: &[&str]) -> Output {
@@ -169,4 +171,53 @@ fn the_demo_runs_and_refinement_helps() {
     let refused = whereabouts(&["demo", "--out", other.to_str().unwrap()]);
     assert_eq!(refused.status.code(), Some(1));
     assert!(other.join("thesis.tex").is_file());
+}
+
+#[tokio::test]
+async fn the_commands_take_the_key_from_the_environment() {
+    let Guarded { dir, server, admin, .. } = Guarded::start().await;
+    let run = |key: Option<&str>, args: &[&str]| {
+        let mut command = Command::new(&*BINARY);
+        command.args(args).env("WHEREABOUTS_SERVER", &server.url);
+        if let Some(key) = key {
+            command.env("WHEREABOUTS_API_KEY", key);
+        }
+        let output = command.output().unwrap();
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        (output.status.success(), text(&output.stdout), text(&output.stderr))
+    };
+    let (ok, _, said) = run(None, &["jobs"]);
+    assert!(!ok && said.contains("keys create"), "{said}");
+    let (ok, _, said) = run(Some(&admin), &["jobs"]);
+    assert!(ok, "{said}");
+    let create = ["keys", "create", "--name", "robot 7", "--role", "robot", "--map", "yard"];
+    let (ok, key, said) = run(Some(&admin), &create);
+    assert!(ok && key.starts_with("wab_"), "{said}");
+    get(&server, key.trim(), "/maps/yard").await.expect(200);
+    let (_, listed, _) = run(Some(&admin), &["keys", "list"]);
+    assert!(listed.contains("robot 7") && listed.contains("yard"), "{listed}");
+    let (ok, _, said) = run(Some(&admin), &["keys", "revoke", &key[4..16]]);
+    assert!(ok, "{said}");
+    get(&server, key.trim(), "/maps/yard").await.problem(401);
+    // The whole token is accepted instead of the id; anything else must not get into a URL.
+    let (_, other, _) = run(Some(&admin), &create);
+    let (ok, _, said) = run(Some(&admin), &["keys", "revoke", other.trim()]);
+    assert!(ok, "{said}");
+    get(&server, other.trim(), "/maps/yard").await.problem(401);
+    let (ok, _, said) = run(Some(&admin), &["keys", "revoke", "../maps/vault"]);
+    assert!(!ok && said.contains("hexadecimal"), "{said}");
+    get(&server, &admin, "/maps/vault").await.expect(200);
+    let whole = get(&server, &admin, &format!("/keys/{}", other.trim())).await;
+    assert!(whole.status.is_client_error());
+    assert!(!server.log().contains(&other[20..70]), "a key is in the log");
+    // A database is not locked by a server, and needs no folder.
+    if !deployment::is_scale_out() {
+        let absent = dir.path().join("absent");
+        let (ok, _, said) = run(None, &["keys", "list", "--data", absent.to_str().unwrap()]);
+        assert!(!ok && said.contains("no data folder") && !absent.exists(), "{said}");
+        // A running server locks its data folder.
+        let data = dir.path().to_str().unwrap();
+        let (ok, _, said) = run(None, &["keys", "list", "--data", data]);
+        assert!(!ok && said.contains("leave --data out"), "{said}");
+    }
 }

@@ -26,9 +26,9 @@ async fn confidences(server: &Server, map: &str, places: std::ops::Range<usize>)
             server.post_jpeg(&format!("/localize?map={map}"), frame(place, 0)).await.expect(200);
         let href = answer["job"]["href"].as_str().unwrap();
         let job = server.get(&format!("{href}?wait=60")).await.expect(200);
-        found.push([&answer, &job].map(|told| {
-            let confidence = told["estimate"]["confidence"].as_f64().unwrap();
-            assert_eq!(told["estimate"]["known"], confidence >= 0.9);
+        found.push([&answer, &job].map(|response| {
+            let confidence = response["estimate"]["confidence"].as_f64().unwrap();
+            assert_eq!(response["estimate"]["known"], confidence >= 0.9);
             confidence
         }));
     }

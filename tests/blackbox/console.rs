@@ -98,9 +98,9 @@ async fn a_job_shows_its_frame_and_the_regions_that_match_a_candidate() {
         }
     }
     server.get(&format!("/jobs/{job}/matches/nothing")).await.problem(404);
-    let nobody = uuid::Uuid::nil();
-    server.get(&format!("/jobs/{nobody}/frame")).await.problem(404);
-    server.get(&format!("/jobs/{nobody}/matches/{first}")).await.problem(404);
+    let unknown = uuid::Uuid::nil();
+    server.get(&format!("/jobs/{unknown}/frame")).await.problem(404);
+    server.get(&format!("/jobs/{unknown}/matches/{first}")).await.problem(404);
     server.delete(&format!("/maps/{map}")).await;
     server.get(&format!("/jobs/{job}/matches/{first}")).await.problem(404);
 }

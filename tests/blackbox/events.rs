@@ -121,18 +121,18 @@ async fn the_event_stream_covers_all_jobs_or_those_of_one_map() {
     streams[0].extend(all.bytes().await.unwrap());
     streams[1].extend(of_map.bytes().await.unwrap());
     for (stream, maps) in streams.iter().zip([&["m", "n"][..], &["m"]]) {
-        let told = events(stream);
-        assert!(told.iter().all(|(name, _)| name == "job"), "{told:?}");
-        let ended = told.iter().filter(|(_, job)| job["state"] == "succeeded");
+        let received = events(stream);
+        assert!(received.iter().all(|(name, _)| name == "job"), "{received:?}");
+        let ended = received.iter().filter(|(_, job)| job["state"] == "succeeded");
         let ended: Vec<(String, &str)> = ended
             .map(|(_, job)| (job["id"].as_str().unwrap().to_owned(), job["map"].as_str().unwrap()))
             .collect();
         let of_maps = expected.iter().filter(|(_, map)| maps.contains(map)).cloned();
         assert_eq!(ended, of_maps.collect::<Vec<_>>());
-        for pair in told.windows(2) {
-            assert_ne!(pair[0], pair[1], "told twice");
+        for pair in received.windows(2) {
+            assert_ne!(pair[0], pair[1], "an event came twice");
         }
-        let running = told.iter().any(|(_, job)| job["state"] == "running" && job["of"] == 3);
-        assert!(running || deployment::is_scale_out(), "{told:?}");
+        let running = received.iter().any(|(_, job)| job["state"] == "running" && job["of"] == 3);
+        assert!(running || deployment::is_scale_out(), "{received:?}");
     }
 }

@@ -30,7 +30,7 @@ const END_STREAM: u8 = 1;
 const END_HEADERS: u8 = 4;
 
 /// A deadline that no passing test comes near.
-const PATIENCE: Duration = Duration::from_secs(60);
+const DEADLINE: Duration = Duration::from_secs(60);
 
 fn server(more: &[(&str, &str)]) -> (TempDir, Server) {
     let dir = TempDir::new().unwrap();
@@ -98,7 +98,7 @@ impl Client {
             Some((head[3], head[4], stream, payload))
         };
         let came =
-            tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open")?;
+            tokio::time::timeout(DEADLINE, reading).await.expect("the connection stays open")?;
         if let (PING, 0, 0, payload) = &came {
             // The server may have closed the connection since.
             let _ = self.0.write_all(&frame(PING, ACK, 0, payload)).await;
@@ -123,8 +123,8 @@ impl Client {
 
 async fn refused(server: &Server, reason: &str) -> u64 {
     let metrics = server.metrics().await;
-    let wanted = format!("reason=\"{reason}\"");
-    let line = metrics.lines().find(|line| line.contains("refused") && line.contains(&wanted));
+    let label = format!("reason=\"{reason}\"");
+    let line = metrics.lines().find(|line| line.contains("refused") && line.contains(&label));
     line.and_then(|line| line.rsplit(' ').next()?.parse().ok()).unwrap_or(0)
 }
 
@@ -156,7 +156,7 @@ async fn an_incomplete_preface_times_out() {
     client.send(&PREFACE[..10]).await;
     let mut answer = Vec::new();
     let reading = client.0.read_to_end(&mut answer);
-    tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open").unwrap();
+    tokio::time::timeout(DEADLINE, reading).await.expect("the connection stays open").unwrap();
     assert!(answer.starts_with(b"HTTP/1.1 408 "), "{}", String::from_utf8_lossy(&answer));
 }
 
@@ -223,7 +223,7 @@ async fn a_rapid_reset_flood_closes_the_connection() {
     });
     let mut answer = Vec::new();
     let reading = reader.read_to_end(&mut answer);
-    let _ = tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open");
+    let _ = tokio::time::timeout(DEADLINE, reading).await.expect("the connection stays open");
     flooding.await.unwrap();
     let (mut kinds, mut rest) = (Vec::new(), &answer[..]);
     while let [a, b, c, kind, tail @ ..] = rest {

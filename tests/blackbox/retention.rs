@@ -44,7 +44,7 @@ async fn ended_jobs_are_removed_with_their_frames_beyond_a_number() {
         let answer = server.post_jpeg(path, frame(variant, variant as u32)).await.expect(200);
         made.push(answer["job"]["id"].as_str().unwrap().to_owned());
     }
-    assert_eq!(listed(&server).await.len(), 8, "whoever waits sees its end");
+    assert_eq!(listed(&server).await.len(), 8, "a client that waits still sees the end of its job");
     assert!(deployment::is_scale_out() || files(&dir) == 4 + 8);
     server.kill();
 

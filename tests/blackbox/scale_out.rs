@@ -177,12 +177,12 @@ mod alone {
         let mut attempts = 0..;
         eventually_within(Duration::from_secs(60), async || {
             let server = &servers[(number + attempts.next().unwrap()) % servers.len()];
-            let asked = Instant::now();
+            let sent_at = Instant::now();
             let answer = server.post_jpeg("/localize?map=m", frame(number, 0)).await;
             assert!(
-                asked.elapsed() < Duration::from_secs(8),
+                sent_at.elapsed() < Duration::from_secs(8),
                 "an answer took {:?}",
-                asked.elapsed()
+                sent_at.elapsed()
             );
             if answer.status == 200 {
                 return Ok(answer.expect(200));

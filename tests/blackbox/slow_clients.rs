@@ -11,7 +11,7 @@ use tokio::net::TcpStream;
 use super::support::{Server, reference};
 
 /// A deadline that no passing test comes near.
-const PATIENCE: Duration = Duration::from_secs(60);
+const DEADLINE: Duration = Duration::from_secs(60);
 
 /// Timeouts of a few seconds.
 const STRICT: &[(&str, &str)] = &[
@@ -52,7 +52,7 @@ async fn rest(stream: &mut TcpStream) -> String {
     let mut bytes = Vec::new();
     let reading = stream.read_to_end(&mut bytes);
     // A reset after the response counts as an end.
-    let _ = tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open");
+    let _ = tokio::time::timeout(DEADLINE, reading).await.expect("the connection stays open");
     String::from_utf8(bytes).unwrap()
 }
 
@@ -70,7 +70,7 @@ async fn rest_while_sending(stream: TcpStream, bytes: &[u8], pause: Duration) ->
         }
     });
     let mut answer = Vec::new();
-    let _ = tokio::time::timeout(PATIENCE, from.read_to_end(&mut answer))
+    let _ = tokio::time::timeout(DEADLINE, from.read_to_end(&mut answer))
         .await
         .expect("the connection stays open");
     sending.abort();
@@ -108,7 +108,7 @@ async fn a_trickling_head_gets_408_and_a_silent_connection_is_closed() {
     assert!(start.elapsed() >= Duration::from_secs(2), "before its time: {answer}");
     assert!(problem(&answer, 408).contains("server.header_timeout_s"));
     for stream in &mut silent {
-        assert_eq!(rest(stream).await, "", "who asks nothing is told nothing");
+        assert_eq!(rest(stream).await, "", "a silent connection gets no response");
     }
 }
 
@@ -165,7 +165,7 @@ async fn bodies_beyond_the_shared_memory_budget_get_429() {
     drop((first, second));
     let answered =
         async { while server.post_jpeg("/localize?map=m", reference(0)).await.status == 429 {} };
-    tokio::time::timeout(PATIENCE, answered).await.expect("the memory is not given back");
+    tokio::time::timeout(DEADLINE, answered).await.expect("the memory is not given back");
 }
 
 #[tokio::test]
@@ -230,7 +230,7 @@ async fn a_client_that_reads_no_response_is_disconnected() {
     let (from, mut to) = connect(&server).await.into_split();
     let request = b"GET /openapi.json HTTP/1.1\r\nhost: x\r\n\r\n".repeat(100);
     let failed = async { while to.write_all(&request).await.is_ok() {} };
-    tokio::time::timeout(PATIENCE, failed).await.expect("the server still waits");
+    tokio::time::timeout(DEADLINE, failed).await.expect("the server still waits");
     drop(from);
     server.get("/maps").await.expect(200);
 }
@@ -274,5 +274,5 @@ async fn idle_connections_are_evicted_and_busy_ones_are_not() {
             }
         }
     };
-    tokio::time::timeout(PATIENCE, room).await.expect("no room is made");
+    tokio::time::timeout(DEADLINE, room).await.expect("no room is made");
 }

@@ -55,9 +55,9 @@ fn trusting(certificate: &str) -> Client {
 
 /// Puts a certificate or key in place atomically.
 fn put(folder: &Path, certificate: &str, end: &str) {
-    let beside = folder.join("beside");
-    std::fs::copy(fixture(&format!("{certificate}.{end}")), &beside).unwrap();
-    std::fs::rename(&beside, folder.join(format!("server.{end}"))).unwrap();
+    let staged = folder.join("staged");
+    std::fs::copy(fixture(&format!("{certificate}.{end}")), &staged).unwrap();
+    std::fs::rename(&staged, folder.join(format!("server.{end}"))).unwrap();
 }
 
 #[tokio::test]

@@ -17,8 +17,8 @@ const PRIVATE: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__ALLOW_PRIVATE", "true");
 const NO_RETRY: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[]");
 
 /// Creates a webhook; returns its id and its secret.
-async fn hook(server: &Server, wanted: Value) -> (String, String) {
-    let request = server.request(Method::POST, "/webhooks").json(&wanted);
+async fn hook(server: &Server, webhook: Value) -> (String, String) {
+    let request = server.request(Method::POST, "/webhooks").json(&webhook);
     let made = Answer::of(request).await.expect(201);
     let text = |field: &str| made[field].as_str().unwrap().to_owned();
     (text("id"), text("secret"))
@@ -117,14 +117,14 @@ async fn a_failed_delivery_is_retried_with_the_same_id_and_body() {
     let retry = ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[0, 0, 5]");
     let server =
         Server::start(dir.path(), &[PRIVATE, retry, ("WHEREABOUTS_WEBHOOKS__TIMEOUT_S", "1")]);
-    let patience = Reply::With(503, "retry-after", "2".into());
-    let receiver = Receiver::start([Reply::Status(500), patience, Reply::Silence]).await;
+    let busy = Reply::With(503, "retry-after", "2".into());
+    let receiver = Receiver::start([Reply::Status(500), busy, Reply::Silence]).await;
     let (id, secret) = hook(&server, json!({"url": receiver.url})).await;
     post(&server, &format!("/webhooks/{id}/test")).await.expect(202);
     receiver.wait(2).await;
-    let asked = Instant::now();
+    let start = Instant::now();
     receiver.wait(3).await;
-    assert!(asked.elapsed() > Duration::from_millis(1500), "Retry-After was not waited for");
+    assert!(start.elapsed() > Duration::from_millis(1500), "Retry-After was not waited for");
     let waiting = newest(&server, &id, "waiting", 3).await;
     assert!(waiting["last_error"].as_str().unwrap().contains("webhooks.timeout_s"), "{waiting}");
     assert!(waiting["last_status"].is_null());
@@ -142,9 +142,9 @@ async fn a_failed_delivery_is_retried_with_the_same_id_and_body() {
 async fn a_dead_delivery_is_kept_and_can_be_redelivered() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[0]")]);
-    let (nobody, _) = hook(&server, json!({"url": "http://127.0.0.1:1/"})).await;
-    post(&server, &format!("/webhooks/{nobody}/test")).await.expect(202);
-    let dead = newest(&server, &nobody, "dead", 2).await;
+    let (unreachable, _) = hook(&server, json!({"url": "http://127.0.0.1:1/"})).await;
+    post(&server, &format!("/webhooks/{unreachable}/test")).await.expect(202);
+    let dead = newest(&server, &unreachable, "dead", 2).await;
     assert!(dead["last_error"].as_str().unwrap().contains("refused"), "{dead}");
     assert!(dead["last_status"].is_null() && dead["ended_at"].is_string());
     let receiver = Receiver::start([Reply::Status(500), Reply::Status(404)]).await;
@@ -233,8 +233,8 @@ async fn private_addresses_are_rejected_unless_allowed() {
         assert!(why.contains("webhooks.allow_private"), "{why}");
     }
     assert_eq!(receiver.messages().len(), 1);
-    let refuse = async |wanted: Value, status| {
-        Answer::of(server.request(Method::POST, "/webhooks").json(&wanted)).await.problem(status)
+    let refuse = async |webhook: Value, status| {
+        Answer::of(server.request(Method::POST, "/webhooks").json(&webhook)).await.problem(status)
     };
     for url in [
         receiver.url.as_str(),
@@ -317,15 +317,15 @@ async fn no_delivery_is_lost_when_the_server_is_killed() {
 
     let _server = Server::start(dir.path(), &[PRIVATE]);
     let messages = receiver.wait(before + jobs.len()).await;
-    let mut told: Vec<String> = messages[before..]
+    let mut delivered: Vec<String> = messages[before..]
         .iter()
         .map(|message| {
             message.verify(&secret);
             message.json()["data"]["id"].as_str().unwrap().to_owned()
         })
         .collect();
-    told.sort();
-    assert_eq!(told, jobs);
+    delivered.sort();
+    assert_eq!(delivered, jobs);
 }
 
 #[tokio::test]
@@ -345,9 +345,9 @@ async fn a_slow_receiver_delays_neither_others_nor_shutdown() {
     }
     quick.wait(10).await;
     assert_eq!(slow.messages().len(), 4, "webhooks.concurrency_each");
-    let asked = Instant::now();
+    let start = Instant::now();
     assert!(server.terminate().success());
-    assert!(asked.elapsed() < Duration::from_secs(15), "the end took {:?}", asked.elapsed());
+    assert!(start.elapsed() < Duration::from_secs(15), "the shutdown took {:?}", start.elapsed());
 }
 
 /// Creates a key in the data folder of a server that is not running.
@@ -366,8 +366,8 @@ async fn only_admins_manage_webhooks() {
     let (admin, operator) = (key(dir.path(), "admin"), key(dir.path(), "operator"));
     let settings = [PRIVATE, ("WHEREABOUTS_AUTH__KEYS", "required")];
     let server = Server::start(dir.path(), &settings);
-    let wanted = json!({"url": "https://example.com/"});
-    let make = || server.request(Method::POST, "/webhooks").json(&wanted);
+    let webhook = json!({"url": "https://example.com/"});
+    let make = || server.request(Method::POST, "/webhooks").json(&webhook);
     let made = Answer::of(make().bearer_auth(&admin)).await.expect(201);
     let id = made["id"].as_str().unwrap();
     Answer::of(make()).await.problem(401);

@@ -10,7 +10,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 use whereabouts_core::Digest;
 
-use super::clients::{Chance, Client, Pictures};
+use super::clients::{Client, Pictures, Random};
 use super::ledger::{Key, Picture};
 use super::support::{BINARY, Server};
 use super::wait::until;
@@ -50,7 +50,7 @@ async fn acknowledged_changes_survive_kill_9_at_any_moment() {
 
 struct Driver {
     dir: TempDir,
-    chance: Chance,
+    random: Random,
     pictures: Arc<Pictures>,
     numbers: BTreeMap<String, Picture>,
     clients: Vec<Client>,
@@ -65,7 +65,7 @@ impl Driver {
         let clients = (0..CLIENTS).map(|number| Client::new(number, seed, &pictures)).collect();
         Self {
             dir: TempDir::new().unwrap(),
-            chance: Chance(seed),
+            random: Random(seed),
             pictures,
             numbers,
             clients,
@@ -88,7 +88,7 @@ impl Driver {
     }
 
     async fn round(&mut self, round: usize) {
-        if self.chance.below(4) == 0 {
+        if self.random.below(4) == 0 {
             self.kill_while_starting();
         }
         let server = self.start(GRAPH);
@@ -104,7 +104,7 @@ impl Driver {
         }
         // The moment is what is tested: now and then just after the start, mostly in the middle of things.
         let moment = if round.is_multiple_of(5) { 50 } else { 900 };
-        let moment = Duration::from_millis(self.chance.below(moment) as u64);
+        let moment = Duration::from_millis(self.random.below(moment) as u64);
         tokio::time::sleep(moment).await;
         server.kill();
         for client in working {
@@ -122,7 +122,7 @@ impl Driver {
             .spawn()
             .unwrap();
         // Any moment of the start is what is tested.
-        std::thread::sleep(Duration::from_millis(self.chance.below(300) as u64));
+        std::thread::sleep(Duration::from_millis(self.random.below(300) as u64));
         child.kill().unwrap();
         child.wait().unwrap();
     }
@@ -133,10 +133,10 @@ impl Driver {
         for client in &mut self.clients {
             client.ledger.settle(&found);
         }
-        assert_eq!(self.images(), found.len(), "an image is there that nobody sent");
+        assert_eq!(self.images(), found.len(), "there is an image that no client has sent");
         let keys: Vec<&Key> = found.keys().collect();
         for _ in 0..closely.min(keys.len()) {
-            let key = keys[self.chance.below(keys.len())];
+            let key = keys[self.random.below(keys.len())];
             self.look_closely(server, key, found[key]).await;
         }
         for client in &self.clients {

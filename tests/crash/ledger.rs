@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::clients::Chance;
+use super::clients::Random;
 
 /// A map and an image in it.
 pub type Key = (String, String);
@@ -14,7 +14,7 @@ pub type Picture = usize;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fact {
     /// Acknowledged: the image has this picture, or does not exist.
-    Told(Option<Picture>),
+    Acknowledged(Option<Picture>),
     /// A change was in flight at the kill: it may have been made or not.
     Either(Option<Picture>, Option<Picture>),
 }
@@ -22,7 +22,7 @@ pub enum Fact {
 impl Fact {
     pub fn allows(self, found: Option<Picture>) -> bool {
         match self {
-            Self::Told(picture) => picture == found,
+            Self::Acknowledged(picture) => picture == found,
             Self::Either(before, after) => found == before || found == after,
         }
     }
@@ -39,21 +39,21 @@ pub struct Ledger {
 
 impl Ledger {
     /// An image that certainly exists.
-    pub fn some_present(&self, chance: &mut Chance) -> Option<Key> {
+    pub fn some_present(&self, random: &mut Random) -> Option<Key> {
         let present: Vec<&Key> = self
             .images
             .iter()
-            .filter(|(_, fact)| matches!(fact, Fact::Told(Some(_))))
+            .filter(|(_, fact)| matches!(fact, Fact::Acknowledged(Some(_))))
             .map(|(key, _)| key)
             .collect();
-        (!present.is_empty()).then(|| present[chance.below(present.len())].clone())
+        (!present.is_empty()).then(|| present[random.below(present.len())].clone())
     }
 
     /// Records that a change begins: until it is acknowledged, both states are possible.
     pub fn begin(&mut self, key: &Key, after: Option<Picture>) {
         let before = match self.images.get(key) {
             None => None,
-            Some(Fact::Told(picture)) => *picture,
+            Some(Fact::Acknowledged(picture)) => *picture,
             Some(Fact::Either(..)) => panic!("{key:?} is changed before it is known"),
         };
         self.images.insert(key.clone(), Fact::Either(before, after));
@@ -62,7 +62,7 @@ impl Ledger {
     /// Records that the server acknowledged a change.
     pub fn acknowledged(&mut self, key: &Key) {
         if let Some(Fact::Either(_, after)) = self.images.get(key).copied() {
-            self.images.insert(key.clone(), Fact::Told(after));
+            self.images.insert(key.clone(), Fact::Acknowledged(after));
             self.acknowledged += 1;
         }
     }
@@ -71,8 +71,8 @@ impl Ledger {
     pub fn map_deleted(&mut self, map: &str, acknowledged: bool) {
         for (_, fact) in self.images.iter_mut().filter(|((of, _), _)| of == map) {
             match *fact {
-                _ if acknowledged => *fact = Fact::Told(None),
-                Fact::Told(picture) => *fact = Fact::Either(picture, None),
+                _ if acknowledged => *fact = Fact::Acknowledged(None),
+                Fact::Acknowledged(picture) => *fact = Fact::Either(picture, None),
                 Fact::Either(..) => {}
             }
         }
@@ -82,9 +82,9 @@ impl Ledger {
     pub fn settle(&mut self, found: &BTreeMap<Key, Picture>) {
         for (key, fact) in &mut self.images {
             let found = found.get(key).copied();
-            assert!(fact.allows(found), "{key:?}: {found:?} was found where {fact:?} was told");
-            *fact = Fact::Told(found);
+            assert!(fact.allows(found), "{key:?}: {found:?} was found, but {fact:?} was recorded");
+            *fact = Fact::Acknowledged(found);
         }
-        self.images.retain(|_, fact| *fact != Fact::Told(None));
+        self.images.retain(|_, fact| *fact != Fact::Acknowledged(None));
     }
 }

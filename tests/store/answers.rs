@@ -6,9 +6,9 @@ use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
 use whereabouts_core::Digest;
-use whereabouts_store::{IdempotencyRecord, Progress, Store, StoredResponse};
+use whereabouts_store::{IdempotencyRecord, Progress, Store, StoreError, StoredResponse};
 
-use crate::support::{Fixture, eventually, odd_texts};
+use crate::support::{Fixture, eventually, odd_texts, record};
 
 contract!(
     a_request_is_reserved_once_and_its_response_stored,
@@ -17,6 +17,7 @@ contract!(
     a_forgotten_request_may_be_reserved_again,
     the_oldest_responses_are_evicted_by_age_and_by_number,
     a_request_of_a_process_that_ended_may_be_reserved_again,
+    a_repeated_request_finds_its_job,
 );
 
 fn running(process: Uuid) -> IdempotencyRecord {
@@ -121,4 +122,28 @@ async fn a_request_of_a_process_that_ended_may_be_reserved_again(fixture: &Fixtu
     let free = async || reserve(&*store, "running", second).await.is_none().then_some(());
     eventually(free).await;
     assert_eq!(reserve(&*store, "answered", second).await, Some(answer));
+}
+
+async fn a_repeated_request_finds_its_job(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let reserve = async || {
+        let running = running(Uuid::now_v7());
+        store.reserve_answer("r", running, Timestamp::UNIX_EPOCH).await.unwrap();
+    };
+    let _pin = store.put_blob(Digest::of(b"frame"), "frame".into()).await.unwrap();
+    reserve().await;
+    let first = record("m", b"frame");
+    let id = first.job.id;
+    assert_eq!(store.submit_once(first, 10, "r").await.unwrap(), None);
+    let again = store.submit_once(record("m", b"frame"), 10, "r").await.unwrap();
+    assert_eq!(again.unwrap().id, id);
+    assert_eq!(store.queued().await.unwrap(), 1);
+    // Another request has a job of its own; so has one without a record.
+    assert_eq!(store.submit_once(record("m", b"frame"), 10, "other").await.unwrap(), None);
+    store.forget_answer("r").await.unwrap();
+    reserve().await;
+    assert_eq!(store.submit_once(record("m", b"frame"), 10, "r").await.unwrap(), None);
+    assert_eq!(store.queued().await.unwrap(), 3);
+    let full = store.submit_once(record("m", b"frame"), 3, "third").await;
+    assert!(matches!(full, Err(StoreError::QueueFull { limit: 3 })));
 }

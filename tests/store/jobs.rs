@@ -1,4 +1,4 @@
-//! Jobs: claims, leases, releases, cancellation, lists and search.
+//! Jobs: claims, leases, releases, retries and cancellation.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -7,10 +7,8 @@ use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast;
 use uuid::Uuid;
-use whereabouts_core::{Candidate, Description, Digest, Job, JobState, Priority, StandIn, Usage};
-use whereabouts_store::{
-    Claim, IdempotencyRecord, JobFilter, JobRecord, Progress, Release, Step, Store, StoreError,
-};
+use whereabouts_core::{Candidate, Description, Job, JobState, Priority, StandIn, Usage};
+use whereabouts_store::{Claim, JobFilter, JobRecord, Release, Step, Store, StoreError};
 
 use crate::support::{
     Fixture, claim, descriptor, eventually, image, odd_texts, record, submit, submit_record, until,
@@ -28,9 +26,6 @@ contract!(
     an_unsuccessful_job_may_be_queued_again,
     the_queue_limit_is_exact,
     every_change_of_a_job_is_notified,
-    jobs_are_listed_newest_first_by_map_and_state_a_page_at_a_time,
-    jobs_are_searched_for_a_text,
-    a_repeated_request_finds_its_job,
     an_unknown_job_is_not_found,
     a_job_survives_a_restart_and_is_released_by_the_worker_that_died,
     odd_texts_in_a_job_survive,
@@ -317,9 +312,9 @@ async fn the_queue_limit_is_exact(fixture: &Fixture) {
 }
 
 /// Waits for the next notification about a job.
-async fn told(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
-    let patience = std::time::Duration::from_secs(20);
-    tokio::time::timeout(patience, async { while changes.recv().await.unwrap() != of {} })
+async fn notified(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
+    let timeout = std::time::Duration::from_secs(20);
+    tokio::time::timeout(timeout, async { while changes.recv().await.unwrap() != of {} })
         .await
         .unwrap();
 }
@@ -328,51 +323,22 @@ async fn every_change_of_a_job_is_notified(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut changes = store.changes();
     let id = submit(&*store, "m", b"frame").await;
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     let taken = claim(&*store).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     let step = Step { usage: Usage::default(), description: None };
     store.progress(taken.claim(), step).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     store.release(taken.claim(), release("why")).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     let taken = claim(&*store).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     store.finish(taken.claim(), ended(&taken, JobState::Failed)).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     store.retry(id).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     store.cancel(id).await.unwrap();
-    told(&mut changes, id).await;
-}
-
-async fn jobs_are_listed_newest_first_by_map_and_state_a_page_at_a_time(fixture: &Fixture) {
-    let store = fixture.open().await;
-    let mut ids = Vec::new();
-    for map in ["yard", "vault", "yard", "yard", "vault"] {
-        ids.push(submit(&*store, map, b"frame").await);
-    }
-    for id in &ids[..2] {
-        store.cancel(*id).await.unwrap();
-    }
-    let listed = async |map: Option<&str>, state, before, limit| -> Vec<usize> {
-        let map = map.map(|map| map.parse().unwrap());
-        let filter = JobFilter { map, state, text: None };
-        let jobs = store.jobs(&filter, before, limit).await.unwrap().jobs;
-        jobs.iter().map(|job| ids.iter().position(|id| *id == job.id).unwrap()).collect()
-    };
-    let (queued, cancelled) = (Some(JobState::Queued), Some(JobState::Cancelled));
-    assert_eq!(listed(None, None, None, 9).await, [4, 3, 2, 1, 0]);
-    assert_eq!(listed(None, None, None, 2).await, [4, 3]);
-    assert_eq!(listed(None, None, Some(ids[3]), 2).await, [2, 1]);
-    assert_eq!(listed(Some("yard"), None, None, 9).await, [3, 2, 0]);
-    assert_eq!(listed(Some("yard"), queued, None, 9).await, [3, 2]);
-    assert_eq!(listed(Some("yard"), queued, Some(ids[3]), 9).await, [2]);
-    assert_eq!(listed(None, cancelled, None, 1).await, [1]);
-    assert_eq!(listed(None, Some(JobState::Running), None, 9).await, [0; 0]);
-    assert_eq!(listed(Some("elsewhere"), None, None, 9).await, [0; 0]);
-    claim(&*store).await.unwrap();
-    assert_eq!(listed(None, Some(JobState::Running), None, 9).await, [2]);
+    notified(&mut changes, id).await;
 }
 
 async fn an_unknown_job_is_not_found(fixture: &Fixture) {
@@ -436,51 +402,4 @@ async fn odd_texts_in_a_job_survive(fixture: &Fixture) {
         assert_eq!(store.job(id).await.unwrap().unwrap().job, job);
         assert_eq!(store.jobs(&JobFilter::default(), None, 1).await.unwrap().jobs, [job]);
     }
-}
-
-async fn jobs_are_searched_for_a_text(fixture: &Fixture) {
-    let store = fixture.open().await;
-    let mut ids = Vec::new();
-    for map in ["town", "yard", "town"] {
-        ids.push(submit(&*store, map, b"frame").await);
-    }
-    let search = async |text: &str, limit| -> Vec<Uuid> {
-        let filter = JobFilter { text: Some(text.into()), ..JobFilter::default() };
-        let list = store.jobs(&filter, None, limit).await.unwrap();
-        assert_eq!(list.searched_to, None);
-        list.jobs.iter().map(|job| job.id).collect()
-    };
-    assert_eq!(search("TOW", 10).await, [ids[2], ids[0]]);
-    assert_eq!(search("TOW", 1).await, [ids[2]]);
-    assert_eq!(search(&ids[1].to_string(), 10).await, [ids[1]]);
-    for text in ["nowhere", "%", "\0", "'"] {
-        assert!(search(text, 10).await.is_empty(), "{text:?}");
-    }
-}
-
-async fn a_repeated_request_finds_its_job(fixture: &Fixture) {
-    let store = fixture.open().await;
-    let running = || {
-        let progress = Progress::Running { process: Uuid::now_v7(), job: None };
-        IdempotencyRecord { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
-    };
-    let reserve = async || {
-        store.reserve_answer("r", running(), Timestamp::UNIX_EPOCH).await.unwrap();
-    };
-    let _pin = store.put_blob(Digest::of(b"frame"), "frame".into()).await.unwrap();
-    reserve().await;
-    let first = record("m", b"frame");
-    let id = first.job.id;
-    assert_eq!(store.submit_once(first, 10, "r").await.unwrap(), None);
-    let again = store.submit_once(record("m", b"frame"), 10, "r").await.unwrap();
-    assert_eq!(again.unwrap().id, id);
-    assert_eq!(store.queued().await.unwrap(), 1);
-    // Another request has a job of its own; so has one without a record.
-    assert_eq!(store.submit_once(record("m", b"frame"), 10, "other").await.unwrap(), None);
-    store.forget_answer("r").await.unwrap();
-    reserve().await;
-    assert_eq!(store.submit_once(record("m", b"frame"), 10, "r").await.unwrap(), None);
-    assert_eq!(store.queued().await.unwrap(), 3);
-    let full = store.submit_once(record("m", b"frame"), 3, "third").await;
-    assert!(matches!(full, Err(StoreError::QueueFull { limit: 3 })));
 }

@@ -26,21 +26,21 @@ contract!(
 
 async fn a_map_is_created_once_and_its_scene_and_description_can_change(fixture: &Fixture) {
     let store = fixture.open().await;
-    let wanted = map("m", 3);
-    assert_eq!(store.map(&wanted.name).await.unwrap(), None);
-    assert_eq!(store.put_map(wanted.clone()).await.unwrap(), (wanted.clone(), true));
-    assert_eq!(store.map(&wanted.name).await.unwrap(), Some(wanted.clone()));
+    let requested = map("m", 3);
+    assert_eq!(store.map(&requested.name).await.unwrap(), None);
+    assert_eq!(store.put_map(requested.clone()).await.unwrap(), (requested.clone(), true));
+    assert_eq!(store.map(&requested.name).await.unwrap(), Some(requested.clone()));
     // The same again, with another uid.
-    assert_eq!(store.put_map(map("m", 3)).await.unwrap(), (wanted.clone(), false));
-    add(&*store, &wanted, "a", b"a").await;
+    assert_eq!(store.put_map(map("m", 3)).await.unwrap(), (requested.clone(), false));
+    add(&*store, &requested, "a", b"a").await;
     for text in odd_texts() {
         let other = Map { scene: Scene::Indoor, description: Some(text), ..map("m", 3) };
         let (changed, new) = store.put_map(other.clone()).await.unwrap();
-        let expected = Map { uid: wanted.uid, created_at: wanted.created_at, ..other };
+        let expected = Map { uid: requested.uid, created_at: requested.created_at, ..other };
         assert_eq!((&changed, new), (&expected, false));
-        assert_eq!(store.map(&wanted.name).await.unwrap(), Some(expected));
+        assert_eq!(store.map(&requested.name).await.unwrap(), Some(expected));
     }
-    assert_eq!(store.index_state(&wanted).await.unwrap().images, 1);
+    assert_eq!(store.index_state(&requested).await.unwrap().images, 1);
 }
 
 async fn descriptor_settings_are_fixed_once_there_are_images(fixture: &Fixture) {
@@ -56,13 +56,13 @@ async fn descriptor_settings_are_fixed_once_there_are_images(fixture: &Fixture) 
     for other in others {
         // Also after an image was added and removed.
         let gone = add(&*store, &known, "a", b"a").await;
-        let wanted = other(Map { uid: map("m", 3).uid, ..known.clone() });
-        let refused = store.put_map(wanted.clone()).await.unwrap_err();
+        let requested = other(Map { uid: map("m", 3).uid, ..known.clone() });
+        let refused = store.put_map(requested.clone()).await.unwrap_err();
         assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
         assert_eq!(store.map(&known.name).await.unwrap(), Some(known.clone()));
         assert!(store.delete_image(&known, &gone.id).await.unwrap());
-        let (changed, new) = store.put_map(wanted.clone()).await.unwrap();
-        assert_eq!((&changed, new), (&wanted, false));
+        let (changed, new) = store.put_map(requested.clone()).await.unwrap();
+        assert_eq!((&changed, new), (&requested, false));
         // The former revision is superseded.
         let query = descriptor(&gone, known.dim);
         let refused = store.search(&known, query, 1, SearchMode::Fast).await.unwrap_err();

@@ -153,16 +153,16 @@ async fn is_away(store: &PostgresStore) {
 }
 
 /// Waits until calls succeed and notifications arrive again.
-async fn is_back(store: &PostgresStore, beside: &dyn Store) {
+async fn is_back(store: &PostgresStore, direct: &dyn Store) {
     eventually(async || store.maps().await.ok()).await;
     // As many concurrent calls as there are connections.
     let asking = || join_all((0..16).map(|_| store.maps()));
     eventually(async || asking().await.into_iter().all(|maps| maps.is_ok()).then_some(())).await;
     let mut changes = store.changes();
     eventually(async || {
-        let id = submit(beside, "m", b"frame").await;
-        let told = async { while changes.recv().await.unwrap() != id {} };
-        tokio::time::timeout(Duration::from_millis(500), told).await.ok()
+        let id = submit(direct, "m", b"frame").await;
+        let notified = async { while changes.recv().await.unwrap() != id {} };
+        tokio::time::timeout(Duration::from_millis(500), notified).await.ok()
     })
     .await;
 }
@@ -170,7 +170,7 @@ async fn is_back(store: &PostgresStore, beside: &dyn Store) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_hanging_database_is_unavailable_within_the_timeout_and_recovers() {
     let database = Database::migrated(Pictures::Folder).await;
-    let beside = database.open(Tuning::default()).await;
+    let direct = database.open(Tuning::default()).await;
     let (wire, store) = wired(&database).await;
     submit(&store, "m", b"frame").await;
     for _ in 0..2 {
@@ -178,46 +178,46 @@ async fn a_hanging_database_is_unavailable_within_the_timeout_and_recovers() {
         is_away(&store).await;
         is_away(&store).await;
         wire.thaw();
-        is_back(&store, &beside).await;
+        is_back(&store, &direct).await;
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn connections_that_died_silently_are_replaced() {
     let database = Database::migrated(Pictures::Folder).await;
-    let beside = database.open(Tuning::default()).await;
+    let direct = database.open(Tuning::default()).await;
     let (wire, store) = wired(&database).await;
     submit(&store, "m", b"frame").await;
     wire.freeze();
     is_away(&store).await;
     wire.abandon();
-    is_back(&store, &beside).await;
+    is_back(&store, &direct).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_broken_connection_to_the_database_is_opened_again() {
     let database = Database::migrated(Pictures::Folder).await;
-    let beside = database.open(Tuning::default()).await;
+    let direct = database.open(Tuning::default()).await;
     let (wire, store) = wired(&database).await;
     let mut changes = store.changes();
     submit(&store, "m", b"frame").await;
     wire.cut();
     // A change that was missed while the listener was away is notified afterwards.
-    let id = submit(&beside, "m", b"frame").await;
-    let told = async { while changes.recv().await.unwrap() != id {} };
-    tokio::time::timeout(Duration::from_secs(20), told).await.unwrap();
-    is_back(&store, &beside).await;
+    let id = submit(&direct, "m", b"frame").await;
+    let notified = async { while changes.recv().await.unwrap() != id {} };
+    tokio::time::timeout(Duration::from_secs(20), notified).await.unwrap();
+    is_back(&store, &direct).await;
 }
 
 /// An address without a listener.
-async fn nobody() -> SocketAddr {
+async fn unused_address() -> SocketAddr {
     TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap()
 }
 
 #[tokio::test]
 async fn an_absent_database_is_unavailable_within_the_timeout() {
     let database = Database::empty(Pictures::Folder).await;
-    let settings = settings_at(&database, nobody().await);
+    let settings = settings_at(&database, unused_address().await);
     let began = Instant::now();
     let opened = PostgresStore::open(settings.clone(), database.objects(), Uuid::now_v7()).await;
     for error in [opened.err().unwrap(), migrate(&settings).await.unwrap_err()] {
@@ -231,7 +231,7 @@ async fn an_absent_object_store_is_unavailable_within_the_timeout() {
     let database = Database::migrated(Pictures::Folder).await;
     // An address without a listener, and one that never answers.
     let silent = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    for address in [nobody().await, silent.local_addr().unwrap()] {
+    for address in [unused_address().await, silent.local_addr().unwrap()] {
         let objects = s3("away", &format!("http://{address}"), TIMEOUT);
         let settings = database.settings(hasty());
         let store = PostgresStore::open(settings, objects, Uuid::now_v7()).await.unwrap();

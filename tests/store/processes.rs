@@ -4,22 +4,19 @@ use std::collections::HashSet;
 use std::time::Duration;
 
 use futures_util::future::join_all;
-use jiff::civil::date;
 use jiff::{SignedDuration, Timestamp};
 use sqlx::ConnectOptions;
 use tokio::sync::broadcast;
 use uuid::Uuid;
 use whereabouts_core::{
-    ApiKey, DayUsage, Delivery, Digest, Job, JobState, KeyLimits, Role, StoredKey, StoredWebhook,
-    Usage, Webhook, WebhookEvent, WebhookSecret,
+    ApiKey, CachedDescription, Delivery, Digest, Job, JobState, KeyLimits, Role, StoredKey,
+    StoredWebhook, Webhook, WebhookEvent, WebhookSecret,
 };
-use whereabouts_core::{CachedDescription, Spent};
 use whereabouts_index::SearchMode;
-use whereabouts_store::DescriptionCache;
-use whereabouts_store::postgres::{PostgresStore, SchemaState, migrate, schema_of};
+use whereabouts_store::postgres::PostgresStore;
 use whereabouts_store::{
-    DraftStore, IdempotencyRecord, IdempotencyStore, JobStore, KeyStore, MapStore, Progress,
-    Retention, SharedLimits, StoreError, StoredDelivery, TokenRequest, UsageStore, WebhookStore,
+    DescriptionCache, DraftStore, IdempotencyRecord, IdempotencyStore, JobStore, KeyStore,
+    MapStore, Progress, Retention, StoreError, StoredDelivery, WebhookStore,
 };
 
 use crate::support::{
@@ -28,7 +25,7 @@ use crate::support::{
 };
 
 /// A lifetime that no process misses because the machine is busy.
-fn long_lived() -> Tuning {
+pub fn long_lived() -> Tuning {
     Tuning { lifetime: Duration::from_secs(60), ..Tuning::default() }
 }
 
@@ -38,7 +35,7 @@ const NOW: &str = "SELECT extract(epoch FROM now())";
 const EARLIEST_END: &str = "SELECT extract(epoch FROM min(alive_until)) FROM processes";
 const LATEST_END: &str = "SELECT extract(epoch FROM max(alive_until)) FROM processes";
 
-async fn database() -> Database {
+pub async fn database() -> Database {
     Database::migrated(Pictures::Folder).await
 }
 
@@ -325,7 +322,7 @@ async fn a_description_is_computed_by_one_process_until_its_lease_ends() {
 }
 
 /// Waits for a notification about a job.
-async fn told(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
+async fn notified(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
     let waiting = async { while changes.recv().await.unwrap() != of {} };
     tokio::time::timeout(Duration::from_secs(20), waiting).await.unwrap();
 }
@@ -341,11 +338,11 @@ async fn an_open_process_is_notified_of_the_changes_of_others() {
         let mut queued = other.queued_deliveries();
         let mut keys = other.changed_keys().unwrap();
         let id = submit(&one, "m", b"frame").await;
-        told(&mut changes, id).await;
+        notified(&mut changes, id).await;
         one.cancel(id).await.unwrap();
-        told(&mut changes, id).await;
-        let patience = Duration::from_secs(20);
-        tokio::time::timeout(patience, queued.changed()).await.unwrap().unwrap();
+        notified(&mut changes, id).await;
+        let timeout = Duration::from_secs(20);
+        tokio::time::timeout(timeout, queued.changed()).await.unwrap().unwrap();
         queued.mark_unchanged();
         keys.mark_unchanged();
         let key = ApiKey {
@@ -359,10 +356,10 @@ async fn an_open_process_is_notified_of_the_changes_of_others() {
             revoked_at: None,
         };
         one.put_key(StoredKey { key, digest: Digest::of(b"key") }).await.unwrap();
-        tokio::time::timeout(patience, keys.changed()).await.unwrap().unwrap();
+        tokio::time::timeout(timeout, keys.changed()).await.unwrap().unwrap();
         assert_eq!(other.keys().await.unwrap().len(), 1);
         queue_ping(&one, hook).await;
-        tokio::time::timeout(patience, queued.changed()).await.unwrap().unwrap();
+        tokio::time::timeout(timeout, queued.changed()).await.unwrap().unwrap();
     }
 }
 
@@ -392,54 +389,6 @@ async fn a_map_whose_index_is_being_built_can_be_deleted() {
 }
 
 #[tokio::test]
-async fn a_store_is_not_opened_without_its_schema() {
-    let database = Database::empty(Pictures::Folder).await;
-    let settings = database.settings(Tuning::default());
-    let open =
-        async || PostgresStore::open(settings.clone(), database.objects(), Uuid::now_v7()).await;
-    let refused = open().await.err().unwrap();
-    assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
-    assert!(refused.to_string().contains("whereabouts migrate"), "{refused}");
-    assert!(migrate(&settings).await.unwrap() > 0);
-    open().await.unwrap();
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn concurrent_migrations_apply_each_step_once() {
-    let database = Database::empty(Pictures::Folder).await;
-    let settings = database.settings(Tuning::default());
-    let migrating = join_all((0..4).map(|_| migrate(&settings))).await;
-    migrating.into_iter().for_each(|done| assert!(done.is_ok(), "{done:?}"));
-    assert_eq!(migrate(&settings).await.unwrap(), 0);
-    assert_eq!(schema_of(&settings).await.unwrap(), SchemaState::UpToDate);
-    database.open(Tuning::default()).await;
-}
-
-#[tokio::test]
-async fn a_schema_one_step_ahead_is_tolerated_and_two_steps_are_rejected() {
-    let database = database().await;
-    let step = async |version: u32| {
-        let step = format!(
-            "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
-             VALUES ({version}, 'later', true, '', 0)"
-        );
-        database.run(&step).await;
-    };
-    let settings = database.settings(Tuning::default());
-    let open =
-        async || PostgresStore::open(settings.clone(), database.objects(), Uuid::now_v7()).await;
-    // During a rolling upgrade an old server may have to restart.
-    step(9000).await;
-    open().await.unwrap();
-    assert_eq!(migrate(&settings).await.unwrap(), 0);
-    step(9001).await;
-    for refused in [open().await.err().unwrap(), migrate(&settings).await.unwrap_err()] {
-        assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
-        assert!(refused.to_string().contains("version 9001"), "{refused}");
-    }
-}
-
-#[tokio::test]
 async fn all_processes_count_as_alive_right_after_a_start_of_the_database() {
     let database = database().await;
     let dying = database.open(Tuning::default()).await;
@@ -452,46 +401,4 @@ async fn all_processes_count_as_alive_right_after_a_start_of_the_database() {
     // By its own account it is dead.
     until(async || database.number(NOW).await > database.number(EARLIEST_END).await).await;
     assert!(claim(&other).await.is_none());
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_rate_limit_is_shared_by_all_processes() {
-    let database = database().await;
-    let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
-    // Next to nothing is refilled while this runs.
-    let draw = TokenRequest { per_minute: 0.01, needed: 0.001, taken: 0.001 };
-    let mut taken = 0;
-    for number in 0..30 {
-        let drawn =
-            processes[number % 2].draw("key", [draw, TokenRequest::UNLIMITED]).await.unwrap();
-        taken += usize::from(drawn.taken);
-        assert!(drawn.taken || drawn.left[0] < 0.002);
-    }
-    assert!((9..=12).contains(&taken), "{taken}");
-    // Tokens that are returned are available to others, up to those of a minute.
-    let back = TokenRequest { needed: f64::MIN, taken: -1.0, ..draw };
-    processes[0].draw("key", [back, TokenRequest::UNLIMITED]).await.unwrap();
-    let drawn = processes[1].draw("key", [draw, TokenRequest::UNLIMITED]).await.unwrap();
-    assert!(drawn.taken && drawn.left[0] < 0.01, "{drawn:?}");
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_daily_budget_is_shared_by_all_processes() {
-    let database = database().await;
-    let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
-    let (day, limit) = (date(2026, 5, 1), Spent { tokens: 1000, money: 0.0 });
-    let tokens = |tokens| Spent { tokens, money: 0.0 };
-    assert!(processes[0].set_aside(day, tokens(600), limit).await.unwrap());
-    assert!(!processes[1].set_aside(day, tokens(600), limit).await.unwrap());
-    // The call used 100 tokens: 500 are released, and 100 are recorded as usage.
-    processes[0].give_back(day, tokens(500)).await.unwrap();
-    let usage = Usage { calls: 1, prompt_tokens: 80, completion_tokens: 20, ..Usage::default() };
-    let spent = DayUsage { date: day, map: "m".parse().unwrap(), usage, money: 0.0 };
-    processes[0].add_usage(spent).await.unwrap();
-    assert!(!processes[1].set_aside(day, tokens(901), limit).await.unwrap());
-    assert!(processes[1].set_aside(day, tokens(900), limit).await.unwrap());
-    assert!(!processes[0].set_aside(day, tokens(1), limit).await.unwrap());
-    // Another day, and no limit at all.
-    assert!(processes[0].set_aside(date(2026, 5, 2), tokens(1000), limit).await.unwrap());
-    assert!(processes[0].set_aside(day, tokens(5000), tokens(0)).await.unwrap());
 }

@@ -271,20 +271,20 @@ async fn a_queued_delivery_is_notified(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = webhook(&*store, &WebhookEvent::ENDS, None).await;
     let mut queued = store.queued_deliveries();
-    let mut told = async || {
-        let patience = std::time::Duration::from_secs(20);
-        tokio::time::timeout(patience, queued.changed()).await.unwrap().unwrap();
+    let mut notified = async || {
+        let timeout = std::time::Duration::from_secs(20);
+        tokio::time::timeout(timeout, queued.changed()).await.unwrap().unwrap();
     };
     let ping = ping(id);
     let delivery = ping.delivery.id;
     store.queue_delivery(ping).await.unwrap();
-    told().await;
+    notified().await;
     ended(&*store, "yard", JobState::Failed).await;
-    told().await;
+    notified().await;
     let now = Timestamp::now();
     store.note_attempt(id, delivery, attempt(now, Then::Dead)).await.unwrap();
     store.queue_again(id, delivery, now).await.unwrap();
-    told().await;
+    notified().await;
 }
 
 async fn a_delivery_of_a_process_that_ended_is_due_again(fixture: &Fixture) {

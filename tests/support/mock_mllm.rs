@@ -18,7 +18,7 @@ use tokio::net::TcpListener;
 use tokio::sync::Barrier;
 use tokio::task::JoinHandle;
 
-use checks::{Asked, check_envelope, check_request, notes_in};
+use checks::{ParsedCall, check_envelope, check_request, notes_in};
 
 /// The hashes of the two pictures of a describe call, as they were sent.
 pub type Pair = (String, String);
@@ -252,21 +252,21 @@ async fn answer(
 ) -> Response {
     let _in_flight = InFlight::new(&shared.seen);
     let script = &shared.script;
-    let asked = check_envelope(&uri, &headers, script)
+    let parsed = check_envelope(&uri, &headers, script)
         .and_then(|()| serde_json::from_slice(&body).map_err(|error| error.to_string()))
         .and_then(|request: Value| check_request(&request, script.max_edge));
-    let asked = match asked {
-        Ok(asked) => asked,
+    let parsed = match parsed {
+        Ok(parsed) => parsed,
         Err(violation) => {
             shared.seen.lock().unwrap().violations.push(violation.clone());
             return refusal(400, &violation);
         }
     };
-    if asked.structured && !script.structured {
+    if parsed.structured && !script.structured {
         shared.seen.lock().unwrap().structure_refused += 1;
         return refusal(400, "Unsupported parameter: 'response_format'");
     }
-    if let (Some(barrier), 2) = (&shared.together, asked.pictures.len()) {
+    if let (Some(barrier), 2) = (&shared.together, parsed.pictures.len()) {
         barrier.wait().await;
     }
     if !script.latency.is_zero() {
@@ -276,17 +276,17 @@ async fn answer(
     {
         let mut seen = shared.seen.lock().unwrap();
         let (describe, reason) = &mut seen.request_bytes;
-        *if asked.pictures.is_empty() { reason } else { describe } += body.len();
+        *if parsed.pictures.is_empty() { reason } else { describe } += body.len();
     }
     let prompt_tokens = body.len() / 100;
-    let reply = shared.reply(asked);
+    let reply = shared.reply(parsed);
     render(reply, script.counts_tokens.then_some(prompt_tokens)).await
 }
 
 impl Shared {
-    fn reply(&self, asked: Asked) -> Reply {
+    fn reply(&self, parsed: ParsedCall) -> Reply {
         let mut seen = self.seen.lock().unwrap();
-        let Asked { pictures, prompt, repair, structured } = asked;
+        let ParsedCall { pictures, prompt, repair, structured } = parsed;
         let [frame, candidate] = pictures.as_slice() else {
             seen.reason_calls += 1;
             seen.reason_prompts.push(prompt.clone());
@@ -297,8 +297,8 @@ impl Shared {
         seen.describe_calls += 1;
         let pair = (frame.clone(), candidate.clone());
         let call = DescribeCall { number: seen.describe_calls, pair: pair.clone(), prompt };
-        let (asked, answered) = seen.pairs.entry(pair.clone()).or_default();
-        *asked += 1;
+        let (requested, answered) = seen.pairs.entry(pair.clone()).or_default();
+        *requested += 1;
         let again = usize::from(*answered > 0);
         seen.asked_again += again;
         let reply = (self.script.describe)(&call);

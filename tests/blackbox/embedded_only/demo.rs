@@ -8,7 +8,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use super::model_files::{Bench, fixture};
-use crate::mock_hub::{Hub, Trouble};
+use crate::mock_hub::{Fault, Hub};
 use crate::support::BINARY;
 
 /// A catalogue whose `dinov2-small` is a tiny model, so that it is downloaded at once; and a copy of the binary
@@ -29,8 +29,8 @@ fn binary(bench: &Bench) -> PathBuf {
     bench.assets().with_file_name("whereabouts")
 }
 
-async fn hub(troubles: &[Trouble]) -> Hub {
-    Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), troubles).await
+async fn hub(faults: &[Fault]) -> Hub {
+    Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), faults).await
 }
 
 /// Runs the demo; returns its summary and its standard error.
@@ -65,10 +65,10 @@ async fn dinov2_is_installed_if_the_hub_answers_and_found_the_next_time() {
     let (outcome, said) = demo(&bench, &hub.url, &[]).await;
     uses(&outcome, "dinov2-small", "installed from");
     assert!(said.contains("downloading"), "{said}");
-    assert_eq!(hub.asked().len(), 2, "one look, one download");
+    assert_eq!(hub.requested_paths().len(), 2, "one look, one download");
     let (outcome, _) = demo(&bench, &hub.url, &[]).await;
     uses(&outcome, "dinov2-small", "the first DINOv2 that is installed");
-    assert_eq!(hub.asked().len(), 2);
+    assert_eq!(hub.requested_paths().len(), 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -78,20 +78,20 @@ async fn a_flag_overrides_the_choice_and_the_hub_is_not_contacted() {
     uses(&outcome, "xfeat", "--offline");
     let (outcome, _) = demo(&bench, &hub.url, &["--model", "xfeat"]).await;
     uses(&outcome, "xfeat", "model.name says so");
-    assert_eq!(hub.asked().len(), 0);
+    assert_eq!(hub.requested_paths().len(), 0);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_unreachable_or_failing_hub_falls_back_to_the_built_in_model() {
     let (outcome, _) = demo(&bench(), "http://127.0.0.1:9", &[]).await;
     uses(&outcome, "xfeat", "no connection");
-    for (trouble, why) in [
-        (vec![Trouble::Hang], "no answer within 1 s"),
-        (vec![Trouble::Status(503)], "503"),
-        (vec![Trouble::None, Trouble::Corrupt], "could not be installed"),
-        (vec![Trouble::None, Trouble::StallAfter(100), Trouble::StallAfter(100)], "gave up"),
+    for (fault, why) in [
+        (vec![Fault::Hang], "no answer within 1 s"),
+        (vec![Fault::Status(503)], "503"),
+        (vec![Fault::None, Fault::Corrupt], "could not be installed"),
+        (vec![Fault::None, Fault::StallAfter(100), Fault::StallAfter(100)], "gave up"),
     ] {
-        let (outcome, _) = demo(&bench(), &hub(&trouble).await.url, &[]).await;
+        let (outcome, _) = demo(&bench(), &hub(&fault).await.url, &[]).await;
         uses(&outcome, "xfeat", why);
     }
 }

@@ -71,7 +71,7 @@ fn with_input(root: &Path, exported: &Path, expected: &Expected) -> PathBuf {
 }
 
 /// Compares the descriptors of a model with all that are expected of it.
-fn check(model: &str, options: &[&str], wanted: f64) {
+fn check(model: &str, options: &[&str], minimum: f64) {
     let fixtures = repository().join("tests/fixtures/dinov2");
     let text = std::fs::read_to_string(fixtures.join("expected.json")).unwrap();
     let mut expected: Vec<Expected> = serde_json::from_str(&text).unwrap();
@@ -108,7 +108,7 @@ fn check(model: &str, options: &[&str], wanted: f64) {
             for running in running {
                 let (similarity, expected) = running.join().unwrap();
                 assert!(
-                    similarity >= wanted,
+                    similarity >= minimum,
                     "{model} {name} {} {}: cosine {similarity:.7}",
                     expected.kind,
                     expected.picture

@@ -6,7 +6,7 @@ use std::process::{Child, Command, Output, Stdio};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::mock_hub::{Hub, Trouble};
+use crate::mock_hub::{Fault, Hub};
 use crate::support::{BINARY, Server};
 use crate::wait::until;
 
@@ -124,8 +124,8 @@ impl Outcome {
     }
 }
 
-async fn hub(troubles: &[Trouble]) -> Hub {
-    Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), troubles).await
+async fn hub(faults: &[Fault]) -> Hub {
+    Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), faults).await
 }
 
 /// Runs `model pull` off the async threads, which the hub needs.
@@ -143,10 +143,10 @@ async fn a_model_is_pulled_once_and_then_served() {
     bench.tiny_is_installed();
     let licence = std::fs::read_to_string(bench.models().join("tiny/LICENCE")).unwrap();
     assert!(licence.contains("Apache-2.0") && licence.contains("Nobody's."), "{licence}");
-    assert_eq!(hub.asked(), ["/lab/tiny/resolve/v1/model.onnx"]);
+    assert_eq!(hub.requested_paths(), ["/lab/tiny/resolve/v1/model.onnx"]);
     let again = pull(&bench, &hub).await.good();
     assert!(again.contains("installed already"), "{again}");
-    assert_eq!(hub.asked().len(), 1);
+    assert_eq!(hub.requested_paths().len(), 1);
 
     bench.run(&hub.url, &["use", "tiny"]).good();
     let assets = bench.assets();
@@ -165,11 +165,11 @@ async fn a_model_is_pulled_once_and_then_served() {
 async fn an_external_weights_file_is_pulled_with_the_model() {
     let data = "[model.manifest.data]\nfile = \"weights.bin\"\n[input]";
     let bench = Bench::with(|manifest| manifest.replace("[input]", data));
-    let cut = Trouble::CutAfter(1000);
-    let hub = hub(&[Trouble::None, cut]).await;
+    let cut = Fault::CutAfter(1000);
+    let hub = hub(&[Fault::None, cut]).await;
     pull(&bench, &hub).await.good();
-    let asked = hub.asked();
-    assert_eq!(asked[..2], ["/lab/tiny/resolve/v1/model.onnx", "/lab/tiny/resolve/v1/weights.bin"]);
+    let paths = hub.requested_paths();
+    assert_eq!(paths[..2], ["/lab/tiny/resolve/v1/model.onnx", "/lab/tiny/resolve/v1/weights.bin"]);
     bench.tiny_is_installed();
     let weights = bench.models().join("tiny/weights.bin");
     std::fs::write(&weights, "others").unwrap();
@@ -181,11 +181,10 @@ async fn an_external_weights_file_is_pulled_with_the_model() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_broken_download_is_resumed_and_no_byte_is_sent_twice() {
     let bench = Bench::new();
-    let hub =
-        hub(&[Trouble::CutAfter(6_000), Trouble::CutAfter(6_000), Trouble::CutAfter(6_000)]).await;
+    let hub = hub(&[Fault::CutAfter(6_000), Fault::CutAfter(6_000), Fault::CutAfter(6_000)]).await;
     pull(&bench, &hub).await.good();
     bench.tiny_is_installed();
-    assert_eq!(hub.asked().len(), 4);
+    assert_eq!(hub.requested_paths().len(), 4);
     let whole = std::fs::metadata(fixture("model.onnx")).unwrap().len();
     // Bytes in flight at a cut may be lost, but the rest is not requested again.
     assert!(hub.sent() >= whole && hub.sent() <= whole + 3 * 6_000, "{} bytes", hub.sent());
@@ -194,21 +193,19 @@ async fn a_broken_download_is_resumed_and_no_byte_is_sent_twice() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn transient_errors_of_the_hub_are_retried() {
-    for trouble in
-        [Trouble::Status(500), Trouble::Status(429), Trouble::Hang, Trouble::StallAfter(5_000)]
-    {
-        let (bench, hub) = (Bench::new(), hub(&[trouble]).await);
+    for fault in [Fault::Status(500), Fault::Status(429), Fault::Hang, Fault::StallAfter(5_000)] {
+        let (bench, hub) = (Bench::new(), hub(&[fault]).await);
         pull(&bench, &hub).await.good();
         bench.tiny_is_installed();
     }
     // A server without range support sends everything again.
     let bench = Bench::new();
-    let hub = hub(&[Trouble::CutAfter(9_000), Trouble::IgnoreRange]).await;
+    let hub = hub(&[Fault::CutAfter(9_000), Fault::IgnoreRange]).await;
     pull(&bench, &hub).await.good();
     bench.tiny_is_installed();
     // 416: the partial file cannot be resumed.
     let bench = Bench::new();
-    let hub = self::hub(&[Trouble::CutAfter(9_000), Trouble::Status(416)]).await;
+    let hub = self::hub(&[Fault::CutAfter(9_000), Fault::Status(416)]).await;
     pull(&bench, &hub).await.good();
     bench.tiny_is_installed();
 }
@@ -216,7 +213,7 @@ async fn transient_errors_of_the_hub_are_retried() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_file_that_changes_during_a_download_is_downloaded_again() {
     let bench = Bench::unpinned();
-    let hub = hub(&[Trouble::CutAfter(9_000), Trouble::Change]).await;
+    let hub = hub(&[Fault::CutAfter(9_000), Fault::Change]).await;
     pull(&bench, &hub).await.good();
     let installed = std::fs::read(bench.models().join("tiny/model.onnx")).unwrap();
     assert!(installed == hub.file(), "parts of two files were mixed");
@@ -224,7 +221,7 @@ async fn a_file_that_changes_during_a_download_is_downloaded_again() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn corrupt_bytes_are_rejected_and_removed() {
-    let (bench, hub) = (Bench::new(), hub(&[Trouble::Corrupt]).await);
+    let (bench, hub) = (Bench::new(), hub(&[Fault::Corrupt]).await);
     pull(&bench, &hub).await.bad(&["is pinned", "removed", "again", "model.hub"]);
     bench.nothing_is_installed();
     pull(&bench, &hub).await.good();
@@ -234,10 +231,10 @@ async fn corrupt_bytes_are_rejected_and_removed() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_failing_hub_is_named_with_a_hint() {
-    let (bench, hub) = (Bench::new(), hub(&[Trouble::Status(404)]).await);
+    let (bench, hub) = (Bench::new(), hub(&[Fault::Status(404)]).await);
     pull(&bench, &hub).await.bad(&["404", "/lab/tiny/resolve/v1/model.onnx", "model add"]);
-    assert_eq!(hub.asked().len(), 1, "a 404 is not asked again");
-    let hub = self::hub(&[Trouble::Status(503); 6]).await;
+    assert_eq!(hub.requested_paths().len(), 1, "a 404 is not asked again");
+    let hub = self::hub(&[Fault::Status(503); 6]).await;
     pull(&bench, &hub).await.bad(&["gave up", "6 attempts", "503", "model.hub"]);
     bench.run("http://127.0.0.1:9", &["pull", "tiny"]).bad(&["gave up", "model.hub"]);
     bench.run(&hub.url, &["pull", "other"]).bad(&["only tiny", "model add"]);
@@ -247,8 +244,8 @@ async fn a_failing_hub_is_named_with_a_hint() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_file_above_the_size_limit_is_rejected_and_removed() {
-    for trouble in [Trouble::None, Trouble::NoLength] {
-        let (bench, hub) = (Bench::new(), hub(&[trouble]).await);
+    for fault in [Fault::None, Fault::NoLength] {
+        let (bench, hub) = (Bench::new(), hub(&[fault]).await);
         let mut command = bench.command(&hub.url, &["pull", "tiny"]);
         command.env("WHEREABOUTS_MODEL__MAX_DOWNLOAD_BYTES", "10000");
         let run = tokio::task::spawn_blocking(move || command.output().unwrap());
@@ -261,7 +258,7 @@ async fn a_file_above_the_size_limit_is_rejected_and_removed() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_killed_pull_installs_nothing_and_is_resumed() {
     let bench = Bench::new();
-    let hub = hub(&[Trouble::StallAfter(12_000)]).await;
+    let hub = hub(&[Fault::StallAfter(12_000)]).await;
     let mut killed = Killed(
         bench
             .command(&hub.url, &["pull", "tiny"])

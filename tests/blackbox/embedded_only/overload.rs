@@ -37,10 +37,10 @@ async fn metric(server: &Server, name: &str) -> f64 {
 }
 
 /// Waits until this many frames are queued.
-async fn wait_for_line(server: &Server, length: f64) {
+async fn wait_for_queue(server: &Server, length: f64) {
     let start = Instant::now();
     while metric(server, r#"whereabouts_pictures_waiting{class="localize"}"#).await < length {
-        assert!(start.elapsed() < Duration::from_secs(60), "the line stays short");
+        assert!(start.elapsed() < Duration::from_secs(60), "the queue stays short");
     }
 }
 
@@ -73,8 +73,8 @@ async fn a_hopeless_deadline_is_rejected_at_once_and_abandoned_requests_are_not_
     const FRAMES: usize = 400;
     let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "500")]);
     server.town("m", 2).await;
-    let mut crowd = post_all(&server, "/localize?map=m&refine=off", FRAMES);
-    wait_for_line(&server, 200.0).await;
+    let mut load = post_all(&server, "/localize?map=m&refine=off", FRAMES);
+    wait_for_queue(&server, 200.0).await;
     let request = server
         .request(Method::POST, "/localize?map=m&refine=off")
         .header("content-type", "image/jpeg")
@@ -83,7 +83,7 @@ async fn a_hopeless_deadline_is_rejected_at_once_and_abandoned_requests_are_not_
     let refused = Answer::of(request).await;
     assert!(refused.problem(429).contains("X-Deadline-Ms"));
     assert!(retry_after(&refused) >= 1);
-    crowd.shutdown().await;
+    load.shutdown().await;
     server.post_jpeg("/localize?map=m&refine=off", frame(1, 0)).await.expect(200);
     let served = metric(&server, r#"whereabouts_stage_seconds_count{stage="decode"}"#).await;
     assert!(served < (FRAMES - 50) as f64, "{served} pictures were decoded");
@@ -134,11 +134,11 @@ async fn under_load_jobs_are_shed_before_frames() {
     let settings = [("WHEREABOUTS_IMAGE__QUEUE", "200"), ("WHEREABOUTS_JOBS__SHED_AT", "0.05")];
     let (_dir, server) = narrow(&settings);
     server.town("m", 2).await;
-    let crowd = post_all(&server, "/localize?map=m&refine=async", 200);
-    wait_for_line(&server, 120.0).await;
+    let load = post_all(&server, "/localize?map=m&refine=async", 200);
+    wait_for_queue(&server, 120.0).await;
     let waits = server.post_jpeg("/localize?map=m&refine=wait", frame(0, 0)).await;
     assert!(waits.problem(429).contains("jobs.shed_at"));
-    let answers = crowd.join_all().await;
+    let answers = load.join_all().await;
     let answers: Vec<Value> = answers.iter().map(|answer| answer.expect(200)).collect();
     let without = answers.iter().filter(|answer| answer["job"].is_null());
     let reasons: Vec<_> = without.map(|answer| &answer["no_job"]["reason"]).collect();
@@ -148,7 +148,7 @@ async fn under_load_jobs_are_shed_before_frames() {
     );
     let with = answers.iter().filter(|answer| answer["no_job"].is_null());
     assert_eq!(with.count(), answers.len() - reasons.len());
-    assert!(reasons.len() < answers.len(), "nobody waits behind the last ones");
+    assert!(reasons.len() < answers.len(), "the last frames have no queue behind them");
 }
 
 #[tokio::test]
