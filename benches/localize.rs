@@ -1,7 +1,6 @@
-//! `/localize` of the real server, against what no server can undercut: the same frames through the
-//! same model in this process, without HTTP, search or store. Once one frame after another, and once
-//! as a batch job, which keeps inference full. All run in turn, in
-//! the same run, and the lines end with ratios.
+//! `/localize` of the real server against a lower bound: the same frames through the same model in this process,
+//! without HTTP, search or store, once one frame after another, and once as a batch job that keeps inference busy.
+//! All are measured in turn in the same run, and the lines end with ratios.
 //!
 //! `cargo bench --bench localize -- MODEL` takes another model than xfeat; WHEREABOUTS_MODEL__ASSETS
 //! says where it is, if it is not among the checkout's assets.
@@ -63,7 +62,7 @@ fn main() -> anyhow::Result<()> {
 fn in_process(model: &str, frames: &[bytes::Bytes]) -> anyhow::Result<(Times, f64)> {
     let config = Config::load(None, &Overrides::default())?;
     let threads = std::thread::available_parallelism()?.get();
-    // By whoever is fastest on this machine, and as the server does.
+    // With the fastest provider on this machine, like the server.
     let settings = ExtractorSettings {
         wanted: ProviderPreference::default(),
         layout: config.model.layout(),
@@ -139,7 +138,7 @@ impl std::fmt::Display for Load {
     }
 }
 
-/// Adds the town's images, by as many clients as `whereabouts index` has.
+/// Adds the images of the town with as many clients as `whereabouts index` uses.
 async fn index(server: &Server, town: &Town, batch: f64) -> anyhow::Result<()> {
     const CLIENTS: usize = 8;
     let map = server.http.put(format!("{}/maps/town", server.url)).body("{}");

@@ -1,7 +1,7 @@
-//! The real server while robots ask for ten times what it can do: how long those wait that are served,
-//! how soon the others are refused, what memory it takes, and when it is back at full speed.
+//! The real server at ten times its capacity: the latency of served frames, how soon others are rejected, memory,
+//! and the time until it is back at full speed.
 //!
-//! Robots and server share this machine, so that the figures are worse than those of a server alone.
+//! Robots and server share this machine, so the figures are worse than those of a server on its own machine.
 //! Ends with exit code 1 if a promise is not kept.
 
 use std::process::ExitCode;
@@ -23,11 +23,11 @@ const CLIENTS: usize = 16;
 const CAPACITY_FOR: Duration = Duration::from_secs(5);
 const OVERLOAD_FOR: Duration = Duration::from_secs(10);
 const RECOVERY_FOR: Duration = Duration::from_secs(8);
-/// The last part of it, by which the server has surely recovered, if it ever does.
+/// The last part of the recovery, when the server should be back at full speed.
 const SETTLED_FOR: Duration = Duration::from_secs(4);
 const TIMES_CAPACITY: f64 = 10.0;
 
-/// What is promised.
+/// Limits that the run must keep.
 const P99_TIMES_P50_TIMES_DEPTH: f64 = 3.0;
 const REFUSED_WITHIN: Duration = Duration::from_millis(50);
 const RECOVERED_WITHIN: Duration = Duration::from_secs(2);
@@ -83,7 +83,7 @@ async fn measure(server: &Server, town: &Town) -> anyhow::Result<bool> {
     let half = samples.len() / 2;
     let most = |part: &[u64]| part.iter().copied().max().unwrap_or(before);
     let (first, second) = (most(&samples[..half]), most(&samples[half..]));
-    // Others on this machine may have taken or left more of it since the start.
+    // The load of other processes on this machine may have changed since the start.
     let settled = rate_after(&recovery, RECOVERY_FOR - SETTLED_FOR);
     let back = full_speed(&recovery, capacity.min(settled) * FULL_SPEED);
     let checks = [
@@ -140,7 +140,7 @@ fn check(kept: bool, what: String) -> bool {
     kept
 }
 
-/// Those who ask.
+/// Clients that post frames.
 #[derive(Clone)]
 struct Robots {
     http: reqwest::Client,
@@ -166,13 +166,13 @@ impl Offered {
         self.asked.len() as f64 / self.sending.as_secs_f64()
     }
 
-    /// When frames of the overload were served that waited at its end, counted from there.
+    /// When the frames that were queued at the end of the overload were served, counted from that end.
     fn served_after_the_end(&self) -> impl Iterator<Item = Duration> {
         let served = self.asked.iter().filter(|asked| asked.status == Some(200));
         served.filter_map(|asked| asked.answered.checked_sub(self.sending))
     }
 
-    /// How long it took, the shortest first: frames that were served, and refused; and how many were
+    /// Latencies in ascending order of the served and of the rejected frames, and the number of frames that were
     /// neither.
     fn sorted(&self) -> (Vec<Duration>, Vec<Duration>, usize) {
         let of = |status: u16| {
@@ -186,7 +186,7 @@ impl Offered {
 }
 
 impl Robots {
-    /// Indexes the town and draws frames of it.
+    /// Indexes the town and renders frames of it.
     async fn new(server: &Server, town: &Town) -> anyhow::Result<Self> {
         let map = server.http.put(format!("{}/maps/town", server.url)).body("{}");
         map.send().await?.error_for_status()?;
@@ -206,7 +206,7 @@ impl Robots {
         })
     }
 
-    /// Posts one frame; a connection that breaks off has no status.
+    /// Posts one frame; a broken connection has no status.
     async fn ask(&self, start: Instant) -> Asked {
         let frame = &self.frames[self.next.fetch_add(1, Ordering::Relaxed) % self.frames.len()];
         let request = self.http.post(&self.url).header("content-type", "image/jpeg");
@@ -232,7 +232,7 @@ impl Robots {
         Ok(took)
     }
 
-    /// Clients that each post the next frame when the last is answered; when frames were served.
+    /// Runs clients that each post the next frame when the last is answered; returns when frames were served.
     async fn side_by_side(&self, span: Duration) -> anyhow::Result<Vec<Duration>> {
         let start = Instant::now();
         let mut clients = JoinSet::new();
@@ -250,7 +250,7 @@ impl Robots {
         Ok(clients.join_all().await.concat())
     }
 
-    /// Posts at a constant rate, whatever becomes of it; and how long that took.
+    /// Posts at a constant rate without waiting for responses; returns how long the posting took.
     async fn offer(&self, per_second: f64, span: Duration) -> (JoinSet<Asked>, Duration) {
         let start = Instant::now();
         let (mut asking, mut sent) = (JoinSet::new(), 0);
@@ -297,13 +297,13 @@ fn resident_of(process: u32) -> anyhow::Result<u64> {
     Ok(kib.parse::<u64>()? * 1024)
 }
 
-/// Answers a second from then until the end of the recovery.
+/// Responses per second from a moment until the end of the recovery.
 fn rate_after(answered: &[Duration], start: Duration) -> f64 {
     let counted = answered.iter().filter(|at| (start..RECOVERY_FOR).contains(*at)).count();
     counted as f64 / (RECOVERY_FOR - start).as_secs_f64()
 }
 
-/// From when on a second was as fast as that.
+/// The first second that reached a rate.
 fn full_speed(answered: &[Duration], per_second: f64) -> Option<Duration> {
     const WINDOW: Duration = Duration::from_secs(1);
     let starts = (0..).map(|step| Duration::from_millis(100) * step);
@@ -319,7 +319,7 @@ fn times(times: impl IntoIterator<Item = Duration>) -> Vec<Duration> {
     times
 }
 
-/// The time that this share of all stays below; `sorted` is not empty.
+/// A quantile of times in ascending order, of which there must be at least one.
 fn at(sorted: &[Duration], share: f64) -> Duration {
     sorted[((sorted.len() - 1) as f64 * share) as usize]
 }
