@@ -30,6 +30,7 @@ chromium:
 test: assets nasm chromium ## Set up, build and run every test
 	tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked --workspace
 	tests/scale_out.sh $(CARGO) target/postgres-venv
+	tests/optional.sh $(CARGO)
 	tests/api/conformance.sh $(BINARY) target/api-venv
 	tests/grpc/check.sh $(BINARY) target/grpc-venv
 	tests/console/check.sh $(BINARY) target/console-venv
@@ -52,7 +53,7 @@ examples: build ## Test the clients, curl examples and load tests against the se
 	examples/check.sh $(BINARY) target/examples-venv
 
 crash: assets nasm ## Kill the server at 200 random moments and check that nothing acknowledged is lost
-	WHEREABOUTS_CRASH_ROUNDS=200 $(CARGO) test --release --locked --test crash what_was -- --nocapture
+	WHEREABOUTS_CRASH_ROUNDS=200 $(CARGO) test --release --locked --test crash kill:: -- --nocapture
 
 fuzz: assets nasm ## Feed a million mutated inputs to every parser of untrusted data
 	WHEREABOUTS_FUZZ_RUNS=120000 $(CARGO) test --release --locked --test fuzz -- --nocapture

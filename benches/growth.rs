@@ -1,5 +1,5 @@
-//! What a store grows to: the database over many jobs of which only some are kept, and each image on
-//! disk and in memory.
+//! Growth of a store: the database over many jobs of which only some are kept, and each image on disk and in
+//! memory.
 //!
 //! `cargo bench --bench growth -- [JOBS] [IMAGES]`
 
@@ -68,7 +68,7 @@ fn settings(dir: &Path) -> EmbeddedSettings {
     }
 }
 
-/// Opens the store, if need be as soon as the threads of an earlier one have ended.
+/// Opens the store, once the threads of an earlier one have ended.
 fn open(dir: &Path) -> EmbeddedStore {
     loop {
         match EmbeddedStore::open(&settings(dir)) {
@@ -103,10 +103,10 @@ async fn job_cycles(jobs: usize) {
         let start = Instant::now();
         let each = stream::iter(0..jobs / 10).map(|_| one_job(&store));
         let changes = each.buffer_unordered(SIDE_BY_SIDE).collect::<Vec<_>>();
-        // What is too much goes meanwhile, as in a server.
+        // Excess jobs are removed meanwhile, as in a server.
         let changes = tokio::select! {
             changes = changes => changes,
-            () = sweep(&store) => unreachable!("it goes on for ever"),
+            () = sweep(&store) => unreachable!("the sweep never ends"),
         };
         let took = start.elapsed().as_secs_f64();
         let mut changes: Vec<f64> = changes.into_iter().flatten().collect();
@@ -144,7 +144,7 @@ async fn sweep(store: &EmbeddedStore) {
     }
 }
 
-/// A job from its submission to its end; how long each change took, in milliseconds.
+/// Runs a job from its submission to its end; returns the time of each change in milliseconds.
 async fn one_job(store: &EmbeddedStore) -> Vec<f64> {
     let (now, frame) = (Timestamp::now(), noise(FRAME_BYTES));
     let digest = Digest::of(&frame);
@@ -178,7 +178,7 @@ async fn one_job(store: &EmbeddedStore) -> Vec<f64> {
     lap(&mut since);
     store.submit(record, usize::MAX).await.unwrap();
     lap(&mut since);
-    // Held for as long as this runs.
+    // Locked as long as this runs.
     let until = now + SignedDuration::from_hours(1);
     let claimed = store.claim(now, until).await.unwrap().unwrap();
     lap(&mut since);
@@ -281,7 +281,7 @@ async fn one_image(store: &EmbeddedStore, map: &Map, number: usize) {
     store.add_image(map, image, Descriptor::normalised(numbers).unwrap()).await.unwrap();
 }
 
-/// Bytes in memory: of its own, and of files.
+/// Resident bytes: anonymous, and of files.
 fn memory() -> [f64; 2] {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     ["RssAnon:", "RssFile:"].map(|field| {

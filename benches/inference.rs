@@ -1,6 +1,6 @@
 //! DINOv2 ViT-S/14 at 224×224: pictures a second and the time of one alone, by this crate and by ONNX
 //! Runtime and OpenVINO in Python on the same file, in turn. The weights are seeded random numbers,
-//! which take as long as any.
+//! which take as long as real ones.
 //!
 //! `make openvino` first, else there is only the CPU provider to compare; then
 //! `PYTHON=$(benches/peers/setup.sh) cargo bench --bench inference`.
@@ -18,8 +18,8 @@ const SIZE: usize = 224;
 const BATCHES: [usize; 3] = [1, 4, 8];
 const SECONDS: f64 = 1.5;
 const PEERS: [&str; 3] = ["onnxruntime", "openvino-latency", "openvino-throughput"];
-/// The machine's speed changes with the moment: all are measured in turn, some times over, and what
-/// counts is the median of the ratios of each round.
+/// Rounds: the speed of the machine varies, so all are measured in turn, and the median of the ratios of all rounds
+/// is reported.
 const ROUNDS: usize = 4;
 
 #[derive(Debug, Clone, Copy)]
@@ -79,7 +79,7 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The middle one, or the mean of the two in the middle.
+/// The median.
 fn median(mut numbers: Vec<f64>) -> f64 {
     numbers.sort_by(f64::total_cmp);
     (numbers[(numbers.len() - 1) / 2] + numbers[numbers.len() / 2]) / 2.0

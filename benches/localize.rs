@@ -1,13 +1,9 @@
-//! `/localize` of the real server, against what no server can undercut: the same frames through the
-//! same model in this process, without HTTP, search or store. Once one frame after another, and once
-//! as a batch job, which keeps inference full. All run in turn, in
-//! the same run, and the lines end with ratios.
+//! `/localize` of the real server against a lower bound: the same frames through the same model in this process,
+//! without HTTP, search or store, once one frame after another, and once as a batch job that keeps inference busy.
+//! All are measured in turn in the same run, and the lines end with ratios.
 //!
 //! `cargo bench --bench localize -- MODEL` takes another model than xfeat; WHEREABOUTS_MODEL__ASSETS
 //! says where it is, if it is not among the checkout's assets.
-
-#[path = "support/server.rs"]
-mod server;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -15,9 +11,9 @@ use std::time::{Duration, Instant};
 
 use futures_util::{TryStreamExt, stream};
 use serde_json::Value;
-use server::Server;
 use whereabouts_core::DescriptorKind;
 use whereabouts_server::config::{Config, Overrides};
+use whereabouts_testkit::server::Server;
 use whereabouts_town::{Town, TownSpec};
 use whereabouts_vision::decode::encode_jpeg;
 use whereabouts_vision::{
@@ -42,13 +38,13 @@ fn main() -> anyhow::Result<()> {
     println!("in this process, as a batch job            {:31}{batch:6.1} frames/s", "");
 
     let data = tempfile::tempdir()?;
-    let server = Server::start(&model, data.path())?;
+    let server = Server::start_for_benchmark(&model, data.path(), &[]);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     runtime.block_on(async {
-        server.index(&town, batch).await?;
+        index(&server, &town, batch).await?;
         for refine in ["off", "async"] {
             for clients in [1, 16] {
-                let load = server.load(&frames, clients, refine).await?;
+                let load = load(&server, &frames, clients, refine).await?;
                 println!("{clients:2} clients, refine={refine:<6}                  {load}");
                 println!(
                     "    p50 {:.2} × one frame in this process; {:.2} × the batch job's frames a \
@@ -68,7 +64,7 @@ fn main() -> anyhow::Result<()> {
 fn in_process(model: &str, frames: &[bytes::Bytes]) -> anyhow::Result<(Times, f64)> {
     let config = Config::load(None, &Overrides::default())?;
     let threads = std::thread::available_parallelism()?.get();
-    // By whoever is fastest on this machine, and as the server does.
+    // With the fastest provider on this machine, like the server.
     let settings = ExtractorSettings {
         preference: ProviderPreference::default(),
         layout: config.model.layout(),
@@ -146,70 +142,68 @@ impl std::fmt::Display for Load {
     }
 }
 
-impl Server {
-    /// Adds the town's images, by as many clients as `whereabouts index` has.
-    async fn index(&self, town: &Town, batch: f64) -> anyhow::Result<()> {
-        const CLIENTS: usize = 8;
-        let map = self.http.put(format!("{}/maps/town", self.url)).body("{}");
-        map.send().await?.error_for_status()?;
-        let pictures = (0..town.places()).map(|place| encode_jpeg(&town.reference(place).image));
-        let pictures = pictures.collect::<Result<Vec<_>, _>>()?;
-        let start = Instant::now();
-        stream::iter(pictures.into_iter().enumerate().map(anyhow::Ok))
-            .try_for_each_concurrent(CLIENTS, |(place, picture)| async move {
-                let url = format!("{}/maps/town/images?id={place}", self.url);
-                let request = self.http.post(url).header("content-type", "image/jpeg");
-                request.body(picture).send().await?.error_for_status()?;
-                Ok(())
-            })
-            .await?;
-        let per_second = PLACES as f64 / start.elapsed().as_secs_f64();
-        println!(
-            "indexed {PLACES} images by {CLIENTS} clients                        {per_second:6.1} \
-             images/s, {:.2} × the batch job",
-            per_second / batch
-        );
-        Ok(())
-    }
+/// Adds the images of the town with as many clients as `whereabouts index` uses.
+async fn index(server: &Server, town: &Town, batch: f64) -> anyhow::Result<()> {
+    const CLIENTS: usize = 8;
+    let map = server.http.put(format!("{}/maps/town", server.url)).body("{}");
+    map.send().await?.error_for_status()?;
+    let pictures = (0..town.places()).map(|place| encode_jpeg(&town.reference(place).image));
+    let pictures = pictures.collect::<Result<Vec<_>, _>>()?;
+    let start = Instant::now();
+    stream::iter(pictures.into_iter().enumerate().map(anyhow::Ok))
+        .try_for_each_concurrent(CLIENTS, |(place, picture)| async move {
+            let url = format!("{}/maps/town/images?id={place}", server.url);
+            let request = server.http.post(url).header("content-type", "image/jpeg");
+            request.body(picture).send().await?.error_for_status()?;
+            Ok(())
+        })
+        .await?;
+    let per_second = PLACES as f64 / start.elapsed().as_secs_f64();
+    println!(
+        "indexed {PLACES} images by {CLIENTS} clients                        {per_second:6.1} \
+         images/s, {:.2} × the batch job",
+        per_second / batch
+    );
+    Ok(())
+}
 
-    async fn load(
-        &self,
-        frames: &[bytes::Bytes],
-        clients: usize,
-        refine: &'static str,
-    ) -> anyhow::Result<Load> {
-        let next = Arc::new(AtomicUsize::new(0));
-        let start = Instant::now();
-        let mut running = tokio::task::JoinSet::new();
-        for _ in 0..clients {
-            let (next, http, frames) = (Arc::clone(&next), self.http.clone(), frames.to_vec());
-            let url = format!("{}/localize?map=town&refine={refine}", self.url);
-            running.spawn(async move {
-                let mut answered = Vec::new();
-                loop {
-                    let i = next.fetch_add(1, Ordering::Relaxed);
-                    if i >= REQUESTS {
-                        return anyhow::Ok(answered);
-                    }
-                    let frame = frames[i % frames.len()].clone();
-                    let start = Instant::now();
-                    let request = http.post(&url).header("content-type", "image/jpeg").body(frame);
-                    let answer: Value = request.send().await?.error_for_status()?.json().await?;
-                    let timing = &answer["timing_ms"];
-                    let share = timing["extract"].as_f64().unwrap_or(0.0)
-                        / timing["total"].as_f64().unwrap_or(1.0);
-                    answered.push((start.elapsed(), share));
+async fn load(
+    server: &Server,
+    frames: &[bytes::Bytes],
+    clients: usize,
+    refine: &'static str,
+) -> anyhow::Result<Load> {
+    let next = Arc::new(AtomicUsize::new(0));
+    let start = Instant::now();
+    let mut running = tokio::task::JoinSet::new();
+    for _ in 0..clients {
+        let (next, http, frames) = (Arc::clone(&next), server.http.clone(), frames.to_vec());
+        let url = format!("{}/localize?map=town&refine={refine}", server.url);
+        running.spawn(async move {
+            let mut answered = Vec::new();
+            loop {
+                let i = next.fetch_add(1, Ordering::Relaxed);
+                if i >= REQUESTS {
+                    return anyhow::Ok(answered);
                 }
-            });
-        }
-        let mut answered = Vec::new();
-        while let Some(client) = running.join_next().await {
-            answered.extend(client??);
-        }
-        let took = start.elapsed();
-        let inference_share =
-            answered.iter().map(|(_, share)| share).sum::<f64>() / answered.len() as f64;
-        let times = answered.into_iter().map(|(time, _)| time).collect();
-        Ok(Load { times: Times::new(times, took), inference_share })
+                let frame = frames[i % frames.len()].clone();
+                let start = Instant::now();
+                let request = http.post(&url).header("content-type", "image/jpeg").body(frame);
+                let answer: Value = request.send().await?.error_for_status()?.json().await?;
+                let timing = &answer["timing_ms"];
+                let share = timing["extract"].as_f64().unwrap_or(0.0)
+                    / timing["total"].as_f64().unwrap_or(1.0);
+                answered.push((start.elapsed(), share));
+            }
+        });
     }
+    let mut answered = Vec::new();
+    while let Some(client) = running.join_next().await {
+        answered.extend(client??);
+    }
+    let took = start.elapsed();
+    let inference_share =
+        answered.iter().map(|(_, share)| share).sum::<f64>() / answered.len() as f64;
+    let times = answered.into_iter().map(|(time, _)| time).collect();
+    Ok(Load { times: Times::new(times, took), inference_share })
 }

@@ -20,7 +20,7 @@ use whereabouts_testkit::server::{Server, jpeg};
 use whereabouts_town::{Town, TownSpec};
 
 const CANDIDATES: usize = 10;
-/// About what a model writes of one pair.
+/// Typical length of the description of a pair.
 const DESCRIPTION_CHARS: usize = 1600;
 
 fn main() {
@@ -68,7 +68,7 @@ async fn refine(server: &Server, frame: Vec<u8>) -> Value {
     job
 }
 
-/// From the robot's request to the end of its job.
+/// The time from the request to the end of its job.
 async fn job_seconds(concurrency: usize) -> f64 {
     let dir = TempDir::new().unwrap();
     let mock =
@@ -86,7 +86,7 @@ async fn sizes() {
     let dir = TempDir::new().unwrap();
     let mock = MockMllm::start(Script {
         describe: Box::new(|_| Reply::Text("wall ".repeat(DESCRIPTION_CHARS / 5))),
-        // So that the server goes by its own estimate.
+        // Without reported usage, the server uses its own estimate.
         counts_tokens: false,
         ..Script::default()
     })
@@ -119,7 +119,7 @@ async fn memory() {
         ..Script::default()
     })
     .await;
-    // Caches are full early, so that only a leak can grow.
+    // The caches fill up early, so that only a leak grows.
     let small = [
         ("WHEREABOUTS_DATA__DB_CACHE_BYTES", "8388608"),
         ("WHEREABOUTS_REFINE__DENSE_CACHE_BYTES", "8388608"),

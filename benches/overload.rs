@@ -1,11 +1,8 @@
-//! The real server while robots ask for ten times what it can do: how long those wait that are served,
-//! how soon the others are refused, what memory it takes, and when it is back at full speed.
+//! The real server at ten times its capacity: the latency of served frames, how soon others are rejected, memory,
+//! and the time until it is back at full speed.
 //!
-//! Robots and server share this machine, so that the figures are worse than those of a server alone.
+//! Robots and server share this machine, so the figures are worse than those of a server on its own machine.
 //! Ends with exit code 1 if a promise is not kept.
-
-#[path = "support/server.rs"]
-mod server;
 
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -14,9 +11,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use bytes::Bytes;
-use server::Server;
 use tokio::task::JoinSet;
 use whereabouts_server::config::{Config, Overrides};
+use whereabouts_testkit::server::Server;
 use whereabouts_town::{Town, TownSpec};
 use whereabouts_vision::decode::encode_jpeg;
 
@@ -26,11 +23,11 @@ const CLIENTS: usize = 16;
 const CAPACITY_FOR: Duration = Duration::from_secs(5);
 const OVERLOAD_FOR: Duration = Duration::from_secs(10);
 const RECOVERY_FOR: Duration = Duration::from_secs(8);
-/// The last part of it, by which the server has surely recovered, if it ever does.
+/// The last part of the recovery, when the server should be back at full speed.
 const SETTLED_FOR: Duration = Duration::from_secs(4);
 const TIMES_CAPACITY: f64 = 10.0;
 
-/// What is promised.
+/// Limits that the run must keep.
 const P99_TIMES_P50_TIMES_DEPTH: f64 = 3.0;
 const REFUSED_WITHIN: Duration = Duration::from_millis(50);
 const RECOVERED_WITHIN: Duration = Duration::from_secs(2);
@@ -42,7 +39,7 @@ fn main() -> anyhow::Result<ExitCode> {
     let _ = rustls::crypto::ring::default_provider().install_default();
     let town = Town::new(TownSpec { places: PLACES, ..TownSpec::default() });
     let data = tempfile::tempdir()?;
-    let server = Server::start("xfeat", data.path())?;
+    let server = Server::start_for_benchmark("xfeat", data.path(), &[]);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let kept = runtime.block_on(measure(&server, &town))?;
     Ok(if kept { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -62,7 +59,7 @@ async fn measure(server: &Server, town: &Town) -> anyhow::Result<bool> {
     println!("{CLIENTS} clients           {capacity:6.1} frames/s");
 
     let watched = Arc::new(Memory::default());
-    let watching = tokio::spawn(Arc::clone(&watched).watch(server.child.id()));
+    let watching = tokio::spawn(Arc::clone(&watched).watch(server.id()));
     let (asking, sending) = robots.offer(capacity * TIMES_CAPACITY, OVERLOAD_FOR).await;
     watched.end.store(true, Ordering::Relaxed);
     let samples = watching.await??;
@@ -86,7 +83,7 @@ async fn measure(server: &Server, town: &Town) -> anyhow::Result<bool> {
     let half = samples.len() / 2;
     let most = |part: &[u64]| part.iter().copied().max().unwrap_or(before);
     let (first, second) = (most(&samples[..half]), most(&samples[half..]));
-    // Others on this machine may have taken or left more of it since the start.
+    // The load of other processes on this machine may have changed since the start.
     let settled = rate_after(&recovery, RECOVERY_FOR - SETTLED_FOR);
     let back = full_speed(&recovery, capacity.min(settled) * FULL_SPEED);
     let checks = [
@@ -143,7 +140,7 @@ fn check(kept: bool, what: String) -> bool {
     kept
 }
 
-/// Those who ask.
+/// Clients that post frames.
 #[derive(Clone)]
 struct Robots {
     http: reqwest::Client,
@@ -169,13 +166,13 @@ impl Offered {
         self.asked.len() as f64 / self.sending.as_secs_f64()
     }
 
-    /// When frames of the overload were served that waited at its end, counted from there.
+    /// When the frames that were queued at the end of the overload were served, counted from that end.
     fn served_after_the_end(&self) -> impl Iterator<Item = Duration> {
         let served = self.asked.iter().filter(|asked| asked.status == Some(200));
         served.filter_map(|asked| asked.answered.checked_sub(self.sending))
     }
 
-    /// How long it took, the shortest first: frames that were served, and refused; and how many were
+    /// Latencies in ascending order of the served and of the rejected frames, and the number of frames that were
     /// neither.
     fn sorted(&self) -> (Vec<Duration>, Vec<Duration>, usize) {
         let of = |status: u16| {
@@ -189,7 +186,7 @@ impl Offered {
 }
 
 impl Robots {
-    /// Indexes the town and draws frames of it.
+    /// Indexes the town and renders frames of it.
     async fn new(server: &Server, town: &Town) -> anyhow::Result<Self> {
         let map = server.http.put(format!("{}/maps/town", server.url)).body("{}");
         map.send().await?.error_for_status()?;
@@ -209,7 +206,7 @@ impl Robots {
         })
     }
 
-    /// Posts one frame; a connection that breaks off has no status.
+    /// Posts one frame; a broken connection has no status.
     async fn ask(&self, start: Instant) -> Asked {
         let frame = &self.frames[self.next.fetch_add(1, Ordering::Relaxed) % self.frames.len()];
         let request = self.http.post(&self.url).header("content-type", "image/jpeg");
@@ -235,7 +232,7 @@ impl Robots {
         Ok(took)
     }
 
-    /// Clients that each post the next frame when the last is answered; when frames were served.
+    /// Runs clients that each post the next frame when the last is answered; returns when frames were served.
     async fn side_by_side(&self, span: Duration) -> anyhow::Result<Vec<Duration>> {
         let start = Instant::now();
         let mut clients = JoinSet::new();
@@ -253,7 +250,7 @@ impl Robots {
         Ok(clients.join_all().await.concat())
     }
 
-    /// Posts at a constant rate, whatever becomes of it; and how long that took.
+    /// Posts at a constant rate without waiting for responses; returns how long the posting took.
     async fn offer(&self, per_second: f64, span: Duration) -> (JoinSet<Asked>, Duration) {
         let start = Instant::now();
         let (mut asking, mut sent) = (JoinSet::new(), 0);
@@ -289,7 +286,7 @@ impl Memory {
 }
 
 fn resident(server: &Server) -> anyhow::Result<u64> {
-    resident_of(server.child.id())
+    resident_of(server.id())
 }
 
 /// Bytes.
@@ -300,13 +297,13 @@ fn resident_of(process: u32) -> anyhow::Result<u64> {
     Ok(kib.parse::<u64>()? * 1024)
 }
 
-/// Answers a second from then until the end of the recovery.
+/// Responses per second from a moment until the end of the recovery.
 fn rate_after(answered: &[Duration], start: Duration) -> f64 {
     let counted = answered.iter().filter(|at| (start..RECOVERY_FOR).contains(*at)).count();
     counted as f64 / (RECOVERY_FOR - start).as_secs_f64()
 }
 
-/// From when on a second was as fast as that.
+/// The first second that reached a rate.
 fn full_speed(answered: &[Duration], per_second: f64) -> Option<Duration> {
     const WINDOW: Duration = Duration::from_secs(1);
     let starts = (0..).map(|step| Duration::from_millis(100) * step);
@@ -322,7 +319,7 @@ fn times(times: impl IntoIterator<Item = Duration>) -> Vec<Duration> {
     times
 }
 
-/// The time that this share of all stays below; `sorted` is not empty.
+/// A quantile of times in ascending order, of which there must be at least one.
 fn at(sorted: &[Duration], share: f64) -> Duration {
     sorted[((sorted.len() - 1) as f64 * share) as usize]
 }

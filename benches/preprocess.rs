@@ -1,6 +1,6 @@
 //! A JPEG of 1280×720 to a 224×224 tensor on one core, by this crate and by OpenCV and torchvision on
 //! the same files: `PYTHON=$(benches/peers/setup.sh) cargo bench --bench preprocess`. Without that
-//! Python, the peers are left out and that is said.
+//! Python, the peers are skipped with a message.
 
 use std::path::Path;
 use std::process::Command;
@@ -54,7 +54,7 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The median over the files of the least of some rounds, in milliseconds.
+/// The median over the files of the minimum over some rounds, in milliseconds.
 fn measure(files: &[Vec<u8>], input: &Input, needed: Needed) -> anyhow::Result<f64> {
     let mut times = Vec::new();
     for file in files {
@@ -71,7 +71,7 @@ fn measure(files: &[Vec<u8>], input: &Input, needed: Needed) -> anyhow::Result<f
     Ok(times[times.len() / 2].as_secs_f64() * 1e3)
 }
 
-/// How close the descriptors of both ways are.
+/// How similar the descriptors of both ways are.
 fn say_similarity(files: &[Vec<u8>]) -> anyhow::Result<()> {
     let load = |exact_decode| {
         let settings =
@@ -93,7 +93,7 @@ fn say_similarity(files: &[Vec<u8>]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What each peer takes, in milliseconds.
+/// The time of each peer, in milliseconds.
 fn peers(files: &[Vec<u8>]) -> anyhow::Result<Vec<(String, f64)>> {
     let dir = tempfile::tempdir()?;
     for (index, file) in files.iter().enumerate() {

@@ -1,5 +1,5 @@
 //! The refiner `local` on one thread: the time of a pair, against the matrix product of the two feature
-//! maps alone, which any comparison of all cells with all cells has to do. Models are not timed.
+//! maps alone, which any comparison of all cells with all cells needs. Models are not timed.
 //!
 //! `cargo bench --bench refine`
 
@@ -34,7 +34,7 @@ fn main() -> anyhow::Result<()> {
         .collect::<anyhow::Result<Vec<_>>>()?;
     let candidates: Vec<&DenseFeatures> = candidates.iter().collect();
     let matcher = LocalMatcher::default();
-    // In turn, as the machine's speed changes with the moment; the least of each.
+    // Measured in turn, because the speed of the machine varies; the minimum of each.
     let (mut pair, mut product) = (f64::MAX, f64::MAX);
     for _ in 0..ROUNDS {
         let start = Instant::now();

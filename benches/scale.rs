@@ -73,7 +73,7 @@ fn find(index: &MapIndex, rows: &Rows, query: &[f32], mode: SearchMode) -> Vec<u
     index.search(rows, query, K, mode).iter().map(|found| found.slot).collect()
 }
 
-/// Builds the graph of the embedded store and prints what it does.
+/// Builds the graph of the embedded store and prints its speed and recall.
 fn in_process(
     index: &MapIndex,
     rows: &Rows,
@@ -188,7 +188,7 @@ async fn in_postgres(
     Ok(())
 }
 
-/// Writes images and descriptors past the store, which would take one transaction for each.
+/// Inserts images and descriptors directly: the store would use one transaction for each.
 async fn fill(pool: &PgPool, map: &Map, rows: &Rows, size: usize) -> anyhow::Result<()> {
     let image = Image {
         id: "x".parse()?,
@@ -235,7 +235,7 @@ async fn fill(pool: &PgPool, map: &Map, rows: &Rows, size: usize) -> anyhow::Res
     Ok(())
 }
 
-/// Queues jobs, takes as many, writes their steps down and ends them; returns how many.
+/// Submits jobs, claims as many, records their steps and finishes them; returns how many.
 async fn jobs(store: &PostgresStore, map: &Map) -> anyhow::Result<usize> {
     let now = Timestamp::now();
     let digest = Digest::of(b"frame");
@@ -255,8 +255,8 @@ async fn jobs(store: &PostgresStore, map: &Map) -> anyhow::Result<usize> {
         };
         store.submit(record, usize::MAX / 2).await?;
         let until = now + jiff::SignedDuration::from_mins(5);
-        // The only job that was there when this one looked may just have been taken by another, whose own
-        // came a moment later.
+        // Another worker may have claimed the only job that this one saw, and submitted its own a moment
+        // later.
         let taken = loop {
             match store.claim(now, until).await? {
                 Some(taken) => break taken,
@@ -281,7 +281,7 @@ async fn jobs(store: &PostgresStore, map: &Map) -> anyhow::Result<usize> {
     Ok(JOBS)
 }
 
-/// One search after another: how long each took, and what it found.
+/// Searches one after another; returns the time and the result of each.
 async fn search(
     store: &PostgresStore,
     map: &Map,

@@ -4,8 +4,8 @@
 //! 76,000 vectors, as many as Tokyo 24/7 has images, or as many as the first argument says:
 //! `PYTHON=$(benches/peers/setup.sh) cargo bench --bench search -- 20000`.
 //!
-//! The peers run in Python, called with all queries at once so that Python itself costs nothing. One
-//! that this Python lacks is left out, and that is said.
+//! The peers run in Python, called with all queries at once, so that Python itself costs nothing. A
+//! peer that is not installed is skipped with a message.
 
 mod vectors;
 
@@ -126,7 +126,7 @@ fn slots(index: &MapIndex, rows: &Rows, query: &[f32], mode: SearchMode) -> Vec<
     index.search(rows, query, K, mode).iter().map(|found| found.slot).collect()
 }
 
-/// What a peer did.
+/// The result of a peer.
 struct Measured {
     /// Seconds to build its graph.
     built: f64,

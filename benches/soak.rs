@@ -1,11 +1,8 @@
-//! The real server under mixed traffic for a while: frames with jobs, images that come and go, jobs that
-//! are looked up. Prints a table of memory, open files, bytes on disk and latency over the time, and ends
+//! Soak test of the real server under mixed traffic: frames with jobs, images that are added and removed, jobs
+//! that are looked up. Prints a table of memory, open files, bytes on disk and latency over the time, and ends
 //! with exit code 1 if something grows that should not.
 //!
 //! `make soak`, or `cargo bench --bench soak -- MINUTES`
-
-#[path = "support/server.rs"]
-mod server;
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -15,9 +12,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use bytes::Bytes;
-use server::Server;
 use tokio::sync::Mutex;
 use tokio::task::JoinSet;
+use whereabouts_testkit::server::Server;
 use whereabouts_town::{Town, TownSpec};
 use whereabouts_vision::decode::encode_jpeg;
 
@@ -25,16 +22,16 @@ const MINUTES: f64 = 10.0;
 const PLACES: usize = 60;
 /// Rows of the table.
 const ROWS: usize = 20;
-/// Jobs that have ended and are kept, so that the bound is reached.
+/// Number of ended jobs that are kept, small enough to be reached.
 const KEPT_JOBS: &str = "200";
 
-/// What is promised, between the second quarter of the time and the last.
+/// Limits of the growth from the second quarter of the time to the last.
 const MEMORY_GROWTH: f64 = 1.15;
 const FILES_GROWTH: usize = 16;
 const DISK_GROWTH: f64 = 1.5;
 const LATENCY_GROWTH: f64 = 2.0;
 
-/// What was seen at one moment.
+/// Measurements at one moment.
 #[derive(Debug, Clone, Copy)]
 struct Sample {
     at: Duration,
@@ -46,7 +43,7 @@ struct Sample {
     p95: Duration,
 }
 
-/// What clients note.
+/// Records of the clients.
 #[derive(Default)]
 struct Notes {
     latencies: Mutex<Vec<Duration>>,
@@ -70,7 +67,7 @@ fn main() -> anyhow::Result<ExitCode> {
     let data = tempfile::tempdir()?;
     let settings =
         [("WHEREABOUTS_JOBS__KEEP_COUNT", KEPT_JOBS), ("WHEREABOUTS_JOBS__SWEEP_S", "2")];
-    let server = Server::start_with("xfeat", data.path(), &settings)?;
+    let server = Server::start_for_benchmark("xfeat", data.path(), &settings);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let kept = runtime.block_on(soak(&server, data.path(), &images, &frames, length))?;
     Ok(if kept { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -183,7 +180,7 @@ async fn send_image(
 }
 
 impl Notes {
-    /// Counts an answer; gives its JSON if it is a good one.
+    /// Counts a response; returns its JSON if it was successful.
     async fn count(&self, answer: reqwest::Result<reqwest::Response>) -> Option<serde_json::Value> {
         self.requests.fetch_add(1, Ordering::Relaxed);
         match answer {
@@ -203,7 +200,7 @@ impl Notes {
 }
 
 async fn look(server: &Server, data: &Path, at: Duration, notes: &Notes) -> anyhow::Result<Sample> {
-    let process = format!("/proc/{}", server.child.id());
+    let process = format!("/proc/{}", server.id());
     let status = std::fs::read_to_string(format!("{process}/status"))?;
     let line = status.lines().find(|line| line.starts_with("VmRSS:")).context("no VmRSS")?;
     let kilobytes: u64 = line.split_whitespace().nth(1).context("no VmRSS")?.parse()?;
@@ -228,7 +225,7 @@ async fn look(server: &Server, data: &Path, at: Duration, notes: &Notes) -> anyh
 fn bytes_of(folder: &Path) -> u64 {
     use std::os::unix::fs::MetadataExt;
     let entries = walkdir::WalkDir::new(folder).into_iter().flatten();
-    // Files go while they are listed.
+    // Files may be removed while they are listed.
     entries.filter_map(|entry| Some(entry.metadata().ok()?.blocks() * 512)).sum()
 }
 

@@ -24,7 +24,7 @@ const IMAGES: usize = 76_000;
 const DIM: usize = 384;
 const COMMITTED: usize = 3_000;
 const SIDE_BY_SIDE: usize = 64;
-/// Asks for nothing but to open a store.
+/// The argument of a process that only opens a store.
 const OPEN: &str = "open";
 
 #[tokio::main]
@@ -112,7 +112,7 @@ async fn new_map(store: &EmbeddedStore) -> anyhow::Result<Map> {
     Ok(store.put_map(map).await?.0)
 }
 
-/// Descriptors around common centres, as those of a town are; without the bytes of pictures.
+/// Adds images with clustered descriptors, like those of a town, without picture bytes.
 async fn add(
     store: &EmbeddedStore,
     map: &Map,
@@ -149,7 +149,7 @@ fn noise(seed: u64) -> Vec<f32> {
     (0..DIM).map(|_| next() + next() + next()).collect()
 }
 
-/// Its threads, and the lock of its database, end a moment after it is dropped.
+/// Closes a store: its threads and the lock of its database end a moment after it is dropped.
 async fn close(store: EmbeddedStore, dir: &Path) -> anyhow::Result<()> {
     drop(store);
     for lock in ["lock", "db/db"] {
@@ -161,7 +161,7 @@ async fn close(store: EmbeddedStore, dir: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Opens the store in a process of its own, as a start of the server does, and says how long it took.
+/// Opens the store in a new process, like a start of the server; returns how long that took.
 fn reopen(dir: &Path) -> anyhow::Result<Duration> {
     let opened = Command::new(std::env::current_exe()?).arg(OPEN).arg(dir).output()?;
     let said = String::from_utf8_lossy(&opened.stdout);
@@ -171,7 +171,7 @@ fn reopen(dir: &Path) -> anyhow::Result<Duration> {
     Ok(Duration::from_secs_f64(seconds))
 }
 
-/// What the process of [`reopen`] does.
+/// The main function of the process of [`reopen`].
 fn open(dir: &Path) -> anyhow::Result<()> {
     let start = Instant::now();
     let store = EmbeddedStore::open(&settings(dir, 256))?;

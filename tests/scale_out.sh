@@ -14,13 +14,7 @@ blackbox() {
         "$cargo" test --release --locked --workspace --test blackbox -- --include-ignored "$@"
 }
 
-# The skipped tests are about the data folder or do not reach the store: models, evaluation, admission control. They
-# run against the embedded store. The test that restarts PostgreSQL runs alone.
-# Four threads, because two would leave a two-core machine half idle.
-blackbox --test-threads=4 \
-    --skip doctor:: --skip schema:: --skip documented:: \
-    --skip durability::a_second_server --skip durability::a_damaged_descriptor \
-    --skip demo:: --skip dinov2:: --skip eval:: --skip model_files:: --skip models:: --skip overload:: \
-    --skip real_images:: --skip smuggling::the_time_of_a_refusal \
-    --skip five_hundred_jobs
-blackbox five_hundred_jobs
+# Tests in a module `embedded_only` run against the embedded store alone, and those in a module `alone` disturb all
+# others. Four threads, because two would leave a two-core machine half idle.
+blackbox --test-threads=4 --skip embedded_only:: --skip alone::
+blackbox alone::

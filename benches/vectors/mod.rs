@@ -1,4 +1,4 @@
-//! Clustered unit vectors, as those of the places of a town are, for benchmarks of search.
+//! Clustered unit vectors, like the descriptors of a town, for benchmarks of search.
 
 use std::ops::Range;
 
@@ -31,7 +31,7 @@ impl Vectors for Rows {
 pub fn clustered(count: usize, seed: u64) -> Rows {
     let mut state = seed;
     let mut random = move || {
-        // Four uniform draws make a bell.
+        // The sum of four uniform numbers is roughly normal.
         (0..4)
             .map(|_| {
                 state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);

@@ -1,4 +1,4 @@
-//! Maps go into one file and come back, on this server or another.
+//! Backup to one file, and restore on this server or another.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -6,7 +6,7 @@ use std::process::{Command, Output, Stdio};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server, frame, reference, server};
+use super::support::{BINARY, Server, frame, reference, server, shared_server};
 
 fn run(server: &Server, args: &[&str]) -> Output {
     command(server, args).output().unwrap()
@@ -44,7 +44,7 @@ fn restore(server: &Server, file: &Path) -> Output {
     run(server, &["restore", file.to_str().unwrap(), "--json"])
 }
 
-/// The candidates of some frames: which images, and how similar.
+/// The candidates of three frames, each with its similarity.
 async fn answers(server: &Server, map: &str) -> Vec<(String, f64)> {
     let mut answers = Vec::new();
     for place in 0..3 {
@@ -94,7 +94,7 @@ async fn another_server_answers_as_the_first_without_running_the_model() {
     let state = |map: Value| json!([map["scene"], map["model_digest"], map["created_at"]]);
     let (there, here) = (to.get("/maps/indoors").await, from.get("/maps/indoors").await);
     assert_eq!(state(there.expect(200)), state(here.expect(200)));
-    // What the model did is counted: nothing, before the frames above.
+    // The model ran only for the three frames above.
     let metrics = to.metrics().await;
     let runs = metrics
         .lines()
@@ -104,7 +104,7 @@ async fn another_server_answers_as_the_first_without_running_the_model() {
 }
 
 #[tokio::test]
-async fn a_map_whose_model_is_missing_is_restored_and_says_what_it_needs() {
+async fn a_map_is_restored_without_its_model_and_names_the_missing_model() {
     let ((_a, from), (_b, to)) = (server(), server());
     from.town("m", 1).await;
     let mut page = from.get("/maps/m/export").await.expect(200);
@@ -140,7 +140,7 @@ async fn restoring_again_adds_only_what_is_missing() {
     same(&answers(&server, "m").await, &before);
     assert_eq!(images(&server, "m").await, listed);
 
-    // An id that has other bytes by now is left alone, and said.
+    // An id that has other bytes by now is left alone and reported.
     server.delete("/maps/m/images/place-0").await.expect(204);
     server.post_jpeg("/maps/m/images?id=place-0", reference(70)).await.expect(201);
     let output = restore(&server, &file);
@@ -148,7 +148,7 @@ async fn restoring_again_adds_only_what_is_missing() {
     let outcome: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(outcome["maps"][0]["conflicts"][0]["id"], "place-0");
 
-    // Under another name nothing is in the way.
+    // Under another name nothing conflicts.
     let file = file.to_str().unwrap();
     let outcome = ok(&run(&server, &["restore", file, "--as", "m2", "--json"]));
     assert_eq!(
@@ -159,7 +159,7 @@ async fn restoring_again_adds_only_what_is_missing() {
 }
 
 #[tokio::test]
-async fn a_map_of_another_model_is_not_mixed_with_the_archives() {
+async fn a_restore_does_not_mix_descriptors_of_two_models() {
     let ((_a, from), (b, to)) = (server(), server());
     from.town("m", 2).await;
     let file = backup(&from, b.path());
@@ -173,7 +173,7 @@ async fn a_map_of_another_model_is_not_mixed_with_the_archives() {
     let why = refused(&restore(&to, &file));
     assert!(why.contains("restore under another name"), "{why}");
     assert_eq!(to.get("/maps/m").await.expect(200)["images"], 1);
-    // The map is there and says what it needs, as any whose model was replaced.
+    // The map names the model that it needs, like any map whose model was replaced.
     let why = to.post_jpeg("/localize?map=m", frame(0, 0)).await.problem(409);
     assert!(why.contains("install the former again"), "{why}");
 }
@@ -192,10 +192,10 @@ async fn import(
 }
 
 #[tokio::test]
-async fn an_import_that_contradicts_itself_is_refused() {
-    let (_dir, server) = server();
-    server.town("m", 2).await;
-    let page = server.get("/maps/m/export").await.expect(200);
+async fn an_inconsistent_import_is_rejected() {
+    let (server, map) = shared_server();
+    server.town(&map, 2).await;
+    let page = server.get(&format!("/maps/{map}/export")).await.expect(200);
     let of = |image: Value| json!({"map": page["map"], "image": image}).to_string();
     let with = |field: &str, value: Value| {
         let mut image = page["images"][0].clone();
@@ -203,7 +203,7 @@ async fn an_import_that_contradicts_itself_is_refused() {
         image["image"][field] = value;
         of(image)
     };
-    import(&server, "m", reference(1), with("id", "new".into())).await.problem(422);
+    import(server, &map, reference(1), with("id", "new".into())).await.problem(422);
     let cases = [
         (with("id", "..".into()), 400),
         (with("media_type", "image/png".into()), 422),
@@ -214,24 +214,24 @@ async fn an_import_that_contradicts_itself_is_refused() {
         ("{".into(), 400),
     ];
     for (meta, status) in cases {
-        import(&server, "m", reference(0), meta).await.problem(status);
+        import(server, &map, reference(0), meta).await.problem(status);
     }
     let mut short = page["images"][0].clone();
     short["image"]["id"] = "new".into();
     short["descriptor"] = "AACAPwAAAAA=".into();
-    let why = import(&server, "m", reference(0), of(short)).await.problem(422);
+    let why = import(server, &map, reference(0), of(short)).await.problem(422);
     assert!(why.contains("2 numbers"), "{why}");
     for (field, value) in [("dim", json!(0)), ("model", json!("../../etc"))] {
-        let mut map = page["map"].clone();
-        map[field] = value;
-        server.put("/maps/new/import", map).await.problem(422);
+        let mut wrong = page["map"].clone();
+        wrong[field] = value;
+        server.put(&format!("/maps/{map}-new/import"), wrong).await.problem(422);
     }
-    assert_eq!(server.get("/maps/m").await.expect(200)["images"], 2);
-    server.get("/maps/new").await.problem(404);
+    assert_eq!(server.get(&format!("/maps/{map}")).await.expect(200)["images"], 2);
+    server.get(&format!("/maps/{map}-new")).await.problem(404);
 }
 
 #[tokio::test]
-async fn a_damaged_or_cut_archive_is_refused_before_anything_changes() {
+async fn a_damaged_or_truncated_archive_is_rejected_before_anything_changes() {
     let ((_a, from), (b, to)) = (server(), server());
     from.town("m", 3).await;
     let file = backup(&from, b.path());
@@ -259,7 +259,7 @@ async fn a_damaged_or_cut_archive_is_refused_before_anything_changes() {
 }
 
 #[tokio::test]
-async fn an_interrupted_backup_goes_on() {
+async fn an_interrupted_backup_is_resumed() {
     let ((a, from), (b, to)) = (server(), server());
     from.town("m", 6).await;
     from.town("n", 2).await;
@@ -268,7 +268,7 @@ async fn an_interrupted_backup_goes_on() {
     let again = a.path().join("again.tar");
     let partial = a.path().join("again.tar.partial");
     std::fs::write(&partial, &bytes[..bytes.len() / 2]).unwrap();
-    // Added behind the place where it broke off: it is in the archive.
+    // Its id sorts after the point of the interruption, so it is in the archive.
     from.post_jpeg("/maps/m/images?id=place-9", reference(9)).await.expect(201);
     let outcome = ok(&run(&from, &["backup", again.to_str().unwrap(), "--json"]));
     let continued = outcome["continued"].as_u64().unwrap();
@@ -283,7 +283,7 @@ async fn an_interrupted_backup_goes_on() {
     let why = refused(&run(&from, &["backup", again.to_str().unwrap()]));
     assert!(why.contains("is there already"), "{why}");
 
-    // One of a map that was made anew meanwhile does not go on with the old images.
+    // If the map was created again meanwhile, the backup starts from the beginning.
     std::fs::write(&partial, &bytes[..bytes.len() / 2]).unwrap();
     std::fs::remove_file(&again).unwrap();
     from.delete("/maps/m").await.expect(204);
@@ -294,7 +294,7 @@ async fn an_interrupted_backup_goes_on() {
 }
 
 #[tokio::test]
-async fn a_restore_whose_server_dies_goes_on_when_it_is_back() {
+async fn a_restore_is_resumed_after_the_server_was_killed() {
     let (b, from) = server();
     from.town("m", 24).await;
     let (file, before) = (backup(&from, b.path()), answers(&from, "m").await);
@@ -305,7 +305,7 @@ async fn a_restore_whose_server_dies_goes_on_when_it_is_back() {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    // As soon as some are there.
+    // Kill the server as soon as a few images have been restored.
     loop {
         let map = to.get("/maps/m").await;
         if map.status == 200 && map.expect(200)["images"].as_u64().unwrap() > 2 {
@@ -329,7 +329,7 @@ async fn a_restore_whose_server_dies_goes_on_when_it_is_back() {
 }
 
 #[tokio::test]
-async fn an_image_that_is_damaged_on_the_server_is_left_out_and_said() {
+async fn a_backup_omits_and_reports_an_image_that_is_damaged_on_the_server() {
     let dir = TempDir::new().unwrap();
     let from = Server::start(dir.path(), &[]);
     from.town("m", 3).await;

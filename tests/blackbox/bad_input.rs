@@ -1,24 +1,27 @@
-//! Bad input gets a clear answer, costs little, and spoils nothing.
+//! Bad input gets a clear error, costs little, and leaves the server working.
 
 use futures_util::StreamExt;
 use image::RgbImage;
 use reqwest::Method;
 use serde_json::json;
 
-use super::support::{Answer, Server, jpeg, reference, server};
+use super::support::{Answer, Server, jpeg, reference, server, shared_server};
 
-async fn still_works(server: &Server) {
-    let answer = server.post_jpeg("/localize?map=m&refine=off", reference(0)).await.expect(200);
+async fn still_works(server: &Server, map: &str) {
+    let path = format!("/localize?map={map}&refine=off");
+    let answer = server.post_jpeg(&path, reference(0)).await.expect(200);
     assert_eq!(answer["candidates"][0]["image_id"], "place-0");
 }
 
 #[tokio::test]
-async fn what_is_no_picture_is_refused_and_the_next_frame_is_answered() {
-    let (_dir, server) = server();
-    server.town("m", 2).await;
+async fn a_body_that_is_not_an_image_is_rejected_and_the_next_frame_is_answered() {
+    let (server, map) = shared_server();
+    server.town(&map, 2).await;
     let whole = reference(1);
     let text = b"I am not a picture.\n".to_vec();
-    for (path, wrong_id) in [("/localize?map=m", false), ("/maps/m/images?id=x", true)] {
+    for (path, wrong_id) in
+        [(&format!("/localize?map={map}"), false), (&format!("/maps/{map}/images?id=x"), true)]
+    {
         let cut = server.post_jpeg(path, whole[..whole.len() / 2].to_vec()).await.problem(422);
         assert!(cut.contains("truncated"), "{cut}");
         let no_picture = server.post_jpeg(path, text.clone()).await.problem(422);
@@ -28,14 +31,14 @@ async fn what_is_no_picture_is_refused_and_the_next_frame_is_answered() {
         let typed = server.post(path, "text/plain", text.clone()).await.problem(415);
         assert!(typed.contains("image/jpeg"), "{typed}");
         if wrong_id {
-            server.get("/maps/m/images/x").await.problem(404);
+            server.get(&format!("/maps/{map}/images/x")).await.problem(404);
         }
-        still_works(&server).await;
+        still_works(server, &map).await;
     }
 }
 
 #[tokio::test]
-async fn a_bomb_of_a_hundred_megapixels_is_refused_by_its_header() {
+async fn a_decompression_bomb_is_rejected_by_its_header() {
     let (_dir, server) = server();
     server.town("m", 1).await;
     let mut bomb = std::io::Cursor::new(Vec::new());
@@ -49,11 +52,11 @@ async fn a_bomb_of_a_hundred_megapixels_is_refused_by_its_header() {
     }
     let grown = server.resident_bytes().saturating_sub(before);
     assert!(grown < 50_000_000, "memory grew by {grown} bytes");
-    still_works(&server).await;
+    still_works(&server, "m").await;
 }
 
 #[tokio::test]
-async fn a_body_of_a_gigabyte_is_refused_without_being_kept() {
+async fn a_body_of_a_gigabyte_is_rejected_without_being_buffered() {
     let (_dir, server) = server();
     server.town("m", 1).await;
     let before = server.resident_bytes();
@@ -62,7 +65,7 @@ async fn a_body_of_a_gigabyte_is_refused_without_being_kept() {
         let chunk = chunk.clone();
         futures_util::stream::iter(0..1024).map(move |_| Ok::<_, std::io::Error>(chunk.clone()))
     };
-    // With its length said in advance, and without.
+    // With a content-length, and chunked.
     for length in [Some(1_u64 << 30), None] {
         let mut request = server
             .request(Method::POST, "/localize?map=m")
@@ -76,61 +79,62 @@ async fn a_body_of_a_gigabyte_is_refused_without_being_kept() {
     }
     let grown = server.resident_bytes().saturating_sub(before);
     assert!(grown < 150_000_000, "memory grew by {grown} bytes");
-    still_works(&server).await;
+    still_works(&server, "m").await;
 }
 
 #[tokio::test]
-async fn numbers_out_of_range_are_named() {
-    let (_dir, server) = server();
-    server.town("m", 1).await;
+async fn a_parameter_out_of_range_is_named_in_the_error() {
+    let (server, map) = shared_server();
+    server.town(&map, 1).await;
     for (path, status, named) in [
-        ("/localize?map=m&k=0", 422, "k is 0"),
-        ("/localize?map=m&k=1000000", 422, "between 1 and 100"),
-        ("/localize?map=m&k=-1", 400, "k"),
-        ("/localize?map=m&k=ten", 400, "k"),
+        ("/localize?map=MAP&k=0", 422, "k is 0"),
+        ("/localize?map=MAP&k=1000000", 422, "between 1 and 100"),
+        ("/localize?map=MAP&k=-1", 400, "k"),
+        ("/localize?map=MAP&k=ten", 400, "k"),
         ("/localize?map=nowhere", 404, "no map nowhere"),
         ("/localize", 400, "map"),
-        ("/localize?map=m&refine=maybe", 400, "refine"),
-        ("/localize?map=m&colour=red", 400, "colour"),
+        ("/localize?map=MAP&refine=maybe", 400, "refine"),
+        ("/localize?map=MAP&colour=red", 400, "colour"),
         ("/localize?map=..%2Fetc", 400, "map name"),
-        ("/maps/m/images?id=p&lat=91&lon=0", 422, "lat is 91"),
-        ("/maps/m/images?id=p&lat=NaN&lon=0", 422, "lat"),
-        ("/maps/m/images?id=p&x=1&y=2", 422, "lat, lon"),
-        ("/maps/m/images?id=p&lat=1", 422, "lon"),
+        ("/maps/MAP/images?id=p&lat=91&lon=0", 422, "lat is 91"),
+        ("/maps/MAP/images?id=p&lat=NaN&lon=0", 422, "lat"),
+        ("/maps/MAP/images?id=p&x=1&y=2", 422, "lat, lon"),
+        ("/maps/MAP/images?id=p&lat=1", 422, "lon"),
         ("/maps/nowhere/images", 404, "no map nowhere"),
     ] {
-        let why = server.post_jpeg(path, reference(1)).await.problem(status);
+        let why = server.post_jpeg(&path.replace("MAP", &map), reference(1)).await.problem(status);
         assert!(why.contains(named), "{path}: {why}");
     }
-    server.get("/maps/m/images/p").await.problem(404);
-    still_works(&server).await;
+    server.get(&format!("/maps/{map}/images/p")).await.problem(404);
+    still_works(server, &map).await;
 }
 
 #[tokio::test]
-async fn json_that_is_not_what_is_asked_for_is_refused() {
-    let (_dir, server) = server();
+async fn json_of_another_schema_is_rejected() {
+    let (server, map) = shared_server();
     for body in [json!({"scene": "underwater"}), json!({"seen": 1}), json!([1]), json!("x")] {
-        server.put("/maps/m", body).await.problem(400);
+        server.put(&format!("/maps/{map}"), body).await.problem(400);
     }
-    let request = server.request(Method::PUT, "/maps/m").body("{");
+    let request = server.request(Method::PUT, &format!("/maps/{map}")).body("{");
     Answer::of(request).await.problem(400);
-    server.get("/maps/m").await.problem(404);
+    server.get(&format!("/maps/{map}")).await.problem(404);
 }
 
 #[tokio::test]
-async fn a_path_or_method_that_is_not_there_points_to_the_docs() {
-    let (_dir, server) = server();
+async fn an_unknown_path_or_method_points_to_the_docs() {
+    let (server, _) = shared_server();
     assert!(server.get("/nothing").await.problem(404).contains("/docs"));
     assert!(server.delete("/localize").await.problem(405).contains("/docs"));
 }
 
 #[tokio::test]
-async fn a_picture_without_any_texture_is_answered_or_refused_but_breaks_nothing() {
-    let (_dir, server) = server();
-    server.town("m", 2).await;
+async fn a_picture_without_texture_is_answered_or_rejected_and_breaks_nothing() {
+    let (server, map) = shared_server();
+    server.town(&map, 2).await;
     for pixels in [RgbImage::new(64, 64), RgbImage::new(1, 1), RgbImage::new(4000, 1)] {
-        let answer = server.post_jpeg("/localize?map=m&refine=wait", jpeg(&pixels)).await;
+        let answer =
+            server.post_jpeg(&format!("/localize?map={map}&refine=wait"), jpeg(&pixels)).await;
         assert!(matches!(answer.status.as_u16(), 200 | 422), "{answer:?}");
     }
-    still_works(&server).await;
+    still_works(server, &map).await;
 }

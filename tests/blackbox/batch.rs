@@ -7,21 +7,22 @@ use reqwest::Method;
 use reqwest::multipart::{Form, Part};
 use serde_json::{Value, json};
 
-use super::support::{Answer, Server, reference, server};
+use super::support::{Answer, Server, reference, server, shared_server};
 
 fn picture(form: Form, name: &str, bytes: Vec<u8>) -> Form {
     form.part("image", Part::bytes(bytes).file_name(name.to_owned()))
 }
 
-async fn send(server: &Server, form: Form) -> Answer {
-    Answer::of(server.request(Method::POST, "/maps/m/images:batch").multipart(form)).await
+async fn send(server: &Server, map: &str, form: Form) -> Answer {
+    let path = format!("/maps/{map}/images:batch");
+    Answer::of(server.request(Method::POST, &path).multipart(form)).await
 }
 
-async fn send_tar(server: &Server, archive: Vec<u8>) -> Answer {
-    server.post("/maps/m/images:batch", "application/x-tar", archive).await
+async fn send_tar(server: &Server, map: &str, archive: Vec<u8>) -> Answer {
+    server.post(&format!("/maps/{map}/images:batch"), "application/x-tar", archive).await
 }
 
-/// Id and outcome of each image.
+/// The id and the outcome of each image.
 fn outcomes(answer: &Value) -> Vec<(String, String)> {
     let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
     let results = answer["results"].as_array().unwrap();
@@ -44,9 +45,9 @@ fn archive(entries: &[(&str, &[u8])]) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn each_image_of_a_form_has_a_result_and_what_is_wrong_with_one_spares_the_others() {
-    let (_dir, server) = server();
-    server.put("/maps/m", json!({})).await.expect(201);
+async fn each_image_of_a_form_has_its_own_result_and_errors_are_isolated() {
+    let (server, map) = shared_server();
+    server.put(&format!("/maps/{map}"), json!({})).await.expect(201);
     let meta = |text: &str| text.to_owned();
     let mut form = Form::new().text("meta", meta(r#"{"id": "a", "pose": {"lat": 1, "lon": 2}}"#));
     form = picture(form, "one.jpg", reference(0));
@@ -61,10 +62,10 @@ async fn each_image_of_a_form_has_a_result_and_what_is_wrong_with_one_spares_the
     );
     form = picture(form.text("meta", meta(r#"{"id": "a"}"#)), "", reference(0));
     form = picture(form.text("meta", meta(r#"{"id": "a"}"#)), "", reference(4));
-    let answer = send(&server, form).await.expect(200);
+    let answer = send(server, &map, form).await.expect(200);
     let digest = answer["results"][3]["id"].as_str().unwrap().to_owned();
     assert_eq!(digest.len(), 16, "without a name it is the head of the digest");
-    let wanted = [
+    let expected_results = [
         ("a", "stored"),
         ("two.jpg", "stored"),
         ("broken.jpg", "failed"),
@@ -74,7 +75,7 @@ async fn each_image_of_a_form_has_a_result_and_what_is_wrong_with_one_spares_the
         ("a", "present"),
         ("a", "failed"),
     ];
-    assert_eq!(outcomes(&answer), expected(&wanted));
+    assert_eq!(outcomes(&answer), expected(&expected_results));
     assert_eq!(
         [&answer["stored"], &answer["present"], &answer["failed"]],
         [&json!(3), &json!(1), &json!(4)]
@@ -84,15 +85,15 @@ async fn each_image_of_a_form_has_a_result_and_what_is_wrong_with_one_spares_the
         [kind(2), kind(4), kind(5), kind(7)],
         ["unprocessable", "malformed", "unprocessable", "conflict"]
     );
-    assert_eq!(server.get("/maps/m").await.expect(200)["images"], 3);
-    let pose = &server.get("/maps/m/images/a").await.expect(200)["pose"];
+    assert_eq!(server.get(&format!("/maps/{map}")).await.expect(200)["images"], 3);
+    let pose = &server.get(&format!("/maps/{map}/images/a")).await.expect(200)["pose"];
     assert_eq!(*pose, json!({"lat": 1.0, "lon": 2.0}));
 }
 
 #[tokio::test]
-async fn an_archive_has_pictures_and_what_is_said_about_them_beside() {
-    let (_dir, server) = server();
-    server.put("/maps/m", json!({"frame": "metric"})).await.expect(201);
+async fn an_archive_holds_pictures_and_their_metadata_in_sidecar_files() {
+    let (server, map) = shared_server();
+    server.put(&format!("/maps/{map}"), json!({"frame": "metric"})).await.expect(201);
     let long = format!("{}/long.jpg", "d".repeat(150));
     let pictures: Vec<_> = (0..5).map(reference).collect();
     let sent = archive(&[
@@ -107,8 +108,8 @@ async fn an_archive_has_pictures_and_what_is_said_about_them_beside() {
         ("d.txt", b"no picture"),
         ("e.jpg", &pictures[4]),
     ]);
-    let answer = send_tar(&server, sent.clone()).await.expect(200);
-    let wanted = [
+    let answer = send_tar(server, &map, sent.clone()).await.expect(200);
+    let expected_results = [
         ("a.jpg", "stored"),
         ("b", "stored"),
         ("", "failed"),
@@ -117,48 +118,55 @@ async fn an_archive_has_pictures_and_what_is_said_about_them_beside() {
         ("d.txt", "failed"),
         ("e.jpg", "stored"),
     ];
-    assert_eq!(outcomes(&answer), expected(&wanted));
+    assert_eq!(outcomes(&answer), expected(&expected_results));
     let detail = |index: usize| answer["results"][index]["problem"]["detail"].as_str().unwrap();
     assert!(detail(2).contains("lost.jpg") && detail(4).contains("c.jpg"), "{answer}");
-    let image = server.get("/maps/m/images/a.jpg").await.expect(200);
+    let image = server.get(&format!("/maps/{map}/images/a.jpg")).await.expect(200);
     assert_eq!(image["pose"], json!({"x": 1.0, "y": 2.0}));
-    assert_eq!(server.get("/maps/m/images/b").await.expect(200)["tags"], json!(["gate"]));
-    let again = send_tar(&server, sent).await.expect(200);
+    assert_eq!(
+        server.get(&format!("/maps/{map}/images/b")).await.expect(200)["tags"],
+        json!(["gate"])
+    );
+    let again = send_tar(server, &map, sent).await.expect(200);
     assert_eq!((again["stored"].as_u64(), again["present"].as_u64()), (Some(0), Some(4)));
 }
 
 #[tokio::test]
-async fn a_request_that_is_wrong_as_a_whole_says_so_and_keeps_what_came_before() {
-    let (_dir, server) = server();
-    server.put("/maps/m", json!({})).await.expect(201);
-    let problem =
-        server.post("/maps/m/images:batch", "image/jpeg", reference(0)).await.problem(415);
+async fn a_malformed_batch_is_rejected_and_keeps_the_images_before_the_error() {
+    let (server, map) = shared_server();
+    server.put(&format!("/maps/{map}"), json!({})).await.expect(201);
+    let problem = server
+        .post(&format!("/maps/{map}/images:batch"), "image/jpeg", reference(0))
+        .await
+        .problem(415);
     assert!(problem.contains("application/x-tar"), "{problem}");
     let nowhere = server.request(Method::POST, "/maps/none/images:batch");
     Answer::of(nowhere.multipart(picture(Form::new(), "a", reference(0)))).await.problem(404);
-    send(&server, Form::new()).await.problem(400);
+    send(server, &map, Form::new()).await.problem(400);
     let unknown = Form::new().text("poses", "{}");
-    assert!(send(&server, unknown).await.problem(400).contains("\"poses\""));
+    assert!(send(server, &map, unknown).await.problem(400).contains("\"poses\""));
     let lonely = picture(Form::new(), "first", reference(0)).text("meta", "{}");
-    assert!(send(&server, lonely).await.problem(400).contains("no \"image\" follows"));
+    assert!(send(server, &map, lonely).await.problem(400).contains("no \"image\" follows"));
     let twice = picture(Form::new().text("meta", "{}").text("meta", "{}"), "a", reference(1));
-    assert!(send(&server, twice).await.problem(400).contains("in a row"));
+    assert!(send(server, &map, twice).await.problem(400).contains("in a row"));
     let long = picture(Form::new().text("meta", " ".repeat(70_000)), "a", reference(1));
-    assert!(send(&server, long).await.problem(413).contains("65536"));
+    assert!(send(server, &map, long).await.problem(413).contains("65536"));
 
     let whole = archive(&[("second", &reference(1)), ("third", &reference(2))]);
-    send_tar(&server, whole[..whole.len() * 2 / 3].to_vec()).await.problem(400);
-    send_tar(&server, b"no archive at all".repeat(100)).await.problem(400);
-    let images = server.get("/maps/m/images").await.expect(200);
+    send_tar(server, &map, whole[..whole.len() * 2 / 3].to_vec()).await.problem(400);
+    send_tar(server, &map, b"no archive at all".repeat(100)).await.problem(400);
+    let images = server.get(&format!("/maps/{map}/images")).await.expect(200);
     let ids: Vec<_> =
         images["images"].as_array().unwrap().iter().map(|image| &image["id"]).collect();
     assert_eq!(ids, ["first", "second"]);
-    let keyed = server.request(Method::POST, "/maps/m/images:batch").header("idempotency-key", "k");
+    let keyed = server
+        .request(Method::POST, &format!("/maps/{map}/images:batch"))
+        .header("idempotency-key", "k");
     Answer::of(keyed.multipart(picture(Form::new(), "a", reference(0)))).await.problem(400);
 }
 
 #[tokio::test]
-async fn the_whole_is_unbounded_and_each_image_is_not() {
+async fn a_batch_is_unbounded_but_each_of_its_images_is_bounded() {
     let dir = tempfile::tempdir().unwrap();
     let one = reference(0).len();
     let limit = (2 * one).to_string();
@@ -178,7 +186,7 @@ async fn the_whole_is_unbounded_and_each_image_is_not() {
     let pictures: Vec<_> = (0..21).map(|place| (place.to_string(), reference(place))).collect();
     let entries: Vec<_> =
         pictures.iter().map(|(name, bytes)| (name.as_str(), &bytes[..])).collect();
-    let answer = send_tar(&server, archive(&entries)).await.expect(200);
+    let answer = send_tar(&server, "m", archive(&entries)).await.expect(200);
     assert_eq!(
         (answer["stored"].as_u64(), answer["failed"].as_u64()),
         (Some(20), Some(1)),
@@ -191,15 +199,16 @@ async fn the_whole_is_unbounded_and_each_image_is_not() {
     for (name, bytes) in pictures.iter().take(5) {
         form = picture(form, name, bytes.clone());
     }
-    assert_eq!(send(&server, form).await.expect(200)["present"], 5);
+    assert_eq!(send(&server, "m", form).await.expect(200)["present"], 5);
 
     let large = picture(Form::new(), "large", vec![0; 2 * one + 1]);
     let large = picture(large, "after", pictures[0].1.clone());
     let zeros = vec![0; 2 * one + 1];
     let archived = archive(&[("large", zeros.as_slice()), ("after", &pictures[0].1)]);
-    for (answer, after) in
-        [(send(&server, large).await, "stored"), (send_tar(&server, archived).await, "present")]
-    {
+    for (answer, after) in [
+        (send(&server, "m", large).await, "stored"),
+        (send_tar(&server, "m", archived).await, "present"),
+    ] {
         let answer = answer.expect(200);
         let [large, last] = &answer["results"].as_array().unwrap()[..] else { panic!("{answer}") };
         assert_eq!(
@@ -208,7 +217,8 @@ async fn the_whole_is_unbounded_and_each_image_is_not() {
         );
     }
 
-    // It takes longer than a request may, and more slowly than a body may come, but never pauses for long.
+    // Slow clients are what is tested: one takes longer than a request may and sends more slowly than a body may
+    // come, but never pauses for long; the other pauses for too long.
     let whole = archive(&entries[..2]);
     let chunks: Vec<_> = whole.chunks(whole.len() / 6).map(<[u8]>::to_vec).collect();
     let slowly = |chunks: Vec<Vec<u8>>, pause: f64| {
@@ -226,11 +236,11 @@ async fn the_whole_is_unbounded_and_each_image_is_not() {
 }
 
 #[tokio::test]
-async fn a_body_in_which_nothing_ends_is_not_kept() {
+async fn a_batch_without_an_end_of_a_part_is_not_buffered() {
     let (_dir, server) = server();
     server.put("/maps/m", json!({})).await.expect(201);
     let before = server.resident_bytes();
-    // A name of a gigabyte, in an archive; and a form without a part.
+    // An archive with a name of a gigabyte, and forms whose first part never begins or ends.
     let mut long_name = tar::Header::new_gnu();
     long_name.set_entry_type(tar::EntryType::GNULongName);
     long_name.set_path("././@LongLink").unwrap();
@@ -247,7 +257,7 @@ async fn a_body_in_which_nothing_ends_is_not_kept() {
         let body = futures_util::stream::iter(chunks.map(Ok::<_, std::io::Error>));
         let request =
             server.request(Method::POST, "/maps/m/images:batch").header("content-type", kind);
-        // The server hangs up; whether the answer is seen before is a matter of luck.
+        // The server closes the connection, possibly before the client has read the response.
         if let Ok(response) = request.body(reqwest::Body::wrap_stream(body)).send().await {
             assert_eq!(response.status(), 400, "{kind}");
         }
@@ -255,5 +265,5 @@ async fn a_body_in_which_nothing_ends_is_not_kept() {
     let grown = server.resident_bytes().saturating_sub(before);
     assert!(grown < 50_000_000, "memory grew by {grown} bytes");
     let image = picture(Form::new(), "a", reference(0));
-    assert_eq!(send(&server, image).await.expect(200)["stored"], 1);
+    assert_eq!(send(&server, "m", image).await.expect(200)["stored"], 1);
 }

@@ -1,4 +1,4 @@
-//! The commands, as a user types them.
+//! The commands as a user types them.
 
 use std::path::Path;
 use std::process::{Command, Output};
@@ -6,10 +6,12 @@ use std::process::{Command, Output};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server, frame, reference, server};
+use super::deployment;
+use super::keys::{Guarded, get};
+use super::support::{BINARY, Server, frame, reference, server, shared_server};
 
 fn whereabouts(args: &[&str]) -> Output {
-    // Whatever else is installed in the checkout, or could be.
+    // The built-in model, whatever else is installed in the checkout.
     Command::new(&*BINARY).args(args).env("WHEREABOUTS_MODEL__NAME", "xfeat").output().unwrap()
 }
 
@@ -36,33 +38,36 @@ fn index(server: &Server, dir: &Path, map: &str) -> Output {
 }
 
 #[tokio::test]
-async fn a_folder_is_indexed_once_however_often_it_is_sent() {
-    let (_dir, server) = server();
+async fn indexing_a_folder_again_adds_nothing() {
+    let (server, map) = shared_server();
     let folder = TempDir::new().unwrap();
     let names = ["@0100.50@0200.25@.jpg", "north/@0110.50@0200.25@.jpg"];
     write_places(folder.path(), &names);
-    let first = json(&index(&server, folder.path(), "m"));
+    let first = json(&index(server, folder.path(), &map));
     assert_eq!((&first["added"], &first["present"]), (&2.into(), &0.into()));
-    let again = json(&index(&server, folder.path(), "m"));
+    let again = json(&index(server, folder.path(), &map));
     assert_eq!((&again["added"], &again["present"]), (&0.into(), &2.into()));
-    assert_eq!(server.get("/maps/m").await.expect(200)["frame"], "metric");
-    let image = server.get("/maps/m/images/north%2F%400110.50%400200.25%40.jpg").await.expect(200);
+    assert_eq!(server.get(&format!("/maps/{map}")).await.expect(200)["frame"], "metric");
+    let image = server
+        .get(&format!("/maps/{map}/images/north%2F%400110.50%400200.25%40.jpg"))
+        .await
+        .expect(200);
     assert_eq!(image["pose"], serde_json::json!({"x": 110.5, "y": 200.25}));
 }
 
 #[tokio::test]
 async fn poses_come_from_a_csv_and_a_bad_file_fails_alone() {
-    let (_dir, server) = server();
+    let (server, map) = shared_server();
     let folder = TempDir::new().unwrap();
     write_places(folder.path(), &["a.jpg", "b.jpg"]);
     std::fs::write(folder.path().join("c.jpg"), "text").unwrap();
     std::fs::write(folder.path().join("poses.csv"), "file,lat,lon\na.jpg,45.5,7.25\n").unwrap();
-    let output = index(&server, folder.path(), "m");
+    let output = index(server, folder.path(), &map);
     assert_eq!(output.status.code(), Some(1));
     assert!(error(&output).contains("c.jpg"), "{}", error(&output));
     let outcome = json(&output);
     assert_eq!((&outcome["added"], &outcome["without_pose"]), (&2.into(), &1.into()));
-    let image = server.get("/maps/m/images/a.jpg").await.expect(200);
+    let image = server.get(&format!("/maps/{map}/images/a.jpg")).await.expect(200);
     assert_eq!(image["pose"], serde_json::json!({"lat": 45.5, "lon": 7.25}));
 }
 
@@ -91,7 +96,7 @@ async fn a_picture_is_localized_and_its_job_is_shown() {
 }
 
 #[test]
-fn a_server_that_is_not_there_is_named_with_what_to_do() {
+fn an_unreachable_server_is_named_with_a_hint() {
     // Port 9 (discard) of this machine has no listener.
     let url = "http://127.0.0.1:9";
     for args in [&["healthcheck", "--server", url][..], &["jobs", "--server", url]] {
@@ -102,7 +107,7 @@ fn a_server_that_is_not_there_is_named_with_what_to_do() {
 }
 
 #[test]
-fn wrong_usage_is_2_and_every_command_explains_itself() {
+fn wrong_usage_exits_with_2_and_every_command_has_help() {
     assert_eq!(whereabouts(&["serve", "--no-such-flag"]).status.code(), Some(2));
     assert_eq!(whereabouts(&[]).status.code(), Some(2));
     for command in [
@@ -124,7 +129,7 @@ fn wrong_usage_is_2_and_every_command_explains_itself() {
 }
 
 #[test]
-fn what_is_missing_at_the_start_is_said_with_what_to_do() {
+fn a_missing_prerequisite_is_reported_at_startup_with_a_hint() {
     let dir = TempDir::new().unwrap();
     let start = |name: &str, value: &str| {
         let output = Command::new(&*BINARY)
@@ -159,11 +164,60 @@ fn the_demo_runs_and_refinement_helps() {
     assert!(recall("after") >= recall("before"), "{outcome}");
     let pictures = std::fs::read_dir(out.join("pictures")).unwrap().count();
     assert_eq!(pictures, 24);
-    // What is not a demo's folder is left alone.
+    // A folder that no demo has written is left alone.
     let other = dir.path().join("other");
     std::fs::create_dir(&other).unwrap();
     std::fs::write(other.join("thesis.tex"), "years of work").unwrap();
     let refused = whereabouts(&["demo", "--out", other.to_str().unwrap()]);
     assert_eq!(refused.status.code(), Some(1));
     assert!(other.join("thesis.tex").is_file());
+}
+
+#[tokio::test]
+async fn the_commands_take_the_key_from_the_environment() {
+    let Guarded { dir, server, admin, .. } = Guarded::start().await;
+    let run = |key: Option<&str>, args: &[&str]| {
+        let mut command = Command::new(&*BINARY);
+        command.args(args).env("WHEREABOUTS_SERVER", &server.url);
+        if let Some(key) = key {
+            command.env("WHEREABOUTS_API_KEY", key);
+        }
+        let output = command.output().unwrap();
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        (output.status.success(), text(&output.stdout), text(&output.stderr))
+    };
+    let (ok, _, said) = run(None, &["jobs"]);
+    assert!(!ok && said.contains("keys create"), "{said}");
+    let (ok, _, said) = run(Some(&admin), &["jobs"]);
+    assert!(ok, "{said}");
+    let create = ["keys", "create", "--name", "robot 7", "--role", "robot", "--map", "yard"];
+    let (ok, key, said) = run(Some(&admin), &create);
+    assert!(ok && key.starts_with("wab_"), "{said}");
+    get(&server, key.trim(), "/maps/yard").await.expect(200);
+    let (_, listed, _) = run(Some(&admin), &["keys", "list"]);
+    assert!(listed.contains("robot 7") && listed.contains("yard"), "{listed}");
+    let (ok, _, said) = run(Some(&admin), &["keys", "revoke", &key[4..16]]);
+    assert!(ok, "{said}");
+    get(&server, key.trim(), "/maps/yard").await.problem(401);
+    // The whole token is accepted instead of the id; anything else must not get into a URL.
+    let (_, other, _) = run(Some(&admin), &create);
+    let (ok, _, said) = run(Some(&admin), &["keys", "revoke", other.trim()]);
+    assert!(ok, "{said}");
+    get(&server, other.trim(), "/maps/yard").await.problem(401);
+    let (ok, _, said) = run(Some(&admin), &["keys", "revoke", "../maps/vault"]);
+    assert!(!ok && said.contains("hexadecimal"), "{said}");
+    get(&server, &admin, "/maps/vault").await.expect(200);
+    let whole = get(&server, &admin, &format!("/keys/{}", other.trim())).await;
+    assert!(whole.status.is_client_error());
+    assert!(!server.log().contains(&other[20..70]), "a key is in the log");
+    // A database is not locked by a server, and needs no folder.
+    if !deployment::is_scale_out() {
+        let absent = dir.path().join("absent");
+        let (ok, _, said) = run(None, &["keys", "list", "--data", absent.to_str().unwrap()]);
+        assert!(!ok && said.contains("no data folder") && !absent.exists(), "{said}");
+        // A running server locks its data folder.
+        let data = dir.path().to_str().unwrap();
+        let (ok, _, said) = run(None, &["keys", "list", "--data", data]);
+        assert!(!ok && said.contains("leave --data out"), "{said}");
+    }
 }

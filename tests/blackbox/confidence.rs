@@ -1,36 +1,34 @@
-//! How sure the service says it is, and what that is worth.
-
-use std::time::Duration;
+//! Confidence: calibration, and how well `known` separates mapped places from others.
 
 use serde_json::Value;
 
-use super::support::{Server, frame, server};
+use super::support::{Server, frame, shared_server};
+use super::wait::eventually;
 
 const PLACES: usize = 40;
 const ASKED: usize = 20;
 
-/// Waits until a map is measured as it now is.
-async fn calibrated(server: &Server, images: usize) -> Value {
-    loop {
-        let map = server.get("/maps/m").await.expect(200);
-        let calibration = &map["calibration"];
-        if calibration["images"] == images && calibration["refined"] != 0 {
-            return calibration.clone();
-        }
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
+/// Waits until the map is calibrated with this many images, and returns its calibration.
+async fn calibrated(server: &Server, map: &str, images: usize) -> Value {
+    eventually(async || {
+        let calibration =
+            server.get(&format!("/maps/{map}")).await.expect(200)["calibration"].take();
+        (calibration["images"] == images && calibration["refined"] != 0).then_some(calibration)
+    })
+    .await
 }
 
-/// The confidence at once and after refinement, for frames of these places.
-async fn confidences(server: &Server, places: std::ops::Range<usize>) -> Vec<[f64; 2]> {
+/// The confidence of the coarse estimate and of the refined one, for frames of these places.
+async fn confidences(server: &Server, map: &str, places: std::ops::Range<usize>) -> Vec<[f64; 2]> {
     let mut found = Vec::new();
     for place in places {
-        let answer = server.post_jpeg("/localize?map=m", frame(place, 0)).await.expect(200);
+        let answer =
+            server.post_jpeg(&format!("/localize?map={map}"), frame(place, 0)).await.expect(200);
         let href = answer["job"]["href"].as_str().unwrap();
         let job = server.get(&format!("{href}?wait=60")).await.expect(200);
-        found.push([&answer, &job].map(|told| {
-            let confidence = told["estimate"]["confidence"].as_f64().unwrap();
-            assert_eq!(told["estimate"]["known"], confidence >= 0.9);
+        found.push([&answer, &job].map(|response| {
+            let confidence = response["estimate"]["confidence"].as_f64().unwrap();
+            assert_eq!(response["estimate"]["known"], confidence >= 0.9);
             confidence
         }));
     }
@@ -38,17 +36,17 @@ async fn confidences(server: &Server, places: std::ops::Range<usize>) -> Vec<[f6
 }
 
 #[tokio::test]
-async fn frames_of_the_map_are_known_and_those_from_elsewhere_are_not() {
-    let (_dir, server) = server();
-    server.town("m", PLACES).await;
-    let calibration = calibrated(&server, PLACES).await;
+async fn frames_of_mapped_places_are_known_and_others_are_not() {
+    let (server, map) = shared_server();
+    server.town(&map, PLACES).await;
+    let calibration = calibrated(server, &map, PLACES).await;
     assert_eq!(calibration["asked"], PLACES);
     let known = |answers: &[[f64; 2]], which: usize| {
         answers.iter().filter(|answer| answer[which] >= 0.9).count()
     };
-    let mapped = confidences(&server, 0..ASKED).await;
-    let unmapped = confidences(&server, 500..500 + ASKED).await;
-    // The promise is a tenth; twenty frames can be unlucky.
+    let mapped = confidences(server, &map, 0..ASKED).await;
+    let unmapped = confidences(server, &map, 500..500 + ASKED).await;
+    // At most a tenth is expected; a sample of twenty frames may exceed it.
     for which in [0, 1] {
         assert!(known(&unmapped, which) <= 5, "{unmapped:?}");
     }
@@ -56,16 +54,17 @@ async fn frames_of_the_map_are_known_and_those_from_elsewhere_are_not() {
 }
 
 #[tokio::test]
-async fn confidence_is_0_before_anything_is_measured_and_is_measured_again_when_a_map_grows() {
-    let (_dir, server) = server();
-    server.town("m", 1).await;
-    let answer = server.post_jpeg("/localize?map=m&refine=off", frame(0, 0)).await.expect(200);
+async fn confidence_is_0_before_calibration_and_is_calibrated_again_when_a_map_grows() {
+    let (server, map) = shared_server();
+    server.town(&map, 1).await;
+    let answer =
+        server.post_jpeg(&format!("/localize?map={map}&refine=off"), frame(0, 0)).await.expect(200);
     assert_eq!(
         (&answer["estimate"]["confidence"], &answer["estimate"]["known"]),
         (&0.0.into(), &false.into())
     );
-    server.town_more("m", 1..12).await;
-    calibrated(&server, 12).await;
-    server.town_more("m", 12..24).await;
-    calibrated(&server, 24).await;
+    server.town_more(&map, 1..12).await;
+    calibrated(server, &map, 12).await;
+    server.town_more(&map, 12..24).await;
+    calibrated(server, &map, 24).await;
 }

@@ -1,14 +1,14 @@
-//! What the operator's console asks for, and how it is served.
+//! The calls of the operator console, and how its files are served.
 
 use reqwest::header::{CONTENT_SECURITY_POLICY, ETAG, IF_NONE_MATCH};
 use reqwest::{Method, StatusCode};
 
 use super::deployment;
-use super::support::{Answer, Server, frame, server};
+use super::support::{Answer, Server, frame, shared_server};
 
 #[tokio::test]
-async fn the_page_comes_with_a_policy_and_is_not_sent_again_unchanged() {
-    let (_dir, server) = server();
+async fn the_console_has_a_content_security_policy_and_is_cached_by_its_etag() {
+    let (server, _) = shared_server();
     for (path, kind) in
         [("/", "text/html; charset=utf-8"), ("/console/app.js", "text/javascript; charset=utf-8")]
     {
@@ -29,12 +29,13 @@ async fn the_page_comes_with_a_policy_and_is_not_sent_again_unchanged() {
 }
 
 #[tokio::test]
-async fn jobs_can_be_listed_without_what_was_found_out() {
-    let (_dir, server) = server();
-    server.town("m", 3).await;
-    server.post_jpeg("/localize?map=m&refine=wait", frame(0, 0)).await.expect(200);
-    let whole = server.get("/jobs").await.expect(200)["jobs"][0].clone();
-    let mut brief = server.get("/jobs?brief=true").await.expect(200)["jobs"][0].clone();
+async fn jobs_can_be_listed_without_descriptions_and_ranking() {
+    let (server, map) = shared_server();
+    server.town(&map, 3).await;
+    server.post_jpeg(&format!("/localize?map={map}&refine=wait"), frame(0, 0)).await.expect(200);
+    let whole = server.get(&format!("/jobs?map={map}")).await.expect(200)["jobs"][0].clone();
+    let mut brief =
+        server.get(&format!("/jobs?map={map}&brief=true")).await.expect(200)["jobs"][0].clone();
     assert_eq!(brief["descriptions"], serde_json::json!([]));
     assert!(brief["ranking"].is_null() && brief["reasoning"].is_null());
     for field in ["descriptions", "ranking", "reasoning"] {
@@ -45,7 +46,7 @@ async fn jobs_can_be_listed_without_what_was_found_out() {
 }
 
 #[tokio::test]
-async fn tiles_are_of_a_configured_server_alone() {
+async fn map_tiles_come_only_from_the_configured_server() {
     let dir = tempfile::tempdir().unwrap();
     let url = "https://tiles.example/{z}/{x}/{y}.png";
     let server = Server::start(dir.path(), &[("WHEREABOUTS_CONSOLE__TILES_URL", url)]);
@@ -66,11 +67,14 @@ async fn tiles_are_of_a_configured_server_alone() {
 }
 
 #[tokio::test]
-async fn a_job_shows_its_frame_and_what_it_shares_with_a_candidate() {
-    let (_dir, server) = server();
-    server.town("m", 4).await;
+async fn a_job_shows_its_frame_and_the_regions_that_match_a_candidate() {
+    let (server, map) = shared_server();
+    server.town(&map, 4).await;
     let sent = frame(1, 0);
-    let answer = server.post_jpeg("/localize?map=m&refine=wait", sent.clone()).await.expect(200);
+    let answer = server
+        .post_jpeg(&format!("/localize?map={map}&refine=wait"), sent.clone())
+        .await
+        .expect(200);
     let job = answer["job"]["id"].as_str().unwrap();
     let shown = server.get(&format!("/jobs/{job}/frame")).await;
     assert_eq!((shown.status, shown.bytes), (StatusCode::OK, sent));
@@ -94,15 +98,15 @@ async fn a_job_shows_its_frame_and_what_it_shares_with_a_candidate() {
         }
     }
     server.get(&format!("/jobs/{job}/matches/nothing")).await.problem(404);
-    let nobody = uuid::Uuid::nil();
-    server.get(&format!("/jobs/{nobody}/frame")).await.problem(404);
-    server.get(&format!("/jobs/{nobody}/matches/{first}")).await.problem(404);
-    server.delete("/maps/m").await;
+    let unknown = uuid::Uuid::nil();
+    server.get(&format!("/jobs/{unknown}/frame")).await.problem(404);
+    server.get(&format!("/jobs/{unknown}/matches/{first}")).await.problem(404);
+    server.delete(&format!("/maps/{map}")).await;
     server.get(&format!("/jobs/{job}/matches/{first}")).await.problem(404);
 }
 
 #[tokio::test]
-async fn the_status_tells_of_the_last_hour_and_keeps_secrets() {
+async fn the_status_covers_the_last_hour_and_hides_secrets() {
     let dir = tempfile::tempdir().unwrap();
     let server = Server::start(dir.path(), &[("WHEREABOUTS_MLLM__API_KEY", "sk-very-secret")]);
     server.town("m", 2).await;
@@ -120,7 +124,7 @@ async fn the_status_tells_of_the_last_hour_and_keeps_secrets() {
         (Some("local"), Some(false))
     );
     assert_eq!(status["models"][0]["name"], "xfeat");
-    // An object store does not say how much room it has.
+    // An object store does not report its free space.
     assert!(deployment::is_scale_out() || status["free_bytes"].as_u64().unwrap() > 0);
     assert!(status["db_bytes"].as_u64().unwrap() > 0);
     let settings = status["settings"].as_str().unwrap();

@@ -1,9 +1,9 @@
-//! What was acknowledged is there after a restart, whether the server was asked to end or not.
+//! Acknowledged changes survive a restart, after a clean shutdown as after a kill.
 
-use serde_json::{Value, json};
+use serde_json::Value;
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server, frame, reference};
+use super::support::{Server, frame, reference};
 
 #[tokio::test]
 async fn everything_is_there_after_kill_9() {
@@ -20,7 +20,7 @@ async fn everything_is_there_after_kill_9() {
     assert_eq!(server.get("/maps/m").await.expect(200)["images"], 7);
     let after = server.post_jpeg("/localize?map=m&refine=off", frame(2, 0)).await.expect(200);
     same_candidates(&after["candidates"], &before["candidates"]);
-    // The job was acknowledged, so it ends, by whichever of the two processes.
+    // The job was acknowledged, so one of the two processes finishes it.
     let href = before["job"]["href"].as_str().unwrap();
     let job = server.get(&format!("{href}?wait=30")).await.expect(200);
     assert_eq!(job["state"], "succeeded", "{job}");
@@ -41,7 +41,7 @@ fn same_candidates(a: &Value, b: &Value) {
 }
 
 #[tokio::test]
-async fn images_go_on_being_added_after_a_restart() {
+async fn images_can_be_added_after_a_restart() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     server.town("m", 3).await;
@@ -67,43 +67,55 @@ async fn sigterm_drains_and_exits_with_0() {
     assert_eq!(job["state"], "succeeded", "{job}");
 }
 
-#[tokio::test]
-async fn a_second_server_on_the_same_folder_is_refused_with_the_reason() {
-    let dir = TempDir::new().unwrap();
-    let _server = Server::start(dir.path(), &[]);
-    let second = std::process::Command::new(&*BINARY)
-        .args(["serve", "--listen", "127.0.0.1:0", "--data"])
-        .arg(dir.path())
-        .output()
-        .unwrap();
-    assert_eq!(second.status.code(), Some(1));
-    let why = String::from_utf8_lossy(&second.stderr).into_owned();
-    assert!(why.contains("another process uses the data folder"), "{why}");
-}
+/// The files of a data folder.
+mod embedded_only {
+    use serde_json::json;
+    use tempfile::TempDir;
 
-#[tokio::test]
-async fn a_damaged_descriptor_is_left_out_and_reported_and_the_rest_is_found() {
-    let dir = TempDir::new().unwrap();
-    let server = Server::start(dir.path(), &[]);
-    server.town("m", 3).await;
-    assert!(server.terminate().success());
-    let maps = std::fs::read_dir(dir.path().join("descriptors")).unwrap();
-    let segment = maps.map(|map| map.unwrap().path().join("000000.seg")).next().unwrap();
-    let mut bytes = std::fs::read(&segment).unwrap();
-    // Somewhere inside the second row: header 64, row 16 + 4 × 576 bytes.
-    bytes[64 + (16 + 4 * 576) + 500] ^= 0x55;
-    std::fs::write(&segment, bytes).unwrap();
+    use crate::support::{BINARY, Server, reference};
 
-    let server = Server::start(dir.path(), &[]);
-    assert!(server.log().contains("its descriptor is damaged"));
-    let answer = server.post_jpeg("/localize?map=m&refine=off", reference(2)).await.expect(200);
-    let ids: Vec<_> =
-        answer["candidates"].as_array().unwrap().iter().map(|c| c["image_id"].clone()).collect();
-    assert_eq!(ids.len(), 2);
-    assert!(!ids.contains(&json!("place-1")), "{ids:?}");
-    // As the log says: delete it and add it again.
-    server.delete("/maps/m/images/place-1").await.expect(204);
-    server.post_jpeg("/maps/m/images?id=place-1", reference(1)).await.expect(201);
-    let answer = server.post_jpeg("/localize?map=m&refine=off", reference(1)).await.expect(200);
-    assert_eq!(answer["candidates"][0]["image_id"], "place-1");
+    #[tokio::test]
+    async fn a_second_server_on_the_same_data_folder_does_not_start() {
+        let dir = TempDir::new().unwrap();
+        let _server = Server::start(dir.path(), &[]);
+        let second = std::process::Command::new(&*BINARY)
+            .args(["serve", "--listen", "127.0.0.1:0", "--data"])
+            .arg(dir.path())
+            .output()
+            .unwrap();
+        assert_eq!(second.status.code(), Some(1));
+        let why = String::from_utf8_lossy(&second.stderr).into_owned();
+        assert!(why.contains("another process uses the data folder"), "{why}");
+    }
+
+    #[tokio::test]
+    async fn a_damaged_descriptor_is_skipped_and_reported_and_the_rest_is_found() {
+        let dir = TempDir::new().unwrap();
+        let server = Server::start(dir.path(), &[]);
+        server.town("m", 3).await;
+        assert!(server.terminate().success());
+        let maps = std::fs::read_dir(dir.path().join("descriptors")).unwrap();
+        let segment = maps.map(|map| map.unwrap().path().join("000000.seg")).next().unwrap();
+        let mut bytes = std::fs::read(&segment).unwrap();
+        // Somewhere inside the second row: header 64, row 16 + 4 × 576 bytes.
+        bytes[64 + (16 + 4 * 576) + 500] ^= 0x55;
+        std::fs::write(&segment, bytes).unwrap();
+
+        let server = Server::start(dir.path(), &[]);
+        assert!(server.log().contains("its descriptor is damaged"));
+        let answer = server.post_jpeg("/localize?map=m&refine=off", reference(2)).await.expect(200);
+        let ids: Vec<_> = answer["candidates"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|c| c["image_id"].clone())
+            .collect();
+        assert_eq!(ids.len(), 2);
+        assert!(!ids.contains(&json!("place-1")), "{ids:?}");
+        // As the log says: delete it and add it again.
+        server.delete("/maps/m/images/place-1").await.expect(204);
+        server.post_jpeg("/maps/m/images?id=place-1", reference(1)).await.expect(201);
+        let answer = server.post_jpeg("/localize?map=m&refine=off", reference(1)).await.expect(200);
+        assert_eq!(answer["candidates"][0]["image_id"], "place-1");
+    }
 }

@@ -1,4 +1,4 @@
-//! A job as it goes on, as server-sent events.
+//! The progress of jobs as server-sent events.
 
 use std::time::{Duration, Instant};
 
@@ -11,6 +11,7 @@ use super::deployment;
 use super::mllm::start;
 use super::mock_mllm::{MockMllm, Reply, Script};
 use super::support::{Server, frame};
+use super::wait::eventually;
 
 /// Event names and data of a stream that has ended.
 fn events(stream: &[u8]) -> Vec<(String, Value)> {
@@ -33,7 +34,7 @@ async fn queue(server: &Server) -> String {
 }
 
 #[tokio::test]
-async fn a_job_is_followed_pair_by_pair_and_can_be_followed_again() {
+async fn a_job_streams_one_event_for_each_pair_and_can_be_replayed() {
     let dir = TempDir::new().unwrap();
     let mock =
         MockMllm::start(Script { latency: Duration::from_millis(40), ..Script::default() }).await;
@@ -54,14 +55,14 @@ async fn a_job_is_followed_pair_by_pair_and_can_be_followed_again() {
     assert!(!described[0]["description"]["text"].as_str().unwrap().is_empty());
     assert_eq!(live.last().unwrap().1["state"], "succeeded");
 
-    // Afterwards it is all told at once.
+    // An ended job is replayed at once.
     let again = events(&server.get(&path).await.bytes);
     assert_eq!(again.len(), 6);
     assert_eq!(again[5], *live.last().unwrap());
 }
 
 #[tokio::test]
-async fn streams_are_bounded_and_end_with_the_server() {
+async fn event_streams_are_limited_in_number_and_end_with_the_server() {
     let dir = TempDir::new().unwrap();
     let mock =
         MockMllm::start(Script { describe: Box::new(|_| Reply::Hang), ..Script::default() }).await;
@@ -75,16 +76,12 @@ async fn streams_are_bounded_and_end_with_the_server() {
     assert!(first.starts_with(b"event: state"), "{first:?}");
     assert!(server.get(&path).await.problem(429).contains("max_streams"));
     drop(chunks);
-    // The place is free again once the server has noticed.
-    let deadline = Instant::now() + Duration::from_secs(20);
-    let stream = loop {
+    // The slot is free once the server has noticed that the client is gone.
+    let stream = eventually(async || {
         let stream = server.request(Method::GET, &path).send().await.unwrap();
-        if stream.status() == 200 {
-            break stream;
-        }
-        assert!(Instant::now() < deadline, "the place was not given back");
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    };
+        (stream.status() == 200).then_some(stream)
+    })
+    .await;
     let began = Instant::now();
     let rest = tokio::spawn(async move { stream.bytes().await.unwrap() });
     assert!(server.terminate().success());
@@ -93,14 +90,14 @@ async fn streams_are_bounded_and_end_with_the_server() {
 }
 
 #[tokio::test]
-async fn all_jobs_are_followed_and_those_of_a_map() {
+async fn the_event_stream_covers_all_jobs_or_those_of_one_map() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     server.town("m", 3).await;
     server.town("n", 3).await;
     let follow = async |path: &str| server.request(Method::GET, path).send().await.unwrap();
-    let (mut all, of_map) = (follow("/events").await, follow("/events?map=m").await);
-    // Browsers hand a stream to the page with its first bytes.
+    let (mut all, mut of_map) = (follow("/events").await, follow("/events?map=m").await);
+    // A browser opens a stream with its first bytes, so they are sent at once.
     let opened = tokio::time::timeout(Duration::from_secs(5), all.chunk()).await;
     assert!(opened.unwrap().unwrap().unwrap().starts_with(b": open"));
     let mut expected = Vec::new();
@@ -111,26 +108,31 @@ async fn all_jobs_are_followed_and_those_of_a_map() {
         server.get(&format!("{href}?wait=60")).await.expect(200);
         expected.push((id.to_owned(), map));
     }
-    if deployment::is_scale_out() {
-        // Notices of a database take a moment, in which a job may have come further.
-        tokio::time::sleep(Duration::from_millis(500)).await;
+    // Notifications of a database take a moment: the streams are read until every end has come.
+    let mut streams = [Vec::new(), Vec::new()];
+    for (bytes, (stream, ends)) in streams.iter_mut().zip([(&mut all, 3), (&mut of_map, 2)]) {
+        while events(bytes).iter().filter(|(_, job)| job["state"] == "succeeded").count() < ends {
+            let chunk = tokio::time::timeout(Duration::from_secs(20), stream.chunk()).await;
+            bytes.extend(chunk.expect("an end is missing").unwrap().expect("the stream ended"));
+        }
     }
     // A drain ends the streams.
     assert!(server.terminate().success());
-    let (all, of_map) = (all.bytes().await.unwrap(), of_map.bytes().await.unwrap());
-    for (stream, maps) in [(&all, &["m", "n"][..]), (&of_map, &["m"][..])] {
-        let told = events(stream);
-        assert!(told.iter().all(|(name, _)| name == "job"), "{told:?}");
-        let ended = told.iter().filter(|(_, job)| job["state"] == "succeeded");
+    streams[0].extend(all.bytes().await.unwrap());
+    streams[1].extend(of_map.bytes().await.unwrap());
+    for (stream, maps) in streams.iter().zip([&["m", "n"][..], &["m"]]) {
+        let received = events(stream);
+        assert!(received.iter().all(|(name, _)| name == "job"), "{received:?}");
+        let ended = received.iter().filter(|(_, job)| job["state"] == "succeeded");
         let ended: Vec<(String, &str)> = ended
             .map(|(_, job)| (job["id"].as_str().unwrap().to_owned(), job["map"].as_str().unwrap()))
             .collect();
         let of_maps = expected.iter().filter(|(_, map)| maps.contains(map)).cloned();
         assert_eq!(ended, of_maps.collect::<Vec<_>>());
-        for pair in told.windows(2) {
-            assert_ne!(pair[0], pair[1], "told twice");
+        for pair in received.windows(2) {
+            assert_ne!(pair[0], pair[1], "an event came twice");
         }
-        let running = told.iter().any(|(_, job)| job["state"] == "running" && job["of"] == 3);
-        assert!(running || deployment::is_scale_out(), "{told:?}");
+        let running = received.iter().any(|(_, job)| job["state"] == "running" && job["of"] == 3);
+        assert!(running || deployment::is_scale_out(), "{received:?}");
     }
 }

@@ -1,4 +1,4 @@
-//! HTTP/2 frame by frame: clients that hold back, begin slowly, or change their minds.
+//! HTTP/2 frame by frame: clients that withhold flow control, send half a preface, or reset their requests.
 
 use std::time::{Duration, Instant};
 
@@ -10,7 +10,7 @@ use super::support::Server;
 
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 
-/// Types of frames (RFC 9113, section 6).
+/// Frame types (RFC 9113, section 6).
 const DATA: u8 = 0;
 const HEADERS: u8 = 1;
 const RST_STREAM: u8 = 3;
@@ -19,18 +19,18 @@ const PING: u8 = 6;
 const GOAWAY: u8 = 7;
 const WINDOW_UPDATE: u8 = 8;
 
-/// Of settings.
+/// Identifier of a setting.
 const INITIAL_WINDOW_SIZE: u16 = 4;
 
-/// More than any answer has bytes.
+/// A window larger than any response.
 const LARGE: u32 = 1 << 24;
 
 const ACK: u8 = 1;
 const END_STREAM: u8 = 1;
 const END_HEADERS: u8 = 4;
 
-/// Long enough for any machine; nothing here should come near it.
-const PATIENCE: Duration = Duration::from_secs(60);
+/// A deadline that no passing test comes near.
+const DEADLINE: Duration = Duration::from_secs(60);
 
 fn server(more: &[(&str, &str)]) -> (TempDir, Server) {
     let dir = TempDir::new().unwrap();
@@ -58,13 +58,13 @@ fn get(path: &str) -> Vec<u8> {
     head
 }
 
-/// A frame that came: its type, flags, stream and payload.
+/// A received frame: its type, flags, stream and payload.
 type Came = (u8, u8, u32, Vec<u8>);
 
 struct Client(TcpStream);
 
 impl Client {
-    /// A client that takes so many bytes of each answer before it says more.
+    /// Connects with an initial flow-control window of this many bytes for each stream.
     async fn connect(server: &Server, window: u32) -> Self {
         let mut client = Self::silent(server).await;
         client.send(PREFACE).await;
@@ -86,7 +86,7 @@ impl Client {
         self.send(&frame(HEADERS, END_HEADERS | END_STREAM, stream, &get(path))).await;
     }
 
-    /// The next frame; `None` when the server has hung up.
+    /// The next frame; `None` once the server has closed the connection.
     async fn next(&mut self) -> Option<Came> {
         let mut head = [0; 9];
         let reading = async {
@@ -98,15 +98,15 @@ impl Client {
             Some((head[3], head[4], stream, payload))
         };
         let came =
-            tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open")?;
+            tokio::time::timeout(DEADLINE, reading).await.expect("the connection stays open")?;
         if let (PING, 0, 0, payload) = &came {
-            // It may have hung up since.
+            // The server may have closed the connection since.
             let _ = self.0.write_all(&frame(PING, ACK, 0, payload)).await;
         }
         Some(came)
     }
 
-    /// The body of an answer.
+    /// The body of the response on a stream.
     async fn body(&mut self, stream: u32) -> Vec<u8> {
         let mut body = Vec::new();
         while let Some((kind, flags, of, payload)) = self.next().await {
@@ -123,13 +123,13 @@ impl Client {
 
 async fn refused(server: &Server, reason: &str) -> u64 {
     let metrics = server.metrics().await;
-    let wanted = format!("reason=\"{reason}\"");
-    let line = metrics.lines().find(|line| line.contains("refused") && line.contains(&wanted));
+    let label = format!("reason=\"{reason}\"");
+    let line = metrics.lines().find(|line| line.contains("refused") && line.contains(&label));
     line.and_then(|line| line.rsplit(' ').next()?.parse().ok()).unwrap_or(0)
 }
 
 #[tokio::test]
-async fn a_client_that_takes_nothing_of_one_answer_is_given_up() {
+async fn a_client_that_does_not_read_a_response_is_disconnected() {
     let (_dir, server) = server(&[]);
     let mut client = Client::connect(&server, 1).await;
     let begun = Instant::now();
@@ -138,7 +138,7 @@ async fn a_client_that_takes_nothing_of_one_answer_is_given_up() {
     while let Some((kind, _, stream, payload)) = client.next().await {
         if kind == DATA && stream == 1 {
             bytes += payload.len();
-            // It goes on with others meanwhile: the window is per answer.
+            // Other streams are served meanwhile: the window is per stream.
             client.request(3, "/nothing").await;
         }
         healthy += usize::from(kind == HEADERS && stream == 3);
@@ -150,18 +150,18 @@ async fn a_client_that_takes_nothing_of_one_answer_is_given_up() {
 }
 
 #[tokio::test]
-async fn a_preface_that_stops_halfway_is_not_waited_for() {
+async fn an_incomplete_preface_times_out() {
     let (_dir, server) = server(&[]);
     let mut client = Client::silent(&server).await;
     client.send(&PREFACE[..10]).await;
     let mut answer = Vec::new();
     let reading = client.0.read_to_end(&mut answer);
-    tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open").unwrap();
+    tokio::time::timeout(DEADLINE, reading).await.expect("the connection stays open").unwrap();
     assert!(answer.starts_with(b"HTTP/1.1 408 "), "{}", String::from_utf8_lossy(&answer));
 }
 
 #[tokio::test]
-async fn an_idle_connection_makes_room_and_a_busy_one_does_not() {
+async fn an_idle_connection_is_evicted_and_a_busy_one_is_not() {
     let (_dir, server) = server(&[("WHEREABOUTS_SERVER__MAX_CONNECTIONS", "2")]);
     let mut idle = Client::connect(&server, LARGE).await;
     idle.request(1, "/openapi.json").await;
@@ -169,7 +169,7 @@ async fn an_idle_connection_makes_room_and_a_busy_one_does_not() {
     let mut busy = Client::connect(&server, LARGE).await;
     busy.request(1, "/events").await;
     while busy.next().await.unwrap().0 != HEADERS {}
-    // A stream has been opened and answered on each; this one needs a place.
+    // Both connections have served a stream; this third one needs a slot.
     server.get("/livez").await.expect(200);
     while let Some((kind, ..)) = idle.next().await {
         assert_ne!(kind, DATA);
@@ -179,7 +179,7 @@ async fn an_idle_connection_makes_room_and_a_busy_one_does_not() {
 }
 
 #[tokio::test]
-async fn a_head_that_is_too_large_is_refused_and_others_are_answered() {
+async fn a_head_that_is_too_large_is_rejected_and_others_are_answered() {
     let (_dir, server) = server(&[("WHEREABOUTS_SERVER__MAX_HEADER_BYTES", "8192")]);
     let mut client = Client::connect(&server, LARGE).await;
     let mut head = get("/livez");
@@ -207,7 +207,7 @@ async fn a_head_that_is_too_large_is_refused_and_others_are_answered() {
 }
 
 #[tokio::test]
-async fn requests_that_are_taken_back_by_the_thousand_cost_the_client_its_connection() {
+async fn a_rapid_reset_flood_closes_the_connection() {
     let (_dir, server) = server(&[]);
     let mut client = Client::connect(&server, LARGE).await;
     let (mut reader, mut writer) = client.0.into_split();
@@ -223,7 +223,7 @@ async fn requests_that_are_taken_back_by_the_thousand_cost_the_client_its_connec
     });
     let mut answer = Vec::new();
     let reading = reader.read_to_end(&mut answer);
-    let _ = tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open");
+    let _ = tokio::time::timeout(DEADLINE, reading).await.expect("the connection stays open");
     flooding.await.unwrap();
     let (mut kinds, mut rest) = (Vec::new(), &answer[..]);
     while let [a, b, c, kind, tail @ ..] = rest {

@@ -2,18 +2,18 @@
 
 use serde_json::{Value, json};
 
-use super::support::{Server, frame, server};
+use super::support::{Server, frame, server, shared_server};
 use tempfile::TempDir;
 
-async fn localize(server: &Server, place: usize) -> Value {
-    server.post_jpeg("/localize?map=m", frame(place, 0)).await.expect(200)
+async fn localize(server: &Server, map: &str, place: usize) -> Value {
+    server.post_jpeg(&format!("/localize?map={map}"), frame(place, 0)).await.expect(200)
 }
 
 #[tokio::test]
 async fn a_job_describes_every_pair_and_ranks_every_candidate_once() {
-    let (_dir, server) = server();
-    server.town("m", 15).await;
-    let answer = localize(&server, 3).await;
+    let (server, map) = shared_server();
+    server.town(&map, 15).await;
+    let answer = localize(server, &map, 3).await;
     let href = answer["job"]["href"].as_str().unwrap();
     let job = server.get(&format!("{href}?wait=30")).await.expect(200);
     assert_eq!(job["state"], "succeeded", "{job}");
@@ -25,8 +25,9 @@ async fn a_job_describes_every_pair_and_ranks_every_candidate_once() {
         let of = |item: &Value| item["image_id"].as_str().unwrap().to_owned();
         list.as_array().unwrap().iter().map(of).collect()
     };
-    // The job compares all fifteen, more than are answered.
-    let compared = server.post_jpeg("/localize?map=m&k=15&refine=off", frame(3, 0)).await;
+    // The job compares all fifteen candidates, of which the response lists ten.
+    let compared =
+        server.post_jpeg(&format!("/localize?map={map}&k=15&refine=off"), frame(3, 0)).await;
     let candidates = ids(&compared.expect(200)["candidates"]);
     assert_eq!(ids(&answer["candidates"]), candidates[..10]);
     assert_eq!(ids(&job["descriptions"]), candidates);
@@ -51,33 +52,34 @@ async fn a_job_describes_every_pair_and_ranks_every_candidate_once() {
 
 #[tokio::test]
 async fn jobs_are_listed_newest_first_by_map_and_state() {
-    let (_dir, server) = server();
-    server.town("m", 3).await;
-    server.town("other", 2).await;
+    let (server, map) = shared_server();
+    server.town(&map, 3).await;
+    server.town(&format!("{map}-other"), 2).await;
     let mut made = Vec::new();
     for place in 0..3 {
-        let answer = localize(&server, place).await;
+        let answer = localize(server, &map, place).await;
         server
             .get(&format!("{}?wait=30", answer["job"]["href"].as_str().unwrap()))
             .await
             .expect(200);
         made.push(answer["job"]["id"].clone());
     }
-    server.post_jpeg("/localize?map=other", frame(0, 0)).await.expect(200);
+    server.post_jpeg(&format!("/localize?map={map}-other"), frame(0, 0)).await.expect(200);
     made.reverse();
     let ids = |page: &Value| -> Vec<Value> {
         page["jobs"].as_array().unwrap().iter().map(|job| job["id"].clone()).collect()
     };
-    let page = server.get("/jobs?map=m&state=succeeded&limit=2").await.expect(200);
+    let page = server.get(&format!("/jobs?map={map}&state=succeeded&limit=2")).await.expect(200);
     assert_eq!(ids(&page), made[..2]);
     let cursor = page["next_cursor"].as_str().unwrap();
-    let rest = server.get(&format!("/jobs?map=m&limit=2&cursor={cursor}")).await.expect(200);
+    let rest = server.get(&format!("/jobs?map={map}&limit=2&cursor={cursor}")).await.expect(200);
     assert_eq!((ids(&rest), &rest["next_cursor"]), (made[2..].to_vec(), &json!(null)));
-    assert_eq!(ids(&server.get("/jobs?state=failed").await.expect(200)), [] as [Value; 0]);
+    let failed = server.get(&format!("/jobs?map={map}&state=failed")).await.expect(200);
+    assert_eq!(ids(&failed), [] as [Value; 0]);
 }
 
 #[tokio::test]
-async fn jobs_are_searched_for_a_text_in_whatever_case() {
+async fn jobs_are_searched_for_a_text_ignoring_case() {
     let (_dir, server) = server();
     server.town("m", 3).await;
     server.town("backyard", 1).await;
@@ -103,7 +105,7 @@ async fn jobs_are_searched_for_a_text_in_whatever_case() {
     let another = only_in_m.map(|one| one["image_id"].as_str().unwrap()).find(|of| *of != first);
     let another = another.unwrap().to_uppercase();
     assert_eq!(search(format!("q={another}")).await, [id(2), id(0)]);
-    // Words of a description, beside the other filters.
+    // Words of a description, combined with the other filters.
     assert_eq!(search("q=Regions+Of+The&brief=true".into()).await, [id(2), id(1), id(0)]);
     assert_eq!(search("q=regions+of+the&map=backyard&state=succeeded".into()).await, [id(1)]);
     assert_eq!(search("q=regions+of+the&state=failed".into()).await, [""; 0]);
@@ -118,7 +120,7 @@ async fn jobs_are_searched_for_a_text_in_whatever_case() {
 }
 
 #[tokio::test]
-async fn a_full_job_queue_leaves_frames_without_a_job_and_refuses_who_waits_for_one() {
+async fn a_full_job_queue_answers_without_a_job_or_429_to_a_client_that_waits_for_one() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     server.town("m", 3).await;
@@ -143,11 +145,12 @@ async fn a_full_job_queue_leaves_frames_without_a_job_and_refuses_who_waits_for_
 }
 
 #[tokio::test]
-async fn a_job_whose_map_was_removed_ends_with_the_reason() {
-    let (dir, server) = server();
-    server.town("m", 3).await;
-    let jobs: Vec<Value> = [localize(&server, 0).await, localize(&server, 1).await].into();
-    server.delete("/maps/m").await.expect(204);
+async fn a_job_whose_map_was_deleted_ends_with_the_reason() {
+    let (server, map) = shared_server();
+    server.town(&map, 3).await;
+    let jobs: Vec<Value> =
+        [localize(server, &map, 0).await, localize(server, &map, 1).await].into();
+    server.delete(&format!("/maps/{map}")).await.expect(204);
     for answer in jobs {
         let href = answer["job"]["href"].as_str().unwrap();
         let job = server.get(&format!("{href}?wait=30")).await.expect(200);
@@ -155,14 +158,16 @@ async fn a_job_whose_map_was_removed_ends_with_the_reason() {
         assert!(matches!(state, "succeeded" | "degraded" | "failed"), "{job}");
         assert_eq!(state == "succeeded", job["error"].is_null(), "{job}");
     }
-    drop(dir);
 }
 
 #[tokio::test]
-async fn an_ended_job_is_not_cancelled_and_a_success_is_not_retried() {
-    let (_dir, server) = server();
-    server.town("m", 2).await;
-    let answer = server.post_jpeg("/localize?map=m&refine=wait", frame(0, 0)).await.expect(200);
+async fn an_ended_job_is_not_cancelled_and_a_succeeded_one_is_not_retried() {
+    let (server, map) = shared_server();
+    server.town(&map, 2).await;
+    let answer = server
+        .post_jpeg(&format!("/localize?map={map}&refine=wait"), frame(0, 0))
+        .await
+        .expect(200);
     let href = answer["job"]["href"].as_str().unwrap();
     let cancelled = server.post(&format!("{href}/cancel"), "text/plain", vec![]).await.expect(200);
     assert_eq!(cancelled["state"], "succeeded");
@@ -170,8 +175,8 @@ async fn an_ended_job_is_not_cancelled_and_a_success_is_not_retried() {
 }
 
 #[tokio::test]
-async fn what_is_no_job_says_so() {
-    let (_dir, server) = server();
+async fn an_unknown_job_id_is_404() {
+    let (server, _) = shared_server();
     server.get("/jobs/not-a-uuid").await.problem(400);
     let unknown = "/jobs/01900000-0000-7000-8000-000000000000";
     server.get(unknown).await.problem(404);

@@ -1,18 +1,19 @@
-//! Several models in one server, and maps that move from one to another.
+//! Several models in one server, and maps that are reindexed from one to another.
 
 use std::path::PathBuf;
 use std::process::Command;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::deployment;
 use super::support::{BINARY, Server, frame, reference};
+use super::wait::eventually_within;
 
 const XFEAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/models/xfeat");
 
-/// Models beside the built-in one, and a data folder.
+/// Models in addition to the built-in one, and a data folder.
 struct Bench {
     dir: TempDir,
 }
@@ -30,7 +31,7 @@ impl Bench {
         self.dir.path().join("data")
     }
 
-    /// XFeat with another input and another grid, which makes other descriptors.
+    /// Installs XFeat with another input size and grid, which gives other descriptors.
     fn install(&self, name: &str, (width, height): (u32, u32), grid: usize) {
         let manifest = std::fs::read_to_string(format!("{XFEAT}/manifest.toml")).unwrap();
         let manifest = manifest
@@ -53,7 +54,7 @@ impl Bench {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
 
-    /// A model that takes its time.
+    /// Installs a slow model.
     fn install_slow(&self) {
         self.install("slow", (960, 720), 1);
     }
@@ -64,26 +65,28 @@ impl Bench {
         Server::start(&self.data(), &[&ours, settings].concat())
     }
 
-    /// Waits until there are the descriptors of one model only. A folder is removed at once; a table when nobody
-    /// is left who could be at it.
+    /// Waits until the descriptors of only one model are left. A folder is removed at once; a table once no process
+    /// can be using it.
     async fn has_descriptors_of_one_model(&self) {
-        let start = Instant::now();
-        loop {
+        let deadline = match deployment::is_scale_out() {
+            true => Duration::from_secs(20),
+            false => Duration::ZERO,
+        };
+        eventually_within(deadline, async || {
             let found = match deployment::is_scale_out() {
                 true => deployment::descriptor_tables(&self.data()),
                 false => std::fs::read_dir(self.data().join("descriptors")).unwrap().count(),
             };
-            if found == 1 {
-                return;
+            match found {
+                1 => Ok(()),
+                _ => Err(format!("there are the descriptors of {found} models")),
             }
-            let patient = deployment::is_scale_out() && start.elapsed() < Duration::from_secs(20);
-            assert!(patient, "there are the descriptors of {found} models");
-            tokio::time::sleep(Duration::from_millis(50)).await;
-        }
+        })
+        .await;
     }
 }
 
-/// A map of the first `places` places, of that model.
+/// Creates a map of this model with the first `places` places.
 async fn town(server: &Server, map: &str, model: &str, places: usize) {
     server.put(&format!("/maps/{map}"), json!({ "model": model })).await.expect(201);
     for place in 0..places {
@@ -96,7 +99,7 @@ async fn add(server: &Server, map: &str, place: usize) {
     server.post_jpeg(&path, reference(place)).await.expect(201);
 }
 
-/// The ids of the candidates for the picture of a place itself, and the model that found them.
+/// The ids of the candidates for the map image of a place, and the model that found them.
 async fn look(server: &Server, map: &str, place: usize) -> (Vec<String>, String) {
     let path = format!("/localize?map={map}&refine=off&k=3");
     let answer = server.post_jpeg(&path, reference(place)).await.expect(200);
@@ -115,17 +118,13 @@ async fn begin(server: &Server, map: &str, request: Value) -> Value {
     server.post(&format!("/maps/{map}/reindex"), "application/json", body).await.expect(202)
 }
 
-/// The map, once its reindex is as far as `far` says.
+/// Waits until the reindex of a map has reached the state that `far` describes, and returns the map.
 async fn until(server: &Server, map: &str, far: impl Fn(&Value) -> bool) -> Value {
-    let start = Instant::now();
-    loop {
+    eventually_within(Duration::from_secs(60), async || {
         let state = server.get(&format!("/maps/{map}")).await.expect(200);
-        if far(&state["reindex"]) {
-            return state;
-        }
-        assert!(start.elapsed() < Duration::from_secs(60), "{state}");
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+        if far(&state["reindex"]) { Ok(state) } else { Err(state) }
+    })
+    .await
 }
 
 async fn ended(server: &Server, map: &str) -> Value {
@@ -137,7 +136,7 @@ async fn in_the_middle(server: &Server, map: &str) -> Value {
 }
 
 #[tokio::test]
-async fn maps_of_several_models_are_served_side_by_side_within_the_bound() {
+async fn maps_of_several_models_are_served_with_a_bounded_number_loaded() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);
     bench.install("middle", (240, 160), 2);
@@ -154,7 +153,7 @@ async fn maps_of_several_models_are_served_side_by_side_within_the_bound() {
         }
     }
     assert!(server.log().contains("model dropped to make room"), "{}", server.log());
-    // The refiner, too, looks with the model of the map.
+    // The refiner uses the model of the map, too.
     for (map, model) in [("a", "xfeat"), ("b", "small")] {
         let path = format!("/localize?map={map}&refine=wait");
         let answer = server.post_jpeg(&path, frame(1, 0)).await.expect(200);
@@ -163,7 +162,7 @@ async fn maps_of_several_models_are_served_side_by_side_within_the_bound() {
             (&"succeeded".into(), &model.into())
         );
     }
-    // What has images keeps its model, and says how to change it.
+    // A map with images keeps its model, and the error says how to change it.
     server.put("/maps/b", json!({"description": "b"})).await.expect(200);
     let why = server.put("/maps/b", json!({"model": "xfeat"})).await.problem(409);
     assert!(why.contains("--reindex"), "{why}");
@@ -172,10 +171,10 @@ async fn maps_of_several_models_are_served_side_by_side_within_the_bound() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed() {
+async fn a_map_can_be_searched_and_changed_while_it_is_reindexed() {
     let bench = Bench::new();
     bench.install_slow();
-    // Such a small map with a graph stands for a large one.
+    // A small map with a graph stands for a large one.
     let graph = [("WHEREABOUTS_INDEX__EXACT_UP_TO", "4")];
     let server = bench.server(&graph);
     town(&server, "m", "xfeat", 24).await;
@@ -188,7 +187,7 @@ async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed()
     assert!(twice.contains("GET /maps/m"), "{twice}");
 
     in_the_middle(&server, "m").await;
-    // One that has its new descriptor already, one that does not, and both sent again.
+    // Remove images with and without their new descriptor, and add others.
     for place in [0, 9, 23] {
         server.delete(&format!("/maps/m/images/place-{place}")).await.expect(204);
     }
@@ -234,7 +233,7 @@ async fn a_map_is_localized_in_added_to_and_removed_from_while_it_is_reindexed()
 }
 
 #[tokio::test]
-async fn images_that_are_sent_all_the_time_are_neither_lost_nor_refused() {
+async fn images_added_during_a_reindex_are_neither_lost_nor_rejected() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);
     let server = bench.server(&[]);
@@ -252,7 +251,7 @@ async fn images_that_are_sent_all_the_time_are_neither_lost_nor_refused() {
 }
 
 #[tokio::test]
-async fn kill_9_in_the_middle_loses_nothing_and_it_can_be_run_again() {
+async fn a_reindex_interrupted_by_kill_9_loses_nothing_and_can_be_run_again() {
     let bench = Bench::new();
     bench.install_slow();
     let soon = [
@@ -281,7 +280,7 @@ async fn kill_9_in_the_middle_loses_nothing_and_it_can_be_run_again() {
 }
 
 #[tokio::test]
-async fn a_map_whose_model_is_gone_says_so_and_can_move_to_another() {
+async fn a_map_whose_model_was_uninstalled_can_move_to_another() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);
     let server = bench.server(&[]);
@@ -309,13 +308,13 @@ async fn a_map_whose_model_is_gone_says_so_and_can_move_to_another() {
 }
 
 #[tokio::test]
-async fn a_model_that_is_installed_anew_is_taken_up_by_a_reindex() {
+async fn a_reindex_uses_a_model_that_was_reinstalled() {
     let bench = Bench::new();
     bench.install("mine", (160, 120), 2);
     let server = bench.server(&[]);
     town(&server, "m", "mine", 4).await;
     let before = server.get("/maps/m").await.expect(200);
-    // The same graph with a word in its description, as an export on another day has it.
+    // The same graph with other metadata, as a later export would have.
     let file = bench.assets().join("models/mine/model.onnx");
     let bytes = [std::fs::read(&file).unwrap(), b"\x32\x05again".to_vec()].concat();
     std::fs::write(&file, &bytes).unwrap();
@@ -324,7 +323,7 @@ async fn a_model_that_is_installed_anew_is_taken_up_by_a_reindex() {
     let unpinned: Vec<_> = text.lines().filter(|line| !line.starts_with("sha256")).collect();
     std::fs::write(&manifest, unpinned.join("\n")).unwrap();
 
-    // The one in memory serves; after a restart there is only the other.
+    // The loaded model still serves; after a restart only the new one exists.
     first(&look(&server, "m", 2).await, 2, "mine");
     server.terminate();
     let server = bench.server(&[]);
@@ -336,7 +335,7 @@ async fn a_model_that_is_installed_anew_is_taken_up_by_a_reindex() {
     assert_ne!(after["model_digest"], before["model_digest"]);
     first(&look(&server, "m", 2).await, 2, "mine");
 
-    // The same again without a restart.
+    // The same without a restart.
     std::fs::write(&file, [&bytes[..], b"\x32\x07further"].concat()).unwrap();
     begin(&server, "m", json!({"model": "mine"})).await;
     assert_ne!(ended(&server, "m").await["model_digest"], after["model_digest"]);
@@ -344,7 +343,7 @@ async fn a_model_that_is_installed_anew_is_taken_up_by_a_reindex() {
 }
 
 #[tokio::test]
-async fn an_image_that_cannot_be_taken_over_stops_the_reindex_and_nothing_else() {
+async fn an_unreadable_image_fails_the_reindex_and_nothing_else() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);
     let server = bench.server(&[]);
@@ -359,14 +358,14 @@ async fn an_image_that_cannot_be_taken_over_stops_the_reindex_and_nothing_else()
     assert!(why.contains("place-2") && why.contains("delete it"), "{why}");
     bench.has_descriptors_of_one_model().await;
     first(&look(&server, "m", 2).await, 2, "xfeat");
-    // As it says.
+    // As the error advises.
     server.delete("/maps/m/images/place-2").await.expect(204);
     begin(&server, "m", json!({"model": "small"})).await;
     assert_eq!(ended(&server, "m").await["model"], "small");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_command_waits_for_the_end_and_says_how_it_went() {
+async fn the_reindex_command_waits_and_reports_the_result() {
     let bench = Bench::new();
     bench.install_slow();
     let server = bench.server(&[]);

@@ -1,23 +1,20 @@
-//! Several servers and workers share a database: what happens when processes die, and when the database
-//! does.
+//! Several servers and workers share a database: what happens when processes die, and when the database dies.
 //!
 //! These need WHEREABOUTS_TEST_DEPLOYMENT=scale-out; `make scale-out` runs them with `--include-ignored`.
 
-use std::collections::HashSet;
-use std::process::Command;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::deployment;
 use crate::mock_mllm::{MockMllm, Script};
 use crate::support::{Server, frame};
+use crate::wait::eventually_within;
 
-/// Calls of one process to the mock at a time.
+/// Concurrent calls of one process to the mock.
 const CONCURRENCY: usize = 8;
 
-/// Settings that every process has; a process that gives no sign of life is soon dead.
+/// Settings of every process; a process without heartbeats is soon considered dead.
 fn settings(mock: &MockMllm) -> Vec<(&'static str, String)> {
     let given = [
         ("WHEREABOUTS_REFINE__REFINER", "mllm"),
@@ -50,116 +47,9 @@ fn worker(dir: &TempDir, settings: &[(&'static str, String)]) -> Server {
     Server::start_worker(dir.path(), &with(settings, &[("WHEREABOUTS_JOBS__WORKERS", "2")]))
 }
 
-/// Does something to the PostgreSQL of these tests.
-fn database(what: &str) {
-    let control = std::env::var("WHEREABOUTS_TEST_POSTGRES")
-        .expect("this test stops PostgreSQL and starts it again: run it through tests/postgres.sh");
-    let done = Command::new(control).arg(what).output().unwrap();
-    assert!(done.status.success(), "{done:?}");
-}
-
-async fn ended(server: &Server, jobs: usize) -> Vec<Value> {
-    let mut all = Vec::new();
-    for state in ["succeeded", "degraded", "failed"] {
-        let path = format!("/jobs?state={state}&limit={jobs}&brief=true");
-        let answer = server.get(&path).await;
-        if answer.status == 200 {
-            all.extend(answer.expect(200)["jobs"].as_array().unwrap().clone());
-        }
-    }
-    all
-}
-
-/// Posts a frame until a server takes it; a server that cannot says so, and soon.
-async fn localize(servers: &[Server], number: usize) -> Value {
-    let began = Instant::now();
-    for attempt in 0.. {
-        let server = &servers[(number + attempt) % servers.len()];
-        let asked = Instant::now();
-        let answer = server.post_jpeg("/localize?map=m", frame(number, 0)).await;
-        assert!(asked.elapsed() < Duration::from_secs(8), "an answer took {:?}", asked.elapsed());
-        if answer.status == 200 {
-            return answer.expect(200);
-        }
-        answer.problem(503);
-        assert!(answer.headers.contains_key("retry-after"));
-        assert!(began.elapsed() < Duration::from_secs(60), "no server took the frame");
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
-    unreachable!()
-}
-
-#[tokio::test]
-#[ignore = "needs the scale-out deployment and a PostgreSQL that may be restarted"]
-async fn five_hundred_jobs_survive_the_death_of_processes_and_a_restart_of_the_database() {
-    const JOBS: usize = 500;
-    const KILLS: usize = 4;
-    assert!(deployment::is_scale_out());
-    let dir = TempDir::new().unwrap();
-    let script = Script { latency: Duration::from_millis(20), ..Script::default() };
-    let mock = MockMllm::start(script).await;
-    let settings = settings(&mock);
-    let mut servers = vec![serve(&dir, &settings), serve(&dir, &settings)];
-    let mut workers: Vec<Server> = (0..3).map(|_| worker(&dir, &settings)).collect();
-    servers[0].town("m", 10).await;
-
-    let mut ids = HashSet::new();
-    for number in 0..JOBS {
-        match number {
-            100 | 200 => {
-                workers.remove(0).kill();
-                workers.push(worker(&dir, &settings));
-            }
-            150 => {
-                // The other server goes on.
-                servers.remove(0).kill();
-                localize(&servers, number + JOBS).await;
-                servers.push(serve(&dir, &settings));
-            }
-            250 => {
-                database("kill");
-                let down = servers[0].post_jpeg("/localize?map=m", frame(1, 0)).await;
-                assert!(down.problem(503).contains("database"), "{}", down.problem(503));
-                database("start");
-            }
-            350 => {
-                workers.remove(0).kill();
-                workers.push(worker(&dir, &settings));
-            }
-            _ => {}
-        }
-        let answer = localize(&servers, number).await;
-        ids.insert(answer["job"]["id"].as_str().unwrap().to_owned());
-    }
-    assert_eq!(ids.len(), JOBS);
-    let began = Instant::now();
-    let jobs = loop {
-        let jobs = ended(&servers[0], 2 * JOBS).await;
-        let mine = jobs.iter().filter(|job| ids.contains(job["id"].as_str().unwrap()));
-        if mine.count() == JOBS {
-            break jobs;
-        }
-        assert!(began.elapsed() < Duration::from_secs(180), "{} jobs ended", jobs.len());
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    };
-    let of = |state: &str| jobs.iter().filter(|job| job["state"] == state).count();
-    assert_eq!(of("failed"), 0);
-    // Those that were in the middle of a pair when the database died.
-    assert!(of("degraded") <= JOBS / 50, "{} jobs are degraded", of("degraded"));
-    // A process that dies takes along what it has not yet written down; one that lives buys nothing twice.
-    let again = mock.asked_again();
-    eprintln!(
-        "{JOBS} jobs by 2 servers and 3 workers, {KILLS} of them killed and the database once: {} \
-         describe calls, {again} of them for pairs that had been answered",
-        mock.describe_calls()
-    );
-    assert!(again <= (KILLS + 5) * CONCURRENCY, "{again} answered pairs were asked again");
-    assert_eq!(mock.violations(), [""; 0]);
-}
-
 #[tokio::test]
 #[ignore = "needs the scale-out deployment"]
-async fn two_workers_that_want_the_same_pair_buy_it_once() {
+async fn two_workers_that_need_the_same_pair_pay_for_it_once() {
     let dir = TempDir::new().unwrap();
     let script = Script { latency: Duration::from_millis(300), ..Script::default() };
     let mock = MockMllm::start(script).await;
@@ -181,7 +71,7 @@ async fn two_workers_that_want_the_same_pair_buy_it_once() {
 
 #[tokio::test]
 #[ignore = "needs the scale-out deployment"]
-async fn what_one_server_is_told_the_other_knows() {
+async fn a_change_at_one_server_is_visible_at_the_other() {
     let dir = TempDir::new().unwrap();
     let (one, other) = (Server::start(dir.path(), &[]), Server::start(dir.path(), &[]));
     one.town("m", 5).await;
@@ -199,7 +89,7 @@ async fn what_one_server_is_told_the_other_knows() {
 
 #[tokio::test]
 #[ignore = "needs the scale-out deployment"]
-async fn a_key_that_is_revoked_at_one_server_lets_nobody_into_the_other() {
+async fn a_key_revoked_at_one_server_is_rejected_by_the_other() {
     let dir = TempDir::new().unwrap();
     let make = |server: &Server, role: &str| {
         let request = server.request(reqwest::Method::POST, "/keys");
@@ -220,16 +110,18 @@ async fn a_key_that_is_revoked_at_one_server_lets_nobody_into_the_other() {
     let revoke = one.request(reqwest::Method::DELETE, &path);
     let revoked = revoke.bearer_auth(admin["token"].as_str().unwrap()).send().await.unwrap();
     assert_eq!(revoked.status(), 200);
-    let began = Instant::now();
-    while get(&other, &robot).await.unwrap().status() != 401 {
-        assert!(began.elapsed() < Duration::from_secs(2), "the other server still lets it in");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
+    eventually_within(Duration::from_secs(2), async || {
+        match get(&other, &robot).await.unwrap().status().as_u16() {
+            401 => Ok(()),
+            status => Err(format!("the other server still answers {status}")),
+        }
+    })
+    .await;
 }
 
 #[test]
 #[ignore = "needs the scale-out deployment"]
-fn a_worker_answers_those_who_look_after_it_and_nobody_else() {
+fn a_worker_serves_health_and_metrics_only() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let dir = TempDir::new().unwrap();
     let worker = Server::start_worker(dir.path(), &[]);
@@ -242,4 +134,128 @@ fn a_worker_answers_those_who_look_after_it_and_nobody_else() {
         }
     });
     assert!(worker.terminate().success());
+}
+
+/// Tests that disturb all others: `tests/scale_out.sh` runs them on their own.
+mod alone {
+    use std::collections::HashSet;
+    use std::process::Command;
+    use std::time::{Duration, Instant};
+
+    use serde_json::Value;
+    use tempfile::TempDir;
+
+    use super::{CONCURRENCY, serve, settings, worker};
+    use crate::deployment;
+    use crate::mock_mllm::{MockMllm, Script};
+    use crate::support::{Server, frame};
+    use crate::wait::eventually_within;
+
+    /// Stops, kills or starts the PostgreSQL of these tests.
+    fn database(what: &str) {
+        let control = std::env::var("WHEREABOUTS_TEST_POSTGRES").expect(
+            "this test stops PostgreSQL and starts it again: run it through tests/postgres.sh",
+        );
+        let done = Command::new(control).arg(what).output().unwrap();
+        assert!(done.status.success(), "{done:?}");
+    }
+
+    async fn ended(server: &Server, jobs: usize) -> Vec<Value> {
+        let mut all = Vec::new();
+        for state in ["succeeded", "degraded", "failed"] {
+            let path = format!("/jobs?state={state}&limit={jobs}&brief=true");
+            let answer = server.get(&path).await;
+            if answer.status == 200 {
+                all.extend(answer.expect(200)["jobs"].as_array().unwrap().clone());
+            }
+        }
+        all
+    }
+
+    /// Posts a frame until a server accepts it; a server that cannot must answer 503 soon.
+    async fn localize(servers: &[Server], number: usize) -> Value {
+        let mut attempts = 0..;
+        eventually_within(Duration::from_secs(60), async || {
+            let server = &servers[(number + attempts.next().unwrap()) % servers.len()];
+            let sent_at = Instant::now();
+            let answer = server.post_jpeg("/localize?map=m", frame(number, 0)).await;
+            assert!(
+                sent_at.elapsed() < Duration::from_secs(8),
+                "an answer took {:?}",
+                sent_at.elapsed()
+            );
+            if answer.status == 200 {
+                return Ok(answer.expect(200));
+            }
+            assert!(answer.headers.contains_key("retry-after"));
+            Err(answer.problem(503))
+        })
+        .await
+    }
+
+    #[tokio::test]
+    #[ignore = "needs the scale-out deployment and a PostgreSQL that may be restarted"]
+    async fn five_hundred_jobs_survive_the_death_of_processes_and_a_restart_of_the_database() {
+        const JOBS: usize = 500;
+        const KILLS: usize = 4;
+        assert!(deployment::is_scale_out());
+        let dir = TempDir::new().unwrap();
+        let script = Script { latency: Duration::from_millis(20), ..Script::default() };
+        let mock = MockMllm::start(script).await;
+        let settings = settings(&mock);
+        let mut servers = vec![serve(&dir, &settings), serve(&dir, &settings)];
+        let mut workers: Vec<Server> = (0..3).map(|_| worker(&dir, &settings)).collect();
+        servers[0].town("m", 10).await;
+
+        let mut ids = HashSet::new();
+        for number in 0..JOBS {
+            match number {
+                100 | 200 => {
+                    workers.remove(0).kill();
+                    workers.push(worker(&dir, &settings));
+                }
+                150 => {
+                    // The other server still accepts frames.
+                    servers.remove(0).kill();
+                    localize(&servers, number + JOBS).await;
+                    servers.push(serve(&dir, &settings));
+                }
+                250 => {
+                    database("kill");
+                    let down = servers[0].post_jpeg("/localize?map=m", frame(1, 0)).await;
+                    assert!(down.problem(503).contains("database"), "{}", down.problem(503));
+                    database("start");
+                }
+                350 => {
+                    workers.remove(0).kill();
+                    workers.push(worker(&dir, &settings));
+                }
+                _ => {}
+            }
+            let answer = localize(&servers, number).await;
+            ids.insert(answer["job"]["id"].as_str().unwrap().to_owned());
+        }
+        assert_eq!(ids.len(), JOBS);
+        for id in &ids {
+            eventually_within(Duration::from_secs(180), async || {
+                let job = servers[0].get(&format!("/jobs/{id}?wait=30")).await.expect(200);
+                if job["finished_at"].is_null() { Err(job) } else { Ok(()) }
+            })
+            .await;
+        }
+        let jobs = ended(&servers[0], 2 * JOBS).await;
+        let of = |state: &str| jobs.iter().filter(|job| job["state"] == state).count();
+        assert_eq!(of("failed"), 0);
+        // Jobs that were describing a pair when the database died.
+        assert!(of("degraded") <= JOBS / 50, "{} jobs are degraded", of("degraded"));
+        // A process that dies loses the answers it has not stored yet; one that lives pays for nothing twice.
+        let again = mock.asked_again();
+        eprintln!(
+            "{JOBS} jobs by 2 servers and 3 workers, {KILLS} of them killed and the database once: {} \
+             describe calls, {again} of them for pairs that had been answered",
+            mock.describe_calls()
+        );
+        assert!(again <= (KILLS + 5) * CONCURRENCY, "{again} answered pairs were asked again");
+        assert_eq!(mock.violations(), [""; 0]);
+    }
 }

@@ -1,14 +1,14 @@
-//! Health, metrics, the description of the API, and what guards every request.
+//! Health, metrics, the OpenAPI description, and the limits of every request.
 
 use reqwest::Method;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::support::{Answer, BINARY, Server, frame, server};
+use super::support::{Answer, BINARY, Server, frame, server, shared_server};
 
 #[tokio::test]
-async fn a_ready_server_says_so_and_shows_its_docs() {
-    let (_dir, server) = server();
+async fn a_ready_server_is_healthy_and_serves_its_docs() {
+    let (server, _) = shared_server();
     server.get("/livez").await.expect(200);
     server.get("/readyz").await.expect(200);
     let docs = server.get("/docs").await;
@@ -16,8 +16,8 @@ async fn a_ready_server_says_so_and_shows_its_docs() {
 }
 
 #[tokio::test]
-async fn the_committed_description_is_the_one_the_handlers_give() {
-    let (_dir, server) = server();
+async fn the_committed_openapi_file_matches_the_handlers() {
+    let (server, _) = shared_server();
     let served = server.get("/openapi.json").await.expect(200);
     let committed = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/openapi.json");
     let committed: Value =
@@ -48,8 +48,8 @@ async fn metrics_count_requests_jobs_and_images() {
 }
 
 #[tokio::test]
-async fn a_request_keeps_the_id_it_came_with() {
-    let (_dir, server) = server();
+async fn a_request_keeps_its_x_request_id() {
+    let (server, _) = shared_server();
     let request = server.request(Method::GET, "/maps/none").header("x-request-id", "robot-7/42");
     let answer = Answer::of(request).await;
     answer.problem(404);
@@ -59,11 +59,11 @@ async fn a_request_keeps_the_id_it_came_with() {
 }
 
 #[tokio::test]
-async fn more_requests_than_the_bound_are_refused_while_health_is_answered() {
+async fn requests_beyond_the_limit_are_429_while_health_is_answered() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[("WHEREABOUTS_SERVER__MAX_REQUESTS", "1")]);
     server.town("m", 1).await;
-    // A body that never ends holds the only place.
+    // A body that never ends occupies the only slot.
     let hold = || {
         let (sender, body) = tokio::sync::mpsc::channel::<Result<Vec<u8>, std::io::Error>>(1);
         let body = futures_util::stream::unfold(body, |mut body| async {
@@ -83,7 +83,7 @@ async fn more_requests_than_the_bound_are_refused_while_health_is_answered() {
         if answer.status == 429 {
             break answer;
         }
-        // It met a look at the maps, which had the place, and was itself refused.
+        // The request for the maps had the slot, so that this one was rejected.
         if held.is_finished() {
             (sender, held) = hold();
             sender.send(Ok(vec![0xFF])).await.unwrap();

@@ -1,5 +1,5 @@
-//! Clients that are slow, silent, endless or rude: each is cut off within its bound, and others are
-//! answered meanwhile.
+//! Clients that are slow, silent, endless or rude: each is disconnected within its timeout, and others are
+//! served meanwhile.
 
 use std::time::{Duration, Instant};
 
@@ -10,10 +10,10 @@ use tokio::net::TcpStream;
 
 use super::support::{Server, reference};
 
-/// Long enough for any machine; nothing here should come near it.
-const PATIENCE: Duration = Duration::from_secs(60);
+/// A deadline that no passing test comes near.
+const DEADLINE: Duration = Duration::from_secs(60);
 
-/// Bounds of a few seconds.
+/// Timeouts of a few seconds.
 const STRICT: &[(&str, &str)] = &[
     ("WHEREABOUTS_SERVER__HEADER_TIMEOUT_S", "2"),
     ("WHEREABOUTS_SERVER__BODY_PAUSE_S", "1"),
@@ -33,30 +33,30 @@ async fn connect(server: &Server) -> TcpStream {
     TcpStream::connect(server.url.trim_start_matches("http://")).await.unwrap()
 }
 
-/// A connection on which that much has been sent.
+/// Opens a connection and sends these bytes.
 async fn sent(server: &Server, bytes: &[u8]) -> TcpStream {
     let mut stream = connect(server).await;
     stream.write_all(bytes).await.unwrap();
     stream
 }
 
-/// The head of a post whose body is to come.
+/// The head of a POST request without its body.
 fn head(framing: &str) -> String {
     format!(
         "POST /localize?map=m HTTP/1.1\r\nhost: x\r\ncontent-type: image/jpeg\r\n{framing}\r\n\r\n"
     )
 }
 
-/// All that comes until the server hangs up.
+/// Reads until the server closes the connection.
 async fn rest(stream: &mut TcpStream) -> String {
     let mut bytes = Vec::new();
     let reading = stream.read_to_end(&mut bytes);
-    // A reset after the answer is as good as an end.
-    let _ = tokio::time::timeout(PATIENCE, reading).await.expect("the connection stays open");
+    // A reset after the response counts as an end.
+    let _ = tokio::time::timeout(DEADLINE, reading).await.expect("the connection stays open");
     String::from_utf8(bytes).unwrap()
 }
 
-/// What comes while `bytes` is sent again and again, with pauses in between.
+/// Reads to the end while sending `bytes` again and again with pauses.
 async fn rest_while_sending(stream: TcpStream, bytes: &[u8], pause: Duration) -> String {
     let (mut from, mut to) = stream.into_split();
     let bytes = bytes.to_vec();
@@ -70,14 +70,14 @@ async fn rest_while_sending(stream: TcpStream, bytes: &[u8], pause: Duration) ->
         }
     });
     let mut answer = Vec::new();
-    let _ = tokio::time::timeout(PATIENCE, from.read_to_end(&mut answer))
+    let _ = tokio::time::timeout(DEADLINE, from.read_to_end(&mut answer))
         .await
         .expect("the connection stays open");
     sending.abort();
     String::from_utf8(answer).unwrap()
 }
 
-/// The detail of the problem in a raw answer of this status.
+/// Returns the detail of the problem in a raw response with this status.
 #[track_caller]
 fn problem(answer: &str, status: u16) -> String {
     assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{answer:?}");
@@ -90,7 +90,7 @@ fn problem(answer: &str, status: u16) -> String {
 }
 
 #[tokio::test]
-async fn a_head_that_trickles_gets_408_and_silence_is_hung_up_on() {
+async fn a_trickling_head_gets_408_and_a_silent_connection_is_closed() {
     let (_dir, server) = strict(&[]);
     let start = Instant::now();
     let mut silent = Vec::new();
@@ -108,7 +108,7 @@ async fn a_head_that_trickles_gets_408_and_silence_is_hung_up_on() {
     assert!(start.elapsed() >= Duration::from_secs(2), "before its time: {answer}");
     assert!(problem(&answer, 408).contains("server.header_timeout_s"));
     for stream in &mut silent {
-        assert_eq!(rest(stream).await, "", "who asks nothing is told nothing");
+        assert_eq!(rest(stream).await, "", "a silent connection gets no response");
     }
 }
 
@@ -137,7 +137,7 @@ async fn a_body_that_pauses_or_trickles_gets_408() {
 }
 
 #[tokio::test]
-async fn chunks_without_end_get_413() {
+async fn an_endless_chunked_body_gets_413() {
     let (_dir, server) = strict(&[]);
     server.town("m", 1).await;
     let stream = sent(&server, head("transfer-encoding: chunked").as_bytes()).await;
@@ -148,8 +148,8 @@ async fn chunks_without_end_get_413() {
 }
 
 #[tokio::test]
-async fn bodies_that_together_take_too_much_memory_get_429() {
-    // Neither is cut off for its slowness while this goes on.
+async fn bodies_beyond_the_shared_memory_budget_get_429() {
+    // The timeouts are long, so that neither is disconnected for being slow.
     let (_dir, server) = strict(&[
         ("WHEREABOUTS_SERVER__BODY_PAUSE_S", "29"),
         ("WHEREABOUTS_SERVER__BODY_TIMEOUT_S", "29"),
@@ -165,11 +165,11 @@ async fn bodies_that_together_take_too_much_memory_get_429() {
     drop((first, second));
     let answered =
         async { while server.post_jpeg("/localize?map=m", reference(0)).await.status == 429 {} };
-    tokio::time::timeout(PATIENCE, answered).await.expect("the memory is not given back");
+    tokio::time::timeout(DEADLINE, answered).await.expect("the memory is not given back");
 }
 
 #[tokio::test]
-async fn a_client_that_hangs_up_half_way_is_forgotten_at_once() {
+async fn a_client_that_disconnects_halfway_frees_its_slot_at_once() {
     let (_dir, server) = strict(&[
         ("WHEREABOUTS_SERVER__MAX_REQUESTS", "2"),
         ("WHEREABOUTS_SERVER__BODY_PAUSE_S", "29"),
@@ -215,7 +215,7 @@ async fn heads_that_are_too_large_get_431() {
     let many = format!("{start}{}\r\n", "a: b\r\n".repeat(200));
     for head in [long, many] {
         let mut stream = connect(&server).await;
-        // The server may hang up before it has taken all of it.
+        // The server may close the connection before it has read everything.
         let _ = stream.write_all(head.as_bytes()).await;
         let answer = rest(&mut stream).await;
         assert!(answer.is_empty() || answer.starts_with("HTTP/1.1 431 "), "{answer}");
@@ -225,18 +225,18 @@ async fn heads_that_are_too_large_get_431() {
 }
 
 #[tokio::test]
-async fn a_client_that_takes_no_answer_is_given_up() {
+async fn a_client_that_reads_no_response_is_disconnected() {
     let (_dir, server) = strict(&[]);
     let (from, mut to) = connect(&server).await.into_split();
     let request = b"GET /openapi.json HTTP/1.1\r\nhost: x\r\n\r\n".repeat(100);
     let failed = async { while to.write_all(&request).await.is_ok() {} };
-    tokio::time::timeout(PATIENCE, failed).await.expect("the server still waits");
+    tokio::time::timeout(DEADLINE, failed).await.expect("the server still waits");
     drop(from);
     server.get("/maps").await.expect(200);
 }
 
 #[tokio::test]
-async fn idle_connections_make_room_and_busy_ones_do_not() {
+async fn idle_connections_are_evicted_and_busy_ones_are_not() {
     let dir = TempDir::new().unwrap();
     let settings = [("WHEREABOUTS_SERVER__MAX_CONNECTIONS", "4")];
     let server = Server::start(dir.path(), &settings);
@@ -246,13 +246,13 @@ async fn idle_connections_make_room_and_busy_ones_do_not() {
         silent.push(connect(&server).await);
     }
     server.get("/maps").await.expect(200);
-    // Thirty-six made room for each other, and one for the healthy request.
+    // Thirty-six were evicted by later ones, and one by the healthy request.
     for stream in &mut silent[..37] {
         assert_eq!(rest(stream).await, "");
     }
     let mut busy = Vec::new();
     for _ in 0..4 {
-        // An answer that tells that the request is being read before the next connection comes.
+        // The interim response shows that the request is being read before the next connection is opened.
         let expecting = head("content-length: 90000\r\nexpect: 100-continue");
         let mut stream = sent(&server, expecting.as_bytes()).await;
         let mut interim = [0; 25];
@@ -263,7 +263,7 @@ async fn idle_connections_make_room_and_busy_ones_do_not() {
     let mut refused = connect(&server).await;
     assert!(problem(&rest(&mut refused).await, 503).contains("server.max_connections"));
     drop(busy);
-    // Their requests end as soon as the server sees that they have gone.
+    // Their requests end as soon as the server notices the disconnect.
     let room = async {
         loop {
             let mut stream = connect(&server).await;
@@ -274,5 +274,5 @@ async fn idle_connections_make_room_and_busy_ones_do_not() {
             }
         }
     };
-    tokio::time::timeout(PATIENCE, room).await.expect("no room is made");
+    tokio::time::timeout(DEADLINE, room).await.expect("no room is made");
 }

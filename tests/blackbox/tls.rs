@@ -1,4 +1,4 @@
-//! HTTPS: from two files, which may change.
+//! HTTPS with a certificate and a key from files, which are reloaded.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -6,13 +6,14 @@ use std::time::{Duration, Instant};
 use reqwest::{Certificate, Client};
 use tempfile::TempDir;
 
-use super::support::Server;
+use super::support::{Server, value_of};
+use super::wait::until;
 
 fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/tls").join(name)
 }
 
-/// A folder with a certificate and its key, and a server that has them.
+/// A folder with a certificate and its key, and a server that uses them.
 struct Encrypted {
     files: TempDir,
     _data: TempDir,
@@ -38,69 +39,74 @@ impl Encrypted {
 
     /// Whether a client that trusts only this certificate gets an answer.
     async fn is_trusted_by(&self, certificate: &str) -> bool {
-        let pem = std::fs::read(fixture(&format!("{certificate}.pem"))).unwrap();
-        let trusted = [Certificate::from_pem(&pem).unwrap()];
-        let client = Client::builder().tls_certs_only(trusted).build().unwrap();
-        match client.get(format!("{}/readyz", self.url)).send().await {
+        match trusting(certificate).get(format!("{}/readyz", self.url)).send().await {
             Ok(answer) => answer.status() == 200,
             Err(_) => false,
         }
     }
 }
 
-/// Puts a file of a certificate in place, in one step.
+/// A client that trusts only this certificate.
+fn trusting(certificate: &str) -> Client {
+    let pem = std::fs::read(fixture(&format!("{certificate}.pem"))).unwrap();
+    let trusted = [Certificate::from_pem(&pem).unwrap()];
+    Client::builder().tls_certs_only(trusted).build().unwrap()
+}
+
+/// Puts a certificate or key in place atomically.
 fn put(folder: &Path, certificate: &str, end: &str) {
-    let beside = folder.join("beside");
-    std::fs::copy(fixture(&format!("{certificate}.{end}")), &beside).unwrap();
-    std::fs::rename(&beside, folder.join(format!("server.{end}"))).unwrap();
+    let staged = folder.join("staged");
+    std::fs::copy(fixture(&format!("{certificate}.{end}")), &staged).unwrap();
+    std::fs::rename(&staged, folder.join(format!("server.{end}"))).unwrap();
 }
 
 #[tokio::test]
-async fn a_certificate_that_is_replaced_is_taken_up_and_one_that_is_bad_is_not() {
+async fn a_replaced_certificate_is_reloaded_and_an_invalid_one_is_not() {
     let encrypted = Encrypted::start();
     assert!(encrypted.is_trusted_by("first").await);
     assert!(!encrypted.is_trusted_by("second").await);
 
     std::fs::write(encrypted.files.path().join("server.pem"), "nonsense").unwrap();
-    let end = Instant::now() + Duration::from_secs(30);
-    while !encrypted.server.log().contains("the previous one stays") {
-        assert!(Instant::now() < end, "{}", encrypted.server.log());
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    }
+    until(async || encrypted.server.log().contains("the previous one stays")).await;
     assert!(encrypted.is_trusted_by("first").await);
 
     for end in ["key", "pem"] {
         put(encrypted.files.path(), "second", end);
     }
-    let end = Instant::now() + Duration::from_secs(30);
-    while !encrypted.is_trusted_by("second").await {
-        assert!(Instant::now() < end, "{}", encrypted.server.log());
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    }
+    until(async || encrypted.is_trusted_by("second").await).await;
     assert!(!encrypted.is_trusted_by("first").await);
 }
 
 #[tokio::test]
-async fn who_speaks_without_tls_is_told_so() {
+async fn a_plain_http_request_to_the_https_port_is_explained() {
     let encrypted = Encrypted::start();
     let plain = encrypted.server.get("/readyz").await.expect(400);
     assert!(plain["detail"].as_str().unwrap().contains("https://"), "{plain}");
 }
 
 #[tokio::test]
-async fn a_connection_that_says_nothing_does_not_keep_the_server_from_stopping() {
+async fn a_silent_connection_does_not_delay_shutdown() {
     let Encrypted { files: _files, _data, server, url } = Encrypted::start();
     let address = url.trim_start_matches("https://").to_owned();
     let silent = tokio::net::TcpStream::connect(&address).await.unwrap();
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    // The server has accepted it once it counts two connections: this client keeps one.
+    let client = trusting("first");
+    until(async || {
+        let metrics = client.get(format!("{url}/metrics")).send().await.unwrap();
+        value_of(&metrics.text().await.unwrap(), "whereabouts_connections") == Some(2.0)
+    })
+    .await;
+    drop(client);
     let start = Instant::now();
-    assert!(server.terminate().success());
+    // On another thread, so that this one can close the connection of the client.
+    let ended = tokio::task::spawn_blocking(move || server.terminate()).await;
+    assert!(ended.unwrap().success());
     assert!(start.elapsed() < Duration::from_secs(8), "{:?}", start.elapsed());
     drop(silent);
 }
 
 #[test]
-fn files_that_cannot_be_used_are_named_at_the_start() {
+fn unusable_certificate_files_are_named_at_startup() {
     let data = TempDir::new().unwrap();
     let start = |certificate: &Path, key: &Path| {
         let settings = [

@@ -1,4 +1,4 @@
-//! Traces, as a collector gets them.
+//! Traces as a collector receives them.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
@@ -16,11 +16,11 @@ use tempfile::TempDir;
 use tokio::net::TcpListener;
 
 use super::mock_mllm::{MockMllm, Script};
-use super::support::{Answer, Server, frame};
+use super::support::{Answer, Server, frame, shared_server};
 
 type Collected = Arc<Mutex<Vec<Span>>>;
 
-/// A collector of traces: its address, and what it was sent.
+/// Starts a trace collector; returns its URL and the spans that it receives.
 async fn collector() -> (String, Collected) {
     async fn take(State(collected): State<Collected>, body: Bytes) {
         let sent = ExportTraceServiceRequest::decode(body).unwrap();
@@ -40,7 +40,7 @@ fn hex(bytes: &[u8]) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_trace_goes_from_the_caller_through_the_job_to_each_call_of_the_model() {
+async fn a_trace_spans_the_request_the_job_and_each_model_call() {
     const TRACE: &str = "4bf92f3577b34da6a3ce929d0e0e4736";
     let dir = TempDir::new().unwrap();
     let (url, collected) = collector().await;
@@ -84,12 +84,12 @@ async fn a_trace_goes_from_the_caller_through_the_job_to_each_call_of_the_model(
         assert_eq!(call.parent_span_id, job.span_id);
         assert!(call.attributes.iter().any(|about| about.key == "gen_ai.usage.input_tokens"));
     }
-    // The images of the map were added without a trace of their caller's, and have one each.
+    // The requests that added the images had no trace context, so each has a trace of its own.
     assert!(spans.iter().any(|span| span.name == "POST /maps/{map}/images"));
 }
 
 #[tokio::test]
-async fn a_collector_that_is_away_holds_up_nobody() {
+async fn an_unreachable_collector_delays_nothing() {
     let dir = TempDir::new().unwrap();
     let settings = [
         ("WHEREABOUTS_TRACES__URL", "http://127.0.0.1:9"),
@@ -103,11 +103,10 @@ async fn a_collector_that_is_away_holds_up_nobody() {
 }
 
 #[tokio::test]
-async fn nothing_is_traced_unless_somebody_wants_it() {
-    let dir = TempDir::new().unwrap();
-    let server = Server::start(dir.path(), &[]);
-    server.town("m", 3).await;
-    let answer = server.post_jpeg("/localize?map=m", frame(0, 0)).await.expect(200);
+async fn nothing_is_traced_by_default() {
+    let (server, map) = shared_server();
+    server.town(&map, 3).await;
+    let answer = server.post_jpeg(&format!("/localize?map={map}"), frame(0, 0)).await.expect(200);
     let job = server.get(answer["job"]["href"].as_str().unwrap()).await.expect(200);
     assert_eq!(job["trace_id"], Value::Null);
 }

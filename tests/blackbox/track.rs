@@ -1,34 +1,38 @@
-//! A robot that drives through the town and names its track.
-
-use std::time::Duration;
+//! Tracks: a robot that drives through the town.
 
 use image::{Rgb, RgbImage};
 use jiff::{SignedDuration, Timestamp};
 use serde_json::{Value, json};
 use whereabouts_town::{Town, TownSpec};
 
-use super::support::{Answer, Server, frame, jpeg, server};
+use super::support::{Answer, Server, frame, jpeg, shared_server};
+use super::wait::{eventually, until};
 
 const PLACES: usize = 96;
-/// How fast it drives, in metres a second; the service is told no more than the default bound.
+/// Speed of the robot in metres per second; the service knows only the default bound.
 const SPEED: f64 = 8.0;
 
-/// The map image of a place has the number of the place in its id.
+/// The id of the map image of a place.
 fn id(place: usize) -> String {
     format!("place-{place}")
 }
 
-async fn metric_map(server: &Server, town: &Town) {
-    server.put("/maps/m", json!({"scene": "outdoor", "frame": "metric"})).await.expect(201);
+async fn metric_map(server: &Server, map: &str, town: &Town) {
+    server
+        .put(&format!("/maps/{map}"), json!({"scene": "outdoor", "frame": "metric"}))
+        .await
+        .expect(201);
     for place in 0..town.places() {
         let shot = town.reference(place);
-        let path = format!("/maps/m/images?id={}&x={}&y={}", id(place), shot.x, shot.y);
+        let path = format!("/maps/{map}/images?id={}&x={}&y={}", id(place), shot.x, shot.y);
         server.post_jpeg(&path, jpeg(&shot.image)).await.expect(201);
     }
-    // The gap that chance leaves is measured.
-    while server.get("/maps/m").await.expect(200)["calibration"]["images"] != town.places() {
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
+    // The filter needs the calibration of the map.
+    until(async || {
+        server.get(&format!("/maps/{map}")).await.expect(200)["calibration"]["images"]
+            == town.places()
+    })
+    .await;
 }
 
 /// The side of a van that fills nearly all of the picture.
@@ -46,16 +50,16 @@ fn occluded(mut picture: RgbImage, number: usize) -> RgbImage {
     picture
 }
 
-/// Three frames in ten, spread so that they come alone and in a row.
+/// Three frames in ten, both isolated and in a row.
 fn is_occluded(place: usize) -> bool {
     matches!(place % 20, 3 | 4 | 8 | 12 | 13 | 17)
 }
 
 #[tokio::test]
-async fn a_drive_is_located_better_than_its_frames() {
+async fn a_track_is_located_better_than_its_frames() {
     let town = Town::new(TownSpec { seed: 11, places: PLACES, width: 320, height: 240 });
-    let (_dir, server) = server();
-    metric_map(&server, &town).await;
+    let (server, map) = shared_server();
+    metric_map(server, &map, &town).await;
     let (mut single, mut filtered, mut with_odometry) = (0, 0, 0);
     let mut at: Timestamp = "2026-03-01T12:00:00Z".parse().unwrap();
     let mut before: Option<[f64; 2]> = None;
@@ -67,9 +71,9 @@ async fn a_drive_is_located_better_than_its_frames() {
         at += SignedDuration::from_secs_f64(way / SPEED);
         let picture = if is_occluded(place) { occluded(shot.image, place) } else { shot.image };
         let bytes = jpeg(&picture);
-        let path = format!("/localize?map=m&refine=off&captured_at={at}&track=");
+        let path = format!("/localize?map={map}&refine=off&captured_at={at}&track=");
         let plain = server.post_jpeg(&format!("{path}a"), bytes.clone()).await.expect(200);
-        // Five metres more than it was.
+        // Odometry with an error of five metres.
         let moved = format!("{path}b&moved_m={}", way + 5.0);
         let moved = server.post_jpeg(&moved, bytes).await.expect(200);
         single += usize::from(plain["candidates"][0]["image_id"] == id(place));
@@ -89,18 +93,20 @@ async fn a_drive_is_located_better_than_its_frames() {
 }
 
 #[tokio::test]
-async fn a_track_says_nothing_of_images_that_are_gone() {
-    let (_dir, server) = server();
-    server.town("m", 6).await;
+async fn a_track_never_returns_a_deleted_image() {
+    let (server, map) = shared_server();
+    server.town(&map, 6).await;
     let localize = async || -> Value {
-        let answer = server.post_jpeg("/localize?map=m&refine=off&track=r1", frame(2, 0)).await;
+        let answer = server
+            .post_jpeg(&format!("/localize?map={map}&refine=off&track=r1"), frame(2, 0))
+            .await;
         answer.expect(200)["track"].clone()
     };
     for _ in 0..3 {
         localize().await;
     }
     assert_eq!(localize().await["image_id"], "place-2");
-    server.delete("/maps/m/images/place-2").await.expect(204);
+    server.delete(&format!("/maps/{map}/images/place-2")).await.expect(204);
     for frames in 5..8 {
         let track = localize().await;
         assert_eq!(track["frames"], frames);
@@ -110,11 +116,11 @@ async fn a_track_says_nothing_of_images_that_are_gone() {
 }
 
 #[tokio::test]
-async fn what_a_track_cannot_be_is_refused_with_what_to_do() {
-    let (_dir, server) = server();
-    server.town("m", 2).await;
+async fn an_invalid_track_is_rejected_with_a_hint() {
+    let (server, map) = shared_server();
+    server.town(&map, 2).await;
     let ask = async |query: &str| -> Answer {
-        server.post_jpeg(&format!("/localize?map=m&refine=off{query}"), frame(0, 0)).await
+        server.post_jpeg(&format!("/localize?map={map}&refine=off{query}"), frame(0, 0)).await
     };
     for (query, named) in [
         ("&track=", "1 to 64"),
@@ -130,18 +136,23 @@ async fn what_a_track_cannot_be_is_refused_with_what_to_do() {
     ask("&track=a&captured_at=yesterday").await.problem(400);
     assert!(ask("").await.expect(200)["track"].is_null());
 
-    server.put("/maps/bare", json!({"scene": "indoor"})).await.expect(201);
-    let path = "/localize?map=bare&refine=off&track=a";
+    server.put(&format!("/maps/{map}-bare"), json!({"scene": "indoor"})).await.expect(201);
+    let path = &format!("/localize?map={map}-bare&refine=off&track=a");
     let empty = server.post_jpeg(path, frame(0, 0)).await.expect(200);
     assert!(empty["track"]["image_id"].is_null(), "{empty}");
-    server.post_jpeg("/maps/bare/images?id=a", frame(0, 0)).await.expect(201);
-    tokio::time::sleep(Duration::from_secs(3)).await;
-    let problem = server.post_jpeg(path, frame(0, 0)).await.problem(422);
+    server.post_jpeg(&format!("/maps/{map}-bare/images?id=a"), frame(0, 0)).await.expect(201);
+    // The poses of a map are read again after a while.
+    let refused = eventually(async || {
+        let answer = server.post_jpeg(path, frame(0, 0)).await;
+        (answer.status != 200).then_some(answer)
+    })
+    .await;
+    let problem = refused.problem(422);
     assert!(problem.contains("poses"), "{problem}");
 }
 
 #[tokio::test]
-async fn the_track_used_least_recently_makes_room() {
+async fn the_least_recently_used_track_is_evicted() {
     let dir = tempfile::TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[("WHEREABOUTS_TRACK__MAX", "2")]);
     server.town("m", 2).await;

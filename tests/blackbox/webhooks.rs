@@ -1,4 +1,4 @@
-//! Webhooks from outside: what a receiver is told, and what becomes of it when it does not listen.
+//! Webhooks: deliveries, signatures, retries, and addresses that are rejected.
 
 use std::path::Path;
 use std::process::Command;
@@ -11,13 +11,14 @@ use tempfile::TempDir;
 use super::deployment;
 use super::receiver::{Receiver, Reply};
 use super::support::{Answer, BINARY, Server, frame};
+use super::wait::{eventually, eventually_within, until};
 
 const PRIVATE: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__ALLOW_PRIVATE", "true");
 const NO_RETRY: (&str, &str) = ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[]");
 
-/// Makes a webhook; its id and its secret.
-async fn hook(server: &Server, wanted: Value) -> (String, String) {
-    let request = server.request(Method::POST, "/webhooks").json(&wanted);
+/// Creates a webhook; returns its id and its secret.
+async fn hook(server: &Server, webhook: Value) -> (String, String) {
+    let request = server.request(Method::POST, "/webhooks").json(&webhook);
     let made = Answer::of(request).await.expect(201);
     let text = |field: &str| made[field].as_str().unwrap().to_owned();
     (text("id"), text("secret"))
@@ -27,18 +28,17 @@ async fn post(server: &Server, path: &str) -> Answer {
     Answer::of(server.request(Method::POST, path)).await
 }
 
-/// The newest delivery of a webhook, once it is in this state.
+/// Waits until the newest delivery of a webhook is in this state, and returns it.
 async fn newest(server: &Server, id: &str, state: &str, attempts: u32) -> Value {
-    let deadline = Instant::now() + Duration::from_secs(30);
-    loop {
+    eventually_within(Duration::from_secs(30), async || {
         let page = server.get(&format!("/webhooks/{id}/deliveries?limit=1")).await.expect(200);
         let newest = page["deliveries"][0].clone();
-        if newest["state"] == state && newest["attempts"] == attempts {
-            return newest;
+        match newest["state"] == state && newest["attempts"] == attempts {
+            true => Ok(newest),
+            false => Err(newest),
         }
-        assert!(Instant::now() < deadline, "{newest}");
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+    })
+    .await
 }
 
 /// A job that has ended.
@@ -49,9 +49,9 @@ async fn job(server: &Server, map: &str) -> Value {
 }
 
 #[tokio::test]
-async fn the_end_of_a_job_is_told_to_whom_it_concerns_signed_and_whole() {
+async fn the_end_of_a_job_is_delivered_signed_to_the_subscribed_webhooks() {
     let dir = TempDir::new().unwrap();
-    // A proxy would go where the server itself must not.
+    // A proxy could reach addresses that the server must not.
     let proxy = ("HTTP_PROXY", "http://127.0.0.1:9");
     let settings = [PRIVATE, proxy, ("http_proxy", proxy.1), ("WHEREABOUTS_LOG__FILTER", "debug")];
     let server = Server::start(dir.path(), &settings);
@@ -112,19 +112,19 @@ async fn the_end_of_a_job_is_told_to_whom_it_concerns_signed_and_whole() {
 }
 
 #[tokio::test]
-async fn a_message_that_is_not_taken_comes_again_as_the_same() {
+async fn a_failed_delivery_is_retried_with_the_same_id_and_body() {
     let dir = TempDir::new().unwrap();
     let retry = ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[0, 0, 5]");
     let server =
         Server::start(dir.path(), &[PRIVATE, retry, ("WHEREABOUTS_WEBHOOKS__TIMEOUT_S", "1")]);
-    let patience = Reply::With(503, "retry-after", "2".into());
-    let receiver = Receiver::start([Reply::Status(500), patience, Reply::Silence]).await;
+    let busy = Reply::With(503, "retry-after", "2".into());
+    let receiver = Receiver::start([Reply::Status(500), busy, Reply::Silence]).await;
     let (id, secret) = hook(&server, json!({"url": receiver.url})).await;
     post(&server, &format!("/webhooks/{id}/test")).await.expect(202);
     receiver.wait(2).await;
-    let asked = Instant::now();
+    let start = Instant::now();
     receiver.wait(3).await;
-    assert!(asked.elapsed() > Duration::from_millis(1500), "Retry-After was not waited for");
+    assert!(start.elapsed() > Duration::from_millis(1500), "Retry-After was not waited for");
     let waiting = newest(&server, &id, "waiting", 3).await;
     assert!(waiting["last_error"].as_str().unwrap().contains("webhooks.timeout_s"), "{waiting}");
     assert!(waiting["last_status"].is_null());
@@ -139,12 +139,12 @@ async fn a_message_that_is_not_taken_comes_again_as_the_same() {
 }
 
 #[tokio::test]
-async fn what_was_given_up_is_kept_and_can_be_delivered_again() {
+async fn a_dead_delivery_is_kept_and_can_be_redelivered() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[0]")]);
-    let (nobody, _) = hook(&server, json!({"url": "http://127.0.0.1:1/"})).await;
-    post(&server, &format!("/webhooks/{nobody}/test")).await.expect(202);
-    let dead = newest(&server, &nobody, "dead", 2).await;
+    let (unreachable, _) = hook(&server, json!({"url": "http://127.0.0.1:1/"})).await;
+    post(&server, &format!("/webhooks/{unreachable}/test")).await.expect(202);
+    let dead = newest(&server, &unreachable, "dead", 2).await;
     assert!(dead["last_error"].as_str().unwrap().contains("refused"), "{dead}");
     assert!(dead["last_status"].is_null() && dead["ended_at"].is_string());
     let receiver = Receiver::start([Reply::Status(500), Reply::Status(404)]).await;
@@ -168,7 +168,7 @@ async fn what_was_given_up_is_kept_and_can_be_delivered_again() {
     assert!(post(&server, &wrong).await.problem(404).contains("webhooks.keep_days"));
     server.kill();
 
-    // One that waits anyway is not queued again.
+    // A waiting delivery is not queued again.
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__RETRY_S", "[3600]")]);
     receiver.replies.lock().unwrap().push_back(Reply::Status(500));
     post(&server, &path).await.expect(202);
@@ -177,23 +177,21 @@ async fn what_was_given_up_is_kept_and_can_be_delivered_again() {
     assert!(post(&server, &path).await.problem(409).contains("waits anyway"));
     server.kill();
 
-    // Only so many are kept.
+    // The number of deliveries is bounded.
     let few = [PRIVATE, ("WHEREABOUTS_WEBHOOKS__MAX_DELIVERIES", "1")];
     let server = Server::start(dir.path(), &few);
     let (other, _) = hook(&server, json!({"url": receiver.url})).await;
     post(&server, &format!("/webhooks/{other}/test")).await.expect(202);
     newest(&server, &other, "delivered", 1).await;
-    let deadline = Instant::now() + Duration::from_secs(60);
-    while server.get(&format!("/webhooks/{other}/deliveries")).await.expect(200)["deliveries"]
-        != json!([])
-    {
-        assert!(Instant::now() < deadline, "{}", server.log());
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
+    until(async || {
+        let page = server.get(&format!("/webhooks/{other}/deliveries")).await.expect(200);
+        page["deliveries"] == json!([])
+    })
+    .await;
 }
 
 #[tokio::test]
-async fn a_redirect_leads_nowhere() {
+async fn redirects_are_not_followed() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, NO_RETRY]);
     let elsewhere = Receiver::start([]).await;
@@ -203,25 +201,22 @@ async fn a_redirect_leads_nowhere() {
     let (id, _) = hook(&server, json!({"url": receiver.url})).await;
     for status in [301, 302, 303, 307, 308] {
         post(&server, &format!("/webhooks/{id}/test")).await.expect(202);
-        let deadline = Instant::now() + Duration::from_secs(30);
-        let dead = loop {
+        let dead = eventually(async || {
             let dead = newest(&server, &id, "dead", 1).await;
-            if dead["last_status"] == status {
-                break dead;
-            }
-            assert!(Instant::now() < deadline, "{dead}");
-        };
+            (dead["last_status"] == status).then_some(dead)
+        })
+        .await;
         assert!(dead["last_error"].as_str().unwrap().contains("redirects are not followed"));
     }
     assert_eq!((receiver.messages().len(), elsewhere.messages().len()), (5, 0));
 }
 
 #[tokio::test]
-async fn addresses_that_are_not_public_are_refused_unless_the_operator_allows_them() {
+async fn private_addresses_are_rejected_unless_allowed() {
     let dir = TempDir::new().unwrap();
     let receiver = Receiver::start([]).await;
     let server = Server::start(dir.path(), &[PRIVATE]);
-    // A name, and an address in the URL itself: both were allowed once.
+    // A host name and a literal address, both created while private addresses were allowed.
     let named = receiver.url.replace("127.0.0.1", "localhost");
     let (by_name, _) = hook(&server, json!({"url": named})).await;
     let (by_address, _) = hook(&server, json!({"url": receiver.url})).await;
@@ -238,8 +233,8 @@ async fn addresses_that_are_not_public_are_refused_unless_the_operator_allows_th
         assert!(why.contains("webhooks.allow_private"), "{why}");
     }
     assert_eq!(receiver.messages().len(), 1);
-    let refuse = async |wanted: Value, status| {
-        Answer::of(server.request(Method::POST, "/webhooks").json(&wanted)).await.problem(status)
+    let refuse = async |webhook: Value, status| {
+        Answer::of(server.request(Method::POST, "/webhooks").json(&webhook)).await.problem(status)
     };
     for url in [
         receiver.url.as_str(),
@@ -277,14 +272,14 @@ async fn addresses_that_are_not_public_are_refused_unless_the_operator_allows_th
     let shown = server.get(&format!("/webhooks/{public}")).await.expect(200);
     let ends = json!(["job.succeeded", "job.degraded", "job.failed", "job.cancelled"]);
     assert_eq!((&shown["events"], &shown["map"]), (&ends, &Value::Null));
-    // Its answer holds a secret, and is not kept.
+    // The response holds a secret, so it is not stored.
     let keyed = server.request(Method::POST, "/webhooks").header("idempotency-key", "one");
     let keyed = keyed.json(&json!({"url": "https://example.com/"}));
     Answer::of(keyed).await.problem(400);
 }
 
 #[tokio::test]
-async fn who_is_gone_is_told_nothing_more() {
+async fn a_receiver_that_answers_410_is_disabled() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__MAX", "1")]);
     let receiver = Receiver::start([Reply::Status(410)]).await;
@@ -305,7 +300,7 @@ async fn who_is_gone_is_told_nothing_more() {
 }
 
 #[tokio::test]
-async fn no_end_of_a_job_is_lost_when_the_server_is_killed() {
+async fn no_delivery_is_lost_when_the_server_is_killed() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE]);
     server.town("m", 2).await;
@@ -315,26 +310,26 @@ async fn no_end_of_a_job_is_lost_when_the_server_is_killed() {
     for _ in 0..3 {
         jobs.push(job(&server, "m").await["id"].as_str().unwrap().to_owned());
     }
-    // The first are on their way and unanswered; whether the last is makes no difference.
+    // The first deliveries are in flight and unanswered; the last one may be.
     server.kill();
     receiver.replies.lock().unwrap().clear();
     let before = receiver.messages().len();
 
     let _server = Server::start(dir.path(), &[PRIVATE]);
     let messages = receiver.wait(before + jobs.len()).await;
-    let mut told: Vec<String> = messages[before..]
+    let mut delivered: Vec<String> = messages[before..]
         .iter()
         .map(|message| {
             message.verify(&secret);
             message.json()["data"]["id"].as_str().unwrap().to_owned()
         })
         .collect();
-    told.sort();
-    assert_eq!(told, jobs);
+    delivered.sort();
+    assert_eq!(delivered, jobs);
 }
 
 #[tokio::test]
-async fn one_that_is_slow_holds_up_no_other_and_no_end() {
+async fn a_slow_receiver_delays_neither_others_nor_shutdown() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[PRIVATE, ("WHEREABOUTS_WEBHOOKS__TIMEOUT_S", "120")]);
     let slow = Receiver::start(vec![Reply::Silence; 100]).await;
@@ -350,12 +345,12 @@ async fn one_that_is_slow_holds_up_no_other_and_no_end() {
     }
     quick.wait(10).await;
     assert_eq!(slow.messages().len(), 4, "webhooks.concurrency_each");
-    let asked = Instant::now();
+    let start = Instant::now();
     assert!(server.terminate().success());
-    assert!(asked.elapsed() < Duration::from_secs(15), "the end took {:?}", asked.elapsed());
+    assert!(start.elapsed() < Duration::from_secs(15), "the shutdown took {:?}", start.elapsed());
 }
 
-/// A key made in the folder of a server that does not run.
+/// Creates a key in the data folder of a server that is not running.
 fn key(data: &Path, role: &str) -> String {
     let mut command = Command::new(&*BINARY);
     command.args(["keys", "create", "--name", "test", "--role", role, "--data"]).arg(data);
@@ -366,13 +361,13 @@ fn key(data: &Path, role: &str) -> String {
 }
 
 #[tokio::test]
-async fn webhooks_are_for_admins() {
+async fn only_admins_manage_webhooks() {
     let dir = TempDir::new().unwrap();
     let (admin, operator) = (key(dir.path(), "admin"), key(dir.path(), "operator"));
     let settings = [PRIVATE, ("WHEREABOUTS_AUTH__KEYS", "required")];
     let server = Server::start(dir.path(), &settings);
-    let wanted = json!({"url": "https://example.com/"});
-    let make = || server.request(Method::POST, "/webhooks").json(&wanted);
+    let webhook = json!({"url": "https://example.com/"});
+    let make = || server.request(Method::POST, "/webhooks").json(&webhook);
     let made = Answer::of(make().bearer_auth(&admin)).await.expect(201);
     let id = made["id"].as_str().unwrap();
     Answer::of(make()).await.problem(401);

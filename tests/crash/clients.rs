@@ -1,4 +1,4 @@
-//! Clients that change images of their own, and note what they were told.
+//! Clients that change images of their own and record what the server acknowledged.
 
 use std::sync::Arc;
 
@@ -7,11 +7,11 @@ use serde_json::Value;
 use super::ledger::{Fact, Key, Ledger, Picture};
 use super::support::{frame, reference};
 
-/// Numbers that look random and can be had again: SplitMix64 (Steele, Lea and Flood, 2014).
+/// A seeded random number generator: SplitMix64 (Steele, Lea and Flood, 2014).
 #[derive(Debug, Clone)]
-pub struct Chance(pub u64);
+pub struct Random(pub u64);
 
-impl Chance {
+impl Random {
     pub fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -25,7 +25,7 @@ impl Chance {
     }
 }
 
-/// What is sent: map images, and frames near them.
+/// Map images, and frames near them.
 pub struct Pictures {
     pub images: Vec<Vec<u8>>,
     pub frames: Vec<Vec<u8>>,
@@ -39,14 +39,14 @@ impl Pictures {
     }
 }
 
-/// One client; its work ends when the server does.
+/// A client that works until the server is killed.
 pub struct Client {
     pub number: usize,
-    pub chance: Chance,
+    pub random: Random,
     pub pictures: Arc<Pictures>,
     pub http: reqwest::Client,
     pub ledger: Ledger,
-    /// Ids are never used twice, but by a replacement.
+    /// Number of ids in use so far; only a replacement uses an id twice.
     pub ids: usize,
 }
 
@@ -57,7 +57,7 @@ impl Client {
     pub fn new(number: usize, seed: u64, pictures: &Arc<Pictures>) -> Self {
         Self {
             number,
-            chance: Chance(seed ^ (number as u64) << 32),
+            random: Random(seed ^ (number as u64) << 32),
             pictures: Arc::clone(pictures),
             http: reqwest::Client::builder().pool_max_idle_per_host(1).build().unwrap(),
             ledger: Ledger::default(),
@@ -70,14 +70,14 @@ impl Client {
         ["shared".into(), format!("own-{}", self.number)]
     }
 
-    /// Goes on until the server is gone.
+    /// Works until the server is killed.
     pub async fn work(&mut self, url: &str) {
         while self.step(url).await.is_ok() {}
     }
 
     async fn step(&mut self, url: &str) -> Result<(), Killed> {
-        let map = self.maps()[usize::from(self.chance.below(3) == 0)].clone();
-        match self.chance.below(20) {
+        let map = self.maps()[usize::from(self.random.below(3) == 0)].clone();
+        match self.random.below(20) {
             0..=11 => self.add(url, &map).await,
             12..=14 => self.delete(url).await,
             15 => self.replace(url).await,
@@ -89,7 +89,7 @@ impl Client {
     async fn add(&mut self, url: &str, map: &str) -> Result<(), Killed> {
         self.ids += 1;
         let key = (map.to_owned(), format!("c{}-{}", self.number, self.ids));
-        let picture = self.chance.below(self.pictures.images.len());
+        let picture = self.random.below(self.pictures.images.len());
         self.put_map(url, map).await?;
         self.put_image(url, &key, picture).await
     }
@@ -97,7 +97,7 @@ impl Client {
     async fn put_map(&self, url: &str, map: &str) -> Result<(), Killed> {
         let body = serde_json::json!({"scene": "outdoor"});
         let request = self.http.put(format!("{url}/maps/{map}")).json(&body);
-        told(request, &[200, 201]).await.map(drop)
+        send(request, &[200, 201]).await.map(drop)
     }
 
     async fn put_image(&mut self, url: &str, key: &Key, picture: Picture) -> Result<(), Killed> {
@@ -108,49 +108,49 @@ impl Client {
             .post(format!("{url}/maps/{map}/images?id={id}"))
             .header("content-type", "image/jpeg")
             .body(self.pictures.images[picture].clone());
-        told(request, &[201]).await?;
+        send(request, &[201]).await?;
         self.ledger.acknowledged(key);
         Ok(())
     }
 
     async fn delete(&mut self, url: &str) -> Result<(), Killed> {
-        let Some(key) = self.ledger.some_present(&mut self.chance) else { return Ok(()) };
+        let Some(key) = self.ledger.some_present(&mut self.random) else { return Ok(()) };
         self.delete_image(url, &key).await
     }
 
     async fn delete_image(&mut self, url: &str, key: &Key) -> Result<(), Killed> {
         let (map, id) = key;
         self.ledger.begin(key, None);
-        told(self.http.delete(format!("{url}/maps/{map}/images/{id}")), &[204]).await?;
+        send(self.http.delete(format!("{url}/maps/{map}/images/{id}")), &[204]).await?;
         self.ledger.acknowledged(key);
         Ok(())
     }
 
     /// Another picture under the same id.
     async fn replace(&mut self, url: &str) -> Result<(), Killed> {
-        let Some(key) = self.ledger.some_present(&mut self.chance) else { return Ok(()) };
-        let picture = self.chance.below(self.pictures.images.len());
+        let Some(key) = self.ledger.some_present(&mut self.random) else { return Ok(()) };
+        let picture = self.random.below(self.pictures.images.len());
         self.delete_image(url, &key).await?;
         self.put_image(url, &key, picture).await
     }
 
     async fn localize(&mut self, url: &str) -> Result<(), Killed> {
         let map = self.maps()[0].clone();
-        let frame = self.chance.below(self.pictures.frames.len());
+        let frame = self.random.below(self.pictures.frames.len());
         self.put_map(url, &map).await?;
         let request = self
             .http
             .post(format!("{url}/localize?map={map}"))
             .header("content-type", "image/jpeg")
             .body(self.pictures.frames[frame].clone());
-        let answer = told(request, &[200]).await?;
+        let answer = send(request, &[200]).await?;
         for candidate in answer["candidates"].as_array().unwrap() {
             let id = candidate["image_id"].as_str().unwrap();
             let key = (map.clone(), id.to_owned());
-            // Of its own images this client knows whether they are there.
+            // A client knows which of its own images exist.
             let own = id.starts_with(&format!("c{}-", self.number));
             assert!(
-                !own || matches!(self.ledger.images.get(&key), Some(Fact::Told(Some(_)))),
+                !own || matches!(self.ledger.images.get(&key), Some(Fact::Acknowledged(Some(_)))),
                 "{key:?} was found after it had been deleted"
             );
         }
@@ -163,15 +163,15 @@ impl Client {
     async fn delete_map(&mut self, url: &str) -> Result<(), Killed> {
         let map = self.maps()[1].clone();
         self.ledger.map_deleted(&map, false);
-        told(self.http.delete(format!("{url}/maps/{map}")), &[204, 404]).await?;
+        send(self.http.delete(format!("{url}/maps/{map}")), &[204, 404]).await?;
         self.ledger.map_deleted(&map, true);
-        self.ledger.images.retain(|_, fact| *fact != Fact::Told(None));
+        self.ledger.images.retain(|_, fact| *fact != Fact::Acknowledged(None));
         Ok(())
     }
 }
 
-/// What the server answers; it must be one of `statuses`.
-async fn told(request: reqwest::RequestBuilder, statuses: &[u16]) -> Result<Value, Killed> {
+/// Sends a request; returns its response, which must have one of these statuses.
+async fn send(request: reqwest::RequestBuilder, statuses: &[u16]) -> Result<Value, Killed> {
     let response = request.send().await.map_err(|_| Killed)?;
     let status = response.status().as_u16();
     let bytes = response.bytes().await.map_err(|_| Killed)?;

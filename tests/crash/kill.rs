@@ -1,5 +1,5 @@
-//! The driver: several clients change things, the server is killed, and what they were told is held
-//! against what the next server says.
+//! The driver: several clients make changes, the server is killed, and what it acknowledged is compared with
+//! what the next server returns.
 
 use std::collections::BTreeMap;
 use std::process::{Command, Stdio};
@@ -10,17 +10,18 @@ use serde_json::Value;
 use tempfile::TempDir;
 use whereabouts_core::Digest;
 
-use super::clients::{Chance, Client, Pictures};
+use super::clients::{Client, Pictures, Random};
 use super::ledger::{Key, Picture};
 use super::support::{BINARY, Server};
+use super::wait::until;
 
-/// `make crash` sets more.
+/// Default number of rounds; `make crash` runs more.
 const ROUNDS: usize = 20;
 const CLIENTS: usize = 4;
 const PICTURES: usize = 240;
-/// From asking for the server to its being ready, on a machine that does other things too.
+/// Maximum time from the start of the process until it is ready, on a busy machine.
 const QUICK: Duration = Duration::from_secs(10);
-/// Every map has a graph, which has to catch up.
+/// Every map has a graph, which has to catch up after a kill.
 const GRAPH: (&str, &str) = ("WHEREABOUTS_INDEX__EXACT_UP_TO", "0");
 const EXACT: (&str, &str) = ("WHEREABOUTS_INDEX__EXACT_UP_TO", "1000000");
 
@@ -29,7 +30,7 @@ fn number(name: &str, default: usize) -> usize {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_was_acknowledged_survives_kill_9_at_any_moment() {
+async fn acknowledged_changes_survive_kill_9_at_any_moment() {
     let rounds = number("WHEREABOUTS_CRASH_ROUNDS", ROUNDS);
     let seed = number("WHEREABOUTS_CRASH_SEED", 1) as u64;
     let mut driver = Driver::new(seed);
@@ -49,7 +50,7 @@ async fn what_was_acknowledged_survives_kill_9_at_any_moment() {
 
 struct Driver {
     dir: TempDir,
-    chance: Chance,
+    random: Random,
     pictures: Arc<Pictures>,
     numbers: BTreeMap<String, Picture>,
     clients: Vec<Client>,
@@ -64,7 +65,7 @@ impl Driver {
         let clients = (0..CLIENTS).map(|number| Client::new(number, seed, &pictures)).collect();
         Self {
             dir: TempDir::new().unwrap(),
-            chance: Chance(seed),
+            random: Random(seed),
             pictures,
             numbers,
             clients,
@@ -78,7 +79,7 @@ impl Driver {
 
     fn start(&mut self, index: (&str, &str)) -> Server {
         let start = Instant::now();
-        // Graphs are built again often, and segments of descriptors have little room.
+        // Graphs are rebuilt often, and segments are compacted often.
         let settings = [index, ("WHEREABOUTS_INDEX__MAX_DEAD_SHARE", "0.1")];
         let server = Server::start(self.dir.path(), &settings);
         self.slowest = self.slowest.max(start.elapsed());
@@ -87,7 +88,7 @@ impl Driver {
     }
 
     async fn round(&mut self, round: usize) {
-        if self.chance.below(4) == 0 {
+        if self.random.below(4) == 0 {
             self.kill_while_starting();
         }
         let server = self.start(GRAPH);
@@ -101,9 +102,9 @@ impl Driver {
                 client
             }));
         }
-        // Now and then just after the start, mostly in the middle of things.
+        // The moment is what is tested: now and then just after the start, mostly in the middle of things.
         let moment = if round.is_multiple_of(5) { 50 } else { 900 };
-        let moment = Duration::from_millis(self.chance.below(moment) as u64);
+        let moment = Duration::from_millis(self.random.below(moment) as u64);
         tokio::time::sleep(moment).await;
         server.kill();
         for client in working {
@@ -120,21 +121,22 @@ impl Driver {
             .stderr(Stdio::null())
             .spawn()
             .unwrap();
-        std::thread::sleep(Duration::from_millis(self.chance.below(300) as u64));
+        // Any moment of the start is what is tested.
+        std::thread::sleep(Duration::from_millis(self.random.below(300) as u64));
         child.kill().unwrap();
         child.wait().unwrap();
     }
 
-    /// Holds what the server has against what the clients were told; looks closely at `closely` images.
+    /// Compares what the server has with what it acknowledged; checks the bytes of `closely` images.
     async fn check(&mut self, server: &Server, closely: usize) {
         let found = self.found(server).await;
         for client in &mut self.clients {
             client.ledger.settle(&found);
         }
-        assert_eq!(self.images(), found.len(), "an image is there that nobody sent");
+        assert_eq!(self.images(), found.len(), "there is an image that no client has sent");
         let keys: Vec<&Key> = found.keys().collect();
         for _ in 0..closely.min(keys.len()) {
-            let key = keys[self.chance.below(keys.len())];
+            let key = keys[self.random.below(keys.len())];
             self.look_closely(server, key, found[key]).await;
         }
         for client in &self.clients {
@@ -144,7 +146,7 @@ impl Driver {
         }
     }
 
-    /// Every image that is listed.
+    /// All images that the server lists.
     async fn found(&self, server: &Server) -> BTreeMap<Key, Picture> {
         let mut found = BTreeMap::new();
         for map in server.get("/maps").await.expect(200)["maps"].as_array().unwrap() {
@@ -164,7 +166,7 @@ impl Driver {
         found
     }
 
-    /// Its bytes are there, and it is found by them.
+    /// Asserts that the bytes of an image are there and that it is found by them.
     async fn look_closely(&self, server: &Server, key: &Key, picture: Picture) {
         let (map, id) = key;
         let bytes = &self.pictures.images[picture];
@@ -178,7 +180,7 @@ impl Driver {
         assert!(similarity.is_some_and(|s| s > 0.999), "{key:?} is not found: {similarity:?}");
     }
 
-    /// All is there, every job ends, and the graph finds what the exact search finds.
+    /// Asserts that everything is there, that every job ends, and that the graph finds what exact search finds.
     async fn end(&mut self) {
         let server = self.start(GRAPH);
         self.check(&server, usize::MAX).await;
@@ -186,12 +188,10 @@ impl Driver {
             self.clients.iter().flat_map(|client| client.ledger.jobs.clone()).collect();
         for id in jobs {
             let job = server.get(&format!("/jobs/{id}?wait=60")).await.expect(200);
-            // Candidates may have been removed meanwhile.
+            // Its candidates may have been removed since.
             assert!(["succeeded", "degraded"].contains(&job["state"].as_str().unwrap()), "{job}");
         }
-        while server.get("/maps/shared").await.expect(200)["index"] != "hnsw" {
-            tokio::time::sleep(Duration::from_millis(50)).await;
-        }
+        until(async || server.get("/maps/shared").await.expect(200)["index"] == "hnsw").await;
         let graph = self.answers(&server).await;
         server.kill();
         let server = self.start(EXACT);

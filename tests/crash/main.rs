@@ -1,5 +1,5 @@
-//! What was acknowledged survives: the real server is killed at random moments, and its files and its
-//! disk are tampered with.
+//! Acknowledged changes survive: the real server is killed at random moments, and its files and its disk are
+//! damaged.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
@@ -8,5 +8,6 @@ mod disk;
 mod faults;
 mod kill;
 mod ledger;
+mod needs_mount;
 
-use whereabouts_testkit::server as support;
+use whereabouts_testkit::{server as support, wait};

@@ -1,5 +1,5 @@
-//! Mutated input for everything that reads what others wrote. Nothing may panic, and what is accepted
-//! must hold what its reader promises.
+//! Mutated input for every parser of untrusted data. Nothing may panic, and accepted input must satisfy the
+//! invariants of its parser.
 //!
 //! Each target starts from inputs that are whole, and from those in `tests/fuzz/found/TARGET/`, which once
 //! failed. `make fuzz` runs a million mutations, `make test` some thousands; the seed decides which.
@@ -23,7 +23,7 @@ use mutate::Mutator;
 
 /// Mutations of each target in `make test`.
 const RUNS: usize = 1500;
-/// No input of a few kilobytes takes longer, on a machine that does other things too.
+/// Maximum time for an input of a few kilobytes, on a busy machine.
 const SLOWEST: Duration = Duration::from_secs(5);
 
 fn number(name: &str, default: usize) -> usize {
@@ -53,7 +53,7 @@ fn fuzz(target: &str, seeds: Vec<Vec<u8>>, read: fn(&[u8]) -> bool) {
     println!("{target}: {runs} mutations (seed {seed}), {accepted} accepted, slowest {slowest:?}");
 }
 
-/// Runs one input; keeps it where it can be looked at if it fails.
+/// Runs one input; saves it if it fails.
 fn run(target: &str, input: &[u8], read: fn(&[u8]) -> bool) -> bool {
     let start = Instant::now();
     let outcome = catch_unwind(AssertUnwindSafe(|| read(input)));

@@ -1,6 +1,6 @@
-//! Small damages to inputs that are whole, as coverage-guided fuzzers make them, without the coverage.
+//! Small mutations of valid inputs, like those of coverage-guided fuzzers, without the coverage.
 
-/// Numbers at which sizes and offsets go wrong.
+/// Numbers at which sizes and offsets often overflow.
 const EDGES: [u64; 12] = [
     0,
     1,
@@ -16,7 +16,7 @@ const EDGES: [u64; 12] = [
     u64::MAX,
 ];
 
-/// Words at which texts go wrong.
+/// Tokens that often break text parsers.
 const WORDS: [&str; 14] = [
     "-1",
     "NaN",
@@ -37,7 +37,7 @@ const WORDS: [&str; 14] = [
 /// The largest input.
 const MAX_BYTES: usize = 1 << 16;
 
-/// Draws mutations of some inputs.
+/// Generates mutations of some inputs.
 pub struct Mutator {
     state: u64,
     seeds: Vec<Vec<u8>>,
@@ -60,7 +60,7 @@ impl Mutator {
         (self.bits() % bound.max(1) as u64) as usize
     }
 
-    /// One input with one to eight damages.
+    /// One input with one to eight mutations.
     pub fn next_input(&mut self) -> Vec<u8> {
         let seed = self.below(self.seeds.len());
         let mut input = self.seeds[seed].clone();

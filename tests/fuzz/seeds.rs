@@ -1,4 +1,4 @@
-//! Inputs that are whole.
+//! Valid inputs to start from.
 
 use std::io::Cursor;
 use std::ops::Range;

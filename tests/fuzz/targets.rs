@@ -1,5 +1,5 @@
-//! Readers of what others wrote. Each says whether it accepted its input, and checks what it promises of
-//! what it accepts.
+//! Parsers of untrusted data. Each target returns whether it accepted its input, and checks the invariants of what
+//! it accepted.
 
 use std::collections::HashSet;
 use std::io::Cursor;
@@ -60,7 +60,7 @@ fn pictures() -> Vec<PictureFile> {
     names.map(|name| PictureFile { file: name.into(), id: name.parse().unwrap() }).into()
 }
 
-/// A file that a reader can be pointed at.
+/// A file for a parser that takes a path.
 fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), bytes).unwrap();
@@ -85,7 +85,7 @@ pub fn poses(bytes: &[u8]) -> bool {
     }
 }
 
-/// It is in its ranges, so that distances from it are numbers.
+/// Asserts that a pose is in range, so that distances from it are finite.
 fn usable(pose: &Pose) {
     assert!(pose.distance_m(pose).unwrap().abs() < 1e-3, "{pose:?}");
 }

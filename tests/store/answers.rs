@@ -1,4 +1,4 @@
-//! First answers to requests that may be sent again.
+//! Stored responses of requests with an idempotency key.
 
 use std::sync::Arc;
 
@@ -6,17 +6,18 @@ use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
 use whereabouts_core::Digest;
-use whereabouts_store::{IdempotencyRecord, Progress, Store, StoredResponse};
+use whereabouts_store::{IdempotencyRecord, Progress, Store, StoreError, StoredResponse};
 
-use crate::support::{Fixture, eventually, odd_texts};
+use crate::support::{Fixture, eventually, odd_texts, record};
 
 contract!(
-    a_request_is_reserved_once_and_its_answer_kept,
-    of_many_who_reserve_a_request_one_does_it,
-    an_answer_that_is_too_old_is_none,
-    a_forgotten_request_may_be_done_again,
-    the_oldest_answers_are_forgotten_by_age_and_by_number,
-    a_request_of_a_process_that_ended_may_be_done_again,
+    a_request_is_reserved_once_and_its_response_stored,
+    of_concurrent_reservations_of_a_request_one_succeeds,
+    an_expired_response_is_not_found,
+    a_forgotten_request_may_be_reserved_again,
+    the_oldest_responses_are_evicted_by_age_and_by_number,
+    a_request_of_a_process_that_ended_may_be_reserved_again,
+    a_repeated_request_finds_its_job,
 );
 
 fn running(process: Uuid) -> IdempotencyRecord {
@@ -30,12 +31,12 @@ fn answered(at: Timestamp, body: &str) -> IdempotencyRecord {
     IdempotencyRecord { fingerprint: Digest::of(b"request"), at, progress }
 }
 
-/// What is known of a request, whatever its age; if that is nothing, it is reserved.
+/// Reserves a request, or returns its record whatever its age.
 async fn reserve(store: &dyn Store, id: &str, process: Uuid) -> Option<IdempotencyRecord> {
     store.reserve_request(id, running(process), Timestamp::UNIX_EPOCH).await.unwrap()
 }
 
-async fn a_request_is_reserved_once_and_its_answer_kept(fixture: &Fixture) {
+async fn a_request_is_reserved_once_and_its_response_stored(fixture: &Fixture) {
     let store = fixture.open().await;
     let process = Uuid::now_v7();
     for (number, text) in odd_texts().into_iter().enumerate() {
@@ -51,7 +52,7 @@ async fn a_request_is_reserved_once_and_its_answer_kept(fixture: &Fixture) {
     }
 }
 
-async fn of_many_who_reserve_a_request_one_does_it(fixture: &Fixture) {
+async fn of_concurrent_reservations_of_a_request_one_succeeds(fixture: &Fixture) {
     let store = fixture.open().await;
     let process = Uuid::now_v7();
     let reserving = (0..8).map(|_| {
@@ -62,7 +63,7 @@ async fn of_many_who_reserve_a_request_one_does_it(fixture: &Fixture) {
     assert_eq!(known.filter(Option::is_none).count(), 1);
 }
 
-async fn an_answer_that_is_too_old_is_none(fixture: &Fixture) {
+async fn an_expired_response_is_not_found(fixture: &Fixture) {
     let store = fixture.open().await;
     let (now, process) = (Timestamp::now(), Uuid::now_v7());
     let hour = SignedDuration::from_hours(1);
@@ -71,12 +72,12 @@ async fn an_answer_that_is_too_old_is_none(fixture: &Fixture) {
     assert!(known.is_some());
     let known = store.reserve_request("key", running(process), now - hour / 2).await.unwrap();
     assert_eq!(known, None);
-    // What is being done is not too old.
+    // A request in progress does not expire.
     let known = store.reserve_request("key", running(process), now + hour).await.unwrap();
     assert!(matches!(known.unwrap().progress, Progress::Running { .. }));
 }
 
-async fn a_forgotten_request_may_be_done_again(fixture: &Fixture) {
+async fn a_forgotten_request_may_be_reserved_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let process = Uuid::now_v7();
     store.forget_request("key").await.unwrap();
@@ -88,7 +89,7 @@ async fn a_forgotten_request_may_be_done_again(fixture: &Fixture) {
     assert_eq!(reserve(&*store, "key", process).await, None);
 }
 
-async fn the_oldest_answers_are_forgotten_by_age_and_by_number(fixture: &Fixture) {
+async fn the_oldest_responses_are_evicted_by_age_and_by_number(fixture: &Fixture) {
     let store = fixture.open().await;
     let (now, process) = (Timestamp::now(), Uuid::now_v7());
     let hours_ago = |hours| now - SignedDuration::from_hours(hours);
@@ -104,13 +105,13 @@ async fn the_oldest_answers_are_forgotten_by_age_and_by_number(fixture: &Fixture
         let known = reserve(&*store, &hours.to_string(), process).await;
         assert_eq!(known.is_some(), kept, "{hours}");
     }
-    // Both at once: one is too old, and one too many.
+    // By age and by number at once.
     store.store_response("old", answered(hours_ago(9), "")).await.unwrap();
     assert_eq!(store.prune_responses(hours_ago(8), 4).await.unwrap(), 2);
     assert_eq!(store.prune_responses(now + SignedDuration::from_hours(1), 9).await.unwrap(), 4);
 }
 
-async fn a_request_of_a_process_that_ended_may_be_done_again(fixture: &Fixture) {
+async fn a_request_of_a_process_that_ended_may_be_reserved_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let (first, second) = (Uuid::now_v7(), Uuid::now_v7());
     assert_eq!(reserve(&*store, "running", first).await, None);
@@ -121,4 +122,28 @@ async fn a_request_of_a_process_that_ended_may_be_done_again(fixture: &Fixture) 
     let free = async || reserve(&*store, "running", second).await.is_none().then_some(());
     eventually(free).await;
     assert_eq!(reserve(&*store, "answered", second).await, Some(answer));
+}
+
+async fn a_repeated_request_finds_its_job(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let reserve = async || {
+        let running = running(Uuid::now_v7());
+        store.reserve_request("r", running, Timestamp::UNIX_EPOCH).await.unwrap();
+    };
+    let _pin = store.put_blob(Digest::of(b"frame"), "frame".into()).await.unwrap();
+    reserve().await;
+    let first = record("m", b"frame");
+    let id = first.job.id;
+    assert_eq!(store.submit_once(first, 10, "r").await.unwrap(), None);
+    let again = store.submit_once(record("m", b"frame"), 10, "r").await.unwrap();
+    assert_eq!(again.unwrap().id, id);
+    assert_eq!(store.queued().await.unwrap(), 1);
+    // Another request has a job of its own; so has one without a record.
+    assert_eq!(store.submit_once(record("m", b"frame"), 10, "other").await.unwrap(), None);
+    store.forget_request("r").await.unwrap();
+    reserve().await;
+    assert_eq!(store.submit_once(record("m", b"frame"), 10, "r").await.unwrap(), None);
+    assert_eq!(store.queued().await.unwrap(), 3);
+    let full = store.submit_once(record("m", b"frame"), 3, "third").await;
+    assert!(matches!(full, Err(StoreError::QueueFull { limit: 3 })));
 }

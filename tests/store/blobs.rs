@@ -1,4 +1,4 @@
-//! The bytes of pictures: put, read, and gone with the last that needs them, once the janitor has called.
+//! The bytes of pictures: written, read, and removed by the sweep once nothing refers to them.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,21 +12,21 @@ use whereabouts_store::{Added, JobRetention, StoreError};
 use crate::support::{Fixture, Tuning, add, claim, descriptor, image, is_kept, map, submit};
 
 contract!(
-    bytes_come_back_as_they_were,
-    bytes_go_with_the_last_image_that_needs_them,
-    bytes_of_a_frame_go_with_its_job,
+    bytes_are_returned_unchanged,
+    bytes_are_removed_with_the_last_image_that_needs_them,
+    bytes_of_a_frame_are_removed_with_its_job,
     pinned_bytes_stay,
-    bytes_that_are_put_while_they_are_removed_are_there,
+    bytes_put_during_their_removal_are_kept,
 );
 contract_over_s3!(
-    bytes_come_back_as_they_were,
-    bytes_go_with_the_last_image_that_needs_them,
-    bytes_of_a_frame_go_with_its_job,
+    bytes_are_returned_unchanged,
+    bytes_are_removed_with_the_last_image_that_needs_them,
+    bytes_of_a_frame_are_removed_with_its_job,
     pinned_bytes_stay,
-    bytes_that_are_put_while_they_are_removed_are_there,
+    bytes_put_during_their_removal_are_kept,
 );
 
-async fn bytes_come_back_as_they_were(fixture: &Fixture) {
+async fn bytes_are_returned_unchanged(fixture: &Fixture) {
     let store = fixture.open().await;
     let long: Vec<u8> = (0..3_000_000_u32).map(|number| (number % 251) as u8).collect();
     for bytes in [b"\0".to_vec(), b"text".to_vec(), long] {
@@ -39,7 +39,7 @@ async fn bytes_come_back_as_they_were(fixture: &Fixture) {
     }
 }
 
-async fn bytes_go_with_the_last_image_that_needs_them(fixture: &Fixture) {
+async fn bytes_are_removed_with_the_last_image_that_needs_them(fixture: &Fixture) {
     let store = fixture.open().await;
     let (one, _) = store.put_map(map("one", 3)).await.unwrap();
     let (two, _) = store.put_map(map("two", 3)).await.unwrap();
@@ -52,12 +52,12 @@ async fn bytes_go_with_the_last_image_that_needs_them(fixture: &Fixture) {
         assert_eq!(is_kept(&*store, b"bytes").await, kept);
     }
     assert!(is_kept(&*store, b"others").await);
-    // They may come again.
+    // They may be stored again.
     add(&*store, &one, "a", b"bytes").await;
     assert!(is_kept(&*store, b"bytes").await);
 }
 
-async fn bytes_of_a_frame_go_with_its_job(fixture: &Fixture) {
+async fn bytes_of_a_frame_are_removed_with_its_job(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     submit(&*store, "m", b"frame").await;
@@ -92,7 +92,7 @@ async fn pinned_bytes_stay(fixture: &Fixture) {
     assert!(is_kept(&*store, b"bytes").await);
 }
 
-async fn bytes_that_are_put_while_they_are_removed_are_there(fixture: &Fixture) {
+async fn bytes_put_during_their_removal_are_kept(fixture: &Fixture) {
     let pin = Duration::from_millis(30);
     let store = fixture.open_with(Tuning { pin, ..Tuning::default() }).await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
@@ -107,7 +107,7 @@ async fn bytes_that_are_put_while_they_are_removed_are_there(fixture: &Fixture) 
                     let descriptor = descriptor(&image, 3);
                     match store.add_image(&map, image.clone(), descriptor).await {
                         Ok(added) => break assert!(matches!(added, Added::Created(_))),
-                        // So slow that the bytes were forgotten meanwhile, and it is said so.
+                        // So slow that the bytes were removed meanwhile, which is reported.
                         Err(StoreError::Failed(why)) => assert!(why.contains("send them again")),
                         Err(error) => panic!("{error}"),
                     }

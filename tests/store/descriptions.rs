@@ -1,4 +1,4 @@
-//! Descriptions that were paid for, and the frames they are of.
+//! Cached descriptions, and the frames that they describe.
 
 use std::time::Duration;
 
@@ -11,13 +11,13 @@ use whereabouts_store::{DescriptionBounds, Store};
 use crate::support::{Fixture, Random, Tuning, add, eventually, fill, map, next, odd_texts};
 
 contract!(
-    a_description_is_kept_word_for_word,
-    a_description_that_is_too_old_is_not_used,
-    the_oldest_descriptions_make_room,
+    a_description_is_cached_verbatim,
+    an_expired_description_is_not_used,
+    the_oldest_descriptions_are_evicted,
     a_purchase_is_begun_and_ended,
     earlier_frames_are_found_by_their_similarity,
-    the_oldest_frames_are_forgotten,
-    frames_go_with_their_map_and_with_its_descriptors,
+    the_oldest_frames_are_evicted,
+    frames_are_removed_with_their_map_and_with_its_descriptors,
 );
 
 fn description(text: &str) -> CachedDescription {
@@ -29,12 +29,12 @@ fn key(number: usize) -> Digest {
     Digest::of(&number.to_le_bytes())
 }
 
-/// What the janitor does now and then.
+/// The periodic sweep.
 async fn tidy(store: &dyn Store) {
     store.collect_garbage().await.unwrap();
 }
 
-async fn a_description_is_kept_word_for_word(fixture: &Fixture) {
+async fn a_description_is_cached_verbatim(fixture: &Fixture) {
     let store = fixture.open().await;
     assert_eq!(store.description(&key(0)).await.unwrap(), None);
     let texts: Vec<_> = odd_texts().iter().map(|text| description(text)).collect();
@@ -54,7 +54,7 @@ async fn a_description_is_kept_word_for_word(fixture: &Fixture) {
     assert!(store.levels().bytes > bytes as u64);
 }
 
-async fn a_description_that_is_too_old_is_not_used(fixture: &Fixture) {
+async fn an_expired_description_is_not_used(fixture: &Fixture) {
     let max_age = Duration::from_millis(200);
     let descriptions = DescriptionBounds { max_bytes: 1 << 20, max_age };
     let store = fixture.open_with(Tuning { descriptions, ..Tuning::default() }).await;
@@ -63,11 +63,11 @@ async fn a_description_that_is_too_old_is_not_used(fixture: &Fixture) {
     eventually(async || store.description(&key(0)).await.unwrap().is_none().then_some(())).await;
     assert!(Timestamp::now().duration_since(made) > SignedDuration::from_millis(200));
     tidy(&*store).await;
-    // It may be bought again.
+    // It may be computed again.
     store.keep_description(key(0), description("text")).await.unwrap();
 }
 
-async fn the_oldest_descriptions_make_room(fixture: &Fixture) {
+async fn the_oldest_descriptions_are_evicted(fixture: &Fixture) {
     let descriptions = DescriptionBounds { max_bytes: 20_000, max_age: Duration::from_secs(3600) };
     let store = fixture.open_with(Tuning { descriptions, ..Tuning::default() }).await;
     let text = "x".repeat(3000);
@@ -90,7 +90,7 @@ async fn the_oldest_descriptions_make_room(fixture: &Fixture) {
 async fn a_purchase_is_begun_and_ended(fixture: &Fixture) {
     let store = fixture.open().await;
     let until = Timestamp::now() + SignedDuration::from_secs(60);
-    // A process does not keep itself from buying.
+    // A process does not block itself.
     for _ in 0..2 {
         assert!(store.acquire_lease(&key(0), until).await.unwrap());
     }
@@ -106,7 +106,7 @@ fn frame(number: u8, descriptor: &Descriptor) -> DescribedFrame {
     DescribedFrame { query_id, digest: Digest::of(&[number]), descriptor }
 }
 
-/// The numbers of the frames that are as similar.
+/// The numbers of the frames that are at least this similar.
 async fn similar(store: &dyn Store, map: Uuid, to: &Descriptor, at_least: f32) -> Vec<u8> {
     let found = store.similar_frames(map, to, at_least).await.unwrap();
     let number = |digest| (0..100).find(|number| Digest::of(&[*number]) == digest).unwrap();
@@ -136,19 +136,19 @@ async fn earlier_frames_are_found_by_their_similarity(fixture: &Fixture) {
     let long = Random(1).descriptor(5);
     store.keep_frame(one, frame(60, &long), 100).await.unwrap();
     assert_eq!(similar(&*store, one, &at(0.0), 0.9).await, [1, 3]);
-    // No more than a few.
+    // The number of results is bounded.
     assert_eq!(similar(&*store, one, &at(0.0), -1.0).await, [1, 3, 4, 0]);
     assert_eq!(similar(&*store, one, &long, 0.9).await, [60]);
     assert_eq!(similar(&*store, other, &at(0.0), 0.9).await, [50]);
     let found = store.similar_frames(one, &at(0.0), 0.9).await.unwrap();
     assert_eq!(found[0].stand_in.query_id, frames[1].query_id);
     assert!((found[0].stand_in.similarity - 10_f32.to_radians().cos()).abs() < 1e-6);
-    // The same frame again is the same frame.
+    // Storing a frame again does not duplicate it.
     store.keep_frame(one, frames[1].clone(), 100).await.unwrap();
     assert_eq!(similar(&*store, one, &at(0.0), 0.9).await, [1, 3]);
 }
 
-async fn the_oldest_frames_are_forgotten(fixture: &Fixture) {
+async fn the_oldest_frames_are_evicted(fixture: &Fixture) {
     let store = fixture.open().await;
     let (one, other) = (Uuid::now_v7(), Uuid::now_v7());
     store.keep_frame(other, frame(9, &at(0.0)), 3).await.unwrap();
@@ -159,7 +159,7 @@ async fn the_oldest_frames_are_forgotten(fixture: &Fixture) {
     assert_eq!(similar(&*store, other, &at(0.0), 0.9).await, [9]);
 }
 
-async fn frames_go_with_their_map_and_with_its_descriptors(fixture: &Fixture) {
+async fn frames_are_removed_with_their_map_and_with_its_descriptors(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     add(&*store, &map, "a", b"a").await;

@@ -1,4 +1,4 @@
-//! Drafts: whatever happens while the descriptors of a map are made anew.
+//! Drafts: changes to a map while its descriptors are computed again.
 
 use whereabouts_core::{Descriptor, Image, Map, Scene};
 use whereabouts_index::SearchMode;
@@ -7,11 +7,11 @@ use whereabouts_store::{Store, StoreError};
 use crate::support::{Fixture, Tuning, add, descriptor, eventually, fill, image, map, next};
 
 contract!(
-    what_is_added_and_removed_meanwhile_is_carried_over_and_left_out,
-    a_draft_that_is_given_up_leaves_the_map_as_it_was_and_another_may_begin,
-    a_draft_of_a_process_that_ended_is_nothing_to_the_next_one,
+    changes_made_during_a_draft_are_carried_over,
+    a_discarded_draft_leaves_the_map_unchanged_and_another_may_begin,
+    a_draft_of_a_process_that_ended_does_not_block_the_next_one,
     a_large_map_is_searched_by_its_graph_from_the_moment_it_is_replaced,
-    scene_and_description_that_changed_meanwhile_stay,
+    scene_and_description_changed_during_a_draft_are_kept,
 );
 
 /// Small enough that some of these maps have graphs.
@@ -23,7 +23,7 @@ fn new_descriptor(image: &Image) -> Descriptor {
     descriptor(image, 5)
 }
 
-/// Every image is found by its own descriptor, and nothing else is.
+/// Asserts that every image is found by its own descriptor, and nothing else is found.
 async fn finds(store: &dyn Store, images: &[&Image]) {
     let map = store.map(&"m".parse().unwrap()).await.unwrap().unwrap();
     assert_eq!(store.index_state(&map).await.unwrap().images, images.len());
@@ -37,12 +37,12 @@ async fn finds(store: &dyn Store, images: &[&Image]) {
     }
 }
 
-/// A map of the old model, which gives three numbers; the new one gives five.
+/// A map of the old model, whose descriptors have three numbers; those of the new one have five.
 async fn old_map(store: &dyn Store) -> Map {
     store.put_map(map("m", 3)).await.unwrap().0
 }
 
-async fn what_is_added_and_removed_meanwhile_is_carried_over_and_left_out(fixture: &Fixture) {
+async fn changes_made_during_a_draft_are_carried_over(fixture: &Fixture) {
     let store = fixture.open_with(tuning()).await;
     let map = old_map(&*store).await;
     let mut images = Vec::new();
@@ -53,7 +53,7 @@ async fn what_is_added_and_removed_meanwhile_is_carried_over_and_left_out(fixtur
     let page = draft.missing(2).await.unwrap();
     assert_eq!(page, images[..2]);
     draft.write(&page[0], new_descriptor(&page[0])).await.unwrap();
-    // One that has its new descriptor; one that is about to get it, and whose id goes to another.
+    // Remove an image that has its new descriptor, and one that is about to get it and whose id is used again.
     for gone in ["a", "b", "f"] {
         assert!(store.delete_image(&map, &gone.parse().unwrap()).await.unwrap());
     }
@@ -61,7 +61,7 @@ async fn what_is_added_and_removed_meanwhile_is_carried_over_and_left_out(fixtur
     draft.write(&page[1], new_descriptor(&page[1])).await.unwrap();
     let again = add(&*store, &map, "a", b"a").await;
     assert_eq!(fill(draft.as_mut(), 5).await, 4 + 2);
-    // Between the last look and the step.
+    // Between the last check and the replacement.
     let late = add(&*store, &map, "late", b"late").await;
     let all = [&again, &other, &images[2], &images[3], &images[4], &images[6], &late];
     assert!(!draft.replace().await.unwrap());
@@ -74,7 +74,7 @@ async fn what_is_added_and_removed_meanwhile_is_carried_over_and_left_out(fixtur
     finds(&*store, &all).await;
     drop(draft);
 
-    // Who looked at the map before is told so.
+    // A search with the former map is superseded.
     let superseded = |error| assert!(matches!(error, StoreError::Superseded(_)), "{error}");
     let query = descriptor(&late, 3);
     superseded(store.search(&map, query.clone(), 1, SearchMode::Fast).await.unwrap_err());
@@ -83,13 +83,13 @@ async fn what_is_added_and_removed_meanwhile_is_carried_over_and_left_out(fixtur
     superseded(store.add_image(&map, late.clone(), query).await.unwrap_err());
     superseded(store.put_map(map.clone()).await.unwrap_err());
     superseded(store.draft(next(&map, 5)).await.err().unwrap());
-    // A removal means the same in either.
+    // A removal is the same in both.
     assert!(store.delete_image(&map, &late.id).await.unwrap());
     finds(&*store, &all[..5]).await;
     drop(store);
     let store = fixture.open_with(tuning()).await;
     finds(&*store, &all[..5]).await;
-    // And once more.
+    // And again.
     let known = store.map(&map.name).await.unwrap().unwrap();
     assert_eq!(known, Map { created_at: map.created_at, ..next(&map, 5) });
     let mut draft = store.draft(next(&known, 5)).await.unwrap();
@@ -98,9 +98,7 @@ async fn what_is_added_and_removed_meanwhile_is_carried_over_and_left_out(fixtur
     finds(&*store, &all[..5]).await;
 }
 
-async fn a_draft_that_is_given_up_leaves_the_map_as_it_was_and_another_may_begin(
-    fixture: &Fixture,
-) {
+async fn a_discarded_draft_leaves_the_map_unchanged_and_another_may_begin(fixture: &Fixture) {
     let store = fixture.open_with(tuning()).await;
     let map = old_map(&*store).await;
     let image = add(&*store, &map, "a", b"a").await;
@@ -118,7 +116,7 @@ async fn a_draft_that_is_given_up_leaves_the_map_as_it_was_and_another_may_begin
     draft.discard().await;
 }
 
-async fn a_draft_of_a_process_that_ended_is_nothing_to_the_next_one(fixture: &Fixture) {
+async fn a_draft_of_a_process_that_ended_does_not_block_the_next_one(fixture: &Fixture) {
     let store = fixture.open_with(tuning()).await;
     let map = old_map(&*store).await;
     let image = add(&*store, &map, "a", b"a").await;
@@ -148,13 +146,13 @@ async fn a_large_map_is_searched_by_its_graph_from_the_moment_it_is_replaced(fix
     assert_eq!((state.images, state.graph, state.behind), (50, true, false));
 }
 
-async fn scene_and_description_that_changed_meanwhile_stay(fixture: &Fixture) {
+async fn scene_and_description_changed_during_a_draft_are_kept(fixture: &Fixture) {
     let store = fixture.open_with(tuning()).await;
     let map = old_map(&*store).await;
     let mut draft = store.draft(next(&map, 5)).await.unwrap();
     let changed = Map { scene: Scene::Indoor, description: Some("new".into()), ..map.clone() };
     store.put_map(changed.clone()).await.unwrap();
-    // Even a map without images may be given another model.
+    // A map without images can be moved to another model, too.
     assert_eq!(fill(draft.as_mut(), 5).await, 0);
     assert!(draft.replace().await.unwrap());
     let known = store.map(&map.name).await.unwrap().unwrap();

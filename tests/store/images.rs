@@ -12,20 +12,20 @@ use whereabouts_store::{Added, Store, StoreError};
 use crate::support::{Fixture, add, descriptor, fill, image, map, next, odd_texts};
 
 contract!(
-    the_same_bytes_again_change_nothing_and_other_bytes_are_refused,
-    images_come_in_pages_by_the_bytes_of_their_ids,
+    the_same_bytes_again_change_nothing_and_other_bytes_are_a_conflict,
+    images_are_paged_by_the_bytes_of_their_ids,
     images_are_looked_up_by_id_in_the_order_asked_for,
-    all_that_is_known_of_an_image_is_kept,
-    positions_come_in_the_order_of_addition,
+    all_fields_of_an_image_are_kept,
+    poses_are_returned_in_the_order_of_addition,
     the_count_and_the_changes_follow_every_addition_and_removal,
-    of_many_who_add_an_image_at_once_one_creates_it,
-    of_many_who_give_an_id_to_different_bytes_one_does,
-    additions_and_removals_of_the_same_bytes_are_not_in_each_others_way,
+    of_concurrent_additions_of_an_image_one_creates_it,
+    of_concurrent_additions_of_different_bytes_under_one_id_one_succeeds,
+    concurrent_additions_and_removals_of_the_same_bytes_succeed,
     images_of_maps_do_not_mix,
-    images_are_exported_in_pages_with_their_descriptors_to_the_last_bit,
+    images_are_exported_in_pages_with_bit_identical_descriptors,
 );
 
-async fn the_same_bytes_again_change_nothing_and_other_bytes_are_refused(fixture: &Fixture) {
+async fn the_same_bytes_again_change_nothing_and_other_bytes_are_a_conflict(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     let first = add(&*store, &map, "a", b"a").await;
@@ -44,7 +44,7 @@ async fn the_same_bytes_again_change_nothing_and_other_bytes_are_refused(fixture
     add(&*store, &map, "a", b"other").await;
 }
 
-async fn images_come_in_pages_by_the_bytes_of_their_ids(fixture: &Fixture) {
+async fn images_are_paged_by_the_bytes_of_their_ids(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     assert!(store.images(&map, None, 9).await.unwrap().is_empty());
@@ -121,7 +121,7 @@ async fn images_are_looked_up_by_id_in_the_order_asked_for(fixture: &Fixture) {
     assert_eq!(store.images_by_id(&two, &ids(&["b"])).await.unwrap(), [None]);
 }
 
-async fn all_that_is_known_of_an_image_is_kept(fixture: &Fixture) {
+async fn all_fields_of_an_image_are_kept(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     let pose = Pose::Geographic(GeographicPose {
@@ -151,7 +151,7 @@ async fn all_that_is_known_of_an_image_is_kept(fixture: &Fixture) {
     assert_eq!(exported[0].image, image);
 }
 
-async fn positions_come_in_the_order_of_addition(fixture: &Fixture) {
+async fn poses_are_returned_in_the_order_of_addition(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     assert!(store.positions(&map).await.unwrap().is_empty());
@@ -204,7 +204,7 @@ async fn the_count_and_the_changes_follow_every_addition_and_removal(fixture: &F
     assert_eq!(fixture.open().await.index_state(&map).await.unwrap().images, 2);
 }
 
-/// Adds images at once; how many were created, and how many refused.
+/// Adds images concurrently; returns how many were created, and how many were rejected.
 async fn add_at_once(store: &Arc<dyn Store>, map: &Map, images: Vec<Image>) -> (usize, usize) {
     let adding = images.into_iter().map(|image| {
         let (store, map) = (Arc::clone(store), map.clone());
@@ -224,7 +224,7 @@ async fn add_at_once(store: &Arc<dyn Store>, map: &Map, images: Vec<Image>) -> (
     })
 }
 
-async fn of_many_who_add_an_image_at_once_one_creates_it(fixture: &Fixture) {
+async fn of_concurrent_additions_of_an_image_one_creates_it(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     for round in 1..=5 {
@@ -235,7 +235,7 @@ async fn of_many_who_add_an_image_at_once_one_creates_it(fixture: &Fixture) {
     }
 }
 
-async fn of_many_who_give_an_id_to_different_bytes_one_does(fixture: &Fixture) {
+async fn of_concurrent_additions_of_different_bytes_under_one_id_one_succeeds(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     let images = (0..8_u8).map(|number| image("a", &[number])).collect();
@@ -243,7 +243,7 @@ async fn of_many_who_give_an_id_to_different_bytes_one_does(fixture: &Fixture) {
     assert_eq!(store.images(&map, None, 9).await.unwrap().len(), 1);
 }
 
-async fn additions_and_removals_of_the_same_bytes_are_not_in_each_others_way(fixture: &Fixture) {
+async fn concurrent_additions_and_removals_of_the_same_bytes_succeed(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 3)).await.unwrap();
     add(&*store, &map, "stays", b"bytes").await;
@@ -280,7 +280,7 @@ async fn images_of_maps_do_not_mix(fixture: &Fixture) {
     assert_eq!(store.image(&two, &in_two.id).await.unwrap(), Some(in_two));
 }
 
-async fn images_are_exported_in_pages_with_their_descriptors_to_the_last_bit(fixture: &Fixture) {
+async fn images_are_exported_in_pages_with_bit_identical_descriptors(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 100)).await.unwrap();
     let mut images = Vec::new();

@@ -1,4 +1,4 @@
-//! Jobs: who takes which, for how long, and what becomes of them.
+//! Jobs: claims, leases, releases, retries and cancellation.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -7,32 +7,27 @@ use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast;
 use uuid::Uuid;
-use whereabouts_core::{Candidate, Description, Digest, Job, JobState, Priority, StandIn, Usage};
-use whereabouts_store::{
-    Claim, IdempotencyRecord, JobFilter, JobRecord, Progress, Release, Step, Store, StoreError,
-};
+use whereabouts_core::{Candidate, Description, Job, JobState, Priority, StandIn, Usage};
+use whereabouts_store::{Claim, JobFilter, JobRecord, Release, Step, Store, StoreError};
 
 use crate::support::{
-    Fixture, claim, descriptor, eventually, image, odd_texts, record, submit, submit_record,
+    Fixture, claim, descriptor, eventually, image, odd_texts, record, submit, submit_record, until,
 };
 
 contract!(
-    a_job_comes_back_as_it_was_given,
-    jobs_are_taken_by_priority_and_then_by_age,
-    a_job_is_taken_by_one_worker_at_a_time,
-    a_job_whose_lease_ran_out_is_taken_again_and_nobody_hears_the_first_worker,
-    a_released_job_waits_for_its_time,
-    a_release_that_does_not_count_takes_the_attempt_back,
+    a_job_is_returned_as_submitted,
+    jobs_are_claimed_by_priority_and_then_by_age,
+    a_job_is_claimed_by_one_worker_at_a_time,
+    a_job_with_an_expired_lease_is_claimed_again_and_the_first_worker_is_fenced_off,
+    a_released_job_waits_until_it_is_due,
+    a_deferred_release_does_not_count_as_an_attempt,
     steps_add_up_and_a_description_replaces_that_of_the_same_image,
-    a_cancelled_job_is_nobodys,
-    a_job_that_ended_without_success_may_be_queued_again,
-    the_queue_holds_exactly_so_many,
-    every_change_is_told,
-    jobs_are_listed_newest_first_by_map_and_state_a_page_at_a_time,
-    jobs_are_searched_for_a_text,
-    a_request_that_is_done_again_finds_its_job,
-    a_job_that_is_not_there_is_not_found,
-    a_job_outlives_a_restart_and_is_free_of_the_worker_that_did_not,
+    a_cancelled_job_is_held_by_no_worker,
+    an_unsuccessful_job_may_be_queued_again,
+    the_queue_limit_is_exact,
+    every_change_of_a_job_is_notified,
+    an_unknown_job_is_not_found,
+    a_job_survives_a_restart_and_is_released_by_the_worker_that_died,
     odd_texts_in_a_job_survive,
 );
 
@@ -48,7 +43,7 @@ async fn job(store: &dyn Store, id: Uuid) -> Job {
     store.job(id).await.unwrap().unwrap().job
 }
 
-async fn a_job_comes_back_as_it_was_given(fixture: &Fixture) {
+async fn a_job_is_returned_as_submitted(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut given = record("m", b"frame");
     let frame = image("frame", b"frame");
@@ -74,7 +69,7 @@ async fn a_job_comes_back_as_it_was_given(fixture: &Fixture) {
     same(&JobRecord { job: given.job.clone(), claims: 0, ..taken });
 }
 
-async fn jobs_are_taken_by_priority_and_then_by_age(fixture: &Fixture) {
+async fn jobs_are_claimed_by_priority_and_then_by_age(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut jobs = Vec::new();
     for priority in [
@@ -95,7 +90,7 @@ async fn jobs_are_taken_by_priority_and_then_by_age(fixture: &Fixture) {
         let (seconds, nanoseconds) = id.get_timestamp().unwrap().to_unix();
         Timestamp::new(seconds as i64, nanoseconds as i32).unwrap()
     };
-    // What is left then, the oldest first.
+    // The open jobs after each step, oldest first.
     let left = [&[0, 1, 3, 4, 5][..], &[0, 1, 3, 5], &[0, 3, 5], &[0, 3], &[3], &[]];
     for (expected, left) in [2, 4, 1, 5, 0, 3].into_iter().zip(left) {
         let taken = claim(&*store).await.unwrap();
@@ -108,7 +103,7 @@ async fn jobs_are_taken_by_priority_and_then_by_age(fixture: &Fixture) {
     assert_eq!(store.queued().await.unwrap(), 0);
 }
 
-async fn a_job_is_taken_by_one_worker_at_a_time(fixture: &Fixture) {
+async fn a_job_is_claimed_by_one_worker_at_a_time(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut submitted = HashSet::new();
     for _ in 0..30 {
@@ -129,14 +124,15 @@ async fn a_job_is_taken_by_one_worker_at_a_time(fixture: &Fixture) {
     assert_eq!(taken.into_iter().collect::<HashSet<_>>(), submitted);
 }
 
-/// Takes a job for a moment.
+const BRIEF_LEASE: SignedDuration = SignedDuration::from_millis(50);
+
+/// Claims a job with a lease of a moment.
 async fn claim_briefly(store: &dyn Store) -> JobRecord {
     let now = Timestamp::now();
-    let lease = SignedDuration::from_millis(50);
-    store.claim(now, now + lease).await.unwrap().unwrap()
+    store.claim(now, now + BRIEF_LEASE).await.unwrap().unwrap()
 }
 
-/// Nothing that is done with the claim changes the job.
+/// Asserts that the claim can no longer change the job.
 async fn is_void(store: &dyn Store, old: &JobRecord, claim: Claim) {
     let before = serde_json::to_value(store.job(claim.job).await.unwrap().unwrap()).unwrap();
     let usage = Usage { calls: 99, ..Usage::default() };
@@ -147,7 +143,7 @@ async fn is_void(store: &dyn Store, old: &JobRecord, claim: Claim) {
     assert_eq!(before, after);
 }
 
-async fn a_job_whose_lease_ran_out_is_taken_again_and_nobody_hears_the_first_worker(
+async fn a_job_with_an_expired_lease_is_claimed_again_and_the_first_worker_is_fenced_off(
     fixture: &Fixture,
 ) {
     let store = fixture.open().await;
@@ -162,16 +158,17 @@ async fn a_job_whose_lease_ran_out_is_taken_again_and_nobody_hears_the_first_wor
     store.finish(second.claim(), ended(&second, JobState::Failed)).await.unwrap();
     assert_eq!(job(&*store, id).await.state, JobState::Failed);
     is_void(&*store, &second, second.claim()).await;
-    // While nobody else has taken it, a worker may end it late.
+    // As long as no other worker has claimed it, a worker may finish it late.
     let id = submit(&*store, "m", b"frame").await;
     let late = claim_briefly(&*store).await;
-    tokio::time::sleep(std::time::Duration::from_millis(60)).await;
+    let lease_ends = Timestamp::now() + BRIEF_LEASE;
+    until(async || Timestamp::now() > lease_ends).await;
     store.finish(late.claim(), ended(&late, JobState::Succeeded)).await.unwrap();
     assert_eq!(job(&*store, id).await.state, JobState::Succeeded);
     assert!(claim(&*store).await.is_none());
 }
 
-async fn a_released_job_waits_for_its_time(fixture: &Fixture) {
+async fn a_released_job_waits_until_it_is_due(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = submit(&*store, "m", b"frame").await;
     let first = claim(&*store).await.unwrap();
@@ -186,14 +183,14 @@ async fn a_released_job_waits_for_its_time(fixture: &Fixture) {
     store.release(second.claim(), later).await.unwrap();
     assert!(claim(&*store).await.is_none());
     assert_eq!(store.queued().await.unwrap(), 1);
-    // Others pass it.
+    // Other jobs overtake it.
     let other = submit(&*store, "m", b"frame").await;
     assert_eq!(claim(&*store).await.unwrap().job.id, other);
     assert_eq!(eventually(async || claim(&*store).await).await.job.id, id);
     assert!(Timestamp::now() >= not_before);
 }
 
-async fn a_release_that_does_not_count_takes_the_attempt_back(fixture: &Fixture) {
+async fn a_deferred_release_does_not_count_as_an_attempt(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = submit(&*store, "m", b"frame").await;
     for _ in 0..3 {
@@ -242,7 +239,7 @@ async fn steps_add_up_and_a_description_replaces_that_of_the_same_image(fixture:
     assert_eq!(known.descriptions[0].stands_in, stands_in);
 }
 
-async fn a_cancelled_job_is_nobodys(fixture: &Fixture) {
+async fn a_cancelled_job_is_held_by_no_worker(fixture: &Fixture) {
     let store = fixture.open().await;
     let waiting = submit(&*store, "m", b"frame").await;
     let cancelled = store.cancel(waiting).await.unwrap();
@@ -254,11 +251,11 @@ async fn a_cancelled_job_is_nobodys(fixture: &Fixture) {
     store.cancel(running).await.unwrap();
     is_void(&*store, &taken, taken.claim()).await;
     assert_eq!(store.queued().await.unwrap(), 0);
-    // One that has ended stays as it ended.
+    // An ended job does not change.
     assert_eq!(store.cancel(waiting).await.unwrap(), cancelled);
 }
 
-async fn a_job_that_ended_without_success_may_be_queued_again(fixture: &Fixture) {
+async fn an_unsuccessful_job_may_be_queued_again(fixture: &Fixture) {
     let store = fixture.open().await;
     for state in [JobState::Failed, JobState::Degraded, JobState::Cancelled] {
         let id = submit(&*store, "m", b"frame").await;
@@ -285,10 +282,10 @@ async fn a_job_that_ended_without_success_may_be_queued_again(fixture: &Fixture)
     }
 }
 
-async fn the_queue_holds_exactly_so_many(fixture: &Fixture) {
+async fn the_queue_limit_is_exact(fixture: &Fixture) {
     let store = fixture.open().await;
     const LIMIT: usize = 10;
-    // One runs, which counts as well.
+    // A running job counts, too.
     submit(&*store, "m", b"frame").await;
     let running = claim(&*store).await.unwrap();
     let submitting = (0..30).map(|_| {
@@ -308,72 +305,43 @@ async fn the_queue_holds_exactly_so_many(fixture: &Fixture) {
     assert_eq!(store.queued().await.unwrap(), LIMIT);
     store.finish(running.claim(), ended(&running, JobState::Failed)).await.unwrap();
     store.submit(record("m", b"frame"), LIMIT).await.unwrap();
-    // One that is queued again is not refused.
+    // A job that is queued again is not rejected.
     store.retry(running.job.id).await.unwrap();
     assert_eq!(store.queued().await.unwrap(), LIMIT + 1);
     assert!(store.submit(record("m", b"frame"), LIMIT).await.is_err());
 }
 
-/// The next change of a job that is told.
-async fn told(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
-    let patience = std::time::Duration::from_secs(20);
-    tokio::time::timeout(patience, async { while changes.recv().await.unwrap() != of {} })
+/// Waits for the next notification about a job.
+async fn notified(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
+    let timeout = std::time::Duration::from_secs(20);
+    tokio::time::timeout(timeout, async { while changes.recv().await.unwrap() != of {} })
         .await
         .unwrap();
 }
 
-async fn every_change_is_told(fixture: &Fixture) {
+async fn every_change_of_a_job_is_notified(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut changes = store.changes();
     let id = submit(&*store, "m", b"frame").await;
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     let taken = claim(&*store).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     let step = Step { usage: Usage::default(), description: None };
     store.progress(taken.claim(), step).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     store.release(taken.claim(), release("why")).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     let taken = claim(&*store).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     store.finish(taken.claim(), ended(&taken, JobState::Failed)).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     store.retry(id).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
     store.cancel(id).await.unwrap();
-    told(&mut changes, id).await;
+    notified(&mut changes, id).await;
 }
 
-async fn jobs_are_listed_newest_first_by_map_and_state_a_page_at_a_time(fixture: &Fixture) {
-    let store = fixture.open().await;
-    let mut ids = Vec::new();
-    for map in ["yard", "vault", "yard", "yard", "vault"] {
-        ids.push(submit(&*store, map, b"frame").await);
-    }
-    for id in &ids[..2] {
-        store.cancel(*id).await.unwrap();
-    }
-    let listed = async |map: Option<&str>, state, before, limit| -> Vec<usize> {
-        let map = map.map(|map| map.parse().unwrap());
-        let filter = JobFilter { map, state, text: None };
-        let jobs = store.jobs(&filter, before, limit).await.unwrap().jobs;
-        jobs.iter().map(|job| ids.iter().position(|id| *id == job.id).unwrap()).collect()
-    };
-    let (queued, cancelled) = (Some(JobState::Queued), Some(JobState::Cancelled));
-    assert_eq!(listed(None, None, None, 9).await, [4, 3, 2, 1, 0]);
-    assert_eq!(listed(None, None, None, 2).await, [4, 3]);
-    assert_eq!(listed(None, None, Some(ids[3]), 2).await, [2, 1]);
-    assert_eq!(listed(Some("yard"), None, None, 9).await, [3, 2, 0]);
-    assert_eq!(listed(Some("yard"), queued, None, 9).await, [3, 2]);
-    assert_eq!(listed(Some("yard"), queued, Some(ids[3]), 9).await, [2]);
-    assert_eq!(listed(None, cancelled, None, 1).await, [1]);
-    assert_eq!(listed(None, Some(JobState::Running), None, 9).await, [0; 0]);
-    assert_eq!(listed(Some("elsewhere"), None, None, 9).await, [0; 0]);
-    claim(&*store).await.unwrap();
-    assert_eq!(listed(None, Some(JobState::Running), None, 9).await, [2]);
-}
-
-async fn a_job_that_is_not_there_is_not_found(fixture: &Fixture) {
+async fn an_unknown_job_is_not_found(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = submit(&*store, "m", b"frame").await;
     let taken = claim(&*store).await.unwrap();
@@ -386,7 +354,7 @@ async fn a_job_that_is_not_there_is_not_found(fixture: &Fixture) {
     assert_eq!(taken.job.id, id);
 }
 
-async fn a_job_outlives_a_restart_and_is_free_of_the_worker_that_did_not(fixture: &Fixture) {
+async fn a_job_survives_a_restart_and_is_released_by_the_worker_that_died(fixture: &Fixture) {
     let store = fixture.open().await;
     let running = submit(&*store, "m", b"frame").await;
     let waiting = submit(&*store, "m", b"frame").await;
@@ -434,51 +402,4 @@ async fn odd_texts_in_a_job_survive(fixture: &Fixture) {
         assert_eq!(store.job(id).await.unwrap().unwrap().job, job);
         assert_eq!(store.jobs(&JobFilter::default(), None, 1).await.unwrap().jobs, [job]);
     }
-}
-
-async fn jobs_are_searched_for_a_text(fixture: &Fixture) {
-    let store = fixture.open().await;
-    let mut ids = Vec::new();
-    for map in ["town", "yard", "town"] {
-        ids.push(submit(&*store, map, b"frame").await);
-    }
-    let search = async |text: &str, limit| -> Vec<Uuid> {
-        let filter = JobFilter { text: Some(text.into()), ..JobFilter::default() };
-        let list = store.jobs(&filter, None, limit).await.unwrap();
-        assert_eq!(list.searched_to, None);
-        list.jobs.iter().map(|job| job.id).collect()
-    };
-    assert_eq!(search("TOW", 10).await, [ids[2], ids[0]]);
-    assert_eq!(search("TOW", 1).await, [ids[2]]);
-    assert_eq!(search(&ids[1].to_string(), 10).await, [ids[1]]);
-    for text in ["nowhere", "%", "\0", "'"] {
-        assert!(search(text, 10).await.is_empty(), "{text:?}");
-    }
-}
-
-async fn a_request_that_is_done_again_finds_its_job(fixture: &Fixture) {
-    let store = fixture.open().await;
-    let running = || {
-        let progress = Progress::Running { process: Uuid::now_v7(), job: None };
-        IdempotencyRecord { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
-    };
-    let reserve = async || {
-        store.reserve_request("r", running(), Timestamp::UNIX_EPOCH).await.unwrap();
-    };
-    let _pin = store.put_blob(Digest::of(b"frame"), "frame".into()).await.unwrap();
-    reserve().await;
-    let first = record("m", b"frame");
-    let id = first.job.id;
-    assert_eq!(store.submit_once(first, 10, "r").await.unwrap(), None);
-    let again = store.submit_once(record("m", b"frame"), 10, "r").await.unwrap();
-    assert_eq!(again.unwrap().id, id);
-    assert_eq!(store.queued().await.unwrap(), 1);
-    // Another request has a job of its own; so has one that nobody remembers.
-    assert_eq!(store.submit_once(record("m", b"frame"), 10, "other").await.unwrap(), None);
-    store.forget_request("r").await.unwrap();
-    reserve().await;
-    assert_eq!(store.submit_once(record("m", b"frame"), 10, "r").await.unwrap(), None);
-    assert_eq!(store.queued().await.unwrap(), 3);
-    let full = store.submit_once(record("m", b"frame"), 3, "third").await;
-    assert!(matches!(full, Err(StoreError::QueueFull { limit: 3 })));
 }

@@ -1,8 +1,8 @@
-//! The contract of the store: what its traits promise, held against both stores.
+//! The contract of the store: what its traits promise, tested against both stores.
 //!
 //! Each promise is one function, which runs once with the embedded store and once with PostgreSQL; those about
-//! picture bytes also with a server that speaks S3. `processes` and `outages` are about PostgreSQL alone: what
-//! several processes promise each other, and what happens when the database or the object store is away.
+//! picture bytes also with an S3-compatible server. `processes`, `limits`, `schema` and `outages` are about PostgreSQL
+//! only: what several processes can rely on, and what happens when the database or the object store is unavailable.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
@@ -14,12 +14,15 @@ mod blobs;
 mod descriptions;
 mod drafts;
 mod images;
+mod job_lists;
 mod jobs;
 mod keys;
+mod limits;
 mod maps;
 mod outages;
 mod processes;
 mod retention;
+mod schema;
 mod search;
 mod usage;
 mod webhooks;

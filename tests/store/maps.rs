@@ -1,4 +1,4 @@
-//! Maps: made, changed, deleted, and what was measured in them.
+//! Maps: created, changed, deleted, and calibrated.
 
 use std::sync::Arc;
 
@@ -13,37 +13,37 @@ use whereabouts_store::{IndexState, Store, StoreError};
 use crate::support::{Fixture, add, descriptor, fill, image, is_kept, map, next, odd_texts};
 
 contract!(
-    a_map_is_made_once_and_its_scene_and_description_change,
-    what_shapes_the_descriptors_changes_only_while_there_are_no_images,
+    a_map_is_created_once_and_its_scene_and_description_can_change,
+    descriptor_settings_are_fixed_once_there_are_images,
     maps_are_listed_by_the_bytes_of_their_names,
-    a_map_that_is_put_by_many_at_once_is_made_by_one,
+    of_concurrent_creations_of_a_map_one_succeeds,
     a_deleted_map_is_gone_for_good_and_its_name_is_free,
-    a_deleted_map_takes_its_bytes_along,
+    a_deleted_map_is_deleted_with_its_bytes,
     a_map_may_be_deleted_while_images_are_added,
-    a_map_and_all_in_it_is_there_after_a_restart,
-    what_was_measured_is_kept_for_its_revision,
+    a_map_with_its_images_survives_a_restart,
+    a_calibration_is_kept_for_its_revision,
 );
 
-async fn a_map_is_made_once_and_its_scene_and_description_change(fixture: &Fixture) {
+async fn a_map_is_created_once_and_its_scene_and_description_can_change(fixture: &Fixture) {
     let store = fixture.open().await;
-    let wanted = map("m", 3);
-    assert_eq!(store.map(&wanted.name).await.unwrap(), None);
-    assert_eq!(store.put_map(wanted.clone()).await.unwrap(), (wanted.clone(), true));
-    assert_eq!(store.map(&wanted.name).await.unwrap(), Some(wanted.clone()));
-    // The same again, by one who knows no uid.
-    assert_eq!(store.put_map(map("m", 3)).await.unwrap(), (wanted.clone(), false));
-    add(&*store, &wanted, "a", b"a").await;
+    let requested = map("m", 3);
+    assert_eq!(store.map(&requested.name).await.unwrap(), None);
+    assert_eq!(store.put_map(requested.clone()).await.unwrap(), (requested.clone(), true));
+    assert_eq!(store.map(&requested.name).await.unwrap(), Some(requested.clone()));
+    // The same again, with another uid.
+    assert_eq!(store.put_map(map("m", 3)).await.unwrap(), (requested.clone(), false));
+    add(&*store, &requested, "a", b"a").await;
     for text in odd_texts() {
         let other = Map { scene: Scene::Indoor, description: Some(text), ..map("m", 3) };
         let (changed, new) = store.put_map(other.clone()).await.unwrap();
-        let expected = Map { uid: wanted.uid, created_at: wanted.created_at, ..other };
+        let expected = Map { uid: requested.uid, created_at: requested.created_at, ..other };
         assert_eq!((&changed, new), (&expected, false));
-        assert_eq!(store.map(&wanted.name).await.unwrap(), Some(expected));
+        assert_eq!(store.map(&requested.name).await.unwrap(), Some(expected));
     }
-    assert_eq!(store.index_state(&wanted).await.unwrap().images, 1);
+    assert_eq!(store.index_state(&requested).await.unwrap().images, 1);
 }
 
-async fn what_shapes_the_descriptors_changes_only_while_there_are_no_images(fixture: &Fixture) {
+async fn descriptor_settings_are_fixed_once_there_are_images(fixture: &Fixture) {
     let store = fixture.open().await;
     let (mut known, _) = store.put_map(map("m", 3)).await.unwrap();
     let others: [fn(Map) -> Map; 5] = [
@@ -54,16 +54,16 @@ async fn what_shapes_the_descriptors_changes_only_while_there_are_no_images(fixt
         |map| Map { dim: 5, ..map },
     ];
     for other in others {
-        // Also where an image was, and is no more.
+        // Also after an image was added and removed.
         let gone = add(&*store, &known, "a", b"a").await;
-        let wanted = other(Map { uid: map("m", 3).uid, ..known.clone() });
-        let refused = store.put_map(wanted.clone()).await.unwrap_err();
+        let requested = other(Map { uid: map("m", 3).uid, ..known.clone() });
+        let refused = store.put_map(requested.clone()).await.unwrap_err();
         assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
         assert_eq!(store.map(&known.name).await.unwrap(), Some(known.clone()));
         assert!(store.delete_image(&known, &gone.id).await.unwrap());
-        let (changed, new) = store.put_map(wanted.clone()).await.unwrap();
-        assert_eq!((&changed, new), (&wanted, false));
-        // Who knew it as it was is told that it is gone.
+        let (changed, new) = store.put_map(requested.clone()).await.unwrap();
+        assert_eq!((&changed, new), (&requested, false));
+        // The former revision is superseded.
         let query = descriptor(&gone, known.dim);
         let refused = store.search(&known, query, 1, SearchMode::Fast).await.unwrap_err();
         assert!(matches!(refused, StoreError::NotFound(_)), "{refused}");
@@ -87,7 +87,7 @@ async fn maps_are_listed_by_the_bytes_of_their_names(fixture: &Fixture) {
     assert_eq!(maps.iter().map(|map| map.name.as_str()).collect::<Vec<_>>(), names);
 }
 
-async fn a_map_that_is_put_by_many_at_once_is_made_by_one(fixture: &Fixture) {
+async fn of_concurrent_creations_of_a_map_one_succeeds(fixture: &Fixture) {
     let store = fixture.open().await;
     let put = join_all((0..8).map(|_| store.put_map(map("m", 3)))).await;
     let put: Vec<_> = put.into_iter().map(Result::unwrap).collect();
@@ -113,7 +113,7 @@ async fn a_deleted_map_is_gone_for_good_and_its_name_is_free(fixture: &Fixture) 
     add(&*store, &new, "a", b"other").await;
 }
 
-/// Nobody can do anything with a map that was deleted.
+/// Asserts that every operation on a deleted map fails.
 async fn is_gone(store: &dyn Store, map: &Map) {
     let image = image("a", b"a");
     let query = descriptor(&image, map.dim);
@@ -138,11 +138,11 @@ async fn is_gone(store: &dyn Store, map: &Map) {
     assert!(store.images(map, None, 9).await.unwrap().is_empty());
 }
 
-async fn a_deleted_map_takes_its_bytes_along(fixture: &Fixture) {
+async fn a_deleted_map_is_deleted_with_its_bytes(fixture: &Fixture) {
     let store = fixture.open().await;
     let (gone, _) = store.put_map(map("gone", 3)).await.unwrap();
     let (stays, _) = store.put_map(map("stays", 3)).await.unwrap();
-    // More than are cleared away in one step.
+    // More than one step of the sweep removes.
     let frames: Vec<_> = (0..300).map(|number| format!("frame {number}")).collect();
     join_all(frames.iter().map(|frame| add(&*store, &gone, frame, frame.as_bytes()))).await;
     add(&*store, &stays, "a", frames[7].as_bytes()).await;
@@ -177,7 +177,7 @@ async fn a_map_may_be_deleted_while_images_are_added(fixture: &Fixture) {
             })
         });
         let adding: Vec<_> = adding.collect();
-        // Not before there is something to delete.
+        // Wait until there is something to delete.
         crate::support::eventually(async || {
             let state = store.index_state(&map).await.unwrap();
             (state.images > 20).then_some(())
@@ -190,7 +190,7 @@ async fn a_map_may_be_deleted_while_images_are_added(fixture: &Fixture) {
     drop(pins);
 }
 
-async fn a_map_and_all_in_it_is_there_after_a_restart(fixture: &Fixture) {
+async fn a_map_with_its_images_survives_a_restart(fixture: &Fixture) {
     let store = fixture.open().await;
     let (known, _) = store.put_map(map("m", 16)).await.unwrap();
     let mut images = Vec::new();
@@ -213,7 +213,7 @@ async fn a_map_and_all_in_it_is_there_after_a_restart(fixture: &Fixture) {
     add(&*store, &known, "d", b"d").await;
 }
 
-async fn what_was_measured_is_kept_for_its_revision(fixture: &Fixture) {
+async fn a_calibration_is_kept_for_its_revision(fixture: &Fixture) {
     let store = fixture.open().await;
     let (known, _) = store.put_map(map("m", 3)).await.unwrap();
     assert_eq!(store.calibration(&known).await.unwrap(), None);

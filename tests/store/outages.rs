@@ -1,4 +1,4 @@
-//! A database and an object store that are away, silent, or back again.
+//! A database and an object store that are unreachable, hanging, or back again.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
@@ -20,17 +20,17 @@ use whereabouts_store::{BlobStore, JobStore, MapStore, Store, StoreError};
 
 use crate::support::{Database, Pictures, Tuning, eventually, map, record, s3, submit};
 
-/// What stands between the store and a server, and lets bytes through or keeps them.
+/// A proxy between the store and a server that can hold back bytes and cut connections.
 struct Wire {
     address: SocketAddr,
-    /// The connections that there are, and will be.
+    /// Current and future connections.
     now: Mutex<Connections>,
     _end: DropGuard,
 }
 
 #[derive(Clone)]
 struct Connections {
-    /// Whether bytes come through.
+    /// Whether bytes are forwarded.
     flow: watch::Sender<bool>,
     /// Ends them.
     cut: CancellationToken,
@@ -69,7 +69,7 @@ impl Wire {
         wire
     }
 
-    /// From now on nothing comes through, and nobody is told.
+    /// From now on no bytes are forwarded, and no connection is closed.
     fn freeze(&self) {
         self.now.lock().unwrap().flow.send_replace(false);
     }
@@ -78,12 +78,12 @@ impl Wire {
         self.now.lock().unwrap().flow.send_replace(true);
     }
 
-    /// Leaves the connections that there are as they are; later ones flow.
+    /// Later connections are forwarded; current ones stay as they are.
     fn abandon(&self) {
         *self.now.lock().unwrap() = Connections::new();
     }
 
-    /// Ends the connections that there are; later ones flow.
+    /// Cuts the current connections; later ones are forwarded.
     fn cut(&self) {
         std::mem::replace(&mut *self.now.lock().unwrap(), Connections::new()).cut.cancel();
     }
@@ -101,14 +101,14 @@ async fn carry(mut from: OwnedReadHalf, mut to: OwnedWriteHalf, flow: &watch::Se
 
 const TIMEOUT: Duration = Duration::from_millis(700);
 
-/// As soon as a busy machine gets there.
+/// Long enough for a busy machine.
 const SOON: Duration = Duration::from_millis(700 + 1500);
 
 fn hasty() -> Tuning {
     Tuning { timeout: TIMEOUT, lifetime: Duration::from_secs(60), ..Tuning::default() }
 }
 
-/// A store that speaks to its database through a wire.
+/// A store that reaches its database through the proxy.
 async fn wired(database: &Database) -> (Arc<Wire>, PostgresStore) {
     let options = database.options();
     let wire = Wire::to(options.get_host().to_owned(), options.get_port()).await;
@@ -122,7 +122,7 @@ fn settings_at(database: &Database, address: SocketAddr) -> PostgresSettings {
     PostgresSettings { url: options.to_url_lossy().to_string(), ..database.settings(hasty()) }
 }
 
-/// Every kind of call says in time that the database is away.
+/// Asserts that every kind of call reports within the timeout that the database is unavailable.
 async fn is_away(store: &PostgresStore) {
     let (now, began) = (Timestamp::now(), Instant::now());
     let lease = now + SignedDuration::from_secs(60);
@@ -152,25 +152,25 @@ async fn is_away(store: &PostgresStore) {
     assert!(began.elapsed() < SOON, "{:?}", began.elapsed());
 }
 
-/// It works again, and hears again.
-async fn is_back(store: &PostgresStore, beside: &dyn Store) {
+/// Waits until calls succeed and notifications arrive again.
+async fn is_back(store: &PostgresStore, direct: &dyn Store) {
     eventually(async || store.maps().await.ok()).await;
-    // As many calls at once as there are connections.
+    // As many concurrent calls as there are connections.
     let asking = || join_all((0..16).map(|_| store.maps()));
     eventually(async || asking().await.into_iter().all(|maps| maps.is_ok()).then_some(())).await;
     let mut changes = store.changes();
     eventually(async || {
-        let id = submit(beside, "m", b"frame").await;
-        let told = async { while changes.recv().await.unwrap() != id {} };
-        tokio::time::timeout(Duration::from_millis(500), told).await.ok()
+        let id = submit(direct, "m", b"frame").await;
+        let notified = async { while changes.recv().await.unwrap() != id {} };
+        tokio::time::timeout(Duration::from_millis(500), notified).await.ok()
     })
     .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_silent_database_is_unavailable_in_time_and_works_again_when_it_speaks() {
+async fn a_hanging_database_is_unavailable_within_the_timeout_and_recovers() {
     let database = Database::migrated(Pictures::Folder).await;
-    let beside = database.open(Tuning::default()).await;
+    let direct = database.open(Tuning::default()).await;
     let (wire, store) = wired(&database).await;
     submit(&store, "m", b"frame").await;
     for _ in 0..2 {
@@ -178,46 +178,46 @@ async fn a_silent_database_is_unavailable_in_time_and_works_again_when_it_speaks
         is_away(&store).await;
         is_away(&store).await;
         wire.thaw();
-        is_back(&store, &beside).await;
+        is_back(&store, &direct).await;
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn connections_that_died_in_silence_are_replaced() {
+async fn connections_that_died_silently_are_replaced() {
     let database = Database::migrated(Pictures::Folder).await;
-    let beside = database.open(Tuning::default()).await;
+    let direct = database.open(Tuning::default()).await;
     let (wire, store) = wired(&database).await;
     submit(&store, "m", b"frame").await;
     wire.freeze();
     is_away(&store).await;
     wire.abandon();
-    is_back(&store, &beside).await;
+    is_back(&store, &direct).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_database_that_breaks_off_is_spoken_to_again() {
+async fn a_broken_connection_to_the_database_is_opened_again() {
     let database = Database::migrated(Pictures::Folder).await;
-    let beside = database.open(Tuning::default()).await;
+    let direct = database.open(Tuning::default()).await;
     let (wire, store) = wired(&database).await;
     let mut changes = store.changes();
     submit(&store, "m", b"frame").await;
     wire.cut();
-    // What changes while nobody listens is told of afterwards.
-    let id = submit(&beside, "m", b"frame").await;
-    let told = async { while changes.recv().await.unwrap() != id {} };
-    tokio::time::timeout(Duration::from_secs(20), told).await.unwrap();
-    is_back(&store, &beside).await;
+    // A change that was missed while the listener was away is notified afterwards.
+    let id = submit(&direct, "m", b"frame").await;
+    let notified = async { while changes.recv().await.unwrap() != id {} };
+    tokio::time::timeout(Duration::from_secs(20), notified).await.unwrap();
+    is_back(&store, &direct).await;
 }
 
-/// An address where nobody listens.
-async fn nobody() -> SocketAddr {
+/// An address without a listener.
+async fn unused_address() -> SocketAddr {
     TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap()
 }
 
 #[tokio::test]
-async fn a_database_that_is_not_there_is_unavailable_in_time() {
+async fn an_absent_database_is_unavailable_within_the_timeout() {
     let database = Database::empty(Pictures::Folder).await;
-    let settings = settings_at(&database, nobody().await);
+    let settings = settings_at(&database, unused_address().await);
     let began = Instant::now();
     let opened = PostgresStore::open(settings.clone(), database.objects(), Uuid::now_v7()).await;
     for error in [opened.err().unwrap(), migrate(&settings).await.unwrap_err()] {
@@ -227,11 +227,11 @@ async fn a_database_that_is_not_there_is_unavailable_in_time() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_object_store_that_is_away_is_unavailable_in_time() {
+async fn an_absent_object_store_is_unavailable_within_the_timeout() {
     let database = Database::migrated(Pictures::Folder).await;
-    // Nobody is there, or somebody who never answers.
+    // An address without a listener, and one that never answers.
     let silent = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    for address in [nobody().await, silent.local_addr().unwrap()] {
+    for address in [unused_address().await, silent.local_addr().unwrap()] {
         let objects = s3("away", &format!("http://{address}"), TIMEOUT);
         let settings = database.settings(hasty());
         let store = PostgresStore::open(settings, objects, Uuid::now_v7()).await.unwrap();

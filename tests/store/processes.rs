@@ -1,38 +1,41 @@
-//! What several processes that share a PostgreSQL promise each other.
+//! What several processes that share a PostgreSQL can rely on.
 
 use std::collections::HashSet;
 use std::time::Duration;
 
 use futures_util::future::join_all;
-use jiff::civil::date;
 use jiff::{SignedDuration, Timestamp};
 use sqlx::ConnectOptions;
 use tokio::sync::broadcast;
 use uuid::Uuid;
 use whereabouts_core::{
-    ApiKey, DayUsage, Delivery, Digest, Job, JobState, KeyLimits, Role, StoredKey, StoredWebhook,
-    Usage, Webhook, WebhookEvent, WebhookSecret,
+    ApiKey, CachedDescription, Delivery, Digest, Job, JobState, KeyLimits, Role, StoredKey,
+    StoredWebhook, Webhook, WebhookEvent, WebhookSecret,
 };
-use whereabouts_core::{CachedDescription, Spent};
 use whereabouts_index::SearchMode;
-use whereabouts_store::DescriptionCache;
-use whereabouts_store::postgres::{PostgresStore, SchemaState, migrate, schema_of};
+use whereabouts_store::postgres::PostgresStore;
 use whereabouts_store::{
-    DraftStore, IdempotencyRecord, IdempotencyStore, JobStore, KeyStore, MapStore, Progress,
-    Retention, SharedLimits, StoreError, StoredDelivery, TokenRequest, UsageStore, WebhookStore,
+    DescriptionCache, DraftStore, IdempotencyRecord, IdempotencyStore, JobStore, KeyStore,
+    MapStore, Progress, Retention, StoreError, StoredDelivery, WebhookStore,
 };
 
 use crate::support::{
-    Database, Pictures, SHORT_LIFE, Tuning, add, claim, descriptor, eventually, fill, map, next,
-    record, submit,
+    Database, Pictures, Tuning, add, claim, descriptor, eventually, fill, map, next, record,
+    submit, until,
 };
 
-/// One that is not taken for dead because the machine is busy.
-fn long_lived() -> Tuning {
+/// A lifetime that no process misses because the machine is busy.
+pub fn long_lived() -> Tuning {
     Tuning { lifetime: Duration::from_secs(60), ..Tuning::default() }
 }
 
-async fn database() -> Database {
+/// The time of the database, and the first and the last moment at which a process counts as dead unless it sends
+/// another heartbeat; in seconds.
+const NOW: &str = "SELECT extract(epoch FROM now())";
+const EARLIEST_END: &str = "SELECT extract(epoch FROM min(alive_until)) FROM processes";
+const LATEST_END: &str = "SELECT extract(epoch FROM max(alive_until)) FROM processes";
+
+pub async fn database() -> Database {
     Database::migrated(Pictures::Folder).await
 }
 
@@ -41,7 +44,7 @@ fn in_a_minute() -> Timestamp {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn each_job_is_taken_by_one_worker_of_all_processes() {
+async fn each_job_is_claimed_by_one_worker_across_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
     let mut submitted = HashSet::new();
@@ -67,7 +70,7 @@ async fn each_job_is_taken_by_one_worker_of_all_processes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_queue_of_all_processes_holds_exactly_so_many() {
+async fn the_queue_limit_holds_across_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
     submit(&processes[0], "m", b"frame").await;
@@ -81,7 +84,7 @@ async fn the_queue_of_all_processes_holds_exactly_so_many() {
 }
 
 #[tokio::test]
-async fn a_job_of_a_dead_process_is_free_and_one_of_a_live_process_is_not() {
+async fn a_job_of_a_dead_process_can_be_claimed_and_one_of_a_live_process_cannot() {
     let database = database().await;
     let (dying, alive) =
         (database.open(Tuning::default()).await, database.open(long_lived()).await);
@@ -99,20 +102,21 @@ async fn a_job_of_a_dead_process_is_free_and_one_of_a_live_process_is_not() {
 }
 
 #[tokio::test]
-async fn a_process_that_goes_on_saying_so_is_alive_longer_than_its_lifetime() {
+async fn a_process_that_sends_heartbeats_keeps_its_jobs() {
     let database = database().await;
     // Long enough for a busy machine, short enough to wait for.
     let tuning = Tuning { lifetime: Duration::from_secs(2), ..Tuning::default() };
     let working = database.open(tuning).await;
     submit(&working, "m", b"frame").await;
     claim(&working).await.unwrap();
+    let first_end = database.number(LATEST_END).await;
     let other = database.open(Tuning::default()).await;
-    tokio::time::sleep(Duration::from_secs(3)).await;
+    until(async || database.number(NOW).await > first_end).await;
     assert!(claim(&other).await.is_none());
 }
 
 #[tokio::test]
-async fn a_draft_of_a_dead_process_is_nothing_to_the_next_one() {
+async fn a_draft_of_a_dead_process_does_not_block_the_next_one() {
     let database = database().await;
     let (dying, other) =
         (database.open(Tuning::default()).await, database.open(Tuning::default()).await);
@@ -132,7 +136,7 @@ async fn a_draft_of_a_dead_process_is_nothing_to_the_next_one() {
 }
 
 #[tokio::test]
-async fn a_draft_that_was_taken_from_a_process_replaces_nothing() {
+async fn a_draft_taken_over_by_another_process_replaces_nothing() {
     let database = database().await;
     let (silent, other) =
         (database.open(long_lived()).await, database.open(Tuning::default()).await);
@@ -140,7 +144,7 @@ async fn a_draft_that_was_taken_from_a_process_replaces_nothing() {
     let image = add(&silent, &map, "a", b"a").await;
     let mut draft = silent.draft(next(&map, 5)).await.unwrap();
     fill(draft.as_mut(), 5).await;
-    // It could not say that it is alive.
+    // It could not send heartbeats.
     database.run("UPDATE processes SET alive_until = now() - interval '1 hour'").await;
     let mut taken = other.draft(next(&map, 5)).await.unwrap();
     draft.write(&image, descriptor(&image, 5)).await.unwrap();
@@ -154,7 +158,7 @@ async fn a_draft_that_was_taken_from_a_process_replaces_nothing() {
 }
 
 #[tokio::test]
-async fn the_draft_of_a_deleted_map_goes_with_it_though_its_process_is_dead() {
+async fn the_draft_of_a_deleted_map_is_removed_though_its_process_is_dead() {
     let database = database().await;
     let (dying, other) =
         (database.open(Tuning::default()).await, database.open(Tuning::default()).await);
@@ -171,7 +175,7 @@ async fn the_draft_of_a_deleted_map_goes_with_it_though_its_process_is_dead() {
     .await;
 }
 
-/// Tables of descriptors.
+/// The number of descriptor tables.
 async fn tables(database: &Database) -> i64 {
     let mut connection = database.options().connect().await.unwrap();
     sqlx::query_scalar("SELECT count(*) FROM pg_tables WHERE tablename LIKE 'descriptors\\_%'")
@@ -181,7 +185,7 @@ async fn tables(database: &Database) -> i64 {
 }
 
 #[tokio::test]
-async fn what_one_process_replaces_the_others_are_told_of_when_they_ask() {
+async fn a_map_replaced_by_one_process_is_superseded_at_the_others() {
     let database = database().await;
     let tuning = Tuning { exact_up_to: 4, ..long_lived() };
     let (one, other) = (database.open(tuning).await, database.open(tuning).await);
@@ -214,7 +218,7 @@ fn running(process: Uuid) -> IdempotencyRecord {
 }
 
 #[tokio::test]
-async fn a_request_is_done_by_one_process_and_by_another_once_that_is_dead() {
+async fn a_request_is_reserved_by_one_process_until_that_is_dead() {
     let database = database().await;
     let (dying, alive) =
         (database.open(Tuning::default()).await, database.open(long_lived()).await);
@@ -257,7 +261,7 @@ async fn queue_ping(store: &PostgresStore, webhook: Uuid) -> Uuid {
 }
 
 #[tokio::test]
-async fn a_delivery_is_made_by_one_process_and_by_another_once_that_is_dead() {
+async fn a_delivery_is_due_to_one_process_until_that_is_dead() {
     let database = database().await;
     let (dying, alive) =
         (database.open(Tuning::default()).await, database.open(long_lived()).await);
@@ -282,7 +286,7 @@ async fn a_delivery_is_made_by_one_process_and_by_another_once_that_is_dead() {
 }
 
 #[tokio::test]
-async fn a_description_is_bought_by_one_process_and_by_another_if_nothing_comes_of_it() {
+async fn a_description_is_computed_by_one_process_until_its_lease_ends() {
     let database = database().await;
     let (dying, alive) =
         (database.open(Tuning::default()).await, database.open(long_lived()).await);
@@ -307,7 +311,7 @@ async fn a_description_is_bought_by_one_process_and_by_another_if_nothing_comes_
     alive.keep_description(key("kept"), description.clone()).await.unwrap();
     assert_eq!(other.description(&key("kept")).await.unwrap(), Some(description));
     assert!(begins(&other, "kept").await);
-    // Its time runs out, or its process dies.
+    // Its lease expires, or its process dies.
     let soon = Timestamp::now() + SignedDuration::from_millis(100);
     assert!(alive.acquire_lease(&key("late"), soon).await.unwrap());
     assert!(begins(&dying, "dying").await);
@@ -317,14 +321,14 @@ async fn a_description_is_bought_by_one_process_and_by_another_if_nothing_comes_
     eventually(async || begins(&other, "dying").await.then_some(())).await;
 }
 
-/// Waits for the news of a job.
-async fn told(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
+/// Waits for a notification about a job.
+async fn notified(changes: &mut broadcast::Receiver<Uuid>, of: Uuid) {
     let waiting = async { while changes.recv().await.unwrap() != of {} };
     tokio::time::timeout(Duration::from_secs(20), waiting).await.unwrap();
 }
 
 #[tokio::test]
-async fn every_process_hears_what_another_changes_from_the_moment_it_is_open() {
+async fn an_open_process_is_notified_of_the_changes_of_others() {
     let database = database().await;
     let one = database.open(long_lived()).await;
     let hook = webhook(&one).await;
@@ -334,11 +338,11 @@ async fn every_process_hears_what_another_changes_from_the_moment_it_is_open() {
         let mut queued = other.queued_deliveries();
         let mut keys = other.changed_keys().unwrap();
         let id = submit(&one, "m", b"frame").await;
-        told(&mut changes, id).await;
+        notified(&mut changes, id).await;
         one.cancel(id).await.unwrap();
-        told(&mut changes, id).await;
-        let patience = Duration::from_secs(20);
-        tokio::time::timeout(patience, queued.changed()).await.unwrap().unwrap();
+        notified(&mut changes, id).await;
+        let timeout = Duration::from_secs(20);
+        tokio::time::timeout(timeout, queued.changed()).await.unwrap().unwrap();
         queued.mark_unchanged();
         keys.mark_unchanged();
         let key = ApiKey {
@@ -352,10 +356,10 @@ async fn every_process_hears_what_another_changes_from_the_moment_it_is_open() {
             revoked_at: None,
         };
         one.put_key(StoredKey { key, digest: Digest::of(b"key") }).await.unwrap();
-        tokio::time::timeout(patience, keys.changed()).await.unwrap().unwrap();
+        tokio::time::timeout(timeout, keys.changed()).await.unwrap().unwrap();
         assert_eq!(other.keys().await.unwrap().len(), 1);
         queue_ping(&one, hook).await;
-        tokio::time::timeout(patience, queued.changed()).await.unwrap().unwrap();
+        tokio::time::timeout(timeout, queued.changed()).await.unwrap().unwrap();
     }
 }
 
@@ -364,119 +368,37 @@ async fn a_map_whose_index_is_being_built_can_be_deleted() {
     let database = database().await;
     let tuning = Tuning { exact_up_to: 50, ..long_lived() };
     let store = database.open(tuning).await;
-    for round in 0..3 {
+    let being_built =
+        "SELECT count(*) FROM pg_stat_progress_create_index WHERE datname = current_database()";
+    for moment in ["before the index is built", "while it is built", "once it is built"] {
         let (map, _) = store.put_map(map("m", 256)).await.unwrap();
         for number in 0..100_u32 {
             add(&store, &map, &number.to_string(), &number.to_le_bytes()).await;
         }
-        // Sometimes before the building begins, sometimes in the middle of it, sometimes after.
-        tokio::time::sleep(Duration::from_millis(400 * round)).await;
-        assert!(store.delete_map(&map.name).await.unwrap());
+        let is_built = async || store.index_state(&map).await.unwrap().graph;
+        match moment {
+            "before the index is built" => {}
+            // It may be over before it is seen.
+            "while it is built" => {
+                until(async || database.number(being_built).await > 0.0 || is_built().await).await;
+            }
+            _ => until(is_built).await,
+        }
+        assert!(store.delete_map(&map.name).await.unwrap(), "{moment}");
     }
 }
 
 #[tokio::test]
-async fn a_store_is_not_opened_before_its_schema_is_there() {
-    let database = Database::empty(Pictures::Folder).await;
-    let settings = database.settings(Tuning::default());
-    let open =
-        async || PostgresStore::open(settings.clone(), database.objects(), Uuid::now_v7()).await;
-    let refused = open().await.err().unwrap();
-    assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
-    assert!(refused.to_string().contains("whereabouts migrate"), "{refused}");
-    assert!(migrate(&settings).await.unwrap() > 0);
-    open().await.unwrap();
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_schema_is_migrated_once_however_many_do_it() {
-    let database = Database::empty(Pictures::Folder).await;
-    let settings = database.settings(Tuning::default());
-    let migrating = join_all((0..4).map(|_| migrate(&settings))).await;
-    migrating.into_iter().for_each(|done| assert!(done.is_ok(), "{done:?}"));
-    assert_eq!(migrate(&settings).await.unwrap(), 0);
-    assert_eq!(schema_of(&settings).await.unwrap(), SchemaState::UpToDate);
-    database.open(Tuning::default()).await;
-}
-
-#[tokio::test]
-async fn a_schema_that_is_later_by_one_step_is_borne_and_by_more_refused() {
-    let database = database().await;
-    let step = async |version: u32| {
-        let step = format!(
-            "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
-             VALUES ({version}, 'later', true, '', 0)"
-        );
-        database.run(&step).await;
-    };
-    let settings = database.settings(Tuning::default());
-    let open =
-        async || PostgresStore::open(settings.clone(), database.objects(), Uuid::now_v7()).await;
-    // While servers are replaced one after another, the old ones may have to start again.
-    step(9000).await;
-    open().await.unwrap();
-    assert_eq!(migrate(&settings).await.unwrap(), 0);
-    step(9001).await;
-    for refused in [open().await.err().unwrap(), migrate(&settings).await.unwrap_err()] {
-        assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
-        assert!(refused.to_string().contains("version 9001"), "{refused}");
-    }
-}
-
-#[tokio::test]
-async fn right_after_the_database_was_started_everybody_counts_as_alive() {
+async fn all_processes_count_as_alive_right_after_a_start_of_the_database() {
     let database = database().await;
     let dying = database.open(Tuning::default()).await;
     submit(&dying, "m", b"frame").await;
     claim(&dying).await.unwrap();
     drop(dying);
-    // To this one, the database was started a moment ago.
+    // Compared with its lifetime, the database was started a moment ago.
     let age = Duration::from_secs(24 * 3600);
     let other = database.open(Tuning { lifetime: age, ..Tuning::default() }).await;
-    tokio::time::sleep(3 * SHORT_LIFE).await;
+    // By its own account it is dead.
+    until(async || database.number(NOW).await > database.number(EARLIEST_END).await).await;
     assert!(claim(&other).await.is_none());
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_limit_by_the_minute_is_that_of_all_processes() {
-    let database = database().await;
-    let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
-    // As good as nothing comes back while this runs.
-    let draw = TokenRequest { per_minute: 0.01, required: 0.001, amount: 0.001 };
-    let mut taken = 0;
-    for number in 0..30 {
-        let drawn = processes[number % 2]
-            .take_tokens("key", [draw, TokenRequest::UNLIMITED])
-            .await
-            .unwrap();
-        taken += usize::from(drawn.granted);
-        assert!(drawn.granted || drawn.remaining[0] < 0.002);
-    }
-    assert!((9..=12).contains(&taken), "{taken}");
-    // What is given back is there for others, and no more than a minute's worth.
-    let back = TokenRequest { required: f64::MIN, amount: -1.0, ..draw };
-    processes[0].take_tokens("key", [back, TokenRequest::UNLIMITED]).await.unwrap();
-    let drawn = processes[1].take_tokens("key", [draw, TokenRequest::UNLIMITED]).await.unwrap();
-    assert!(drawn.granted && drawn.remaining[0] < 0.01, "{drawn:?}");
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_budget_of_a_day_is_that_of_all_processes() {
-    let database = database().await;
-    let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
-    let (day, limit) = (date(2026, 5, 1), Spent { tokens: 1000, money: 0.0 });
-    let tokens = |tokens| Spent { tokens, money: 0.0 };
-    assert!(processes[0].reserve(day, tokens(600), limit).await.unwrap());
-    assert!(!processes[1].reserve(day, tokens(600), limit).await.unwrap());
-    // The call took 100 tokens: 500 go back, and the rest is spent when it is written down.
-    SharedLimits::release(&processes[0], day, tokens(500)).await.unwrap();
-    let usage = Usage { calls: 1, prompt_tokens: 80, completion_tokens: 20, ..Usage::default() };
-    let spent = DayUsage { date: day, map: "m".parse().unwrap(), usage, money: 0.0 };
-    processes[0].add_usage(spent).await.unwrap();
-    assert!(!processes[1].reserve(day, tokens(901), limit).await.unwrap());
-    assert!(processes[1].reserve(day, tokens(900), limit).await.unwrap());
-    assert!(!processes[0].reserve(day, tokens(1), limit).await.unwrap());
-    // Another day, and no limit at all.
-    assert!(processes[0].reserve(date(2026, 5, 2), tokens(1000), limit).await.unwrap());
-    assert!(processes[0].reserve(day, tokens(5000), tokens(0)).await.unwrap());
 }

@@ -1,4 +1,4 @@
-//! Forgetting: jobs that have ended go with their frames, accounts by their day.
+//! Retention: ended jobs are removed with their frames, and usage by day.
 
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
@@ -8,15 +8,15 @@ use whereabouts_store::{JobFilter, JobRetention, RemovedJobs, Store};
 use crate::support::{Fixture, claim, submit};
 
 contract!(
-    old_jobs_go_with_frames_that_nothing_else_needs,
-    the_first_to_end_go_while_there_are_too_many_a_batch_at_a_time,
-    a_job_that_is_retried_is_kept_until_it_has_ended_again,
-    jobs_go_by_their_age_before_they_go_by_their_number,
-    nothing_goes_where_nothing_is_bounded,
+    old_jobs_are_removed_with_frames_that_nothing_else_needs,
+    excess_jobs_are_removed_oldest_end_first_in_batches,
+    a_retried_job_is_kept_until_it_ends_again,
+    jobs_are_removed_by_age_before_they_are_removed_by_number,
+    nothing_is_removed_without_a_bound,
     the_size_of_the_database_is_known,
 );
 
-/// A job with a frame of its own, which failed so many days ago unless it waits.
+/// A job with a frame of its own, which failed this many days ago, or is queued.
 async fn job(store: &dyn Store, frame: &str, days_ago: Option<i64>) -> Uuid {
     let id = submit(store, "m", frame.as_bytes()).await;
     if let Some(days) = days_ago {
@@ -44,7 +44,7 @@ async fn listed(store: &dyn Store, before: Option<Uuid>) -> Vec<Uuid> {
     jobs.iter().map(|job| job.id).collect()
 }
 
-async fn old_jobs_go_with_frames_that_nothing_else_needs(fixture: &Fixture) {
+async fn old_jobs_are_removed_with_frames_that_nothing_else_needs(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     let old = job(store, "old", Some(40)).await;
@@ -55,7 +55,7 @@ async fn old_jobs_go_with_frames_that_nothing_else_needs(fixture: &Fixture) {
     assert_eq!(removed, RemovedJobs { by_age: 2, by_count: 0, bytes: 3 });
     assert!(!has(store, "old").await);
     assert!(has(store, "shared").await && has(store, "waiting").await);
-    // A cursor may stand on a job that has gone.
+    // A cursor may refer to a removed job.
     assert_eq!(listed(store, None).await, [waiting, young]);
     assert!(listed(store, Some(shared)).await.is_empty());
     assert_eq!(listed(store, Some(waiting)).await, [young]);
@@ -65,7 +65,7 @@ async fn old_jobs_go_with_frames_that_nothing_else_needs(fixture: &Fixture) {
     assert_eq!(again, RemovedJobs::default());
 }
 
-async fn the_first_to_end_go_while_there_are_too_many_a_batch_at_a_time(fixture: &Fixture) {
+async fn excess_jobs_are_removed_oldest_end_first_in_batches(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     let mut jobs = Vec::new();
@@ -77,12 +77,12 @@ async fn the_first_to_end_go_while_there_are_too_many_a_batch_at_a_time(fixture:
     assert_eq!(listed(store, None).await, [jobs[2], jobs[0]]);
     assert_eq!(store.remove_ended(keep(30, 1), 2).await.unwrap().by_count, 1);
     assert_eq!(listed(store, None).await, [jobs[0]]);
-    // Whoever waits for it has not seen its end yet.
+    // A client that long-polls may not have seen its end yet.
     let unsettled = JobRetention { settled: Timestamp::UNIX_EPOCH, ..keep(0, 0) };
     assert_eq!(store.remove_ended(unsettled, 2).await.unwrap().jobs(), 0);
 }
 
-async fn a_job_that_is_retried_is_kept_until_it_has_ended_again(fixture: &Fixture) {
+async fn a_retried_job_is_kept_until_it_ends_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     let id = job(store, "a", Some(40)).await;
@@ -93,7 +93,7 @@ async fn a_job_that_is_retried_is_kept_until_it_has_ended_again(fixture: &Fixtur
     assert_eq!((removed.by_count, removed.bytes), (1, 1));
 }
 
-async fn jobs_go_by_their_age_before_they_go_by_their_number(fixture: &Fixture) {
+async fn jobs_are_removed_by_age_before_they_are_removed_by_number(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     for days in [50, 40, 3, 2, 1] {
@@ -110,7 +110,7 @@ async fn jobs_go_by_their_age_before_they_go_by_their_number(fixture: &Fixture) 
     assert_eq!((removed.by_age, removed.by_count, removed.bytes), (0, 1, 5));
 }
 
-async fn nothing_goes_where_nothing_is_bounded(fixture: &Fixture) {
+async fn nothing_is_removed_without_a_bound(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = job(&*store, "a", Some(4000)).await;
     let all = JobRetention { since: None, most: None, settled: Timestamp::now() };

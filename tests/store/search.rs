@@ -1,4 +1,4 @@
-//! Searches: exactly, by a graph, and for images that look like those of other places.
+//! Search: exact, by a graph, and for hard negatives.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -14,20 +14,20 @@ use whereabouts_store::{Store, StoreError};
 use crate::support::{Fixture, Random, Tuning, add, descriptor, eventually, image, map};
 
 contract!(
-    exact_search_finds_what_comparing_with_all_finds,
-    a_graph_finds_nearly_all_of_that_and_nothing_that_was_removed,
-    a_search_for_more_than_there_are_finds_all,
-    equal_images_come_in_the_order_of_addition,
+    exact_search_equals_brute_force,
+    a_graph_has_high_recall_and_finds_no_removed_image,
+    a_search_for_more_images_than_there_are_returns_all,
+    equal_images_are_ranked_in_the_order_of_addition,
     the_similarity_is_the_cosine_from_one_to_minus_one,
-    an_image_that_was_removed_is_not_found_again,
-    a_query_of_another_dimension_is_refused,
-    long_descriptors_are_searched_too,
-    look_alikes_are_the_most_similar_images_of_other_places,
+    a_removed_image_is_not_found,
+    a_query_of_another_dimension_is_rejected,
+    long_descriptors_are_searched,
+    hard_negatives_are_the_most_similar_images_of_other_places,
 );
 
 const BOTH: [SearchMode; 2] = [SearchMode::Fast, SearchMode::Exact];
 
-/// Adds images named by their number, some at once.
+/// Adds images named by their number, some concurrently.
 async fn add_all(store: &Arc<dyn Store>, map: &Map, descriptors: &[Descriptor]) {
     let mut pins = Vec::new();
     for bytes in 0..16_u8 {
@@ -45,7 +45,7 @@ fn numbers(found: &[Candidate]) -> Vec<usize> {
     found.iter().map(|found| found.image_id.as_str().parse().unwrap()).collect()
 }
 
-/// The best of all, by comparing with each.
+/// The best matches by brute force.
 fn brute_force(descriptors: &[Descriptor], query: &Descriptor, k: usize) -> Vec<(usize, f32)> {
     let all = descriptors.iter().map(|descriptor| descriptor.similarity(query));
     let mut all: Vec<_> = all.enumerate().collect();
@@ -54,7 +54,7 @@ fn brute_force(descriptors: &[Descriptor], query: &Descriptor, k: usize) -> Vec<
     all
 }
 
-async fn exact_search_finds_what_comparing_with_all_finds(fixture: &Fixture) {
+async fn exact_search_equals_brute_force(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 64)).await.unwrap();
     let mut random = Random(1);
@@ -89,7 +89,7 @@ async fn graph_is_ready(store: &dyn Store, map: &Map) {
     .await;
 }
 
-async fn a_graph_finds_nearly_all_of_that_and_nothing_that_was_removed(fixture: &Fixture) {
+async fn a_graph_has_high_recall_and_finds_no_removed_image(fixture: &Fixture) {
     let tuning = Tuning { exact_up_to: 100, ..Tuning::default() };
     let store = fixture.open_with(tuning).await;
     let (map, _) = store.put_map(map("m", 48)).await.unwrap();
@@ -119,14 +119,14 @@ async fn a_graph_finds_nearly_all_of_that_and_nothing_that_was_removed(fixture: 
         let similarity = found[0].similarity;
         assert!((similarity - 1.0).abs() < 1e-3, "{number}: {similarity}");
     }
-    // More than one search of the graph finds.
+    // More than one graph search returns.
     for k in [150, 2000, 2100] {
         let query = descriptors[0].clone();
         let found = store.search(&map, query, k, SearchMode::Fast).await.unwrap();
         assert_eq!(found.len(), k.min(2000));
     }
 
-    // What is added later is found at once.
+    // An image that is added later is found at once.
     let late = image("2000", &[0]);
     let query = Random(3).descriptor(48);
     store.add_image(&map, late.clone(), query.clone()).await.unwrap();
@@ -150,7 +150,7 @@ async fn a_graph_finds_nearly_all_of_that_and_nothing_that_was_removed(fixture: 
     assert!(found >= 0.95, "{found}");
 }
 
-async fn a_search_for_more_than_there_are_finds_all(fixture: &Fixture) {
+async fn a_search_for_more_images_than_there_are_returns_all(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 8)).await.unwrap();
     let mut random = Random(5);
@@ -168,7 +168,7 @@ async fn a_search_for_more_than_there_are_finds_all(fixture: &Fixture) {
     }
 }
 
-async fn equal_images_come_in_the_order_of_addition(fixture: &Fixture) {
+async fn equal_images_are_ranked_in_the_order_of_addition(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 8)).await.unwrap();
     let ids = ["z", "a", "m", "b", "y", "0"];
@@ -202,7 +202,7 @@ async fn the_similarity_is_the_cosine_from_one_to_minus_one(fixture: &Fixture) {
     }
 }
 
-async fn an_image_that_was_removed_is_not_found_again(fixture: &Fixture) {
+async fn a_removed_image_is_not_found(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 8)).await.unwrap();
     let first = add(&*store, &map, "a", b"first").await;
@@ -224,7 +224,7 @@ async fn an_image_that_was_removed_is_not_found_again(fixture: &Fixture) {
     assert!(found(&*store, &first).await.iter().all(|(_, same)| !same));
 }
 
-async fn a_query_of_another_dimension_is_refused(fixture: &Fixture) {
+async fn a_query_of_another_dimension_is_rejected(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 8)).await.unwrap();
     add(&*store, &map, "a", b"a").await;
@@ -237,7 +237,7 @@ async fn a_query_of_another_dimension_is_refused(fixture: &Fixture) {
     }
 }
 
-async fn long_descriptors_are_searched_too(fixture: &Fixture) {
+async fn long_descriptors_are_searched(fixture: &Fixture) {
     let store = fixture.open_with(Tuning { exact_up_to: 4, ..Tuning::default() }).await;
     for (name, dim) in [("long", 2048), ("longer", 8192)] {
         let (map, _) = store.put_map(map(name, dim)).await.unwrap();
@@ -258,7 +258,7 @@ async fn long_descriptors_are_searched_too(fixture: &Fixture) {
     }
 }
 
-async fn look_alikes_are_the_most_similar_images_of_other_places(fixture: &Fixture) {
+async fn hard_negatives_are_the_most_similar_images_of_other_places(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 16)).await.unwrap();
     let mut random = Random(11);
@@ -312,7 +312,7 @@ async fn look_alikes_are_the_most_similar_images_of_other_places(fixture: &Fixtu
         assert_eq!((&found.image_id, ids(&found.others)), (&image.id, others));
         assert!(found.others.iter().map(|other| other.rank).eq(1..=5));
     }
-    // Fewer, where there are not so many.
+    // Fewer, if there are fewer.
     let wide = CalibrationSettings { place_m: 38.0, ..settings };
     let found = store.hard_negatives(&map, wide, 50).await.unwrap();
     assert!(found.iter().any(|found| (1..50).contains(&found.others.len())));

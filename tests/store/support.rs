@@ -1,9 +1,9 @@
-//! Stores to hold the contract against, each in a folder or a database of its own, and what is put into them.
+//! Stores under test, each in a folder or a database of its own, and test data.
 
 use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use jiff::{SignedDuration, Timestamp};
@@ -22,7 +22,9 @@ use whereabouts_store::{
     Added, DescriptionBounds, Draft, JobRecord, JobRetention, ObjectSettings, Objects, Query, Store,
 };
 
-/// Makes each of these promises a test of both stores.
+pub use whereabouts_testkit::wait::{eventually, until};
+
+/// Turns each of these functions into a test of both stores.
 macro_rules! contract {
     ($($promise:ident),+ $(,)?) => {
         mod embedded {
@@ -40,7 +42,7 @@ macro_rules! contract {
     };
 }
 
-/// Makes each of these promises a test of PostgreSQL with its bytes in a server that speaks S3.
+/// Turns each of these functions into a test of PostgreSQL with its bytes in an S3-compatible store.
 macro_rules! contract_over_s3 {
     ($($promise:ident),+ $(,)?) => {
         mod s3 {
@@ -52,16 +54,16 @@ macro_rules! contract_over_s3 {
     };
 }
 
-/// How a store is opened, where a test cares.
+/// Settings of a store that tests vary.
 #[derive(Debug, Clone, Copy)]
 pub struct Tuning {
     /// Maps with at most this many images have no graph.
     pub exact_up_to: usize,
-    /// How long fresh bytes stay that nothing refers to, where that is a time.
+    /// How long unreferenced new bytes are kept, in stores that keep them for a time.
     pub pin: Duration,
-    /// After so long without a sign of life a process counts as dead.
+    /// A process without a heartbeat for this long is considered dead.
     pub lifetime: Duration,
-    /// The longest a call may take.
+    /// Timeout of a call.
     pub timeout: Duration,
     /// Bounds of the cache of descriptions.
     pub descriptions: DescriptionBounds,
@@ -82,13 +84,10 @@ impl Default for Tuning {
     }
 }
 
-/// A process that says nothing for so long is dead to the others.
-pub const SHORT_LIFE: Duration = Duration::from_millis(300);
+/// A lifetime after which tests can wait for a process to be considered dead.
+const SHORT_LIFE: Duration = Duration::from_millis(300);
 
-/// What has not happened by then does not happen.
-const PATIENCE: Duration = Duration::from_secs(30);
-
-/// One place where a store keeps its things, which outlives the store.
+/// The storage of a store, which outlives the store.
 pub struct Fixture(Kind);
 
 enum Kind {
@@ -118,7 +117,7 @@ impl Fixture {
         match &self.0 {
             Kind::Embedded(dir) => {
                 let settings = embedded_settings(dir.path(), tuning);
-                // The threads of the store that was dropped may take a moment to end.
+                // The threads of the dropped store may take a moment to end.
                 let open = async || EmbeddedStore::open(&settings).ok();
                 Arc::new(eventually(open).await)
             }
@@ -151,14 +150,14 @@ fn embedded_settings(dir: &Path, tuning: Tuning) -> EmbeddedSettings {
     }
 }
 
-/// Where a store in PostgreSQL has its bytes.
+/// Where a PostgreSQL store keeps its bytes.
 #[derive(Clone, Copy)]
 pub enum Pictures {
     Folder,
     S3,
 }
 
-/// A database of its own in the server for tests, which goes when this does; and a place for bytes.
+/// A database of its own in the test server, which is removed when this is dropped; and a place for bytes.
 pub struct Database {
     server: PgConnectOptions,
     name: String,
@@ -208,21 +207,28 @@ impl Database {
         }
     }
 
-    /// A process of its own.
+    /// Opens the store as another process would.
     pub async fn open(&self, tuning: Tuning) -> PostgresStore {
         PostgresStore::open(self.settings(tuning), self.objects(), Uuid::now_v7()).await.unwrap()
     }
 
-    /// Runs a statement beside the store.
+    /// Runs a statement on a connection that is not the store's.
     pub async fn run(&self, sql: &str) {
         administer(&self.options(), sql).await;
+    }
+
+    /// Reads one number on a connection that is not the store's.
+    pub async fn number(&self, sql: &str) -> f64 {
+        let mut connection = self.options().connect().await.unwrap();
+        let sql = format!("SELECT ({sql})::float8");
+        sqlx::query_scalar(AssertSqlSafe(sql)).fetch_one(&mut connection).await.unwrap()
     }
 }
 
 impl Drop for Database {
     fn drop(&mut self) {
         let (server, name) = (self.server.clone(), self.name.clone());
-        // The test's own runtime is in the middle of something.
+        // The runtime of the test cannot be blocked.
         let dropping = std::thread::spawn(move || {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
             let sql = format!("DROP DATABASE {name} WITH (FORCE)");
@@ -252,26 +258,14 @@ fn s3_server() -> String {
     })
 }
 
-/// Part of the bucket for tests.
+/// A prefix in the test bucket.
 pub fn s3(prefix: &str, endpoint: &str, timeout: Duration) -> Objects {
     let url = format!("s3://whereabouts-test/{prefix}");
     let (endpoint, region) = (endpoint.to_owned(), "us-east-1".to_owned());
     Objects::open(&ObjectSettings { url, endpoint, region, allow_http: true, timeout }).unwrap()
 }
 
-/// What comes of asking again and again, once something does.
-pub async fn eventually<T>(mut ask: impl AsyncFnMut() -> Option<T>) -> T {
-    let began = Instant::now();
-    loop {
-        if let Some(answer) = ask().await {
-            return answer;
-        }
-        assert!(began.elapsed() < PATIENCE, "it did not happen within {PATIENCE:?}");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
-}
-
-/// A map whose descriptors have so many numbers.
+/// A map whose descriptors have this many dimensions.
 pub fn map(name: &str, dim: usize) -> Map {
     Map {
         uid: Uuid::now_v7(),
@@ -289,7 +283,7 @@ pub fn map(name: &str, dim: usize) -> Map {
     }
 }
 
-/// The map as another model would have it.
+/// The map with another model.
 pub fn next(map: &Map, dim: usize) -> Map {
     Map {
         model: "new".into(),
@@ -314,7 +308,7 @@ pub fn image(id: &str, bytes: &[u8]) -> Image {
     }
 }
 
-/// Another direction for each picture.
+/// A descriptor that differs from picture to picture.
 pub fn descriptor(image: &Image, dim: usize) -> Descriptor {
     let seed = image.digest.as_bytes().first_chunk().unwrap();
     Random(u64::from_le_bytes(*seed) | 1).descriptor(dim)
@@ -330,7 +324,7 @@ pub async fn add(store: &dyn Store, map: &Map, id: &str, bytes: &[u8]) -> Image 
     image
 }
 
-/// Gives all that is missing in a draft its descriptor; returns how many that were.
+/// Writes all missing descriptors of a draft; returns how many were missing.
 pub async fn fill(draft: &mut dyn Draft, dim: usize) -> usize {
     let mut written = 0;
     loop {
@@ -345,7 +339,7 @@ pub async fn fill(draft: &mut dyn Draft, dim: usize) -> usize {
     }
 }
 
-/// A job of the map that waits, with the bytes of its frame.
+/// Submits a job of the map, with the bytes of its frame.
 pub async fn submit(store: &dyn Store, map: &str, frame: &[u8]) -> Uuid {
     let record = record(map, frame);
     let id = record.job.id;
@@ -376,20 +370,20 @@ pub fn record(map: &str, frame: &[u8]) -> JobRecord {
     }
 }
 
-/// Takes a job for a minute.
+/// Claims a job with a lease of a minute.
 pub async fn claim(store: &dyn Store) -> Option<JobRecord> {
     let now = Timestamp::now();
     store.claim(now, now + SignedDuration::from_secs(60)).await.unwrap()
 }
 
-/// Whether the bytes are there once the janitor has called.
+/// Whether the bytes are still there after a sweep.
 pub async fn is_kept(store: &dyn Store, bytes: &[u8]) -> bool {
     let all = JobRetention { since: None, most: None, settled: Timestamp::now() };
     store.remove_ended(all, 64).await.unwrap();
     store.blob(&Digest::of(bytes)).await.unwrap().is_some()
 }
 
-/// Text that is hard to keep.
+/// Texts that are hard to store.
 pub fn odd_texts() -> Vec<String> {
     vec![
         String::new(),

@@ -1,4 +1,4 @@
-//! Accounts: what was spent, by day and map.
+//! Usage: spend by day and map.
 
 use futures_util::future::join_all;
 use jiff::civil::{Date, date};
@@ -7,7 +7,7 @@ use whereabouts_store::Store;
 
 use crate::support::Fixture;
 
-contract!(what_was_spent_adds_up_by_day_and_map, what_was_spent_before_a_day_is_forgotten,);
+contract!(spend_adds_up_by_day_and_map, spend_before_a_day_is_forgotten,);
 
 fn spent(date: Date, map: &str, calls: u32, money: f64) -> DayUsage {
     let usage = Usage {
@@ -20,7 +20,7 @@ fn spent(date: Date, map: &str, calls: u32, money: f64) -> DayUsage {
     DayUsage { date, map: map.parse().unwrap(), usage, money }
 }
 
-async fn what_was_spent_adds_up_by_day_and_map(fixture: &Fixture) {
+async fn spend_adds_up_by_day_and_map(fixture: &Fixture) {
     let store = fixture.open().await;
     let (first, second) = (date(2026, 2, 28), date(2026, 3, 1));
     assert!(store.usage(first).await.unwrap().is_empty());
@@ -56,7 +56,7 @@ async fn what_was_spent_adds_up_by_day_and_map(fixture: &Fixture) {
     assert_eq!(all(&*store, first).await, expected);
 }
 
-async fn what_was_spent_before_a_day_is_forgotten(fixture: &Fixture) {
+async fn spend_before_a_day_is_forgotten(fixture: &Fixture) {
     let store = fixture.open().await;
     for day in [1, 9, 10, 11] {
         store.add_usage(spent(date(2026, 10, day), "m", 1, 1.0)).await.unwrap();

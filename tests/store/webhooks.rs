@@ -1,4 +1,4 @@
-//! Webhooks: what they are told, and what becomes of telling them.
+//! Webhooks and their deliveries.
 
 use std::sync::Arc;
 
@@ -14,15 +14,15 @@ use whereabouts_store::{DeliveryRetention, RemovedDeliveries, Store, StoreError,
 use crate::support::{Fixture, claim, eventually, odd_texts, submit};
 
 contract!(
-    webhooks_are_kept_oldest_first_and_no_more_than_so_many,
-    the_end_of_a_job_is_queued_for_whom_it_concerns_and_for_nobody_who_came_later,
+    webhooks_are_listed_oldest_first_and_bounded_in_number,
+    the_end_of_a_job_is_queued_for_the_webhooks_subscribed_at_that_time,
     a_delivery_is_due_at_its_time_until_it_has_ended,
-    a_delivery_that_is_tried_again_is_due_again_when_its_time_has_come,
-    a_webhook_goes_with_its_deliveries_and_a_disabled_one_takes_none,
-    the_first_to_end_are_forgotten_and_what_waits_only_if_there_is_no_other_way,
-    what_is_queued_is_told,
-    a_delivery_of_a_process_that_ended_is_due_for_the_next_one,
-    what_is_not_there_is_not_found,
+    a_retried_delivery_is_due_at_its_next_attempt,
+    a_webhook_is_deleted_with_its_deliveries_and_a_disabled_one_gets_none,
+    ended_deliveries_are_evicted_before_waiting_ones,
+    a_queued_delivery_is_notified,
+    a_delivery_of_a_process_that_ended_is_due_again,
+    an_unknown_webhook_or_delivery_is_not_found,
     odd_texts_in_a_delivery_survive,
 );
 
@@ -46,7 +46,7 @@ fn new_webhook(events: &[WebhookEvent], map: Option<&str>) -> StoredWebhook {
     StoredWebhook { webhook, secret: WebhookSecret::new(&[1; 32]) }
 }
 
-/// A job that ended so.
+/// A job that ended in this state.
 async fn ended(store: &dyn Store, map: &str, state: JobState) -> Uuid {
     submit(store, map, b"frame").await;
     end(store, state).await
@@ -77,7 +77,7 @@ fn ping(webhook: Uuid) -> StoredDelivery {
     StoredDelivery { delivery, body: b"{}".to_vec() }
 }
 
-/// A webhook of which so many pings wait.
+/// A webhook with this many waiting pings.
 async fn pinged(store: &dyn Store, pings: usize) -> (Uuid, Vec<Uuid>) {
     let id = webhook(store, &WebhookEvent::ENDS, None).await;
     let mut ids = Vec::new();
@@ -89,7 +89,7 @@ async fn pinged(store: &dyn Store, pings: usize) -> (Uuid, Vec<Uuid>) {
     (id, ids)
 }
 
-async fn webhooks_are_kept_oldest_first_and_no_more_than_so_many(fixture: &Fixture) {
+async fn webhooks_are_listed_oldest_first_and_bounded_in_number(fixture: &Fixture) {
     let store = fixture.open().await;
     let mut known: Vec<_> = (0..3).map(|_| new_webhook(&[WebhookEvent::JobFailed], None)).collect();
     for webhook in [1, 0, 2] {
@@ -119,9 +119,7 @@ async fn webhooks_are_kept_oldest_first_and_no_more_than_so_many(fixture: &Fixtu
     assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
 }
 
-async fn the_end_of_a_job_is_queued_for_whom_it_concerns_and_for_nobody_who_came_later(
-    fixture: &Fixture,
-) {
+async fn the_end_of_a_job_is_queued_for_the_webhooks_subscribed_at_that_time(fixture: &Fixture) {
     let store = fixture.open().await;
     let early = ended(&*store, "yard", JobState::Failed).await;
     let all = webhook(&*store, &WebhookEvent::ENDS, None).await;
@@ -138,7 +136,7 @@ async fn the_end_of_a_job_is_queued_for_whom_it_concerns_and_for_nobody_who_came
     assert_eq!(jobs(listed(&*store, all).await), [bad, good]);
     assert_eq!(jobs(listed(&*store, failures).await), [bad]);
     assert!(listed(&*store, elsewhere).await.is_empty());
-    // One that ends again is news again.
+    // A job that ends again is delivered again.
     store.retry(early).await.unwrap();
     assert_eq!(end(&*store, JobState::Degraded).await, early);
     assert_eq!(jobs(listed(&*store, all).await), [early, bad, good]);
@@ -150,7 +148,7 @@ async fn the_end_of_a_job_is_queued_for_whom_it_concerns_and_for_nobody_who_came
     );
     let job = store.job(early).await.unwrap().unwrap().job;
     assert_eq!(message["data"], serde_json::to_value(job).unwrap());
-    // A cancelled one is told once, however often it is cancelled.
+    // A job is delivered once, however often it is cancelled.
     store.retry(bad).await.unwrap();
     store.cancel(bad).await.unwrap();
     store.cancel(bad).await.unwrap();
@@ -174,7 +172,7 @@ async fn a_delivery_is_due_at_its_time_until_it_has_ended(fixture: &Fixture) {
     assert_eq!(due(&*store, id, now).await, [pings[2]]);
     assert_eq!(due(&*store, id, later).await, [pings[2], pings[0]]);
     assert_eq!(store.waiting_deliveries().await.unwrap(), 2);
-    // It has been delivered; what comes late changes nothing.
+    // It has been delivered; a late outcome changes nothing.
     assert_eq!(note(1, Disposition::Dead).await.unwrap(), None);
     let again = store.queue_again(id, pings[0], now).await.unwrap_err().to_string();
     assert!(again.contains("waits anyway"), "{again}");
@@ -185,13 +183,13 @@ async fn a_delivery_is_due_at_its_time_until_it_has_ended(fixture: &Fixture) {
     let page = store.deliveries(id, waiting, Some(pings[1]), 9).await.unwrap();
     assert_eq!(page.iter().map(|delivery| delivery.id).collect::<Vec<_>>(), [pings[0]]);
     assert_eq!(store.deliveries(id, None, None, 1).await.unwrap()[0].id, pings[2]);
-    // What was given up has been delivered all the same.
+    // A delivery that was given up may have arrived all the same.
     note(2, Disposition::Dead).await.unwrap().unwrap();
     let after = note(2, Disposition::Delivered).await.unwrap().unwrap();
     assert_eq!((after.state, after.attempts), (DeliveryState::Delivered, 2));
 }
 
-async fn a_delivery_that_is_tried_again_is_due_again_when_its_time_has_come(fixture: &Fixture) {
+async fn a_retried_delivery_is_due_at_its_next_attempt(fixture: &Fixture) {
     let store = fixture.open().await;
     let (id, pings) = pinged(&*store, 1).await;
     for tries in 1..4 {
@@ -214,10 +212,10 @@ async fn a_delivery_that_is_tried_again_is_due_again_when_its_time_has_come(fixt
     }
 }
 
-async fn a_webhook_goes_with_its_deliveries_and_a_disabled_one_takes_none(fixture: &Fixture) {
+async fn a_webhook_is_deleted_with_its_deliveries_and_a_disabled_one_gets_none(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
-    // More than are removed in one step.
+    // More than one step of the sweep removes.
     let (gone, pings) = pinged(store, 259).await;
     let (stays, _) = pinged(store, 2).await;
     let now = Timestamp::now();
@@ -244,9 +242,7 @@ async fn a_webhook_goes_with_its_deliveries_and_a_disabled_one_takes_none(fixtur
     assert!(refused.contains("disabled (gone)"), "{refused}");
 }
 
-async fn the_first_to_end_are_forgotten_and_what_waits_only_if_there_is_no_other_way(
-    fixture: &Fixture,
-) {
+async fn ended_deliveries_are_evicted_before_waiting_ones(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     let (id, pings) = pinged(store, 6).await;
@@ -276,27 +272,27 @@ async fn the_first_to_end_are_forgotten_and_what_waits_only_if_there_is_no_other
     assert_eq!(store.forget_deliveries(keep, 9).await.unwrap(), RemovedDeliveries::default());
 }
 
-async fn what_is_queued_is_told(fixture: &Fixture) {
+async fn a_queued_delivery_is_notified(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = webhook(&*store, &WebhookEvent::ENDS, None).await;
     let mut queued = store.queued_deliveries();
-    let mut told = async || {
-        let patience = std::time::Duration::from_secs(20);
-        tokio::time::timeout(patience, queued.changed()).await.unwrap().unwrap();
+    let mut notified = async || {
+        let timeout = std::time::Duration::from_secs(20);
+        tokio::time::timeout(timeout, queued.changed()).await.unwrap().unwrap();
     };
     let ping = ping(id);
     let delivery = ping.delivery.id;
     store.queue_delivery(ping).await.unwrap();
-    told().await;
+    notified().await;
     ended(&*store, "yard", JobState::Failed).await;
-    told().await;
+    notified().await;
     let now = Timestamp::now();
     store.note_attempt(id, delivery, attempt(now, Disposition::Dead)).await.unwrap();
     store.queue_again(id, delivery, now).await.unwrap();
-    told().await;
+    notified().await;
 }
 
-async fn a_delivery_of_a_process_that_ended_is_due_for_the_next_one(fixture: &Fixture) {
+async fn a_delivery_of_a_process_that_ended_is_due_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let (id, pings) = pinged(&*store, 2).await;
     assert_eq!(due(&*store, id, Timestamp::now()).await, pings);
@@ -313,7 +309,7 @@ async fn a_delivery_of_a_process_that_ended_is_due_for_the_next_one(fixture: &Fi
     assert_eq!(taken, pings);
 }
 
-async fn what_is_not_there_is_not_found(fixture: &Fixture) {
+async fn an_unknown_webhook_or_delivery_is_not_found(fixture: &Fixture) {
     let store = fixture.open().await;
     let (id, _) = pinged(&*store, 1).await;
     let (gone, now) = (Uuid::now_v7(), Timestamp::now());

@@ -1,9 +1,8 @@
-//! Which store the servers under test have: the embedded one, or with `WHEREABOUTS_TEST_DEPLOYMENT=scale-out` a
+//! The store of the servers under test: the embedded one, or with `WHEREABOUTS_TEST_DEPLOYMENT=scale-out` a
 //! database each in the PostgreSQL of `WHEREABOUTS_TEST_DATABASE_URL` (`tests/postgres.sh` starts one), and
-//! a prefix each in the object store of `WHEREABOUTS_TEST_S3` (`tests/s3.sh`), or where that is missing the
-//! data folder.
+//! a prefix each in the object store of `WHEREABOUTS_TEST_S3` (`tests/s3.sh`) or, without it, the data folder.
 //!
-//! A data folder stands for its database, so that a server that is started again finds what it had.
+//! The database is derived from the data folder, so that a restarted server finds its records.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::Path;
@@ -16,7 +15,7 @@ use sqlx::{AssertSqlSafe, ConnectOptions, Connection};
 
 use crate::server::BINARY;
 
-/// Whether the servers share nothing but a database and an object store.
+/// Whether the servers share a database and an object store.
 pub fn is_scale_out() -> bool {
     match std::env::var("WHEREABOUTS_TEST_DEPLOYMENT").as_deref() {
         Err(_) | Ok("embedded") => false,
@@ -27,7 +26,7 @@ pub fn is_scale_out() -> bool {
     }
 }
 
-/// The settings of a server whose data folder this is.
+/// The settings of a server with this data folder.
 pub fn settings(data: &Path) -> Vec<(String, String)> {
     if !is_scale_out() {
         return Vec::new();
@@ -50,7 +49,7 @@ pub fn settings(data: &Path) -> Vec<(String, String)> {
     settings
 }
 
-/// How many tables of descriptors a server has whose data folder this is.
+/// The number of descriptor tables of a server with this data folder.
 pub fn descriptor_tables(data: &Path) -> usize {
     on_server(&database_of(data), async |connection| {
         let count =
@@ -60,7 +59,7 @@ pub fn descriptor_tables(data: &Path) -> usize {
     })
 }
 
-/// A database for the data folder, made when it is first asked for.
+/// The database of a data folder, created at the first call.
 fn database_of(data: &Path) -> String {
     static TEMPLATE: OnceLock<String> = OnceLock::new();
     let template = TEMPLATE.get_or_init(|| {
@@ -92,7 +91,7 @@ fn address(database: &str) -> String {
     server().database(database).to_url_lossy().to_string()
 }
 
-/// Makes a database, unless it is there.
+/// Creates a database unless it exists.
 fn make(name: &str, template: Option<&str>) {
     let from = template.map(|name| format!(" TEMPLATE {name}")).unwrap_or_default();
     let sql = format!("CREATE DATABASE {name}{from}");
@@ -101,13 +100,13 @@ fn make(name: &str, template: Option<&str>) {
         if there.fetch_optional(&mut *connection).await.unwrap().is_some() {
             return;
         }
-        // Two tests cannot copy the template at once.
+        // A template cannot be copied concurrently.
         sqlx::query("SELECT pg_advisory_lock(1)").execute(&mut *connection).await.unwrap();
         sqlx::query(AssertSqlSafe(sql)).execute(connection).await.unwrap();
     });
 }
 
-/// Asks one database of the server. Tests run on runtimes of their own, which must not be blocked.
+/// Runs queries in a database of the server, on a thread of its own: the runtime of a test must not be blocked.
 fn on_server<T: Send>(database: &str, ask: impl AsyncFnOnce(&mut PgConnection) -> T + Send) -> T {
     let asking = || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

@@ -1,6 +1,6 @@
-//! What tests and benchmarks share: the real server as a child process ([`server`]), the store that it is given
-//! ([`deployment`]), and scripted peers: a multimodal LLM ([`mock_mllm`]), a model hub ([`mock_hub`]) and a
-//! receiver of webhooks ([`receiver`]).
+//! What tests and benchmarks share: the real server as a child process ([`server`]), the store that it uses
+//! ([`deployment`]), waiting for a condition ([`wait`]), and scripted peers: a multimodal LLM ([`mock_mllm`]), a
+//! model hub ([`mock_hub`]) and a webhook receiver ([`receiver`]).
 
 #![allow(
     missing_docs,
@@ -15,3 +15,4 @@ pub mod mock_hub;
 pub mod mock_mllm;
 pub mod receiver;
 pub mod server;
+pub mod wait;

@@ -1,4 +1,4 @@
-//! A model hub with one file, on a free port, that misbehaves as it is told.
+//! A mock of a model hub with one file, on a free port, with faults on demand.
 
 use std::collections::VecDeque;
 use std::io;
@@ -15,25 +15,25 @@ use bytes::Bytes;
 use futures_util::{Stream, StreamExt, stream};
 use tokio::net::TcpListener;
 
-/// What goes wrong with one request.
+/// The fault that one request meets.
 #[derive(Debug, Clone, Copy)]
-pub enum Trouble {
+pub enum Fault {
     None,
-    /// The connection breaks after so many bytes of the body.
+    /// The connection breaks after this many bytes of the body.
     CutAfter(usize),
-    /// No more bytes come after so many, but the connection stays.
+    /// The body stalls after this many bytes, with the connection open.
     StallAfter(usize),
-    /// No answer comes.
+    /// No response is sent.
     Hang,
-    /// One byte is another one.
+    /// One byte is corrupted.
     Corrupt,
-    /// This answer instead.
+    /// A response with this status.
     Status(u16),
-    /// The whole file, whatever was asked for.
+    /// The whole file, whatever range was requested.
     IgnoreRange,
-    /// The body's length is not told.
+    /// No `Content-Length`.
     NoLength,
-    /// From this request on, the file is another one.
+    /// From this request on, the file has other contents.
     Change,
 }
 
@@ -46,20 +46,20 @@ pub struct Hub {
 struct Shared {
     file: Bytes,
     version: u32,
-    troubles: VecDeque<Trouble>,
-    asked: Vec<String>,
+    faults: VecDeque<Fault>,
+    requested_paths: Vec<String>,
     ranges: Vec<Option<String>>,
     sent: u64,
 }
 
 impl Hub {
-    /// Serves `file` under every path; the first requests meet `troubles`, one each.
-    pub async fn start(file: Vec<u8>, troubles: &[Trouble]) -> Self {
+    /// Serves `file` under every path; the first requests meet one of `faults` each.
+    pub async fn start(file: Vec<u8>, faults: &[Fault]) -> Self {
         let shared = Arc::new(Mutex::new(Shared {
             file: file.into(),
             version: 1,
-            troubles: troubles.iter().copied().collect(),
-            asked: Vec::new(),
+            faults: faults.iter().copied().collect(),
+            requested_paths: Vec::new(),
             ranges: Vec::new(),
             sent: 0,
         }));
@@ -70,52 +70,52 @@ impl Hub {
         Self { url, shared }
     }
 
-    /// The paths that were asked for.
-    pub fn asked(&self) -> Vec<String> {
-        self.shared.lock().unwrap().asked.clone()
+    /// The requested paths.
+    pub fn requested_paths(&self) -> Vec<String> {
+        self.shared.lock().unwrap().requested_paths.clone()
     }
 
-    /// The `Range` of each request.
+    /// The `Range` header of each request.
     pub fn ranges(&self) -> Vec<Option<String>> {
         self.shared.lock().unwrap().ranges.clone()
     }
 
-    /// Bytes of bodies that were sent.
+    /// Number of body bytes sent.
     pub fn sent(&self) -> u64 {
         self.shared.lock().unwrap().sent
     }
 
-    /// The file as it is now.
+    /// The current contents of the file.
     pub fn file(&self) -> Bytes {
         self.shared.lock().unwrap().file.clone()
     }
 }
 
 async fn answer(State(shared): State<Arc<Mutex<Shared>>>, request: Request) -> Response {
-    let (trouble, file, etag) = {
+    let (fault, file, etag) = {
         let mut shared = shared.lock().unwrap();
-        let trouble = shared.troubles.pop_front().unwrap_or(Trouble::None);
-        shared.asked.push(request.uri().path().to_owned());
+        let fault = shared.faults.pop_front().unwrap_or(Fault::None);
+        shared.requested_paths.push(request.uri().path().to_owned());
         shared.ranges.push(text(request.headers(), RANGE.as_str()));
-        if let Trouble::Change = trouble {
+        if let Fault::Change = fault {
             shared.file = shared.file.iter().rev().copied().collect();
             shared.version += 1;
         }
-        (trouble, shared.file.clone(), format!("\"{}\"", shared.version))
+        (fault, shared.file.clone(), format!("\"{}\"", shared.version))
     };
     let whole = file.len();
-    let from = match trouble {
-        Trouble::IgnoreRange => 0,
-        _ => asked_from(request.headers(), &etag),
+    let from = match fault {
+        Fault::IgnoreRange => 0,
+        _ => range_start(request.headers(), &etag),
     };
     let mut body = file.slice(from..);
     let response = Response::builder().header(ETAG, &etag);
-    match trouble {
-        Trouble::Status(status) => {
-            return response.status(status).body(Body::from("trouble")).unwrap();
+    match fault {
+        Fault::Status(status) => {
+            return response.status(status).body(Body::from("fault")).unwrap();
         }
-        Trouble::Hang => tokio::time::sleep(Duration::from_secs(60)).await,
-        Trouble::Corrupt => {
+        Fault::Hang => std::future::pending().await,
+        Fault::Corrupt => {
             let mut bytes = body.to_vec();
             bytes[whole / 2] ^= 1;
             body = bytes.into();
@@ -128,29 +128,29 @@ async fn answer(State(shared): State<Arc<Mutex<Shared>>>, request: Request) -> R
             .status(StatusCode::PARTIAL_CONTENT)
             .header(CONTENT_RANGE, format!("bytes {from}-{}/{whole}", whole - 1)),
     };
-    if !matches!(trouble, Trouble::NoLength) {
+    if !matches!(fault, Fault::NoLength) {
         response = response.header(CONTENT_LENGTH, body.len());
     }
-    response.body(Body::from_stream(sent_in_parts(body, trouble, shared))).unwrap()
+    response.body(Body::from_stream(in_chunks(body, fault, shared))).unwrap()
 }
 
-/// Where a range begins; a tag that is out of date asks for everything.
-fn asked_from(headers: &HeaderMap, etag: &str) -> usize {
-    let current = text(headers, IF_RANGE.as_str()).is_none_or(|asked| asked == etag);
+/// The offset at which a range begins; 0 with an `If-Range` that is out of date.
+fn range_start(headers: &HeaderMap, etag: &str) -> usize {
+    let current = text(headers, IF_RANGE.as_str()).is_none_or(|tag| tag == etag);
     let range = text(headers, RANGE.as_str()).filter(|_| current);
     range.map_or(0, |range| {
         range.strip_prefix("bytes=").unwrap().strip_suffix('-').unwrap().parse().unwrap()
     })
 }
 
-/// The body in parts, so that what went over the line before the trouble has arrived.
-fn sent_in_parts(
+/// The body in chunks, with pauses, so that the bytes before a fault have arrived.
+fn in_chunks(
     body: Bytes,
-    trouble: Trouble,
+    fault: Fault,
     shared: Arc<Mutex<Shared>>,
 ) -> impl Stream<Item = io::Result<Bytes>> {
-    let good = match trouble {
-        Trouble::CutAfter(bytes) | Trouble::StallAfter(bytes) => bytes.min(body.len()),
+    let good = match fault {
+        Fault::CutAfter(bytes) | Fault::StallAfter(bytes) => bytes.min(body.len()),
         _ => body.len(),
     };
     let parts: Vec<Bytes> = body[..good].chunks(1_000).map(Bytes::copy_from_slice).collect();
@@ -162,15 +162,13 @@ fn sent_in_parts(
         }
     });
     let end = stream::once(async move {
-        match trouble {
-            Trouble::CutAfter(_) => {
+        match fault {
+            Fault::CutAfter(_) => {
+                // A pause as of a slow network, so that the bytes before the cut have arrived.
                 tokio::time::sleep(Duration::from_millis(50)).await;
                 Some(Err(io::Error::other("cut")))
             }
-            Trouble::StallAfter(_) => {
-                tokio::time::sleep(Duration::from_secs(60)).await;
-                None
-            }
+            Fault::StallAfter(_) => std::future::pending().await,
             _ => None,
         }
     });

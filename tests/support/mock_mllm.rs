@@ -1,5 +1,5 @@
 //! A mock of an MLLM server: a real HTTP server on a free port that speaks the chat-completions
-//! format, refuses what the real API would refuse, and answers from a script, with faults on demand.
+//! format, rejects what the real API would reject, and answers from a script, with faults on demand.
 
 mod checks;
 
@@ -18,7 +18,7 @@ use tokio::net::TcpListener;
 use tokio::sync::Barrier;
 use tokio::task::JoinHandle;
 
-use checks::{Asked, check_envelope, check_request, notes_in};
+use checks::{ParsedCall, check_envelope, check_request, notes_in};
 
 /// The hashes of the two pictures of a describe call, as they were sent.
 pub type Pair = (String, String);
@@ -38,9 +38,9 @@ pub struct ReasonCall {
     /// Label and text, in the order of the prompt.
     pub notes: Vec<(String, String)>,
     pub prompt: String,
-    /// Whether an earlier answer was refused.
+    /// Whether the call repeats one whose answer was rejected.
     pub repair: bool,
-    /// Whether the answer is to follow a schema.
+    /// Whether the answer must follow a schema.
     pub structured: bool,
 }
 
@@ -49,7 +49,7 @@ impl ReasonCall {
         self.notes.iter().map(|(label, _)| label.as_str()).collect()
     }
 
-    /// The labels, those first whose notes hold `text`.
+    /// The labels, with those whose notes contain `text` first.
     pub fn labels_with_first(&self, text: &str) -> Vec<&str> {
         let (mut first, rest): (Vec<_>, Vec<_>) =
             self.notes.iter().partition(|(_, notes)| notes.contains(text));
@@ -61,7 +61,7 @@ impl ReasonCall {
 /// What the mock does with a call.
 #[derive(Clone)]
 pub enum Reply {
-    /// Answers with these words.
+    /// Answers with this text.
     Text(String),
     /// Answers 429 with this `Retry-After`.
     Busy(String),
@@ -75,7 +75,7 @@ pub enum Reply {
     HalfBody,
     /// Answers 200 with a page that is not JSON.
     NotJson,
-    /// Answers 200 with a body of so many bytes and more.
+    /// Answers 200 with a body of more than this many bytes.
     Huge(usize),
 }
 
@@ -91,9 +91,9 @@ type Reason = Box<dyn Fn(&ReasonCall) -> Reply + Send + Sync>;
 pub struct Script {
     pub describe: Describe,
     pub reason: Reason,
-    /// Whether `response_format` is taken; else it is answered 400.
+    /// Whether `response_format` is accepted; otherwise it is answered 400.
     pub structured: bool,
-    /// Whether answers say what they cost.
+    /// Whether answers report their usage.
     pub counts_tokens: bool,
     /// The key that every call must carry.
     pub key: Option<String>,
@@ -101,7 +101,7 @@ pub struct Script {
     pub max_edge: u32,
     /// How long each call takes.
     pub latency: Duration,
-    /// Describe calls are held until so many are there.
+    /// Describe calls are held until this many are in flight.
     pub together: Option<usize>,
 }
 
@@ -130,7 +130,7 @@ struct Seen {
     reason_calls: usize,
     in_flight: usize,
     max_in_flight: usize,
-    /// How often each pair was asked, and how often answered.
+    /// How often each pair was requested, and how often answered.
     pairs: HashMap<Pair, (usize, usize)>,
     asked_again: usize,
     structure_refused: usize,
@@ -191,7 +191,7 @@ impl MockMllm {
         self.seen(|seen| seen.max_in_flight)
     }
 
-    /// How often each pair was asked, and how often answered.
+    /// How often each pair was requested, and how often answered.
     pub fn pairs(&self) -> HashMap<Pair, (usize, usize)> {
         self.seen(|seen| seen.pairs.clone())
     }
@@ -201,12 +201,12 @@ impl MockMllm {
         self.seen(|seen| seen.asked_again)
     }
 
-    /// Calls that were refused because of their `response_format`.
+    /// Calls that were rejected because of their `response_format`.
     pub fn structure_refused(&self) -> usize {
         self.seen(|seen| seen.structure_refused)
     }
 
-    /// What the real API would not have accepted.
+    /// Requests that the real API would have rejected.
     pub fn violations(&self) -> Vec<String> {
         self.seen(|seen| seen.violations.clone())
     }
@@ -226,7 +226,7 @@ impl MockMllm {
     }
 }
 
-/// Counts a call as long as it lasts, also if the caller hangs up.
+/// Counts a call as long as it lasts, even if the caller disconnects.
 struct InFlight<'a>(&'a Mutex<Seen>);
 
 impl<'a> InFlight<'a> {
@@ -252,40 +252,41 @@ async fn answer(
 ) -> Response {
     let _in_flight = InFlight::new(&shared.seen);
     let script = &shared.script;
-    let asked = check_envelope(&uri, &headers, script)
+    let parsed = check_envelope(&uri, &headers, script)
         .and_then(|()| serde_json::from_slice(&body).map_err(|error| error.to_string()))
         .and_then(|request: Value| check_request(&request, script.max_edge));
-    let asked = match asked {
-        Ok(asked) => asked,
+    let parsed = match parsed {
+        Ok(parsed) => parsed,
         Err(violation) => {
             shared.seen.lock().unwrap().violations.push(violation.clone());
             return refusal(400, &violation);
         }
     };
-    if asked.structured && !script.structured {
+    if parsed.structured && !script.structured {
         shared.seen.lock().unwrap().structure_refused += 1;
         return refusal(400, "Unsupported parameter: 'response_format'");
     }
-    if let (Some(barrier), 2) = (&shared.together, asked.pictures.len()) {
+    if let (Some(barrier), 2) = (&shared.together, parsed.pictures.len()) {
         barrier.wait().await;
     }
     if !script.latency.is_zero() {
+        // A slow model is part of the script.
         tokio::time::sleep(script.latency).await;
     }
     {
         let mut seen = shared.seen.lock().unwrap();
         let (describe, reason) = &mut seen.request_bytes;
-        *if asked.pictures.is_empty() { reason } else { describe } += body.len();
+        *if parsed.pictures.is_empty() { reason } else { describe } += body.len();
     }
     let prompt_tokens = body.len() / 100;
-    let reply = shared.reply(asked);
+    let reply = shared.reply(parsed);
     render(reply, script.counts_tokens.then_some(prompt_tokens)).await
 }
 
 impl Shared {
-    fn reply(&self, asked: Asked) -> Reply {
+    fn reply(&self, parsed: ParsedCall) -> Reply {
         let mut seen = self.seen.lock().unwrap();
-        let Asked { pictures, prompt, repair, structured } = asked;
+        let ParsedCall { pictures, prompt, repair, structured } = parsed;
         let [frame, candidate] = pictures.as_slice() else {
             seen.reason_calls += 1;
             seen.reason_prompts.push(prompt.clone());
@@ -296,8 +297,8 @@ impl Shared {
         seen.describe_calls += 1;
         let pair = (frame.clone(), candidate.clone());
         let call = DescribeCall { number: seen.describe_calls, pair: pair.clone(), prompt };
-        let (asked, answered) = seen.pairs.entry(pair.clone()).or_default();
-        *asked += 1;
+        let (requested, answered) = seen.pairs.entry(pair.clone()).or_default();
+        *requested += 1;
         let again = usize::from(*answered > 0);
         seen.asked_again += again;
         let reply = (self.script.describe)(&call);

@@ -1,9 +1,9 @@
-//! A receiver of webhooks: it keeps what comes, checks signatures as its own code would have to, and answers
-//! as it is told.
+//! A webhook receiver: it keeps the messages, verifies their signatures with code of its own, and answers from a
+//! script.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use axum::Router;
 use axum::body::to_bytes;
@@ -16,17 +16,19 @@ use reqwest::{Method, StatusCode};
 use ring::hmac;
 use serde_json::Value;
 
-/// What a receiver answers.
+use crate::wait::eventually_within;
+
+/// How a receiver answers.
 #[derive(Clone)]
 pub enum Reply {
     Status(u16),
     /// A status with a header.
     With(u16, &'static str, String),
-    /// Nothing, for ever.
+    /// No response.
     Silence,
 }
 
-/// What came.
+/// A received message.
 #[derive(Clone)]
 pub struct Message {
     pub path: String,
@@ -43,7 +45,7 @@ impl Message {
         serde_json::from_slice(&self.body).unwrap()
     }
 
-    /// Checks the signature as a receiver does.
+    /// Verifies the signature as a receiver does.
     #[track_caller]
     pub fn verify(&self, secret: &str) {
         let key = STANDARD.decode(secret.strip_prefix("whsec_").unwrap()).unwrap();
@@ -59,12 +61,12 @@ impl Message {
     }
 }
 
-/// Somebody who is told.
+/// A running receiver.
 #[derive(Clone)]
 pub struct Receiver {
     pub url: String,
     messages: Arc<Mutex<Vec<Message>>>,
-    /// What it answers next; 200 when there is nothing left.
+    /// The next responses; 200 when there are none left.
     pub replies: Arc<Mutex<VecDeque<Reply>>>,
 }
 
@@ -104,13 +106,15 @@ impl Receiver {
         self.messages.lock().unwrap().clone()
     }
 
-    /// The messages, once there are so many.
+    /// Waits until at least `count` messages have come, and returns all of them.
     pub async fn wait(&self, count: usize) -> Vec<Message> {
-        let deadline = Instant::now() + Duration::from_secs(30);
-        while self.messages().len() < count {
-            assert!(Instant::now() < deadline, "{} of {count} came", self.messages().len());
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-        self.messages()
+        eventually_within(Duration::from_secs(30), async || {
+            let messages = self.messages();
+            match messages.len() {
+                received if received < count => Err(format!("{received} of {count} messages came")),
+                _ => Ok(messages),
+            }
+        })
+        .await
     }
 }

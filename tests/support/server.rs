@@ -1,8 +1,10 @@
 //! Starts the real server on a free port and speaks HTTP with it.
 
+use std::ffi::OsStr;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, LazyLock, Mutex};
 use std::thread;
 
@@ -27,7 +29,7 @@ pub struct Server {
     child: Child,
     pub url: String,
     log: Arc<Mutex<Vec<String>>>,
-    http: reqwest::Client,
+    pub http: reqwest::Client,
 }
 
 /// A server with a data folder of its own.
@@ -37,6 +39,20 @@ pub fn server() -> (TempDir, Server) {
     (dir, server)
 }
 
+/// The server that all tests of this process share, and the name of a map of the caller's own, which is yet to be
+/// created. For tests that look at nothing but their map: not at the list of maps, nor at all jobs, metrics, the log,
+/// or the files.
+pub fn shared_server() -> (&'static Server, String) {
+    static SHARED: LazyLock<Server> = LazyLock::new(Server::start_shared);
+    static MAPS: AtomicUsize = AtomicUsize::new(0);
+    (&SHARED, format!("map-{}", MAPS.fetch_add(1, Ordering::Relaxed)))
+}
+
+/// Runs the command in its arguments until its standard input is closed, and then removes the folder `$DATA`: a static
+/// is never dropped, but the pipe is closed when the test process ends.
+const UNTIL_THE_TESTS_END: &str =
+    r#""$0" "$@" </dev/null & server=$!; exec 2>&-; cat; kill -9 "$server"; wait; rm -rf "$DATA""#;
+
 impl Server {
     /// Starts a server and waits until it says that it is ready. `settings` are environment
     /// variables, such as `("WHEREABOUTS_JOBS__QUEUE", "1")`.
@@ -45,35 +61,59 @@ impl Server {
             .unwrap_or_else(|log| panic!("the server did not start: {log}"))
     }
 
-    /// The same; gives the log of a server that does not start.
+    /// Like [`Server::start`], but returns the log of a server that does not start.
     pub fn try_start(data: &Path, settings: &[(&str, &str)]) -> Result<Self, String> {
         Self::try_start_as("serve", data, settings)
     }
 
-    /// Starts a process that refines and does nothing else, for the servers of that data folder.
+    /// Starts a worker for the servers of that data folder.
     pub fn start_worker(data: &Path, settings: &[(&str, &str)]) -> Self {
         Self::try_start_as("worker", data, settings)
             .unwrap_or_else(|log| panic!("the worker did not start: {log}"))
     }
 
     fn try_start_as(role: &str, data: &Path, settings: &[(&str, &str)]) -> Result<Self, String> {
-        // reqwest has no cryptography of its own; the binary chooses the same.
-        let _ = rustls::crypto::ring::default_provider().install_default();
-        // Connections are not kept, so that a drain never waits for an idle one.
-        let http = reqwest::Client::builder().pool_max_idle_per_host(0).build().unwrap();
+        let mut command = Command::new(&*BINARY);
+        command.arg(role).args(arguments(data)).envs(test_settings(data)).envs(settings.to_vec());
+        Self::spawn(command, unpooled())
+    }
+
+    fn start_shared() -> Self {
+        let data = TempDir::new().unwrap().keep();
+        let mut command = Command::new("sh");
+        command
+            .args([
+                OsStr::new("-c"),
+                UNTIL_THE_TESTS_END.as_ref(),
+                BINARY.as_ref(),
+                "serve".as_ref(),
+            ])
+            .args(arguments(&data))
+            .envs(test_settings(&data))
+            .env("DATA", &data)
+            .stdin(Stdio::piped());
+        Self::spawn(command, unpooled())
+            .unwrap_or_else(|log| panic!("the shared server did not start: {log}"))
+    }
+
+    /// Starts a server as it is deployed, for a benchmark: with the default number of threads, and a client that
+    /// keeps its connections. `settings` are environment variables.
+    pub fn start_for_benchmark(model: &str, data: &Path, settings: &[(&str, &str)]) -> Self {
+        install_cryptography();
+        let mut command = Command::new(&*BINARY);
+        command.args(["serve", "--model", model]).args(arguments(data)).envs(settings.to_vec());
+        Self::spawn(command, reqwest::Client::new())
+            .unwrap_or_else(|log| panic!("the server did not start: {log}"))
+    }
+
+    /// Runs the command until it says that it is ready; returns the log of one that ends instead.
+    fn spawn(mut command: Command, http: reqwest::Client) -> Result<Self, String> {
         let address_file =
             std::env::temp_dir().join(format!("whereabouts-{}.address", uuid::Uuid::now_v7()));
-        let mut child = Command::new(&*BINARY)
-            .args([role, "--listen", "127.0.0.1:0", "--data"])
-            .arg(data)
+        let mut child = command
             .arg("--address-file")
             .arg(&address_file)
             .env("WHEREABOUTS_LOG__FORMAT", "json")
-            .env("WHEREABOUTS_MODEL__THREADS", "1")
-            // Whatever else is installed in the checkout.
-            .env("WHEREABOUTS_MODEL__NAME", "xfeat")
-            .envs(deployment::settings(data))
-            .envs(settings.iter().copied())
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
@@ -90,13 +130,18 @@ impl Server {
                 break;
             }
         }
-        let kept = Arc::clone(&log);
+        let rest_of_log = Arc::clone(&log);
         thread::spawn(move || {
-            lines.map_while(Result::ok).for_each(|line| kept.lock().unwrap().push(line));
+            lines.map_while(Result::ok).for_each(|line| rest_of_log.lock().unwrap().push(line));
         });
         let address = std::fs::read_to_string(&address_file).unwrap();
         std::fs::remove_file(&address_file).unwrap();
         Ok(Self { child, url: format!("http://{}", address.trim()), log, http })
+    }
+
+    /// The id of the process.
+    pub fn id(&self) -> u32 {
+        self.child.id()
     }
 
     pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
@@ -120,7 +165,7 @@ impl Server {
         Answer::of(self.request(Method::PUT, path).json(&body)).await
     }
 
-    /// Posts a body with its type.
+    /// Posts a body of a media type.
     pub async fn post(&self, path: &str, media_type: &str, body: Vec<u8>) -> Answer {
         let request = self.request(Method::POST, path).header("content-type", media_type);
         Answer::of(request.body(body)).await
@@ -130,13 +175,13 @@ impl Server {
         self.post(path, "image/jpeg", body).await
     }
 
-    /// A map of the first `places` places of the town.
+    /// Creates a map of the first `places` places of the town.
     pub async fn town(&self, map: &str, places: usize) {
         self.put(&format!("/maps/{map}"), json!({"scene": "outdoor"})).await.expect(201);
         self.town_more(map, 0..places).await;
     }
 
-    /// More places of the town.
+    /// Adds places of the town to a map.
     pub async fn town_more(&self, map: &str, places: std::ops::Range<usize>) {
         for place in places {
             let path =
@@ -145,13 +190,13 @@ impl Server {
         }
     }
 
-    /// Asks the server to end, and waits until it has.
+    /// Sends SIGTERM and waits until the server has ended.
     pub fn terminate(mut self) -> std::process::ExitStatus {
         signal(&self.child, "TERM");
         self.child.wait().unwrap()
     }
 
-    /// Ends the server as a power cut would.
+    /// Kills the server.
     pub fn kill(mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
@@ -169,6 +214,29 @@ impl Server {
     }
 }
 
+fn arguments(data: &Path) -> [&OsStr; 4] {
+    ["--listen".as_ref(), "127.0.0.1:0".as_ref(), "--data".as_ref(), data.as_ref()]
+}
+
+/// One thread, because tests run side by side; and the same model whatever else is installed in the checkout.
+fn test_settings(data: &Path) -> Vec<(String, String)> {
+    let model = [("WHEREABOUTS_MODEL__THREADS", "1"), ("WHEREABOUTS_MODEL__NAME", "xfeat")];
+    let model = model.map(|(name, value)| (name.to_owned(), value.to_owned()));
+    model.into_iter().chain(deployment::settings(data)).collect()
+}
+
+/// A client that keeps no connections, so that a drain never waits for an idle one, and that may be used from
+/// several runtimes.
+fn unpooled() -> reqwest::Client {
+    install_cryptography();
+    reqwest::Client::builder().pool_max_idle_per_host(0).build().unwrap()
+}
+
+/// reqwest has no cryptography of its own; this is the one that the binary has.
+fn install_cryptography() {
+    let _ = rustls::crypto::ring::default_provider().install_default();
+}
+
 impl Drop for Server {
     fn drop(&mut self) {
         let _ = self.child.kill();
@@ -181,7 +249,7 @@ fn signal(child: &Child, name: &str) {
     assert!(status.unwrap().success());
 }
 
-/// An answer, read to its end.
+/// A response, read to its end.
 #[derive(Debug)]
 pub struct Answer {
     pub status: StatusCode,
@@ -196,14 +264,14 @@ impl Answer {
         Self { status, headers, bytes: response.bytes().await.unwrap().to_vec() }
     }
 
-    /// The JSON of an answer that must have this status.
+    /// Asserts the status; returns the JSON body.
     #[track_caller]
     pub fn expect(&self, status: u16) -> Value {
         assert_eq!(self.status.as_u16(), status, "{}", String::from_utf8_lossy(&self.bytes));
         serde_json::from_slice(&self.bytes).unwrap_or(Value::Null)
     }
 
-    /// A problem of this status: it has all its fields. Returns what it says.
+    /// Asserts that the response is a complete problem with this status; returns its detail.
     #[track_caller]
     pub fn problem(&self, status: u16) -> String {
         let problem = self.expect(status);

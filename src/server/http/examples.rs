@@ -1,5 +1,5 @@
-//! Examples of each call for its description. `tests/blackbox/documented.rs` executes them all, and writes the
-//! answers in `docs/examples.json`.
+//! An example of each call, for its description. The tests execute all of them
+//! (`tests/blackbox/embedded_only/documented.rs`), and write the answers of `docs/examples.json`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -1,4 +1,4 @@
-//! What the mock MLLM takes, as strictly as the real API.
+//! Checks the requests to the mock MLLM as strictly as the real API.
 
 use axum::http::{HeaderMap, Uri};
 use base64::Engine;
@@ -8,8 +8,8 @@ use sha2::{Digest, Sha256};
 
 use super::Script;
 
-/// What a request that obeys the rules asks for.
-pub struct Asked {
+/// A valid request.
+pub struct ParsedCall {
     /// The hashes of its pictures.
     pub pictures: Vec<String>,
     /// The text of its first message.
@@ -35,7 +35,7 @@ pub fn check_envelope(uri: &Uri, headers: &HeaderMap, script: &Script) -> Result
     }
 }
 
-pub fn check_request(request: &Value, max_edge: u32) -> Result<Asked, String> {
+pub fn check_request(request: &Value, max_edge: u32) -> Result<ParsedCall, String> {
     const KNOWN: [&str; 6] = [
         "model",
         "messages",
@@ -61,22 +61,23 @@ pub fn check_request(request: &Value, max_edge: u32) -> Result<Asked, String> {
     ensure(bounded, "the answer's length must be bounded once, by a positive integer")?;
     let structured = fields.get("response_format").map(check_format).transpose()?.is_some();
     let messages = request["messages"].as_array().ok_or("messages is no array")?;
-    let mut asked = Asked { pictures: vec![], prompt: String::new(), repair: false, structured };
+    let mut parsed =
+        ParsedCall { pictures: vec![], prompt: String::new(), repair: false, structured };
     for (index, message) in messages.iter().enumerate() {
         let expected = if index % 2 == 0 { "user" } else { "assistant" };
         ensure(message["role"] == expected, format!("message {index} is not the {expected}'s"))?;
-        let text = check_content(&message["content"], max_edge, &mut asked.pictures)?;
+        let text = check_content(&message["content"], max_edge, &mut parsed.pictures)?;
         ensure(!text.trim().is_empty(), format!("message {index} is empty"))?;
         if index == 0 {
-            asked.prompt = text;
+            parsed.prompt = text;
         }
     }
     ensure(messages.len() % 2 == 1, "the last message is not the user's")?;
-    asked.repair = messages.len() > 1;
-    let pictures = asked.pictures.len();
+    parsed.repair = messages.len() > 1;
+    let pictures = parsed.pictures.len();
     ensure(pictures == 0 || pictures == 2, format!("{pictures} pictures"))?;
     ensure(pictures == 0 || !structured, "a describe call with a schema")?;
-    Ok(asked)
+    Ok(parsed)
 }
 
 /// Returns the text, and adds the hashes of the pictures.

@@ -1,8 +1,8 @@
 //! DINOv2 from the bytes of a JPEG to the descriptor, against PyTorch, torchvision and transformers.
 //!
-//! The weights are seeded random numbers, made anew for each run: the real ones are hundreds of
-//! megabytes and prove nothing more about the arithmetic. `deploy/models/reference_dinov2.py` made
-//! the expected descriptors, in Python, from the same weights and the same pictures.
+//! The weights are seeded random numbers, generated for each run: the real ones are hundreds of
+//! megabytes and prove nothing more about the arithmetic. `deploy/models/reference_dinov2.py` computed
+//! the expected descriptors in Python, from the same weights and the same pictures.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,10 +13,10 @@ use tempfile::TempDir;
 use whereabouts_core::DescriptorKind;
 use whereabouts_vision::{Assets, Extractor, ExtractorSettings, FeatureSet, ImageLimits, Layout};
 
-/// The least cosine similarity to the descriptor of the original.
+/// The minimum cosine similarity to the descriptor of the original.
 const SAME: f64 = 0.9999;
 
-/// That of the variant that multiplies 8-bit numbers.
+/// The minimum for the 8-bit quantized variant.
 const NEAR: f64 = 0.995;
 
 #[derive(Deserialize)]
@@ -35,7 +35,7 @@ fn repository() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Makes the ONNX file and manifest of a model of random weights.
+/// Exports the ONNX file and the manifest of a model with random weights.
 fn export(model: &str, seed: u32, options: &[&str], folder: &Path) {
     let packages = std::fs::read_to_string(repository().join("assets/.python"))
         .expect("run `make assets` first: it gets the Python packages that this needs");
@@ -52,7 +52,7 @@ fn export(model: &str, seed: u32, options: &[&str], folder: &Path) {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// The model with another input, as a folder of its own beside the shared ONNX file.
+/// Creates a model folder with another input size, which shares the ONNX file.
 fn with_input(root: &Path, exported: &Path, expected: &Expected) -> PathBuf {
     let name = format!("{}-{}-{}", expected.width, expected.height, expected.resize);
     let folder = root.join("models").join(&name);
@@ -70,8 +70,8 @@ fn with_input(root: &Path, exported: &Path, expected: &Expected) -> PathBuf {
     folder
 }
 
-/// Compares all that is expected of one model.
-fn check(model: &str, options: &[&str], wanted: f64) {
+/// Compares the descriptors of a model with all that are expected of it.
+fn check(model: &str, options: &[&str], minimum: f64) {
     let fixtures = repository().join("tests/fixtures/dinov2");
     let text = std::fs::read_to_string(fixtures.join("expected.json")).unwrap();
     let mut expected: Vec<Expected> = serde_json::from_str(&text).unwrap();
@@ -91,7 +91,7 @@ fn check(model: &str, options: &[&str], wanted: f64) {
         let layout = Layout { threads: 2, sessions: 1, max_batch: 8 };
         let settings = ExtractorSettings { layout, ..ExtractorSettings::plain(name, 2, limits) };
         let extractor = Extractor::load(&Assets::locate(Some(root.path())), &settings).unwrap();
-        // Each twice at once: what shares a batch must not depend on it.
+        // Each runs twice at once: a descriptor must not depend on its batch.
         std::thread::scope(|scope| {
             let running: Vec<_> = expected
                 .iter()
@@ -110,7 +110,7 @@ fn check(model: &str, options: &[&str], wanted: f64) {
             for running in running {
                 let (similarity, expected) = running.join().unwrap();
                 assert!(
-                    similarity >= wanted,
+                    similarity >= minimum,
                     "{model} {name} {} {}: cosine {similarity:.7}",
                     expected.kind,
                     expected.picture
@@ -132,17 +132,17 @@ fn cosine(a: &[f32], b: &[f32]) -> f64 {
 }
 
 #[test]
-fn the_small_model_is_the_original() {
+fn the_small_model_equals_the_original() {
     check("dinov2-small", &[], SAME);
 }
 
 #[test]
-fn the_base_model_is_the_original() {
+fn the_base_model_equals_the_original() {
     check("dinov2-base", &[], SAME);
 }
 
 #[test]
-fn the_small_model_with_registers_is_the_original() {
+fn the_small_model_with_registers_equals_the_original() {
     check("dinov2-with-registers-small", &[], SAME);
 }
 

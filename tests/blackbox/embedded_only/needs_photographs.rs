@@ -1,6 +1,7 @@
-//! Real photographs, where they are at hand: `../shared/data`, or the folder `WHEREABOUTS_DATA`.
+//! Real photographs: sets with their ground truth in `../shared/data`, or in the folder `WHEREABOUTS_DATA`.
 //!
-//! Indexed over HTTP, restarted in between, localized, refined, and scored by R@1.
+//! Indexed over HTTP, restarted in between, localized, refined, and scored by R@1; and evaluated by
+//! `whereabouts eval`. `tests/optional.sh` runs these tests where the photographs are.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -9,19 +10,21 @@ use std::process::Command;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server};
+use super::eval::{json, recalls};
+use crate::support::{BINARY, Server};
 
-pub fn data(set: &str) -> Option<PathBuf> {
+fn data(set: &str) -> PathBuf {
     let root = std::env::var_os("WHEREABOUTS_DATA").map_or_else(
         || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
         PathBuf::from,
     );
     let folder = root.join(set);
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    eprintln!("SKIPPED: no photographs at {}; set WHEREABOUTS_DATA to test with", root.display());
-    None
+    assert!(
+        folder.is_dir(),
+        "there are no photographs at {}: set WHEREABOUTS_DATA",
+        root.display()
+    );
+    folder
 }
 
 fn ground_truth(folder: &Path) -> HashMap<String, HashSet<String>> {
@@ -33,7 +36,7 @@ fn ground_truth(folder: &Path) -> HashMap<String, HashSet<String>> {
     .collect()
 }
 
-/// Percent of queries with a true image among the first 1, 5 and 10.
+/// Percentage of queries with a correct image among the first 1, 5 and 10.
 #[derive(Debug, Default)]
 struct Recall {
     at: [f64; 3],
@@ -57,9 +60,9 @@ fn ids(list: &Value) -> Vec<String> {
     list.as_array().unwrap().iter().map(of).collect()
 }
 
-/// Indexes, restarts, localizes and refines a set; the recall before and after.
-async fn evaluate(set: &str, references: &str, queries: &str) -> Option<(Recall, Recall)> {
-    let folder = data(set)?;
+/// Indexes a set, restarts, localizes and refines; returns the recall before and after refinement.
+async fn evaluate(set: &str, references: &str, queries: &str) -> (Recall, Recall) {
+    let folder = data(set);
     let truth = ground_truth(&folder);
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
@@ -87,19 +90,51 @@ async fn evaluate(set: &str, references: &str, queries: &str) -> Option<(Recall,
     }
     let recalls = (Recall::of(&coarse, &truth), Recall::of(&refined, &truth));
     eprintln!("{set}: R@1/5/10 {:.1?} before, {:.1?} after", recalls.0.at, recalls.1.at);
-    Some(recalls)
+    recalls
 }
 
 #[tokio::test]
+#[ignore = "needs photographs"]
 async fn refinement_in_the_corridor_reaches_90_percent() {
-    let Some((before, after)) = evaluate("corridor", "ref", "query").await else { return };
+    let (before, after) = evaluate("corridor", "ref", "query").await;
     assert!(before.at[0] >= 60.0 && before.at[2] >= 90.0, "{before:?}");
     assert!(after.at[0] >= 90.0, "{after:?}");
     assert!(after.at[2] >= before.at[2], "{before:?} {after:?}");
 }
 
 #[tokio::test]
+#[ignore = "needs photographs"]
 async fn refinement_in_the_tower_does_no_harm() {
-    let Some((before, after)) = evaluate("tower", "database", "queries").await else { return };
+    let (before, after) = evaluate("tower", "database", "queries").await;
     assert!(after.at[0] >= before.at[0], "{before:?} {after:?}");
+}
+
+/// The summary of `whereabouts eval` on a set, with a graph however small the map is.
+fn eval(set: &str, [database, queries]: [&str; 2], args: &[&str]) -> Value {
+    let folder = data(set);
+    let work = TempDir::new().unwrap();
+    let output = Command::new(&*BINARY)
+        .args(["eval", "--json", "--scene", "indoor", "--model", "xfeat", "--refine", "off"])
+        .args([Path::new("--work"), work.path(), Path::new("--database"), &folder.join(database)])
+        .args([Path::new("--queries"), &folder.join(queries)])
+        .args(args)
+        // Each run has a folder of its own, and would choose a provider for itself.
+        .env("WHEREABOUTS_MODEL__PROVIDER", "cpu")
+        .env("WHEREABOUTS_MODEL__PRECISION", "full")
+        .env("WHEREABOUTS_INDEX__EXACT_UP_TO", "0")
+        .env("WHEREABOUTS_MODEL__THREADS", "1")
+        .output()
+        .unwrap();
+    json(&output)
+}
+
+#[test]
+#[ignore = "needs photographs"]
+fn the_graph_and_the_exact_search_have_the_same_recall() {
+    for (set, folders) in [("corridor", ["ref", "query"]), ("tower", ["database", "queries"])] {
+        let (graph, exact) = (eval(set, folders, &[]), eval(set, folders, &["--exact"]));
+        assert_eq!((&graph["search"], &exact["search"]), (&"fast".into(), &"exact".into()));
+        assert_eq!(graph["skipped"], 0);
+        assert_eq!(recalls(&graph), recalls(&exact), "{set}");
+    }
 }

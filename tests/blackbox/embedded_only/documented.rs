@@ -7,25 +7,25 @@ use reqwest::{Method, Response};
 use serde_json::{Value, json};
 use whereabouts_server::http::{Captured, Example, ExampleBody, examples};
 
-use super::support::{Server, frame, reference, server};
+use crate::support::{Server, frame, reference, server};
 
-/// Where the examples are, to be written anew.
+/// The file that recording overwrites.
 const FILE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/examples.json");
 
-/// The longest text of an answer that is shown.
+/// The longest text of a response that is documented.
 const LONGEST: usize = 600;
 
-/// The most items of a list that are shown.
+/// The maximum number of documented items of a list.
 const MOST: usize = 3;
 
-/// Words for people, and what may be another on another machine.
+/// Fields whose text may change, or differs between machines.
 const DIFFERS: [&str; 6] = ["text", "reasoning", "detail", "request_id", "provider", "precision"];
 
-/// What the server does by itself just then, and may have done or not: measure a map that images
-/// were added to, try a delivery that nobody takes.
+/// Fields that background work may have filled in already or not: the calibration of a map, and attempts at a
+/// delivery.
 const UNDER_WAY: [&str; 3] = [".calibration", ".last_attempt_at", ".last_error"];
 
-/// Lists of what has happened on this server.
+/// Lists whose contents depend on the history of the server.
 const HAPPENED: [&str; 2] = [".minutes", ".errors"];
 
 fn file(name: &str) -> Vec<u8> {
@@ -101,7 +101,7 @@ async fn beginning(mut response: Response, is_stream: bool) -> String {
     beginning
 }
 
-/// Descriptors and lists are long; their beginning shows what they are.
+/// Truncates long texts, such as descriptors, and lists.
 fn shortened(value: &mut Value) {
     match value {
         Value::Object(fields) => fields.values_mut().for_each(shortened),
@@ -120,7 +120,7 @@ fn shortened(value: &mut Value) {
     }
 }
 
-/// What a text is like that differs from server to server.
+/// The kind of a text that differs from server to server.
 fn kind(text: &str) -> Option<&'static str> {
     if text.parse::<uuid::Uuid>().is_ok() {
         return Some("an id");
@@ -142,7 +142,7 @@ fn kind(text: &str) -> Option<&'static str> {
     text.ends_with('…').then_some("a long text")
 }
 
-/// Holds an answer against what is shown of it.
+/// Compares a response with the documented one.
 fn compare(at: &str, shown: &Value, real: &Value) {
     match (shown, real) {
         (Value::Object(shown), Value::Object(real)) => {
@@ -180,7 +180,7 @@ fn compare(at: &str, shown: &Value, real: &Value) {
 }
 
 #[tokio::test]
-async fn the_examples_are_answered_as_they_say() {
+async fn the_documented_examples_are_answered_as_documented() {
     let recording = std::env::var_os("WHEREABOUTS_RECORD_EXAMPLES").is_some();
     let (_dir, server) = server();
     let (mut all, mut captured, mut exported) = (examples().unwrap(), Captured::new(), Value::Null);

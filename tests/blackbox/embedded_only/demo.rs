@@ -1,4 +1,4 @@
-//! `whereabouts demo`: which model it uses, and why.
+//! Which model `whereabouts demo` uses, and why.
 
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
@@ -7,12 +7,12 @@ use std::process::Command;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::mock_hub::{Hub, Trouble};
 use super::model_files::{Bench, fixture};
-use super::support::BINARY;
+use crate::mock_hub::{Fault, Hub};
+use crate::support::BINARY;
 
-/// A catalogue whose `dinov2-small` is a tiny model, so that the demo has it at once; and the binary
-/// away from the checkout, whatever is installed there.
+/// A catalogue whose `dinov2-small` is a tiny model, so that it is downloaded at once; and a copy of the binary
+/// outside the checkout, so that the models installed there do not matter.
 fn bench() -> Bench {
     let bench =
         Bench::with(|manifest| manifest.replace("name = \"tiny\"", "name = \"dinov2-small\""));
@@ -29,11 +29,11 @@ fn binary(bench: &Bench) -> PathBuf {
     bench.assets().with_file_name("whereabouts")
 }
 
-async fn hub(troubles: &[Trouble]) -> Hub {
-    Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), troubles).await
+async fn hub(faults: &[Fault]) -> Hub {
+    Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), faults).await
 }
 
-/// The outcome of a demo, and what it wrote to the standard error.
+/// Runs the demo; returns its summary and its standard error.
 async fn demo(bench: &Bench, hub: &str, more: &[&str]) -> (Value, String) {
     let out = TempDir::new().unwrap();
     let mut command = Command::new(binary(bench));
@@ -60,38 +60,38 @@ fn uses(outcome: &Value, model: &str, why: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn it_installs_dinov2_where_the_hub_answers_and_finds_it_the_next_time() {
+async fn dinov2_is_installed_if_the_hub_answers_and_found_the_next_time() {
     let (bench, hub) = (bench(), hub(&[]).await);
     let (outcome, said) = demo(&bench, &hub.url, &[]).await;
     uses(&outcome, "dinov2-small", "installed from");
     assert!(said.contains("downloading"), "{said}");
-    assert_eq!(hub.asked().len(), 2, "one look, one download");
+    assert_eq!(hub.requested_paths().len(), 2, "one look, one download");
     let (outcome, _) = demo(&bench, &hub.url, &[]).await;
     uses(&outcome, "dinov2-small", "the first installed DINOv2 model");
-    assert_eq!(hub.asked().len(), 2);
+    assert_eq!(hub.requested_paths().len(), 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_flag_decides_and_asks_nobody() {
+async fn a_flag_overrides_the_choice_and_the_hub_is_not_contacted() {
     let (bench, hub) = (bench(), hub(&[]).await);
     let (outcome, _) = demo(&bench, &hub.url, &["--offline"]).await;
     uses(&outcome, "xfeat", "--offline");
     let (outcome, _) = demo(&bench, &hub.url, &["--model", "xfeat"]).await;
     uses(&outcome, "xfeat", "set by model.name");
-    assert_eq!(hub.asked().len(), 0);
+    assert_eq!(hub.requested_paths().len(), 0);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_hub_that_cannot_be_reached_or_breaks_off_is_not_waited_for() {
+async fn an_unreachable_or_failing_hub_falls_back_to_the_built_in_model() {
     let (outcome, _) = demo(&bench(), "http://127.0.0.1:9", &[]).await;
     uses(&outcome, "xfeat", "no connection");
-    for (trouble, why) in [
-        (vec![Trouble::Hang], "no answer within 1 s"),
-        (vec![Trouble::Status(503)], "503"),
-        (vec![Trouble::None, Trouble::Corrupt], "could not be installed"),
-        (vec![Trouble::None, Trouble::StallAfter(100), Trouble::StallAfter(100)], "gave up"),
+    for (fault, why) in [
+        (vec![Fault::Hang], "no answer within 1 s"),
+        (vec![Fault::Status(503)], "503"),
+        (vec![Fault::None, Fault::Corrupt], "could not be installed"),
+        (vec![Fault::None, Fault::StallAfter(100), Fault::StallAfter(100)], "gave up"),
     ] {
-        let (outcome, _) = demo(&bench(), &hub(&trouble).await.url, &[]).await;
+        let (outcome, _) = demo(&bench(), &hub(&fault).await.url, &[]).await;
         uses(&outcome, "xfeat", why);
     }
 }

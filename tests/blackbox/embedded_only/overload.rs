@@ -1,4 +1,4 @@
-//! More than the server can do: frames are refused at once, jobs and indexing before frames.
+//! Overload: excess frames are rejected at once, and jobs and indexing are shed before frames.
 
 use std::time::{Duration, Instant};
 
@@ -7,9 +7,9 @@ use serde_json::Value;
 use tempfile::TempDir;
 use tokio::task::JoinSet;
 
-use super::support::{Answer, Server, frame, reference, value_of};
+use crate::support::{Answer, Server, frame, reference, value_of};
 
-/// One picture in work, so that others wait, and time for all of them on any machine.
+/// One permit, so that other pictures wait, and timeouts that no machine reaches.
 const NARROW: &[(&str, &str)] = &[
     ("WHEREABOUTS_IMAGE__PERMITS", "1"),
     ("WHEREABOUTS_IMAGE__MAX_WAIT_MS", "600000"),
@@ -22,7 +22,7 @@ fn narrow(more: &[(&str, &str)]) -> (TempDir, Server) {
     (dir, server)
 }
 
-/// Posts so many frames at once.
+/// Posts this many frames at once.
 fn post_all(server: &Server, path: &str, frames: usize) -> JoinSet<Answer> {
     let bytes = frame(0, 0);
     let requests = (0..frames).map(|_| {
@@ -36,11 +36,11 @@ async fn metric(server: &Server, name: &str) -> f64 {
     value_of(&server.metrics().await, name).unwrap_or(0.0)
 }
 
-/// Waits until so many frames wait.
-async fn wait_for_line(server: &Server, length: f64) {
+/// Waits until this many frames are queued.
+async fn wait_for_queue(server: &Server, length: f64) {
     let start = Instant::now();
     while metric(server, r#"whereabouts_pictures_waiting{class="localize"}"#).await < length {
-        assert!(start.elapsed() < Duration::from_secs(60), "the line stays short");
+        assert!(start.elapsed() < Duration::from_secs(60), "the queue stays short");
     }
 }
 
@@ -50,7 +50,7 @@ fn retry_after(answer: &Answer) -> u64 {
 }
 
 #[tokio::test]
-async fn frames_beyond_the_queue_get_429_and_are_told_when_to_come_back() {
+async fn a_full_queue_answers_429_with_retry_after() {
     let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "2")]);
     server.town("m", 2).await;
     let answers = post_all(&server, "/localize?map=m&refine=off", 60).join_all().await;
@@ -69,12 +69,12 @@ async fn frames_beyond_the_queue_get_429_and_are_told_when_to_come_back() {
 }
 
 #[tokio::test]
-async fn a_deadline_that_cannot_be_met_is_refused_at_once_and_who_has_gone_is_not_served() {
+async fn a_hopeless_deadline_is_rejected_at_once_and_abandoned_requests_are_not_served() {
     const FRAMES: usize = 400;
     let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "500")]);
     server.town("m", 2).await;
-    let mut crowd = post_all(&server, "/localize?map=m&refine=off", FRAMES);
-    wait_for_line(&server, 200.0).await;
+    let mut load = post_all(&server, "/localize?map=m&refine=off", FRAMES);
+    wait_for_queue(&server, 200.0).await;
     let request = server
         .request(Method::POST, "/localize?map=m&refine=off")
         .header("content-type", "image/jpeg")
@@ -83,14 +83,14 @@ async fn a_deadline_that_cannot_be_met_is_refused_at_once_and_who_has_gone_is_no
     let refused = Answer::of(request).await;
     assert!(refused.problem(429).contains("X-Deadline-Ms"));
     assert!(retry_after(&refused) >= 1);
-    crowd.shutdown().await;
+    load.shutdown().await;
     server.post_jpeg("/localize?map=m&refine=off", frame(1, 0)).await.expect(200);
     let served = metric(&server, r#"whereabouts_stage_seconds_count{stage="decode"}"#).await;
     assert!(served < (FRAMES - 50) as f64, "{served} pictures were decoded");
 }
 
 #[tokio::test]
-async fn a_deadline_that_passes_answers_504_and_one_that_is_none_400() {
+async fn a_missed_deadline_is_504_and_a_malformed_one_400() {
     let (_dir, server) = narrow(&[]);
     server.town("m", 2).await;
     let post = |deadline: &str| {
@@ -103,7 +103,7 @@ async fn a_deadline_that_passes_answers_504_and_one_that_is_none_400() {
         let answer = Answer::of(post(rubbish).body(frame(0, 0))).await;
         assert!(answer.problem(400).contains("X-Deadline-Ms"), "{rubbish}");
     }
-    // A body that never comes cannot be answered in time.
+    // A body that never comes misses the deadline.
     let never = futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>();
     let answer = Answer::of(post("200").body(reqwest::Body::wrap_stream(never))).await;
     assert!(answer.problem(504).contains("200 ms"));
@@ -111,8 +111,8 @@ async fn a_deadline_that_passes_answers_504_and_one_that_is_none_400() {
 }
 
 #[tokio::test]
-async fn waiting_for_a_refinement_ends_in_time_for_the_deadline() {
-    // Nobody refines: the endpoint of the model is not there, and the job waits for it.
+async fn waiting_for_a_refinement_ends_before_the_deadline() {
+    // The endpoint of the model is unreachable, so the job waits for it.
     let (_dir, server) = narrow(&[
         ("WHEREABOUTS_REFINE__REFINER", "mllm"),
         ("WHEREABOUTS_MLLM__BASE_URL", "http://127.0.0.1:1/v1"),
@@ -130,15 +130,15 @@ async fn waiting_for_a_refinement_ends_in_time_for_the_deadline() {
 }
 
 #[tokio::test]
-async fn frames_go_without_jobs_before_any_is_refused() {
+async fn under_load_jobs_are_shed_before_frames() {
     let settings = [("WHEREABOUTS_IMAGE__QUEUE", "200"), ("WHEREABOUTS_JOBS__SHED_AT", "0.05")];
     let (_dir, server) = narrow(&settings);
     server.town("m", 2).await;
-    let crowd = post_all(&server, "/localize?map=m&refine=async", 200);
-    wait_for_line(&server, 120.0).await;
+    let load = post_all(&server, "/localize?map=m&refine=async", 200);
+    wait_for_queue(&server, 120.0).await;
     let waits = server.post_jpeg("/localize?map=m&refine=wait", frame(0, 0)).await;
     assert!(waits.problem(429).contains("jobs.shed_at"));
-    let answers = crowd.join_all().await;
+    let answers = load.join_all().await;
     let answers: Vec<Value> = answers.iter().map(|answer| answer.expect(200)).collect();
     let without = answers.iter().filter(|answer| answer["job"].is_null());
     let reasons: Vec<_> = without.map(|answer| &answer["no_job"]["reason"]).collect();
@@ -148,11 +148,11 @@ async fn frames_go_without_jobs_before_any_is_refused() {
     );
     let with = answers.iter().filter(|answer| answer["no_job"].is_null());
     assert_eq!(with.count(), answers.len() - reasons.len());
-    assert!(reasons.len() < answers.len(), "nobody waits behind the last ones");
+    assert!(reasons.len() < answers.len(), "the last frames have no queue behind them");
 }
 
 #[tokio::test]
-async fn indexing_makes_room_for_frames() {
+async fn indexing_yields_to_localization() {
     let (_dir, server) = narrow(&[("WHEREABOUTS_IMAGE__QUEUE", "4")]);
     server.town("m", 1).await;
     let picture = reference(2);

@@ -2,13 +2,13 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
-use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::mock_hub::{Hub, Trouble};
-use super::support::{BINARY, Server};
+use crate::mock_hub::{Fault, Hub};
+use crate::support::{BINARY, Server};
+use crate::wait::until;
 
 const FIXTURE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/models/tiny-tokens");
 
@@ -16,7 +16,7 @@ pub fn fixture(file: &str) -> PathBuf {
     Path::new(FIXTURE).join(file)
 }
 
-/// Assets of their own and a catalogue with one model, `tiny`.
+/// An assets folder, and a catalogue with one model, `tiny`.
 pub struct Bench {
     dir: TempDir,
 }
@@ -26,7 +26,7 @@ impl Bench {
         Self::with(|manifest| manifest)
     }
 
-    /// The catalogue's manifest is what `change` makes of the fixture's.
+    /// A catalogue with the manifest of the fixture, changed by `change`.
     pub fn with(change: impl FnOnce(String) -> String) -> Self {
         let dir = TempDir::new().unwrap();
         let manifest = std::fs::read_to_string(fixture("manifest.toml")).unwrap();
@@ -44,7 +44,7 @@ impl Bench {
         self.dir.path().join("catalogue.toml")
     }
 
-    /// Without a pin, the first download is believed.
+    /// A catalogue without a pinned digest: the first download is trusted.
     fn unpinned() -> Self {
         Self::with(|manifest| {
             let lines: Vec<_> = manifest.lines().filter(|l| !l.starts_with("sha256")).collect();
@@ -78,7 +78,7 @@ impl Bench {
         Outcome::of(&self.command(hub, args).output().unwrap())
     }
 
-    /// Nothing is installed, not even in part.
+    /// Asserts that nothing is installed, not even partially.
     #[track_caller]
     fn nothing_is_installed(&self) {
         assert!(!self.models().join("tiny").exists());
@@ -114,7 +114,7 @@ impl Outcome {
         self.out
     }
 
-    /// It failed and says all of these words.
+    /// Asserts that the command failed and that its error contains all of these words.
     #[track_caller]
     fn bad(self, words: &[&str]) {
         assert_eq!(self.code, Some(1), "{}{}", self.out, self.err);
@@ -124,11 +124,11 @@ impl Outcome {
     }
 }
 
-async fn hub(troubles: &[Trouble]) -> Hub {
-    Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), troubles).await
+async fn hub(faults: &[Fault]) -> Hub {
+    Hub::start(std::fs::read(fixture("model.onnx")).unwrap(), faults).await
 }
 
-/// Off the async threads, on which the hub runs.
+/// Runs `model pull` off the async threads, which the hub needs.
 async fn pull(bench: &Bench, hub: &Hub) -> Outcome {
     let mut command = bench.command(&hub.url, &["pull", "tiny"]);
     let run = tokio::task::spawn_blocking(move || command.output().unwrap());
@@ -143,10 +143,10 @@ async fn a_model_is_pulled_once_and_then_served() {
     bench.tiny_is_installed();
     let licence = std::fs::read_to_string(bench.models().join("tiny/LICENCE")).unwrap();
     assert!(licence.contains("Apache-2.0") && licence.contains("Nobody's."), "{licence}");
-    assert_eq!(hub.asked(), ["/lab/tiny/resolve/v1/model.onnx"]);
+    assert_eq!(hub.requested_paths(), ["/lab/tiny/resolve/v1/model.onnx"]);
     let again = pull(&bench, &hub).await.good();
     assert!(again.contains("installed already"), "{again}");
-    assert_eq!(hub.asked().len(), 1);
+    assert_eq!(hub.requested_paths().len(), 1);
 
     bench.run(&hub.url, &["use", "tiny"]).good();
     let assets = bench.assets();
@@ -162,14 +162,14 @@ async fn a_model_is_pulled_once_and_then_served() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn weights_in_a_file_of_their_own_come_with_the_model() {
+async fn an_external_weights_file_is_pulled_with_the_model() {
     let data = "[model.manifest.data]\nfile = \"weights.bin\"\n[input]";
     let bench = Bench::with(|manifest| manifest.replace("[input]", data));
-    let cut = Trouble::CutAfter(1000);
-    let hub = hub(&[Trouble::None, cut]).await;
+    let cut = Fault::CutAfter(1000);
+    let hub = hub(&[Fault::None, cut]).await;
     pull(&bench, &hub).await.good();
-    let asked = hub.asked();
-    assert_eq!(asked[..2], ["/lab/tiny/resolve/v1/model.onnx", "/lab/tiny/resolve/v1/weights.bin"]);
+    let paths = hub.requested_paths();
+    assert_eq!(paths[..2], ["/lab/tiny/resolve/v1/model.onnx", "/lab/tiny/resolve/v1/weights.bin"]);
     bench.tiny_is_installed();
     let weights = bench.models().join("tiny/weights.bin");
     std::fs::write(&weights, "others").unwrap();
@@ -179,52 +179,49 @@ async fn weights_in_a_file_of_their_own_come_with_the_model() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_line_that_breaks_is_continued_and_no_byte_is_sent_twice() {
+async fn a_broken_download_is_resumed_and_no_byte_is_sent_twice() {
     let bench = Bench::new();
-    let hub =
-        hub(&[Trouble::CutAfter(6_000), Trouble::CutAfter(6_000), Trouble::CutAfter(6_000)]).await;
+    let hub = hub(&[Fault::CutAfter(6_000), Fault::CutAfter(6_000), Fault::CutAfter(6_000)]).await;
     pull(&bench, &hub).await.good();
     bench.tiny_is_installed();
-    assert_eq!(hub.asked().len(), 4);
+    assert_eq!(hub.requested_paths().len(), 4);
     let whole = std::fs::metadata(fixture("model.onnx")).unwrap().len();
-    // What was on the line when it was cut may be lost, but the rest is not asked for again.
+    // Bytes in flight at a cut may be lost, but the rest is not requested again.
     assert!(hub.sent() >= whole && hub.sent() <= whole + 3 * 6_000, "{} bytes", hub.sent());
     assert!(hub.ranges()[1..].iter().any(Option::is_some), "{:?}", hub.ranges());
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn passing_troubles_pass() {
-    for trouble in
-        [Trouble::Status(500), Trouble::Status(429), Trouble::Hang, Trouble::StallAfter(5_000)]
-    {
-        let (bench, hub) = (Bench::new(), hub(&[trouble]).await);
+async fn transient_errors_of_the_hub_are_retried() {
+    for fault in [Fault::Status(500), Fault::Status(429), Fault::Hang, Fault::StallAfter(5_000)] {
+        let (bench, hub) = (Bench::new(), hub(&[fault]).await);
         pull(&bench, &hub).await.good();
         bench.tiny_is_installed();
     }
-    // A server that has never heard of ranges sends everything again.
+    // A server without range support sends everything again.
     let bench = Bench::new();
-    let hub = hub(&[Trouble::CutAfter(9_000), Trouble::IgnoreRange]).await;
+    let hub = hub(&[Fault::CutAfter(9_000), Fault::IgnoreRange]).await;
     pull(&bench, &hub).await.good();
     bench.tiny_is_installed();
-    // 416: what is there cannot be continued.
+    // 416: the partial file cannot be resumed.
     let bench = Bench::new();
-    let hub = self::hub(&[Trouble::CutAfter(9_000), Trouble::Status(416)]).await;
+    let hub = self::hub(&[Fault::CutAfter(9_000), Fault::Status(416)]).await;
     pull(&bench, &hub).await.good();
     bench.tiny_is_installed();
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_file_that_changes_in_between_is_begun_anew() {
+async fn a_file_that_changes_during_a_download_is_downloaded_again() {
     let bench = Bench::unpinned();
-    let hub = hub(&[Trouble::CutAfter(9_000), Trouble::Change]).await;
+    let hub = hub(&[Fault::CutAfter(9_000), Fault::Change]).await;
     pull(&bench, &hub).await.good();
     let installed = std::fs::read(bench.models().join("tiny/model.onnx")).unwrap();
     assert!(installed == hub.file(), "parts of two files were mixed");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn corrupt_bytes_are_refused_and_removed() {
-    let (bench, hub) = (Bench::new(), hub(&[Trouble::Corrupt]).await);
+async fn corrupt_bytes_are_rejected_and_removed() {
+    let (bench, hub) = (Bench::new(), hub(&[Fault::Corrupt]).await);
     pull(&bench, &hub).await.bad(&["is pinned", "removed", "again", "model.hub"]);
     bench.nothing_is_installed();
     pull(&bench, &hub).await.good();
@@ -233,11 +230,11 @@ async fn corrupt_bytes_are_refused_and_removed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_hub_that_refuses_or_stays_away_is_named_with_what_to_do() {
-    let (bench, hub) = (Bench::new(), hub(&[Trouble::Status(404)]).await);
+async fn a_failing_hub_is_named_with_a_hint() {
+    let (bench, hub) = (Bench::new(), hub(&[Fault::Status(404)]).await);
     pull(&bench, &hub).await.bad(&["404", "/lab/tiny/resolve/v1/model.onnx", "model add"]);
-    assert_eq!(hub.asked().len(), 1, "a 404 is not asked again");
-    let hub = self::hub(&[Trouble::Status(503); 6]).await;
+    assert_eq!(hub.requested_paths().len(), 1, "a 404 is not asked again");
+    let hub = self::hub(&[Fault::Status(503); 6]).await;
     pull(&bench, &hub).await.bad(&["gave up", "6 attempts", "503", "model.hub"]);
     bench.run("http://127.0.0.1:9", &["pull", "tiny"]).bad(&["gave up", "model.hub"]);
     bench.run(&hub.url, &["pull", "other"]).bad(&["only tiny", "model add"]);
@@ -246,9 +243,9 @@ async fn a_hub_that_refuses_or_stays_away_is_named_with_what_to_do() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_file_above_the_bound_is_refused_and_not_kept() {
-    for trouble in [Trouble::None, Trouble::NoLength] {
-        let (bench, hub) = (Bench::new(), hub(&[trouble]).await);
+async fn a_file_above_the_size_limit_is_rejected_and_removed() {
+    for fault in [Fault::None, Fault::NoLength] {
+        let (bench, hub) = (Bench::new(), hub(&[fault]).await);
         let mut command = bench.command(&hub.url, &["pull", "tiny"]);
         command.env("WHEREABOUTS_MODEL__MAX_DOWNLOAD_BYTES", "10000");
         let run = tokio::task::spawn_blocking(move || command.output().unwrap());
@@ -259,9 +256,9 @@ async fn a_file_above_the_bound_is_refused_and_not_kept() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_pull_that_is_killed_leaves_nothing_installed_and_is_continued() {
+async fn a_killed_pull_installs_nothing_and_is_resumed() {
     let bench = Bench::new();
-    let hub = hub(&[Trouble::StallAfter(12_000)]).await;
+    let hub = hub(&[Fault::StallAfter(12_000)]).await;
     let mut killed = Killed(
         bench
             .command(&hub.url, &["pull", "tiny"])
@@ -271,12 +268,8 @@ async fn a_pull_that_is_killed_leaves_nothing_installed_and_is_continued() {
             .unwrap(),
     );
     let partial = bench.models().join(".partial/tiny-model.onnx");
-    let start = Instant::now();
-    while std::fs::metadata(&partial).map_or(0, |file| file.len()) < 12_000 {
-        assert!(start.elapsed() < Duration::from_secs(20), "nothing was downloaded");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
-    // While it is at work, another one does not get in its way.
+    until(async || std::fs::metadata(&partial).map_or(0, |file| file.len()) >= 12_000).await;
+    // A second pull does not interfere with it.
     pull(&bench, &hub).await.bad(&["another process is installing tiny"]);
     killed.0.kill().unwrap();
     killed.0.wait().unwrap();
@@ -288,7 +281,7 @@ async fn a_pull_that_is_killed_leaves_nothing_installed_and_is_continued() {
     assert_eq!(hub.sent(), whole);
 }
 
-/// Ends with the test.
+/// Kills the process when dropped.
 struct Killed(Child);
 
 impl Drop for Killed {
@@ -299,7 +292,7 @@ impl Drop for Killed {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_a_pin_the_first_digest_is_recorded_and_holds() {
+async fn without_a_pin_the_first_digest_is_recorded_and_enforced() {
     let (bench, hub) = (Bench::unpinned(), hub(&[]).await);
     let said = pull(&bench, &hub).await.good();
     assert!(said.contains("recorded in its manifest"), "{said}");
@@ -322,7 +315,7 @@ async fn without_a_pin_the_first_digest_is_recorded_and_holds() {
 }
 
 #[test]
-fn a_file_is_added_without_a_hub_and_chosen() {
+fn a_local_file_is_added_and_selected_without_a_hub() {
     let bench = Bench::new();
     let run = |args: &[&str]| bench.run("http://127.0.0.1:9", args);
     let (file, manifest) = (fixture("model.onnx"), fixture("manifest.toml"));

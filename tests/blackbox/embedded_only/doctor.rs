@@ -1,4 +1,4 @@
-//! What `whereabouts doctor` says about data folders that are in order, and about others.
+//! `whereabouts doctor` on healthy and on damaged data folders.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server, frame, reference};
+use crate::support::{BINARY, Server, frame, reference};
 
 fn doctor(dir: &Path, args: &[&str]) -> Output {
     Command::new(&*BINARY).arg("doctor").args(args).arg("--data").arg(dir).output().unwrap()
@@ -20,7 +20,7 @@ fn report(dir: &Path, args: &[&str]) -> (Value, i32) {
     (serde_json::from_slice(&output.stdout).expect(&error), output.status.code().unwrap())
 }
 
-/// What is found, one line each.
+/// The findings, one line each.
 fn findings(report: &Value) -> Vec<String> {
     let findings = report["findings"].as_array().unwrap().iter();
     findings.map(|finding| format!("{} ({})", finding["what"], finding["advice"])).collect()
@@ -43,7 +43,7 @@ fn blob(dir: &Path, bytes: &[u8]) -> PathBuf {
 }
 
 #[tokio::test]
-async fn a_folder_that_is_in_order_is_said_to_be_so() {
+async fn a_healthy_folder_is_reported_as_healthy() {
     let dir = folder().await;
     let output = doctor(dir.path(), &["--deep"]);
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
@@ -59,7 +59,7 @@ async fn a_folder_that_is_in_order_is_said_to_be_so() {
 }
 
 #[tokio::test]
-async fn what_nothing_needs_and_what_is_derived_is_put_right() {
+async fn orphans_and_derived_files_are_repaired() {
     let dir = folder().await;
     let orphan = blob(dir.path(), b"orphan");
     fs::create_dir_all(orphan.parent().unwrap()).unwrap();
@@ -87,7 +87,7 @@ async fn what_nothing_needs_and_what_is_derived_is_put_right() {
 }
 
 #[tokio::test]
-async fn what_is_lost_is_named_with_what_to_do() {
+async fn lost_data_is_named_with_a_hint() {
     let dir = folder().await;
     fs::remove_file(blob(dir.path(), &reference(2))).unwrap();
     let picture = blob(dir.path(), &reference(1));
@@ -111,7 +111,7 @@ async fn what_is_lost_is_named_with_what_to_do() {
 }
 
 #[tokio::test]
-async fn a_folder_in_use_a_newer_one_and_none_are_said_to_be_so() {
+async fn a_folder_in_use_a_newer_folder_and_a_missing_folder_are_reported() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     let output = doctor(dir.path(), &[]);
@@ -135,7 +135,7 @@ async fn a_folder_in_use_a_newer_one_and_none_are_said_to_be_so() {
 }
 
 #[tokio::test]
-async fn a_compacted_database_serves_as_before() {
+async fn a_compacted_database_still_serves() {
     let dir = folder().await;
     let (report, code) = report(dir.path(), &["--compact"]);
     assert_eq!(code, 0, "{report}");

@@ -5,10 +5,10 @@ use std::process::Command;
 
 use tempfile::TempDir;
 
-use super::support::{BINARY, Server, frame, reference};
+use crate::support::{BINARY, Server, frame, reference};
 
 #[tokio::test]
-async fn a_folder_without_a_version_is_copied_and_brought_up_to_date() {
+async fn a_folder_without_a_version_is_backed_up_and_migrated() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);
     server.town("m", 3).await;
@@ -31,7 +31,7 @@ async fn a_folder_without_a_version_is_copied_and_brought_up_to_date() {
 }
 
 #[tokio::test]
-async fn a_newer_folder_is_refused_with_what_to_do() {
+async fn a_folder_of_a_newer_version_is_rejected_with_a_hint() {
     let dir = TempDir::new().unwrap();
     assert!(Server::start(dir.path(), &[]).terminate().success());
     fs::write(dir.path().join("version"), "3\n").unwrap();

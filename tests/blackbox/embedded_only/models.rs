@@ -1,4 +1,4 @@
-//! Models of both layouts, from the bytes of a picture to the descriptor.
+//! Models with both output layouts, from the bytes of a picture to the descriptor.
 
 use std::path::Path;
 
@@ -7,14 +7,14 @@ use tempfile::TempDir;
 use whereabouts_core::{Descriptor, DescriptorKind};
 use whereabouts_vision::{Assets, Extractor, ExtractorSettings, FeatureSet, ImageLimits, Layout};
 
-use super::support::{BINARY, Server, frame, reference};
+use crate::support::{BINARY, reference};
 
 const ONE: Layout = Layout { threads: 1, sessions: 1, max_batch: 1 };
 const EIGHT: Layout = Layout { threads: 1, sessions: 1, max_batch: 8 };
 const SIDE_BY_SIDE: Layout = Layout { threads: 4, sessions: 2, max_batch: 2 };
 
 fn load(model: &str, layout: Layout) -> Extractor {
-    // The fixtures first, then what `make build` installed.
+    // The fixtures, and then the models that `make build` installed.
     let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures");
     let limits = ImageLimits { max_pixels: 10_000_000 };
     let settings = ExtractorSettings { layout, ..ExtractorSettings::plain(model, 1, limits) };
@@ -26,7 +26,7 @@ fn descriptor(extractor: &Extractor, place: usize) -> Descriptor {
     extractor.extract(&reference(place), kind, features).unwrap().descriptor
 }
 
-/// The picture that the fixture's script describes, as a PNG.
+/// The test pattern of the script that generated the fixture, as a PNG.
 fn pattern() -> Vec<u8> {
     let pixels = image::RgbImage::from_fn(56, 42, |x, y| {
         let byte = |value: u32| (value % 256) as u8;
@@ -43,7 +43,7 @@ fn cosine(a: &[f32], b: &[f32]) -> f64 {
 }
 
 #[test]
-fn a_token_model_gives_the_descriptors_that_numpy_worked_out() {
+fn a_token_model_gives_the_descriptors_computed_with_numpy() {
     let extractor = load("tiny-tokens", ONE);
     let file =
         concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/models/tiny-tokens/expected.json");
@@ -69,7 +69,7 @@ fn a_batch_gives_what_single_runs_give() {
         std::thread::scope(|scope| {
             let shared = &shared;
             let extract = move |place| descriptor(shared, place);
-            // Several rounds, so that pictures come both alone and while others are in progress.
+            // Several rounds, so that pictures arrive both alone and during other batches.
             let threads: Vec<_> =
                 (0..8).map(|place| scope.spawn(move || [(); 5].map(|()| extract(place)))).collect();
             for (thread, alone) in threads.into_iter().zip(&alone) {
@@ -83,7 +83,7 @@ fn a_batch_gives_what_single_runs_give() {
 }
 
 #[test]
-fn a_damaged_model_is_refused_by_its_digest() {
+fn a_damaged_model_is_rejected_by_its_digest() {
     let root = tempfile::tempdir().unwrap();
     let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/models/tiny-tokens");
     let to = root.path().join("models/tiny-tokens");
@@ -98,59 +98,8 @@ fn a_damaged_model_is_refused_by_its_digest() {
     assert!(error.to_string().contains("pins"), "{error}");
 }
 
-/// Whether `make openvino` has been run.
-fn has_openvino() -> bool {
-    let library = "assets/onnxruntime-openvino/libonnxruntime.so";
-    Path::new(env!("CARGO_MANIFEST_DIR")).join(library).is_file()
-}
-
-#[tokio::test]
-async fn another_provider_gives_the_same_descriptors_and_another_precision_is_refused() {
-    if !has_openvino() {
-        eprintln!("not run: `make openvino` gets the library that this needs");
-        return;
-    }
-    let dir = TempDir::new().unwrap();
-    let start = |provider, precision| {
-        let settings = [
-            ("WHEREABOUTS_MODEL__PROVIDER", provider),
-            ("WHEREABOUTS_MODEL__PRECISION", precision),
-        ];
-        Server::start(dir.path(), &settings)
-    };
-    let localize = async |server: &Server| {
-        let answer = server.post_jpeg("/localize?map=m&refine=off", frame(1, 0)).await.expect(200);
-        let candidates = answer["candidates"].as_array().unwrap().clone();
-        candidates.iter().map(|one| one["similarity"].as_f64().unwrap()).collect::<Vec<_>>()
-    };
-    let server = start("cpu", "auto");
-    server.town("m", 4).await;
-    assert_eq!(server.get("/maps/m").await.expect(200)["precision"], "full");
-    let by_cpu = localize(&server).await;
-    server.terminate();
-    // auto keeps to the precision of the maps.
-    let server = start("openvino", "auto");
-    assert!(server.log().contains("openvino at full precision"), "{}", server.log());
-    for (one, other) in localize(&server).await.iter().zip(&by_cpu) {
-        assert!((one - other).abs() < 1e-4, "{one} is not {other}");
-    }
-    server.terminate();
-    let server = start("openvino", "bf16");
-    let refused = server.post_jpeg("/localize?map=m&refine=off", frame(1, 0)).await.problem(409);
-    assert!(refused.contains("model.precision"), "{refused}");
-    server.town("b", 2).await;
-    assert_eq!(server.get("/maps/b").await.expect(200)["precision"], "bf16");
-    // As it says, too: the descriptors are made anew.
-    assert!(refused.contains("--reindex --map m"), "{refused}");
-    server.post("/maps/m/reindex", "application/json", Vec::new()).await.expect(202);
-    while server.get("/maps/m").await.expect(200)["precision"] == "full" {
-        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-    }
-    assert_eq!(localize(&server).await.len(), 4);
-}
-
 #[test]
-fn a_provider_that_is_not_there_is_named_at_the_start() {
+fn a_missing_provider_is_named_at_startup() {
     let dir = TempDir::new().unwrap();
     let output = std::process::Command::new(&*BINARY)
         .args(["serve", "--listen", "127.0.0.1:0", "--data"])
