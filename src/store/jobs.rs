@@ -96,8 +96,8 @@ pub struct Release {
 pub trait JobStore: Send + Sync {
     /// Queues a job unless `limit` jobs wait already ([`StoreError::QueueFull`]).
     async fn submit(&self, record: JobRecord, limit: usize) -> Result<(), StoreError>;
-    /// The same for a request that was reserved with that id ([`IdempotencyStore::reserve_answer`](super::AnswerStore::reserve_answer)); the job and
-    /// the note that it was queued for this request are one change. If one was queued for it before, by a
+    /// The same for a request that was reserved with that id ([`super::IdempotencyStore::reserve_answer`]); the
+    /// job and the note that it was queued for this request are one change. If one was queued for it before, by a
     /// process that ended too soon to answer, gives that one and queues nothing.
     async fn submit_once(
         &self,

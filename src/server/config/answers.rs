@@ -100,7 +100,7 @@ impl Refine {
 pub enum Refiner {
     /// Geometric matching of dense features.
     Local,
-    /// A multimodal LLM ([mllm] says which).
+    /// A multimodal LLM (`[mllm]` says which).
     Mllm,
     /// Nobody.
     Off,

@@ -42,7 +42,7 @@ const fn admin(path: &'static str) -> Call {
     Call { role: Some(Role::Admin), changes: true, ..robot(path) }
 }
 
-/// All calls but those of reflection, which are [`REFLECTION`] and [`REFLECTION_ALPHA`].
+/// All calls but those of reflection, which are `REFLECTION` and `REFLECTION_ALPHA`.
 pub const CALLS: &[Call] = &[
     Call { pictures: true, waits: true, ..robot("/whereabouts.v1.LocalizationService/Localize") },
     Call {

@@ -3,7 +3,7 @@
 //!
 //! Nothing is kept in a process that another would need. What a process holds for a while, a job, a draft, a
 //! request that is to be done once, is marked with the process's id, and free again when the process has
-//! not said for a while that it is alive ([`processes`]). No lock outlives its statement or its short
+//! not said for a while that it is alive (`processes`). No lock outlives its statement or its short
 //! transaction; building an index, which may take minutes, holds an advisory lock that nobody waits for.
 //!
 //! Every call has a time limit. A database that is away, too slow or too busy is
