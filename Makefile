@@ -61,7 +61,7 @@ lint: nasm ## Check formatting, spelling, lints, rustdoc, licences, and the buil
 	CARGO=$(CARGO) deploy/setup/lint.sh target/lint
 	$(CARGO) fmt --check
 	target/lint/bin/typos
-	target/lint/bin/cargo-deny --offline --locked check bans licenses sources
+	target/lint/bin/cargo-deny --locked check bans licenses sources
 	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --release --locked --workspace --no-deps
 	$(MAKE) features
