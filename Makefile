@@ -3,10 +3,10 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino chromium test scale-out conformance console console-bench examples crash fuzz lint features advisories format bench load soak openapi clean
+.PHONY: help demo build assets nasm openvino chromium test scale-out conformance console console-bench examples crash fuzz lint features advisories format bench load soak record-examples openapi package clean
 
 help: ## List the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
 
 demo: build ## Set up, build, index a town, localize frames in it, refine, print a report
 	$(BINARY) demo --out demo-out
@@ -86,8 +86,14 @@ load: build ## Overload test: ten times the load the server can handle
 soak: build ## Soak test: mixed traffic for ten minutes, then check for growth
 	$(CARGO) bench --locked --bench soak
 
-openapi: build ## Regenerate docs/openapi.json from the handlers
+record-examples: assets nasm ## Send the requests of docs/examples.json to a server and write its answers there
+	WHEREABOUTS_RECORD_EXAMPLES=1 $(CARGO) test --release --locked --test blackbox -- documented
+
+openapi: build ## Regenerate docs/openapi.json from the handlers and docs/examples.json
 	$(BINARY) openapi > docs/openapi.json
+
+package: build ## Pack the binary, its assets and the licences into target/whereabouts-VERSION-TARGET.tar.gz
+	deploy/setup/package.sh $(BINARY) target
 
 clean: ## Remove build output and downloads
 	$(CARGO) clean
