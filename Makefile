@@ -3,16 +3,16 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino chromium test scale-out conformance console console-bench examples crash fuzz lint format bench load soak openapi clean
+.PHONY: help demo build assets nasm openvino chromium test scale-out conformance console console-bench examples crash fuzz lint features advisories format bench load soak record-examples openapi package clean
 
 help: ## List the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
 
 demo: build ## Set up, build, index a town, localize frames in it, refine, print a report
 	$(BINARY) demo --out demo-out
 
 build: assets nasm ## Set up and build target/release/whereabouts
-	@command -v $(CARGO) >/dev/null || { echo "cargo is missing: install Rust 1.95 or later, then run make again" >&2; exit 1; }
+	@command -v $(CARGO) >/dev/null || { echo "cargo is missing: install Rust 1.95 with rustup (https://rustup.rs), then run make again" >&2; exit 1; }
 	$(CARGO) build --release --locked
 
 assets: ## Download ONNX Runtime and the built-in model, pinned by version and hash
@@ -58,9 +58,21 @@ crash: assets nasm ## Kill the server at 200 random moments and check that nothi
 fuzz: assets nasm ## Feed a million mutated inputs to every parser of untrusted data
 	WHEREABOUTS_FUZZ_RUNS=120000 $(CARGO) test --release --locked --test fuzz -- --nocapture
 
-lint: ## Check formatting and lints
+lint: nasm ## Check formatting, spelling, lints, rustdoc, licences, and the build without optional features
+	CARGO=$(CARGO) deploy/setup/lint.sh target/lint
 	$(CARGO) fmt --check
+	target/lint/bin/typos
+	target/lint/bin/cargo-deny --locked check bans licenses sources
 	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
+	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --release --locked --workspace --no-deps
+	$(MAKE) features
+
+features: nasm ## Check that the service builds without its optional features
+	$(CARGO) clippy --release --locked -p whereabouts --no-default-features -- -D warnings
+
+advisories: ## Check dependencies for known vulnerabilities; fetches the RustSec database
+	CARGO=$(CARGO) deploy/setup/lint.sh target/lint
+	target/lint/bin/cargo-deny --locked check advisories
 
 format: ## Format the code
 	$(CARGO) fmt
@@ -75,8 +87,14 @@ load: build ## Overload test: ten times the load the server can handle
 soak: build ## Soak test: mixed traffic for ten minutes, then check for growth
 	$(CARGO) bench --locked --bench soak
 
-openapi: build ## Regenerate docs/openapi.json from the handlers
+record-examples: assets nasm ## Send the requests of docs/examples.json to a server and write its answers there
+	WHEREABOUTS_RECORD_EXAMPLES=1 $(CARGO) test --release --locked --test blackbox -- documented
+
+openapi: build ## Regenerate docs/openapi.json from the handlers and docs/examples.json
 	$(BINARY) openapi > docs/openapi.json
+
+package: build ## Pack the binary, its assets and the licences into target/whereabouts-VERSION-TARGET.tar.gz
+	deploy/setup/package.sh $(BINARY) target
 
 clean: ## Remove build output and downloads
 	$(CARGO) clean

@@ -106,7 +106,7 @@ impl TrackStep {
     /// Checks what a robot says; a frame without a time was taken now.
     ///
     /// # Errors
-    /// [`ErrorKind::Unprocessable`](super::ErrorKind) for an id that is none, and for a way that cannot be.
+    /// [`ErrorKind::Unprocessable`](whereabouts_api::ErrorKind) for an id that is none, and for a way that cannot be.
     pub fn new(
         caller: &Principal,
         id: String,
