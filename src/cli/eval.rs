@@ -126,9 +126,9 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let _logs =
         whereabouts_telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
     let service = open(config.clone()).await?;
-    let model = service.models.default_model().to_owned();
-    let execution = service.installed_model(&model).await?.execution().to_string();
-    let limits = service.models.limits();
+    let model = service.maps.imaging.models.default_model().to_owned();
+    let execution = service.maps.imaging.installed_model(&model).await?.execution().to_string();
+    let limits = service.maps.imaging.models.limits();
     let watch = Bars::default();
     let evaluator = Evaluator {
         refiners: args.refiners(&service, &config)?,
@@ -282,12 +282,12 @@ impl Args {
     ) -> anyhow::Result<Vec<Arc<dyn Refiner>>> {
         let mut refiners: Vec<Arc<dyn Refiner>> = Vec::new();
         for kind in self.refine.iter().filter_map(|refiner| refiner.kind()) {
-            refiners.push(match (kind, &service.refiner) {
+            refiners.push(match (kind, &service.jobs.refiner) {
                 (RefinerKind::Mllm, Some(mllm)) => Arc::clone(mllm),
                 _ => Arc::new(LocalRefiner {
-                    maps: Arc::clone(&service.maps),
-                    blobs: Arc::clone(&service.blobs),
-                    models: service.models.clone(),
+                    maps: Arc::clone(&service.maps.store),
+                    blobs: Arc::clone(&service.images.blobs),
+                    models: service.maps.imaging.models.clone(),
                     dense: Arc::clone(&service.dense),
                     pool: CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?,
                     matcher: LocalMatcher::new(LocalSettings::default()),

@@ -127,7 +127,7 @@ impl Evaluator<'_> {
             references.map.name,
             references.digest,
             search,
-            self.service.settings.calibration
+            self.service.calibrator.settings
         );
         let folder = work.join("outcomes");
         std::fs::create_dir_all(&folder)
@@ -140,8 +140,8 @@ impl Evaluator<'_> {
     /// be of other references.
     async fn calibrated(&self, map: &Map) -> anyhow::Result<Arc<Calibration>> {
         let local = self.refiners.iter().find(|refiner| refiner.kind() == RefinerKind::Local);
-        self.service.calibrate(map, local.map(AsRef::as_ref)).await?;
-        Ok(self.service.maps.calibration(map).await?.unwrap_or_default())
+        self.service.calibrator.calibrate(map, local.map(AsRef::as_ref)).await?;
+        Ok(self.service.maps.store.calibration(map).await?.unwrap_or_default())
     }
 
     /// The outcome of each method for one query; what is kept is not worked out again.
@@ -163,6 +163,7 @@ impl Evaluator<'_> {
         let wanted = self.settings.k.max(LEAST_ANSWERS);
         let retrieved = self
             .service
+            .localizer
             .retrieve(&map.name, &frame, wanted, self.settings.search, AdmissionRequest::BACKGROUND)
             .await
             .with_context(named)?;
@@ -170,7 +171,7 @@ impl Evaluator<'_> {
         let mut outcomes = Vec::with_capacity(kept.len());
         let record = self.record(map, digest, retrieved);
         // The refiners fetch the frame from the store; the pin keeps it there meanwhile.
-        let _pin = self.service.blobs.put_blob(digest, frame).await?;
+        let _pin = self.service.images.blobs.put_blob(digest, frame).await?;
         for (place, (known, kept)) in known.into_iter().zip(kept).enumerate() {
             let outcome = match (known, place.checked_sub(1)) {
                 (Some(known), _) => known,

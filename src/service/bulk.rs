@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
 
-use super::{NewImage, Principal, Service, ServiceError};
+use super::{Images, NewImage, Principal, ServiceError};
 use whereabouts_api::{ErrorKind, ImageMeta};
 use whereabouts_core::{ImageId, MapName};
 use whereabouts_store::Added;
@@ -43,18 +43,18 @@ pub struct BulkImage {
 /// What became of an image of an upload: it is stored, or why not, with its id if the caller gave one.
 pub type BulkResult = Result<Added, (Option<ImageId>, ServiceError)>;
 
-impl Service {
+impl Images {
     /// Stores images as they come; the results are in the same order. What is wrong with one image does
     /// not keep the others back. An upload ends with the first image beyond the bound, with an error of the
     /// stream itself, or when `until` does; those before are then done.
-    pub async fn add_images<E, O>(
+    pub async fn add_many<E, O>(
         &self,
         map: &MapName,
         caller: &Principal,
         images: impl Stream<Item = Result<Result<BulkImage, ServiceError>, E>> + Send,
         until: impl Future<Output = O> + Send,
     ) -> Result<Vec<BulkResult>, E> {
-        let BulkSettings { in_flight, max_images, .. } = self.settings.bulk;
+        let BulkSettings { in_flight, max_images, .. } = self.bulk;
         let mut broken = None;
         // The last image so far of each id, and whether it is done: of two with one id the first counts.
         let mut last_of: HashMap<ImageId, CancellationToken> = HashMap::new();
@@ -98,7 +98,7 @@ impl Service {
         let image = image.map_err(|error| (None, error))?;
         let id = image.meta.id.as_deref().map(str::parse::<ImageId>).transpose();
         let id = id.map_err(|error| (None, error.into()))?;
-        let max_images = self.settings.bulk.max_images;
+        let max_images = self.bulk.max_images;
         if index >= max_images {
             let detail = format!(
                 "an upload has at most {max_images} images (bulk.max_images); send this one and the rest in \
@@ -113,10 +113,10 @@ impl Service {
     async fn add_patiently(&self, map: &MapName, image: BulkImage) -> Result<Added, ServiceError> {
         const LONGEST: Duration = Duration::from_secs(1);
         let demand = AdmissionRequest { class: WorkClass::Index, deadline: None };
-        let until = Instant::now() + Duration::from_secs(self.settings.bulk.patience_s);
+        let until = Instant::now() + Duration::from_secs(self.bulk.patience_s);
         loop {
             let new = NewImage { bytes: image.bytes.clone(), meta: image.meta.clone(), demand };
-            match self.add_image(map, new).await {
+            match self.add(map, new).await {
                 Err(error) if error.kind == ErrorKind::Overloaded && Instant::now() < until => {
                     tokio::time::sleep(error.retry_after.unwrap_or(LONGEST).min(LONGEST)).await;
                 }

@@ -1,16 +1,17 @@
 //! Measures in each map how far chance resemblance goes; see [`whereabouts_core::confidence`].
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::{Service, ServiceError};
+use super::ServiceError;
 use whereabouts_core::confidence::{COMPARED, NullDistribution};
-use whereabouts_core::{Calibration, Evidence, Map};
+use whereabouts_core::{Calibration, CalibrationSettings, Evidence, Map};
 use whereabouts_refine::{RefineError, Refiner};
-use whereabouts_store::{HardNegatives, IndexState};
+use whereabouts_store::{HardNegatives, IndexState, MapStore};
 
 /// How often it is looked for maps that have changed.
 const LOOK: Duration = Duration::from_millis(500);
@@ -28,9 +29,19 @@ const PAUSES: usize = 300;
 /// A map is measured again when its number of images has changed by one in so many.
 const CHANGED: usize = 5;
 
-impl Service {
+/// Measures in each map how similar images of different places look, which confidence rests on.
+pub struct Calibrator {
+    /// The maps.
+    pub store: Arc<dyn MapStore>,
+    /// The refiner, which is measured too.
+    pub refiner: Option<Arc<dyn Refiner>>,
+    /// How many images are asked, and what counts as a place.
+    pub settings: CalibrationSettings,
+}
+
+impl Calibrator {
     /// Measures maps when their images have changed, until `shutdown`.
-    pub async fn keep_calibrated(&self, shutdown: CancellationToken) {
+    pub async fn run(&self, shutdown: CancellationToken) {
         let mut seen = BTreeMap::new();
         let mut pause = LOOK;
         loop {
@@ -56,10 +67,10 @@ impl Service {
         &self,
         seen: &mut BTreeMap<Uuid, usize>,
     ) -> Result<(), ServiceError> {
-        let maps = self.maps.maps().await?;
+        let maps = self.store.maps().await?;
         seen.retain(|uid, _| maps.iter().any(|map| map.uid == *uid));
         for map in maps {
-            let IndexState { images, .. } = self.maps.index_state(&map).await?;
+            let IndexState { images, .. } = self.store.index_state(&map).await?;
             let settled = seen.insert(map.uid, images) == Some(images);
             if settled && self.is_due(&map, images).await? {
                 self.calibrate(&map, self.refiner.as_deref()).await?;
@@ -69,9 +80,9 @@ impl Service {
     }
 
     async fn is_due(&self, map: &Map, images: usize) -> Result<bool, ServiceError> {
-        let Some(known) = self.maps.calibration(map).await? else { return Ok(images > 1) };
+        let Some(known) = self.store.calibration(map).await? else { return Ok(images > 1) };
         Ok(!known.complete
-            || known.settings != self.settings.calibration
+            || known.settings != self.settings
             || known.images.abs_diff(images) * CHANGED > known.images)
     }
 
@@ -82,14 +93,15 @@ impl Service {
         map: &Map,
         refiner: Option<&dyn Refiner>,
     ) -> Result<(), ServiceError> {
-        let settings = self.settings.calibration;
-        let IndexState { images, .. } = self.maps.index_state(map).await?;
-        let asked = self.maps.look_alikes(map, settings, COMPARED.max(settings.candidates)).await?;
+        let settings = self.settings;
+        let IndexState { images, .. } = self.store.index_state(map).await?;
+        let asked =
+            self.store.look_alikes(map, settings, COMPARED.max(settings.candidates)).await?;
         let similarity = NullDistribution::from(values(asked.iter().filter_map(|asked| {
             Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
         })));
         let mut measured = Calibration { images, settings, similarity, ..Calibration::default() };
-        self.maps.put_calibration(map, measured.clone()).await?;
+        self.store.put_calibration(map, measured.clone()).await?;
         if let Some(refiner) = refiner {
             let step = asked.len().div_ceil(settings.refined.max(1)).max(1);
             let mut found = Vec::new();
@@ -104,7 +116,7 @@ impl Service {
             map = %map.name, images, asked = measured.similarity.len(),
             refined = measured.agreement.len(), "measured what chance resemblance is like"
         );
-        Ok(self.maps.put_calibration(map, measured).await?)
+        Ok(self.store.put_calibration(map, measured).await?)
     }
 }
 

@@ -10,7 +10,7 @@ use tokio::sync::broadcast::error::RecvError;
 use uuid::Uuid;
 
 use super::jobs::no_job;
-use super::{Service, ServiceError};
+use super::{Jobs, ServiceError};
 use whereabouts_api::{JobChange, JobStatus, Missed, PairDescribed};
 use whereabouts_core::{ImageId, Job, JobState, MapName};
 use whereabouts_store::{JobRecord, JobStore};
@@ -35,15 +35,15 @@ pub enum AnyJobEvent {
     Missed(Missed),
 }
 
-impl Service {
+impl Jobs {
     /// What happens from now on to the jobs of a map, or of all. Never ends by itself.
-    pub fn follow_jobs(
+    pub fn follow_all(
         &self,
         map: Option<MapName>,
     ) -> impl Stream<Item = AnyJobEvent> + Send + use<> {
         let follower = AllFollower {
-            changes: self.jobs.changes(),
-            jobs: Arc::clone(&self.jobs),
+            changes: self.store.changes(),
+            jobs: Arc::clone(&self.store),
             map,
             told: HashMap::new(),
         };
@@ -53,20 +53,20 @@ impl Service {
     }
 
     /// What has happened to a job, and then what happens to it until it has ended.
-    pub async fn follow_job(
+    pub async fn follow(
         &self,
         id: Uuid,
     ) -> Result<impl Stream<Item = JobEvent> + Send + use<>, ServiceError> {
         let mut follower = Follower {
-            changes: self.jobs.changes(),
-            jobs: Arc::clone(&self.jobs),
+            changes: self.store.changes(),
+            jobs: Arc::clone(&self.store),
             id,
             status: None,
             told: HashSet::new(),
             waiting: VecDeque::new(),
             ended: false,
         };
-        match self.jobs.job(id).await? {
+        match self.store.job(id).await? {
             Some(record) => follower.look_at(record),
             None => return Err(no_job(id)),
         }

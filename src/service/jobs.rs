@@ -1,38 +1,60 @@
 //! Jobs: look at them, wait for them, cancel and retry them.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use jiff::Timestamp;
+use tokio::sync::Semaphore;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::RecvError;
 use uuid::Uuid;
 
 use super::images::page_size;
-use super::{Service, ServiceError};
+use super::{Imaging, ServiceError};
 use whereabouts_api::{ErrorKind, JobPage, PairRegions};
 use whereabouts_core::{ImageId, Job, MediaType};
-use whereabouts_refine::RefineError;
-use whereabouts_store::{JobFilter, JobList};
+use whereabouts_refine::{RefineError, Refiner};
+use whereabouts_store::{BlobStore, JobFilter, JobList, JobStore};
 
 /// The longest text that jobs are searched for, in characters.
 const LONGEST_SEARCH: usize = 200;
 
-impl Service {
+/// Refinement jobs: look at them, wait for them, cancel and retry them. Clones share the store.
+#[derive(Clone)]
+pub struct Jobs {
+    /// The jobs.
+    pub store: Arc<dyn JobStore>,
+    /// The bytes of their frames.
+    pub blobs: Arc<dyn BlobStore>,
+    /// Makes thumbnails.
+    pub imaging: Imaging,
+    /// What refines them, if anything does.
+    pub refiner: Option<Arc<dyn Refiner>>,
+    /// One pair is compared for display at a time, so that jobs are not slowed down.
+    pub matching: Arc<Semaphore>,
+    /// One text search runs at a time: each reads many jobs.
+    pub searching: Arc<Semaphore>,
+    /// The longest wait for the end of a job.
+    pub max_wait: Duration,
+}
+
+impl Jobs {
     /// One job, at once or when it has ended, but after `wait` at the latest.
-    pub async fn get_job(&self, id: Uuid, wait: Option<Duration>) -> Result<Job, ServiceError> {
+    pub async fn get(&self, id: Uuid, wait: Option<Duration>) -> Result<Job, ServiceError> {
         match wait {
-            Some(wait) if wait > self.settings.max_wait => Err(ServiceError::unprocessable(
-                format!("wait must be at most {} seconds", self.settings.max_wait.as_secs()),
-            )),
+            Some(wait) if wait > self.max_wait => Err(ServiceError::unprocessable(format!(
+                "wait must be at most {} seconds",
+                self.max_wait.as_secs()
+            ))),
             Some(wait) => self.wait_for(id, wait).await,
-            None => self.known_job(id).await,
+            None => self.known(id).await,
         }
     }
 
     /// Jobs, newest first, a page at a time. A search for a text ends its page early once it has looked at
     /// as many jobs as the store looks at in one go.
-    pub async fn list_jobs(
+    pub async fn list(
         &self,
         filter: JobFilter,
         cursor: Option<Uuid>,
@@ -43,7 +65,7 @@ impl Service {
             Some(_) => Some(self.searching.acquire().await),
             None => None,
         };
-        let JobList { mut jobs, searched_to } = self.jobs.jobs(&filter, cursor, limit + 1).await?;
+        let JobList { mut jobs, searched_to } = self.store.jobs(&filter, cursor, limit + 1).await?;
         let more = jobs.len() > limit;
         jobs.truncate(limit);
         let next_cursor = jobs.last().filter(|_| more).map(|job| job.id).or(searched_to);
@@ -51,45 +73,45 @@ impl Service {
     }
 
     /// Cancels a job; one that has ended stays as it is.
-    pub async fn cancel_job(&self, id: Uuid) -> Result<Job, ServiceError> {
-        Ok(self.jobs.cancel(id).await?)
+    pub async fn cancel(&self, id: Uuid) -> Result<Job, ServiceError> {
+        Ok(self.store.cancel(id).await?)
     }
 
     /// Queues a job again that ended without success.
-    pub async fn retry_job(&self, id: Uuid) -> Result<Job, ServiceError> {
-        Ok(self.jobs.retry(id).await?)
+    pub async fn retry(&self, id: Uuid) -> Result<Job, ServiceError> {
+        Ok(self.store.retry(id).await?)
     }
 
     /// Jobs that wait or run.
-    pub async fn open_jobs(&self) -> Result<usize, ServiceError> {
-        Ok(self.jobs.queued().await?)
+    pub async fn open(&self) -> Result<usize, ServiceError> {
+        Ok(self.store.queued().await?)
     }
 
     /// How long ago the oldest of them was submitted; zero, if there is none.
-    pub async fn age_of_oldest_job(&self) -> Result<Duration, ServiceError> {
-        let submitted = self.jobs.oldest_open().await?;
+    pub async fn oldest_age(&self) -> Result<Duration, ServiceError> {
+        let submitted = self.store.oldest_open().await?;
         let age = submitted.map(|submitted| Timestamp::now().duration_since(submitted));
         // The clock of whoever submitted it may be ahead.
         Ok(age.and_then(|age| age.try_into().ok()).unwrap_or_default())
     }
 
     /// The frame of a job: as it was sent, or as a JPEG no larger than `max_edge` pixels.
-    pub async fn frame_of(
+    pub async fn frame(
         &self,
         id: Uuid,
         max_edge: Option<u32>,
     ) -> Result<(MediaType, Bytes), ServiceError> {
-        let query = self.jobs.job(id).await?.ok_or_else(|| no_job(id))?.query;
+        let query = self.store.job(id).await?.ok_or_else(|| no_job(id))?.query;
         let bytes = self.blobs.blob(&query.digest).await?.ok_or_else(|| {
             ServiceError::not_found(format!("the frame of the job {id} is no longer there"))
         })?;
-        self.shown(query.media_type, bytes, max_edge).await
+        self.imaging.thumbnail(query.media_type, bytes, max_edge).await
     }
 
     /// The regions that a job's frame and one of its candidates have in common, if its refiner compares
     /// regions. They are compared anew, with the pictures as they are now.
     pub async fn matches(&self, id: Uuid, image: &ImageId) -> Result<PairRegions, ServiceError> {
-        let record = self.jobs.job(id).await?.ok_or_else(|| no_job(id))?;
+        let record = self.store.job(id).await?.ok_or_else(|| no_job(id))?;
         let refiner = self.refiner.as_ref().filter(|refiner| refiner.kind() == record.job.refiner);
         let _turn = self.matching.acquire().await;
         let regions = match refiner {
@@ -113,11 +135,11 @@ impl Service {
     }
 
     /// Waits until the job has ended, but no longer than `longest`; the job as it then is.
-    pub(super) async fn wait_for(&self, id: Uuid, longest: Duration) -> Result<Job, ServiceError> {
-        let mut changes = self.jobs.changes();
+    pub(crate) async fn wait_for(&self, id: Uuid, longest: Duration) -> Result<Job, ServiceError> {
+        let mut changes = self.store.changes();
         let ended = async {
             loop {
-                let job = self.known_job(id).await?;
+                let job = self.known(id).await?;
                 if job.state.is_final() {
                     return Ok(job);
                 }
@@ -127,12 +149,12 @@ impl Service {
         };
         match tokio::time::timeout(longest, ended).await {
             Ok(job) => job,
-            Err(_) => self.known_job(id).await,
+            Err(_) => self.known(id).await,
         }
     }
 
-    async fn known_job(&self, id: Uuid) -> Result<Job, ServiceError> {
-        match self.jobs.job(id).await? {
+    async fn known(&self, id: Uuid) -> Result<Job, ServiceError> {
+        match self.store.job(id).await? {
             Some(record) => Ok(record.job),
             None => Err(no_job(id)),
         }

@@ -7,8 +7,8 @@ use tracing::Instrument;
 use uuid::Uuid;
 
 use super::images::empty_body;
-use super::submit::Frame;
-use super::{SUPERSEDED, Service, ServiceError, TrackStep};
+use super::submit::{LocalizedFrame, Submission};
+use super::{Jobs, Maps, RecallCheck, SUPERSEDED, ServiceError, Submitter, TrackStep, Tracks};
 use whereabouts_api::{Answer, JobLink, RefineMode, TimingMs};
 use whereabouts_core::confidence::COMPARED;
 use whereabouts_core::{Calibration, Candidate, Digest, Estimate, Map, MapName, Priority};
@@ -38,7 +38,7 @@ pub struct LocalizeRequest {
     pub deadline: Option<Instant>,
     /// Which track the frame belongs to, if any.
     pub track: Option<TrackStep>,
-    /// The id of the request, if it is done once however often it comes ([`Service::begin_once`]).
+    /// The id of the request, if it is done once however often it comes ([`Idempotency`](super::Idempotency)).
     pub once: Option<String>,
 }
 
@@ -57,7 +57,36 @@ pub struct Retrieved {
     pub searched: Duration,
 }
 
-impl Service {
+/// Bounds and defaults of localization.
+#[derive(Debug, Clone, Copy)]
+pub struct LocalizeSettings {
+    /// Candidates in an answer, unless the caller says otherwise.
+    pub k: usize,
+    /// The most candidates in an answer.
+    pub max_k: usize,
+    /// Candidates that a job compares.
+    pub compared: usize,
+    /// The confidence from which on a place counts as known.
+    pub known_confidence: f64,
+}
+
+/// Localizes frames: coarse retrieval, the track that a frame belongs to, and the job that refines the answer.
+pub struct Localizer {
+    /// The maps.
+    pub maps: Maps,
+    /// The tracks of robots.
+    pub tracks: Tracks,
+    /// Queues the refinement.
+    pub submitter: Submitter,
+    /// Waits for the refinement.
+    pub jobs: Jobs,
+    /// Compares searches with exact ones now and then.
+    pub recall: RecallCheck,
+    /// Bounds and defaults.
+    pub settings: LocalizeSettings,
+}
+
+impl Localizer {
     /// Answers with the most similar images and queues their refinement.
     pub async fn localize(&self, request: LocalizeRequest) -> Result<Answer, ServiceError> {
         let start = Instant::now();
@@ -65,29 +94,29 @@ impl Service {
         if request.frame.is_empty() {
             return Err(empty_body());
         }
-        let refined = request.refine != RefineMode::Off && self.refiner.is_some();
+        let refined = request.refine != RefineMode::Off && self.submitter.refiner.is_some();
         if request.refine == RefineMode::Wait {
             // Before any work is done.
-            self.check_submission().await?;
+            self.submitter.check().await?;
         }
         let demand = AdmissionRequest { class: WorkClass::Localize, deadline: request.deadline };
-        let compared = if refined { self.settings.candidates } else { 0 };
+        let compared = if refined { self.settings.compared } else { 0 };
         let followed = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
         let wanted = k.max(compared).max(COMPARED).max(followed);
         let Retrieved { map, model, extraction, mut candidates, searched } =
             self.retrieve(&request.map, &request.frame, wanted, SearchMode::Fast, demand).await?;
 
-        let calibration = self.maps.calibration(&map).await?.unwrap_or_default();
+        let calibration = self.maps.store.calibration(&map).await?.unwrap_or_default();
         let track = match request.track {
-            Some(step) => Some(self.follow(&map, step, &candidates, &calibration).await?),
+            Some(step) => Some(self.tracks.follow(&map, step, &candidates, &calibration).await?),
             None => None,
         };
         let query_id = Uuid::now_v7();
         let (mut job, no_job) = if request.refine == RefineMode::Off {
             (None, None)
         } else {
-            let compared = candidates.iter().take(self.settings.candidates).cloned().collect();
-            let frame = Frame {
+            let compared = candidates.iter().take(self.settings.compared).cloned().collect();
+            let frame = LocalizedFrame {
                 query_id,
                 bytes: request.frame,
                 model,
@@ -96,13 +125,15 @@ impl Service {
                 dense: extraction.dense,
             };
             let once = request.once.as_deref();
-            let submit = self.submit(&map, frame, compared, request.priority, once);
+            let submit = self.submitter.submit(&map, frame, compared, request.priority, once);
             match submit.instrument(traces::stage("submit")).await? {
-                Ok(job) => (Some(job), None),
-                Err(why) if request.refine == RefineMode::Wait && why.is_shedding() => {
-                    return Err(self.refuse_job(&why));
+                Submission::Queued(job) => (Some(job), None),
+                Submission::Declined(why)
+                    if request.refine == RefineMode::Wait && why.is_shedding() =>
+                {
+                    return Err(self.submitter.refuse(&why));
                 }
-                Err(why) => (None, Some(why)),
+                Submission::Declined(why) => (None, Some(why)),
             }
         };
         let mut estimate = self.estimate(&candidates, &calibration);
@@ -110,8 +141,8 @@ impl Service {
         if request.refine == RefineMode::Wait
             && let Some(queued) = &mut job
         {
-            let longest = Self::time_left(self.settings.max_wait, request.deadline);
-            *queued = self.wait_for(queued.id, longest).await?;
+            let longest = time_left(self.jobs.max_wait, request.deadline);
+            *queued = self.jobs.wait_for(queued.id, longest).await?;
             estimate = queued.estimate.clone().or(estimate);
         }
         let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
@@ -149,20 +180,27 @@ impl Service {
     ) -> Result<Retrieved, ServiceError> {
         let mut left = SUPERSEDED;
         loop {
-            let (map, extractor) = self.usable_map(map).await?;
-            let extracting = self.extract(&extractor, frame.clone(), map.descriptor, demand);
+            let (map, extractor) = self.maps.usable(map).await?;
+            let extracting =
+                self.maps.imaging.extract(&extractor, frame.clone(), map.descriptor, demand);
             let extraction = extracting.instrument(traces::stage("extract")).await?;
-            self.metrics.observe_extraction(&extraction);
+            self.maps.imaging.metrics.observe_extraction(&extraction);
             let searching = Instant::now();
-            let search = self.maps.search(&map, extraction.descriptor.clone(), k, mode);
+            let search = self.maps.store.search(&map, extraction.descriptor.clone(), k, mode);
             match search.instrument(traces::stage("search")).await {
                 // The frame's descriptor is of the model that the map had a moment ago.
                 Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
                 found => {
                     let (candidates, searched) = (found?, searching.elapsed());
-                    self.metrics.observe_search(searched);
+                    self.maps.imaging.metrics.observe_search(searched);
                     if mode == SearchMode::Fast {
-                        self.check_search(&map, &extraction.descriptor, &candidates);
+                        self.recall.check(
+                            &self.maps.store,
+                            &self.maps.imaging.metrics,
+                            &map,
+                            &extraction.descriptor,
+                            &candidates,
+                        );
                     }
                     let model = extractor.identity();
                     return Ok(Retrieved { map, model, extraction, candidates, searched });
@@ -189,4 +227,13 @@ impl Service {
         let known_from = self.settings.known_confidence;
         Some(Estimate::new(&first.image_id, first.pose, confidence, known_from))
     }
+}
+
+/// The time that a caller's deadline leaves for waiting, no longer than `longest`.
+fn time_left(longest: Duration, deadline: Option<Instant>) -> Duration {
+    deadline.map_or(longest, |deadline| {
+        let left = deadline.saturating_duration_since(Instant::now());
+        // The answer has still to be made and sent.
+        longest.min(left * 9 / 10)
+    })
 }

@@ -1,17 +1,30 @@
 //! Maps: create, change, list, remove.
 
+use std::sync::Arc;
+
 use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::models::dimension;
-use super::{SUPERSEDED, Service, ServiceError};
+use super::{Imaging, Reindexes, SUPERSEDED, ServiceError};
 use whereabouts_api::{CalibrationState, ErrorKind, IndexKind, MapChange, MapState};
 use whereabouts_core::{Map, MapName};
-use whereabouts_store::{IndexState, StoreError};
+use whereabouts_store::{IndexState, MapStore, StoreError};
 
-impl Service {
+/// Maps: create, change, list, remove. Clones share the store.
+#[derive(Clone)]
+pub struct Maps {
+    /// Maps, images, descriptors.
+    pub store: Arc<dyn MapStore>,
+    /// Models and what runs them.
+    pub imaging: Imaging,
+    /// The last reindex of each map.
+    pub reindexes: Arc<Reindexes>,
+}
+
+impl Maps {
     /// Creates a map or changes it; also says whether it is new.
-    pub async fn put_map(
+    pub async fn put(
         &self,
         name: MapName,
         change: MapChange,
@@ -21,9 +34,9 @@ impl Service {
         }
         let mut left = SUPERSEDED;
         loop {
-            let known = self.maps.map(&name).await?;
+            let known = self.store.map(&name).await?;
             let wanted = self.changed(&name, &change, known).await?;
-            match self.maps.put_map(wanted).await {
+            match self.store.put_map(wanted).await {
                 // It was reindexed since it was looked up.
                 Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
                 put => {
@@ -43,18 +56,18 @@ impl Service {
     ) -> Result<Map, ServiceError> {
         let known = known.as_ref();
         let model = change.model.as_deref().or(known.map(|map| map.model.as_str()));
-        let model = model.unwrap_or(self.models.default_model());
+        let model = model.unwrap_or(self.imaging.models.default_model());
         let descriptor = change.descriptor.or(known.map(|map| map.descriptor)).unwrap_or_default();
         let (model_digest, precision, dim) = match known {
             // Those of its images, whatever is installed by now.
             Some(map)
                 if (map.model.as_str(), map.descriptor) == (model, descriptor)
-                    && self.maps.index_state(map).await?.images > 0 =>
+                    && self.store.index_state(map).await?.images > 0 =>
             {
                 (map.model_digest, map.precision, map.dim)
             }
             _ => {
-                let extractor = self.installed_model(model).await?;
+                let extractor = self.imaging.installed_model(model).await?;
                 let dim = dimension(extractor.manifest(), descriptor)?;
                 (extractor.digest(), extractor.execution().precision, dim)
             }
@@ -79,14 +92,14 @@ impl Service {
     }
 
     /// One map.
-    pub async fn get_map(&self, name: &MapName) -> Result<MapState, ServiceError> {
+    pub async fn get(&self, name: &MapName) -> Result<MapState, ServiceError> {
         self.state_of(name).await
     }
 
     /// All maps, by name.
-    pub async fn list_maps(&self) -> Result<Vec<MapState>, ServiceError> {
+    pub async fn list(&self) -> Result<Vec<MapState>, ServiceError> {
         let mut states = Vec::new();
-        for map in self.maps.maps().await? {
+        for map in self.store.maps().await? {
             match self.state_of(&map.name).await {
                 Ok(state) => states.push(state),
                 // Removed since it was listed.
@@ -98,9 +111,9 @@ impl Service {
     }
 
     /// Removes a map with all its images.
-    pub async fn delete_map(&self, name: &MapName) -> Result<(), ServiceError> {
-        let map = self.known_map(name).await?;
-        match self.maps.delete_map(name).await? {
+    pub async fn delete(&self, name: &MapName) -> Result<(), ServiceError> {
+        let map = self.known(name).await?;
+        match self.store.delete_map(name).await? {
             true => {
                 self.reindexes.forget(map.uid);
                 Ok(())
@@ -109,16 +122,16 @@ impl Service {
         }
     }
 
-    pub(super) async fn known_map(&self, name: &MapName) -> Result<Map, ServiceError> {
-        self.maps.map(name).await?.ok_or_else(|| no_map(name))
+    pub(crate) async fn known(&self, name: &MapName) -> Result<Map, ServiceError> {
+        self.store.map(name).await?.ok_or_else(|| no_map(name))
     }
 
-    pub(super) async fn state_of(&self, name: &MapName) -> Result<MapState, ServiceError> {
-        let reindex = self.reindexes.of(self.known_map(name).await?.uid);
+    pub(crate) async fn state_of(&self, name: &MapName) -> Result<MapState, ServiceError> {
+        let reindex = self.reindexes.of(self.known(name).await?.uid);
         // Looked up after that: when a reindex has succeeded, the map shows it.
-        let map = self.known_map(name).await?;
-        let IndexState { images, graph, behind, .. } = self.maps.index_state(&map).await?;
-        let calibration = self.maps.calibration(&map).await?;
+        let map = self.known(name).await?;
+        let IndexState { images, graph, behind, .. } = self.store.index_state(&map).await?;
+        let calibration = self.store.calibration(&map).await?;
         let index = match (graph, behind) {
             (false, _) => IndexKind::Exact,
             (true, true) => IndexKind::Building,

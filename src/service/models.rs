@@ -1,20 +1,21 @@
-//! Which model makes the descriptors of a map.
+//! Which model makes the descriptors of a map, and what to do if it cannot be used.
 
 use std::sync::Arc;
 
-use super::{Service, ServiceError};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::{DescriptorKind, Map, MapName};
 use whereabouts_vision::{Extractor, Manifest, ModelError};
 
-impl Service {
+use super::{Maps, ServiceError};
+
+impl Maps {
     /// The map, and the very model that made its descriptors.
-    pub(super) async fn usable_map(
+    pub(crate) async fn usable(
         &self,
         name: &MapName,
     ) -> Result<(Map, Arc<Extractor>), ServiceError> {
-        let map = self.known_map(name).await?;
-        let extractor = self.models.of(&map).await.map_err(|error| match error {
+        let map = self.known(name).await?;
+        let extractor = self.imaging.models.of(&map).await.map_err(|error| match error {
             ModelError::NotInstalled(_) => ServiceError::new(
                 ErrorKind::Conflict,
                 format!(
@@ -27,32 +28,10 @@ impl Service {
             ),
             error => unusable(&map.model, error),
         })?;
-        match validate(&map, &extractor) {
+        match mismatch(&map, &extractor) {
             Some(detail) => Err(ServiceError::new(ErrorKind::Conflict, detail)),
             None => Ok((map, extractor)),
         }
-    }
-
-    /// A model as it is installed, for descriptors yet to be made: at the precision that the
-    /// settings say, else at that of the maps which have it already.
-    pub async fn installed_model(&self, name: &str) -> Result<Arc<Extractor>, ServiceError> {
-        let precision = match self.models.precision() {
-            Some(precision) => Some(precision),
-            None => {
-                let maps = self.maps.maps().await?;
-                maps.iter().find(|map| map.model == name).map(|map| map.precision)
-            }
-        };
-        self.models.installed(name, precision).await.map_err(|error| unusable(name, error))
-    }
-
-    /// What an installed model says about itself.
-    pub(super) async fn manifest(&self, name: &str) -> Result<Manifest, ServiceError> {
-        let (models, wanted) = (self.models.clone(), name.to_owned());
-        tokio::task::spawn_blocking(move || models.manifest(&wanted))
-            .await
-            .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))?
-            .map_err(|error| unusable(name, error))
     }
 }
 
@@ -67,7 +46,7 @@ pub(super) fn dimension(manifest: &Manifest, kind: DescriptorKind) -> Result<usi
 }
 
 /// Why the model in memory cannot serve the map, if it cannot.
-fn validate(map: &Map, extractor: &Extractor) -> Option<String> {
+fn mismatch(map: &Map, extractor: &Extractor) -> Option<String> {
     if extractor.is_of(map) {
         return None;
     }
@@ -91,7 +70,7 @@ fn validate(map: &Map, extractor: &Extractor) -> Option<String> {
 }
 
 /// A model that was named and cannot be used.
-fn unusable(name: &str, error: ModelError) -> ServiceError {
+pub(super) fn unusable(name: &str, error: ModelError) -> ServiceError {
     match error {
         ModelError::NotInstalled(_) => ServiceError::unprocessable(format!(
             "the model {name:?} is not installed on the server; install it there ({}), or name one \

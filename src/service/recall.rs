@@ -7,7 +7,6 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::{Mutex, OwnedMutexGuard};
 
-use super::Service;
 use crate::ServiceMetrics;
 use whereabouts_core::{Candidate, Descriptor, Map};
 use whereabouts_index::SearchMode;
@@ -29,19 +28,17 @@ impl RecallCheck {
         Self { pause, last: Arc::default() }
     }
 
-    /// The right to check a search, if it is time and no other is being checked.
-    fn turn(&self) -> Option<OwnedMutexGuard<Option<Instant>>> {
-        let pause = self.pause?;
-        let turn = Arc::clone(&self.last).try_lock_owned().ok()?;
-        turn.is_none_or(|last| last.elapsed() >= pause).then_some(turn)
-    }
-}
-
-impl Service {
     /// Checks what a search in a map has found, if it is time. The caller does not wait.
-    pub(super) fn check_search(&self, map: &Map, query: &Descriptor, found: &[Candidate]) {
-        let Some(mut turn) = self.recall.turn() else { return };
-        let (maps, metrics) = (Arc::clone(&self.maps), Arc::clone(&self.metrics));
+    pub(super) fn check(
+        &self,
+        maps: &Arc<dyn MapStore>,
+        metrics: &Arc<ServiceMetrics>,
+        map: &Map,
+        query: &Descriptor,
+        found: &[Candidate],
+    ) {
+        let Some(mut turn) = self.turn() else { return };
+        let (maps, metrics) = (Arc::clone(maps), Arc::clone(metrics));
         let (map, query, found) = (map.clone(), query.clone(), found.to_vec());
         tokio::spawn(async move {
             if let Err(error) = check(maps.as_ref(), &metrics, &map, query, &found).await {
@@ -49,6 +46,13 @@ impl Service {
             }
             *turn = Some(Instant::now());
         });
+    }
+
+    /// The right to check a search, if it is time and no other is being checked.
+    fn turn(&self) -> Option<OwnedMutexGuard<Option<Instant>>> {
+        let pause = self.pause?;
+        let turn = Arc::clone(&self.last).try_lock_owned().ok()?;
+        turn.is_none_or(|last| last.elapsed() >= pause).then_some(turn)
     }
 }
 

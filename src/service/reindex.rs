@@ -10,10 +10,10 @@ use tokio::sync::Semaphore;
 use uuid::Uuid;
 
 use super::models::dimension;
-use super::{Service, ServiceError};
+use super::{Maps, ServiceError};
 use whereabouts_api::{ErrorKind, MapState, Reindex, ReindexRequest, ReindexState};
 use whereabouts_core::{Descriptor, DescriptorKind, Image, Map, MapName};
-use whereabouts_store::Draft;
+use whereabouts_store::{BlobStore, Draft, DraftStore};
 use whereabouts_vision::{AdmissionRequest, Extractor};
 
 /// Images that are looked up at a time.
@@ -83,49 +83,61 @@ impl Reindexes {
     }
 }
 
-impl Service {
+/// Makes all descriptors of a map again, by another model or by its own as it is installed now, while the old
+/// ones serve. Clones share the state.
+#[derive(Clone)]
+pub struct Reindexer {
+    /// The maps.
+    pub maps: Maps,
+    /// Sets of descriptors in the making.
+    pub drafts: Arc<dyn DraftStore>,
+    /// The bytes of images.
+    pub blobs: Arc<dyn BlobStore>,
+}
+
+impl Reindexer {
     /// Begins to make all descriptors of a map anew, and answers at once.
-    pub async fn reindex(
-        self: &Arc<Self>,
+    pub async fn start(
+        &self,
         name: &MapName,
         request: ReindexRequest,
     ) -> Result<MapState, ServiceError> {
-        let map = self.known_map(name).await?;
+        let map = self.maps.known(name).await?;
         let model = request.model.unwrap_or_else(|| map.model.clone());
         let descriptor = request.descriptor.unwrap_or(map.descriptor);
-        dimension(&self.manifest(&model).await?, descriptor)?;
+        dimension(&self.maps.imaging.manifest(&model).await?, descriptor)?;
         let begun = Reindex {
             model: model.clone(),
             descriptor,
             state: ReindexState::Running,
             done: 0,
-            total: self.maps.index_state(&map).await?.images,
+            total: self.maps.store.index_state(&map).await?.images,
             error: None,
             started_at: Timestamp::now(),
             finished_at: None,
         };
-        self.reindexes.begin(&map, begun)?;
+        self.maps.reindexes.begin(&map, begun)?;
         tracing::info!(map = %name, from = map.model, to = model, "reindexing");
-        let (service, name) = (Arc::clone(self), name.clone());
-        let state = self.state_of(&name).await;
+        let (reindexer, name) = (self.clone(), name.clone());
+        let state = self.maps.state_of(&name).await;
         tokio::spawn(async move {
-            let outcome = service.make_anew(&map, &model, descriptor).await;
+            let outcome = reindexer.run(&map, &model, descriptor).await;
             match &outcome {
                 Ok(()) => tracing::info!(map = %name, model, "reindexed"),
                 Err(error) => tracing::warn!(map = %name, model, %error, "not reindexed"),
             }
-            service.reindexes.end(map.uid, outcome.err().map(|error| error.detail));
+            reindexer.maps.reindexes.end(map.uid, outcome.err().map(|error| error.detail));
         });
         state
     }
 
-    async fn make_anew(
+    async fn run(
         &self,
         map: &Map,
         model: &str,
         descriptor: DescriptorKind,
     ) -> Result<(), ServiceError> {
-        let extractor = patiently(|| self.installed_model(model)).await?;
+        let extractor = patiently(|| self.maps.imaging.installed_model(model)).await?;
         let next = Map {
             model: model.to_owned(),
             model_digest: extractor.digest(),
@@ -156,18 +168,18 @@ impl Service {
                 return Ok(());
             }
             for image in missing {
-                let made = self.descriptor_anew(map, &image, extractor, descriptor).await?;
+                let made = self.new_descriptor(map, &image, extractor, descriptor).await?;
                 if let Some(made) = made {
                     draft.write(&image, made).await?;
-                    let images = self.maps.index_state(map).await?.images;
-                    self.reindexes.step(map.uid, images);
+                    let images = self.maps.store.index_state(map).await?.images;
+                    self.maps.reindexes.step(map.uid, images);
                 }
             }
         }
     }
 
     /// The new descriptor of an image; `None` if it was removed meanwhile.
-    async fn descriptor_anew(
+    async fn new_descriptor(
         &self,
         map: &Map,
         image: &Image,
@@ -175,16 +187,21 @@ impl Service {
         descriptor: DescriptorKind,
     ) -> Result<Option<Descriptor>, ServiceError> {
         let Some(bytes) = self.blobs.blob(&image.digest).await? else {
-            return match self.maps.image(map, &image.id).await? {
+            return match self.maps.store.image(map, &image.id).await? {
                 Some(still) if still.digest == image.digest => {
                     Err(left_behind(image, "its bytes are missing from the store"))
                 }
                 _ => Ok(None),
             };
         };
-        let _turn = self.reindexes.turn.acquire().await;
+        let _turn = self.maps.reindexes.turn.acquire().await;
         // It waits for as long as anybody else does.
-        match self.extract(extractor, bytes, descriptor, AdmissionRequest::BACKGROUND).await {
+        match self
+            .maps
+            .imaging
+            .extract(extractor, bytes, descriptor, AdmissionRequest::BACKGROUND)
+            .await
+        {
             Ok(extraction) => Ok(Some(extraction.descriptor)),
             Err(error) => Err(left_behind(image, &error.detail)),
         }

@@ -1,21 +1,20 @@
 //! The job of a frame, or why it has none: jobs are given up before frames are refused.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use jiff::Timestamp;
 use uuid::Uuid;
 
-use super::{Service, ServiceError};
-use crate::Rejection;
+use super::{Rejection, ServiceError, ServiceMetrics};
 use whereabouts_api::{ErrorKind, NoJob, NoJobReason};
 use whereabouts_core::{
     Candidate, DenseFeatures, Descriptor, Digest, Job, Map, MediaType, Priority,
 };
-use whereabouts_refine::DenseKey;
-use whereabouts_store::{JobRecord, Query, StoreError};
+use whereabouts_refine::{DenseCache, DenseKey, JobServiceTime, Refiner};
+use whereabouts_store::{BlobStore, JobRecord, JobStore, Query, StoreError};
 use whereabouts_telemetry::traces;
+use whereabouts_vision::Admission;
 
 fn queue_full(limit: usize) -> NoJob {
     let full = StoreError::QueueFull { limit };
@@ -23,7 +22,7 @@ fn queue_full(limit: usize) -> NoJob {
 }
 
 /// A frame that has been localized.
-pub(super) struct Frame {
+pub(super) struct LocalizedFrame {
     pub query_id: Uuid,
     pub bytes: Bytes,
     /// The identity of the model that looked at it.
@@ -33,34 +32,66 @@ pub(super) struct Frame {
     pub dense: DenseFeatures,
 }
 
-impl Service {
+/// Whether a frame got a job.
+#[derive(Debug)]
+pub(super) enum Submission {
+    /// A job is queued; the one of an earlier attempt, if the request was sent again.
+    Queued(Job),
+    /// There is none, and why.
+    Declined(NoJob),
+}
+
+/// Queues jobs for frames, and sheds them under load. Clones share the queue.
+#[derive(Clone)]
+pub struct Submitter {
+    /// The job queue.
+    pub jobs: Arc<dyn JobStore>,
+    /// The bytes of frames.
+    pub blobs: Arc<dyn BlobStore>,
+    /// Dense features that the job will need soon.
+    pub dense: Arc<DenseCache>,
+    /// What refines jobs, if anything does.
+    pub refiner: Option<Arc<dyn Refiner>>,
+    /// The queue of images before decoding, whose length is the measure of load.
+    pub admission: Arc<Admission>,
+    /// How long a job takes, for `Retry-After`.
+    pub service_time: JobServiceTime,
+    /// Counts jobs and rejections.
+    pub metrics: Arc<ServiceMetrics>,
+    /// The most jobs that wait or run.
+    pub queue: usize,
+    /// The share of the image queue from which on frames get no job.
+    pub shed_at: f64,
+}
+
+impl Submitter {
     /// Refuses a caller who wants nothing but the refined answer, while frames get no job.
-    pub(super) async fn check_submission(&self) -> Result<(), ServiceError> {
+    pub(super) async fn check(&self) -> Result<(), ServiceError> {
         if self.refiner.is_none() {
             return Ok(());
         }
-        self.obstacle().await?.map_or(Ok(()), |why| Err(self.refuse_job(&why)))
+        self.obstacle().await?.map_or(Ok(()), |why| Err(self.refuse(&why)))
     }
 
     /// Queues the refinement of a frame, unless something speaks against it.
     pub(super) async fn submit(
         &self,
         map: &Map,
-        frame: Frame,
+        frame: LocalizedFrame,
         candidates: Vec<Candidate>,
         priority: Priority,
         once: Option<&str>,
-    ) -> Result<Result<Job, NoJob>, ServiceError> {
+    ) -> Result<Submission, ServiceError> {
         let Some(refiner) = &self.refiner else {
             let detail = "the server refines nothing (refine.refiner)";
-            return Ok(Err(NoJob::new(NoJobReason::NoRefiner, detail)));
+            return Ok(Submission::Declined(NoJob::new(NoJobReason::NoRefiner, detail)));
         };
         if candidates.is_empty() {
             let detail = "the map has no images yet; add some with `whereabouts index`";
-            return Ok(Err(NoJob::new(NoJobReason::EmptyMap, detail)));
+            return Ok(Submission::Declined(NoJob::new(NoJobReason::EmptyMap, detail)));
         }
         if let Some(why) = self.obstacle().await? {
-            return Ok(Err(why));
+            return Ok(Submission::Declined(why));
         }
         let query = Query {
             id: frame.query_id,
@@ -90,33 +121,33 @@ impl Service {
             Ok(pin) => pin,
             Err(full @ StoreError::Full { .. }) => {
                 let why = NoJob::new(NoJobReason::DiskFull, full.to_string());
-                return Ok(Err(self.counted_job(why)));
+                return Ok(Submission::Declined(self.counted_job(why)));
             }
             Err(error) => return Err(error.into()),
         };
-        let limit = self.settings.job_queue;
+        let limit = self.queue;
         let submitted = match once {
             Some(request) => self.jobs.submit_once(record, limit, request).await,
             None => self.jobs.submit(record, limit).await.map(|()| None),
         };
         match submitted {
             // A process that ended before it could answer has queued it.
-            Ok(Some(before)) => return Ok(Ok(before)),
+            Ok(Some(before)) => return Ok(Submission::Queued(before)),
             Ok(None) => self.metrics.job_submitted(),
             Err(StoreError::QueueFull { limit }) => {
-                return Ok(Err(self.counted_job(queue_full(limit))));
+                return Ok(Submission::Declined(self.counted_job(queue_full(limit))));
             }
             Err(error) => return Err(error.into()),
         }
-        Ok(Ok(job))
+        Ok(Submission::Queued(job))
     }
 
     /// Why no job should be submitted now, if so.
     async fn obstacle(&self) -> Result<Option<NoJob>, ServiceError> {
-        if self.jobs.queued().await? >= self.settings.job_queue {
-            return Ok(Some(self.counted_job(queue_full(self.settings.job_queue))));
+        if self.jobs.queued().await? >= self.queue {
+            return Ok(Some(self.counted_job(queue_full(self.queue))));
         }
-        if self.admission.pressure() <= self.settings.shed_jobs_at {
+        if self.admission.pressure() <= self.shed_at {
             return Ok(None);
         }
         let detail = "so many pictures wait that no frame gets a job (jobs.shed_at); post a later \
@@ -130,24 +161,15 @@ impl Service {
     }
 
     /// What a caller hears who wants nothing but the refined answer.
-    pub(super) fn refuse_job(&self, why: &NoJob) -> ServiceError {
+    pub(super) fn refuse(&self, why: &NoJob) -> ServiceError {
         let pause = match why.reason {
             NoJobReason::QueueFull => {
-                let pace = self.job_pace.lock();
+                let pace = self.service_time.lock();
                 self.admission.within_bounds(pace.until_done(1))
             }
             _ => self.admission.retry_after(),
         };
         let detail = format!("{}, or ask with refine=async or refine=off", why.detail);
         ServiceError::new(ErrorKind::Overloaded, detail).retry_after(pause)
-    }
-
-    /// The time that a caller's deadline leaves for waiting, no longer than `longest`.
-    pub(super) fn time_left(longest: Duration, deadline: Option<Instant>) -> Duration {
-        deadline.map_or(longest, |deadline| {
-            let left = deadline.saturating_duration_since(Instant::now());
-            // The answer has still to be made and sent.
-            longest.min(left * 9 / 10)
-        })
     }
 }

@@ -1,20 +1,32 @@
 //! Maps that come from another store or go there, with the descriptors that their images have.
 
+use std::sync::Arc;
+
 use bytes::Bytes;
 use uuid::Uuid;
 
 use super::images::{check_tags, page_size};
-use super::{SUPERSEDED, Service, ServiceError};
+use super::{Maps, SUPERSEDED, ServiceError};
 use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, Image, ImageId, Map, MapName, MediaType};
-use whereabouts_store::{Added, StoreError};
+use whereabouts_store::{Added, BlobStore, ExportStore, StoreError};
 use whereabouts_vision::AdmissionRequest;
 
 /// The most numbers in a descriptor that comes from elsewhere.
 const MAX_DIM: usize = 1 << 16;
 
-impl Service {
+/// Copies maps between stores, with the descriptors that their images have.
+pub struct Transfer {
+    /// The maps.
+    pub maps: Maps,
+    /// Images with their descriptors.
+    pub exports: Arc<dyn ExportStore>,
+    /// The bytes of images.
+    pub blobs: Arc<dyn BlobStore>,
+}
+
+impl Transfer {
     /// Images of a map with their descriptors, a page at a time.
     pub async fn export(
         &self,
@@ -25,7 +37,7 @@ impl Service {
         let limit = page_size(limit)?;
         let mut left = SUPERSEDED;
         loop {
-            let map = self.known_map(name).await?;
+            let map = self.maps.known(name).await?;
             let mut images = match self.exports.export(&map, cursor, limit + 1).await {
                 Err(StoreError::Superseded(_)) if left > 0 => {
                     left -= 1;
@@ -50,23 +62,23 @@ impl Service {
         check_map(&from)?;
         let mut left = SUPERSEDED;
         loop {
-            let known = self.maps.map(name).await?;
+            let known = self.maps.store.map(name).await?;
             let revision = match &known {
                 Some(known) if fits(known, &from) => {
-                    return Ok((self.state_of(name).await?, false));
+                    return Ok((self.maps.state_of(name).await?, false));
                 }
-                Some(known) if self.maps.index_state(known).await?.images > 0 => {
+                Some(known) if self.maps.store.index_state(known).await?.images > 0 => {
                     return Err(unlike(known, &from));
                 }
                 Some(known) => known.revision,
                 None => 0,
             };
             let wanted = Map { uid: Uuid::now_v7(), name: name.clone(), revision, ..from.clone() };
-            match self.maps.put_map(wanted).await {
+            match self.maps.store.put_map(wanted).await {
                 Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
                 put => {
                     let (_, new) = put?;
-                    return Ok((self.state_of(name).await?, new));
+                    return Ok((self.maps.state_of(name).await?, new));
                 }
             }
         }
@@ -81,7 +93,7 @@ impl Service {
         demand: AdmissionRequest,
     ) -> Result<Added, ServiceError> {
         let ImportedImage { map: source, image: ExportedImage { image, descriptor } } = from;
-        let map = self.known_map(name).await?;
+        let map = self.maps.known(name).await?;
         if !fits(&map, &source) {
             return Err(unlike(&map, &source));
         }
@@ -97,13 +109,17 @@ impl Service {
                 )));
             }
             None => {
-                let (_, extractor) = self.usable_map(name).await?;
-                self.extract(&extractor, bytes.clone(), map.descriptor, demand).await?.descriptor
+                let (_, extractor) = self.maps.usable(name).await?;
+                self.maps
+                    .imaging
+                    .extract(&extractor, bytes.clone(), map.descriptor, demand)
+                    .await?
+                    .descriptor
             }
         };
         let _pin = self.blobs.put_blob(image.digest, bytes).await?;
         // Superseded, if it was reindexed since it was looked up: its descriptors are of another model.
-        Ok(self.maps.add_image(&map, image, descriptor).await?)
+        Ok(self.maps.store.add_image(&map, image, descriptor).await?)
     }
 }
 

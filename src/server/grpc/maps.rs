@@ -24,7 +24,7 @@ impl MapService for Api {
         request: Request<ListMapsRequest>,
     ) -> Result<Response<ListMapsResponse>, Status> {
         let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let maps = asked.service.list_maps().await.map_err(status::of)?.into_iter();
+        let maps = asked.service.maps.list().await.map_err(status::of)?.into_iter();
         let maps = maps.filter(|map| asked.caller.may_use(&map.name));
         Ok(Response::new(ListMapsResponse { maps: maps.map(Into::into).collect() }))
     }
@@ -35,7 +35,7 @@ impl MapService for Api {
     ) -> Result<Response<GetMapResponse>, Status> {
         let asked = self.asked(request.extensions()).map_err(status::of)?;
         let name = asked.map(&request.get_ref().map).map_err(status::of)?;
-        let map = asked.service.get_map(&name).await.map_err(status::of)?;
+        let map = asked.service.maps.get(&name).await.map_err(status::of)?;
         Ok(Response::new(GetMapResponse { map: Some(map.into()) }))
     }
 
@@ -54,7 +54,7 @@ impl MapService for Api {
     ) -> Result<Response<DeleteMapResponse>, Status> {
         let asked = self.asked(request.extensions()).map_err(status::of)?;
         let name = asked.map(&request.get_ref().map).map_err(status::of)?;
-        asked.service.delete_map(&name).await.map_err(status::of)?;
+        asked.service.maps.delete(&name).await.map_err(status::of)?;
         Ok(Response::new(DeleteMapResponse {}))
     }
 
@@ -68,11 +68,11 @@ impl MapService for Api {
             return Ok(Response::new(AddImagesResponse { results: Vec::new() }));
         };
         let map = asked.map(&first.map).map_err(status::of)?;
-        asked.service.get_map(&map).await.map_err(status::of)?;
+        asked.service.maps.get(&map).await.map_err(status::of)?;
         let images = stream::iter([Ok(first)]).chain(coming);
         let images = images.map_ok(|next| image(&map, next, asked.held.take()));
-        let until = asked.service.over(&self.door, asked.caller.clone(), asked.deadline);
-        let results = asked.service.add_images(&map, &asked.caller, images, until).await?;
+        let until = asked.service.cancelled_by(&self.door, asked.caller.clone(), asked.deadline);
+        let results = asked.service.images.add_many(&map, &asked.caller, images, until).await?;
         Ok(Response::new(AddImagesResponse { results: results.into_iter().map(result).collect() }))
     }
 }
@@ -87,7 +87,7 @@ impl Asked {
             model,
             description,
         };
-        let (map, created) = self.service.put_map(self.map(&map)?, change).await?;
+        let (map, created) = self.service.maps.put(self.map(&map)?, change).await?;
         Ok(PutMapResponse { map: Some(map.into()), created })
     }
 }

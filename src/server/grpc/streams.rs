@@ -18,7 +18,7 @@ pub(super) fn until_over<T: Send + 'static>(
     asked: Asked,
 ) -> Answers<T> {
     let Asked { service, caller, deadline, .. } = asked;
-    let over = service.over(door, caller, deadline).map(|why| Err(status::of(why)));
+    let over = service.cancelled_by(door, caller, deadline).map(|why| Err(status::of(why)));
     // The end of either ends both: what is over is told once.
     let answers = answers.map(Some).chain(stream::iter([None]));
     let over = stream::once(over).map(Some).chain(stream::iter([None]));

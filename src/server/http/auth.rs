@@ -195,7 +195,7 @@ async fn may_make(
         _ if route.starts_with("/jobs/") => match parameter("id").and_then(|id| id.parse().ok()) {
             // What is no id, or of no job, the handler says.
             None => return Ok(()),
-            Some(id) => match service.get_job(id, None).await {
+            Some(id) => match service.jobs.get(id, None).await {
                 Ok(job) => Some(job.map.to_string()),
                 Err(error) if error.kind == ErrorKind::NotFound => return Ok(()),
                 Err(error) => return Err(error),

@@ -75,7 +75,7 @@ impl PictureBody {
         service: &Service,
         demand: AdmissionRequest,
     ) -> Result<Self, Problem> {
-        if let Err(refused) = service.check_admission(demand) {
+        if let Err(refused) = service.maps.imaging.check_admission(demand) {
             throw_away(request);
             return Err(refused.into());
         }

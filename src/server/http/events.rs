@@ -37,7 +37,7 @@ pub(super) async fn follow_job(
     Segments(id): Segments<String>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let permit = state.stream()?;
-    let events = service.follow_job(job_id(&id)?).await?.map(move |event| {
+    let events = service.jobs.follow(job_id(&id)?).await?.map(move |event| {
         // Given back when the stream ends or the client has gone.
         let _permit = &permit;
         match event {
@@ -46,7 +46,7 @@ pub(super) async fn follow_job(
             JobEvent::Ended(job) => Event::default().event("end").json_data(job),
         }
     });
-    Ok(streamed(events, service.over(&state.door, caller, Deadline::default())))
+    Ok(streamed(events, service.cancelled_by(&state.door, caller, Deadline::default())))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -76,7 +76,7 @@ pub(super) async fn follow_jobs(
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let map = params.map.as_deref().map(map_name).transpose()?;
     let permit = state.stream()?;
-    let events = service.follow_jobs(map).map(move |event| {
+    let events = service.jobs.follow_all(map).map(move |event| {
         let _permit = &permit;
         match event {
             AnyJobEvent::Changed(change) => Event::default().event("job").json_data(change),
@@ -84,7 +84,10 @@ pub(super) async fn follow_jobs(
         }
     });
     let opened = stream::once(async { Ok(Event::default().comment("open")) });
-    Ok(streamed(opened.chain(events), service.over(&state.door, caller, Deadline::default())))
+    Ok(streamed(
+        opened.chain(events),
+        service.cancelled_by(&state.door, caller, Deadline::default()),
+    ))
 }
 
 /// Sends events until they end, the server drains, or the caller may ask no more. A drain does not wait for

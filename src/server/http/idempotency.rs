@@ -68,7 +68,7 @@ async fn answer(state: AppState, request: Request, next: Next) -> Result<Respons
     let what = format!("{} {}\n", parts.method, parts.uri);
     let kind = parts.headers.get(CONTENT_TYPE).map_or(&[][..], HeaderValue::as_bytes);
     let fingerprint = Digest::of(&[what.as_bytes(), kind, b"\n", &bytes].concat());
-    match service.begin_once(&id, fingerprint).await? {
+    match service.idempotency.begin(&id, fingerprint).await? {
         Once::Again(kept) => Ok(replay(kept)),
         Once::Other => Err(Problem::new(
             ErrorKind::Unprocessable,
@@ -134,7 +134,7 @@ async fn do_and_keep(
             .and_then(|kind| Some(kind.to_str().ok()?.to_owned())),
         body: body.to_owned(),
     });
-    if let Err(error) = service.end_once(&id, fingerprint, kept).await {
+    if let Err(error) = service.idempotency.end(&id, fingerprint, kept).await {
         // It is done all the same.
         tracing::error!(%error, "an answer could not be kept for an Idempotency-Key");
     }

@@ -116,5 +116,5 @@ pub(super) async fn localize(
         track,
         once,
     };
-    Ok(Json(service.localize(request).await?))
+    Ok(Json(service.localizer.localize(request).await?))
 }

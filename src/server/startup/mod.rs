@@ -1,5 +1,6 @@
 //! The only place where everything is wired: build, serve, drain.
 
+mod settings;
 mod store;
 
 use std::net::SocketAddr;
@@ -10,25 +11,21 @@ use anyhow::Context;
 use jiff::Timestamp;
 use tokio::net::TcpListener;
 use tokio::runtime::Handle;
-use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use crate::Metrics;
 use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
-use crate::http::{About, AppState, Connections, HttpSettings, router, worker_router};
-use whereabouts_core::{CalibrationSettings, utc_day};
+use crate::http::{About, AppState, Connections, router, worker_router};
+use whereabouts_core::utc_day;
 use whereabouts_refine::local::{LocalMatcher, LocalSettings};
 use whereabouts_refine::mllm::{MllmParts, MllmRefiner};
 use whereabouts_refine::{
     DenseCache, JobServiceTime, LocalRefiner, Refiner, Worker, WorkerSettings,
 };
-use whereabouts_service::{
-    Dispatcher, IdempotencySettings, Janitor, Keys, Limits, RecallCheck, Reindexes,
-    RetentionSettings, Service, ServiceSettings, Tracks, Webhooks,
-};
-use whereabouts_store::{Buckets, JobStore};
+use whereabouts_service::{Dispatcher, Janitor, Keys, Limits, Service, ServiceParts, Webhooks};
+use whereabouts_store::Buckets;
 use whereabouts_telemetry::LogIssues;
 use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
 use whereabouts_vision::{LoadedModels, LoadedSettings, WhyModel};
@@ -59,7 +56,7 @@ pub async fn run(
     let address = listener.local_addr().context("the listener has no address")?;
     let metrics = Arc::new(Metrics::new());
     let state =
-        AppState::new(http_settings(&config), about(&config, troubles)?, Arc::clone(&metrics));
+        AppState::new(settings::http(&config), about(&config, troubles)?, Arc::clone(&metrics));
     let connections = Connections {
         settings: config.server.connections(),
         router: match role {
@@ -71,13 +68,13 @@ pub async fn run(
     };
     let encrypted = connections.tls.is_some();
     let server = tokio::spawn(connections.serve(listener, shutdown.clone()));
-    let (drain_timeout, retention) = (config.server.drain_timeout(), retention(&config));
+    let (drain_timeout, retention) = (config.server.drain_timeout(), settings::retention(&config));
     let counted = Arc::clone(&metrics.service);
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
     let Parts { service, workers, pools } = building.await.context("the start broke off")??;
     let janitor = Janitor {
         store: Arc::clone(&service.retention),
-        answers: Arc::clone(&service.answers),
+        answers: Arc::clone(&service.idempotency.store),
         metrics: Arc::clone(&counted),
         settings: retention,
     };
@@ -91,7 +88,7 @@ pub async fn run(
         running.spawn(async move { janitor.run(until).await });
         running.spawn(dispatcher.run(shutdown.clone()));
         let until = shutdown.clone();
-        running.spawn(async move { service.keep_calibrated(until).await });
+        running.spawn(async move { service.calibrator.run(until).await });
     }
     for worker in workers {
         let shutdown = shutdown.clone();
@@ -131,42 +128,6 @@ fn about(config: &Config, troubles: Arc<LogIssues>) -> anyhow::Result<About> {
     })
 }
 
-fn http_settings(config: &Config) -> HttpSettings {
-    HttpSettings {
-        body_limit_bytes: config.server.body_limit_bytes,
-        bodies_limit_bytes: config.server.bodies_limit_bytes,
-        body_timeout: Duration::from_secs(config.server.body_timeout_s),
-        body_pause: Duration::from_secs(config.server.body_pause_s),
-        request_timeout: config.server.request_timeout(),
-        max_wait: Duration::from_secs(config.jobs.max_wait_s),
-        max_requests: config.server.max_requests,
-        max_streams: config.server.max_streams,
-        stream_idle: Duration::from_secs(config.server.stream_idle_s),
-        bulk_memory_bytes: config.bulk.memory_bytes,
-        keys_required: config.keys_required(),
-    }
-}
-
-fn retention(config: &Config) -> RetentionSettings {
-    let keep = Duration::from_secs(u64::from(config.jobs.keep_days) * 24 * 3600);
-    RetentionSettings {
-        keep: Some(keep).filter(|keep| !keep.is_zero()),
-        most: Some(config.jobs.keep_count).filter(|most| *most > 0),
-        settle: Duration::from_secs(config.jobs.max_wait_s),
-        pause: Duration::from_secs(config.jobs.sweep_s),
-        batch: config.jobs.sweep_batch,
-        usage_days: config.data.usage_days,
-        once: once(config),
-    }
-}
-
-fn once(config: &Config) -> IdempotencySettings {
-    IdempotencySettings {
-        keep: Duration::from_secs(u64::from(config.idempotency.keep_hours) * 3600),
-        most: config.idempotency.max,
-    }
-}
-
 /// What a server is made of.
 pub struct Parts {
     /// The use cases.
@@ -185,7 +146,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     let admission = config.image.admission(config.model.layout());
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
     let pool = CpuPool::new("frames", cores_unless(config.image.threads), admission.permits)?;
-    let job_pace = JobServiceTime::default();
+    let job_service_time = JobServiceTime::default();
     // Beside the workers, calibration and whoever looks at matches come to it, one at a time each.
     let refining = CpuPool::new("refine", config.jobs.workers.max(1), config.jobs.workers + 2)?;
     let pools = [pool.clone(), refining.clone()];
@@ -219,14 +180,13 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             Some(Arc::new(refiner))
         }
     };
-    let jobs: Arc<dyn JobStore> = store.clone();
     let workers = refiner.iter().flat_map(|refiner| {
         (0..config.jobs.workers).map(|_| Worker {
-            jobs: Arc::clone(&jobs),
+            jobs: store.clone(),
             maps: store.clone(),
             refiner: Arc::clone(refiner),
             metrics: Arc::clone(&metrics.refine),
-            pace: Arc::clone(&job_pace),
+            pace: Arc::clone(&job_service_time),
             settings: WorkerSettings {
                 lease: Duration::from_secs(config.jobs.lease_s),
                 timeout: Duration::from_secs(config.jobs.timeout_s),
@@ -241,56 +201,23 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     let mut keys = Handle::current().block_on(Keys::load(store.clone()))?;
     keys.limits = Limits::new(Buckets::of(shared));
     check_keys(config, &keys)?;
-    let service = Service {
-        keys,
-        webhooks: Webhooks { store: store.clone(), settings: config.webhooks.clone() },
-        answers: store.clone(),
+    let parts = ServiceParts {
+        store,
         process,
-        maps: store.clone(),
-        drafts: store.clone(),
-        reindexes: Reindexes::default(),
-        tracks: Tracks::new(config.track.clone()),
-        exports: store.clone(),
-        blobs: store.clone(),
-        jobs,
-        accounts: store.clone(),
-        retention: store.clone(),
+        keys,
         models,
-        recall: RecallCheck::new(
-            Some(Duration::from_secs(config.index.check_s)).filter(|pause| !pause.is_zero()),
-        ),
         admission: Admission::new(admission),
         pool,
-        job_pace,
         refiner,
         dense,
+        job_service_time,
         metrics: Arc::clone(&metrics.service),
-        settings: ServiceSettings {
-            k: config.localize.k,
-            max_k: config.localize.max_k,
-            known_confidence: config.localize.known_confidence,
-            calibration: CalibrationSettings {
-                images: config.confidence.images,
-                refined: config.confidence.refined,
-                candidates: config.refine.compared(),
-                place_images: config.confidence.place_images,
-                place_m: config.confidence.place_m,
-            },
-            candidates: config.refine.compared(),
-            job_queue: config.jobs.queue,
-            shed_jobs_at: config.jobs.shed_at,
-            max_wait: Duration::from_secs(config.jobs.max_wait_s),
-            usage_days: config.data.usage_days,
-            once: once(config),
-            bulk: config.bulk,
-        },
-        matching: Semaphore::new(1),
-        searching: Semaphore::new(1),
     };
-    let model = service.models.default_model();
+    let service = Service::new(parts, settings::service(config));
+    let model = service.maps.imaging.models.default_model();
     tracing::info!(model, %why, "the model of maps that name none");
-    service.models.manifest(model)?;
-    Handle::current().block_on(service.installed_model(model))?;
+    service.maps.imaging.models.manifest(model)?;
+    Handle::current().block_on(service.maps.imaging.installed_model(model))?;
     Ok(Parts { service, workers, pools })
 }
 

@@ -18,9 +18,10 @@ use uuid::Uuid;
 
 use self::belief::{Belief, Motion};
 use self::places::Places;
-use super::{Principal, Service, ServiceError};
+use super::{Principal, ServiceError};
 use whereabouts_api::{ErrorKind, TrackEstimate};
 use whereabouts_core::{Calibration, Candidate, ImageId, Map};
+use whereabouts_store::MapStore;
 
 /// The images of a map that grows are looked up again no sooner than this.
 const REFRESH: Duration = Duration::from_secs(2);
@@ -155,8 +156,10 @@ struct Known {
 }
 
 /// All tracks.
-#[derive(Debug)]
 pub struct Tracks {
+    store: Arc<dyn MapStore>,
+    /// Images closer than this many metres show the same place.
+    place_m: f64,
     settings: Arc<TrackSettings>,
     /// By map, owner and id.
     tracks: Mutex<HashMap<Key, Remembered>>,
@@ -170,8 +173,10 @@ type Key = (Uuid, String, String);
 
 impl Tracks {
     /// No track yet.
-    pub fn new(settings: TrackSettings) -> Self {
+    pub fn new(store: Arc<dyn MapStore>, place_m: f64, settings: TrackSettings) -> Self {
         Self {
+            store,
+            place_m,
             settings: Arc::new(settings),
             tracks: Mutex::default(),
             maps: Mutex::default(),
@@ -233,7 +238,7 @@ impl Tracks {
     }
 }
 
-impl Service {
+impl Tracks {
     /// Takes a frame into its track. `candidates` are the images most similar to it.
     pub(super) async fn follow(
         &self,
@@ -251,7 +256,7 @@ impl Service {
             )));
         }
         // Not more than the filter is set to, however many the caller asked for.
-        let candidates = &candidates[..candidates.len().min(self.tracks.candidates())];
+        let candidates = &candidates[..candidates.len().min(self.candidates())];
         let similarities: Vec<(u32, f32)> = candidates
             .iter()
             .filter_map(|one| Some((places.number(&one.image_id)?, one.similarity)))
@@ -259,10 +264,10 @@ impl Service {
         let gap =
             calibration.similarity.mean().unwrap_or_else(|| spread(candidates)).max(LEAST_GAP);
         let TrackStep { id, owner, captured_at, .. } = step.clone();
-        let track = self.tracks.track(&(map.uid, owner, id.clone()));
+        let track = self.track(&(map.uid, owner, id.clone()));
         // Frames of one track that come at the same time are taken one after another.
         let mut track = track.lock_owned().await;
-        let (filtered, settings) = (Arc::clone(&places), Arc::clone(&self.tracks.settings));
+        let (filtered, settings) = (Arc::clone(&places), Arc::clone(&self.settings));
         let (mut belief, frames) = off_the_runtime(move || {
             let belief = track.moved(&step, &filtered, &settings);
             let belief = belief.given(&similarities, gap, &filtered, &settings);
@@ -271,10 +276,10 @@ impl Service {
             (belief, track.frames)
         })
         .await?;
-        let place_m = self.settings.calibration.place_m;
+        let place_m = self.place_m;
         let mut best = belief.best(&places, place_m);
         while let Some((image, _)) = best
-            && self.maps.image(map, places.id(image)).await?.is_none()
+            && self.store.image(map, places.id(image)).await?.is_none()
         {
             // It was deleted a moment ago, and is in no answer.
             belief = belief.without(image);
@@ -287,22 +292,22 @@ impl Service {
             image_id: best.map(|(image, _)| places.id(image).clone()),
             pose: best.map(|(image, _)| places.pose(image)),
             probability,
-            known: probability >= self.tracks.settings.known_probability,
+            known: probability >= self.settings.known_probability,
         })
     }
 
     async fn places(&self, map: &Map) -> Result<Arc<Places>, ServiceError> {
-        let version = (map.revision, self.maps.index_state(map).await?.changes);
-        if let Some(places) = self.tracks.known(map, version) {
+        let version = (map.revision, self.store.index_state(map).await?.changes);
+        if let Some(places) = self.known(map, version) {
             return Ok(places);
         }
-        let _turn = self.tracks.laying_out.lock().await;
-        if let Some(places) = self.tracks.known(map, version) {
+        let _turn = self.laying_out.lock().await;
+        if let Some(places) = self.known(map, version) {
             return Ok(places);
         }
-        let images = self.maps.positions(map).await?;
+        let images = self.store.positions(map).await?;
         let places = Arc::new(off_the_runtime(move || Places::new(images)).await?);
-        self.tracks.know(map, version, &places);
+        self.know(map, version, &places);
         Ok(places)
     }
 }

@@ -41,7 +41,7 @@ impl Default for Readiness {
 impl Service {
     /// Ends when what a caller has begun is to be ended: the server drains, the caller may ask no more, or
     /// wants no more. Says why.
-    pub fn over(
+    pub fn cancelled_by(
         self: &Arc<Self>,
         door: &Readiness,
         caller: Principal,

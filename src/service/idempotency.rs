@@ -1,13 +1,15 @@
 //! Requests that are done once, however often they are sent.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use uuid::Uuid;
 
+use super::ServiceError;
 use super::retention::before;
-use super::{Service, ServiceError};
 use whereabouts_core::Digest;
-use whereabouts_store::{IdempotencyRecord, Progress, StoredResponse};
+use whereabouts_store::{IdempotencyRecord, IdempotencyStore, Progress, StoredResponse};
 
 /// What answers to requests with a key are kept for.
 #[derive(Debug, Clone, Copy)]
@@ -28,7 +30,7 @@ impl IdempotencySettings {
 /// What is to be done with a request that has a key.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Once {
-    /// It is the first: do it, and then say so with [`Service::end_once`].
+    /// It is the first: do it, and then say so with [`Idempotency::end`].
     First,
     /// It was done: this was the answer.
     Again(StoredResponse),
@@ -38,14 +40,24 @@ pub enum Once {
     Other,
 }
 
-impl Service {
+/// Requests with an `Idempotency-Key`: done once, answered as often as they are sent.
+pub struct Idempotency {
+    /// What is known of such requests.
+    pub store: Arc<dyn IdempotencyStore>,
+    /// This process: a request that a dead process began can be begun again.
+    pub process: Uuid,
+    /// How long and how many responses are kept.
+    pub settings: IdempotencySettings,
+}
+
+impl Idempotency {
     /// Takes up a request by the id that its sender gave it.
-    pub async fn begin_once(&self, id: &str, fingerprint: Digest) -> Result<Once, ServiceError> {
+    pub async fn begin(&self, id: &str, fingerprint: Digest) -> Result<Once, ServiceError> {
         let now = Timestamp::now();
-        let settings = self.settings.once;
+        let settings = self.settings;
         let progress = Progress::Running { process: self.process, job: None };
         let reserved = IdempotencyRecord { fingerprint, at: now, progress };
-        Ok(match self.answers.reserve_answer(id, reserved, settings.since(now)).await? {
+        Ok(match self.store.reserve_answer(id, reserved, settings.since(now)).await? {
             None => Once::First,
             Some(known) if known.fingerprint != fingerprint => Once::Other,
             Some(IdempotencyRecord { progress: Progress::Answered(kept), .. }) => Once::Again(kept),
@@ -55,18 +67,18 @@ impl Service {
 
     /// The request was done: `kept` is what is answered when it comes again; `None`, if it is to be done
     /// anew then.
-    pub async fn end_once(
+    pub async fn end(
         &self,
         id: &str,
         fingerprint: Digest,
         kept: Option<StoredResponse>,
     ) -> Result<(), ServiceError> {
         match kept {
-            None => self.answers.forget_answer(id).await?,
+            None => self.store.forget_answer(id).await?,
             Some(kept) => {
                 let progress = Progress::Answered(kept);
                 let answer = IdempotencyRecord { fingerprint, at: Timestamp::now(), progress };
-                self.answers.keep_answer(id, answer).await?;
+                self.store.keep_answer(id, answer).await?;
             }
         }
         Ok(())
