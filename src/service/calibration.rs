@@ -1,4 +1,5 @@
-//! Measures in each map how far chance resemblance goes; see [`whereabouts_core::confidence`].
+//! Calibration: measures the null distributions of each map, on which confidence rests, in the background; see
+//! [`whereabouts_core::confidence`].
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -13,37 +14,37 @@ use whereabouts_core::{Calibration, CalibrationSettings, Evidence, Map};
 use whereabouts_refine::{RefineError, Refiner};
 use whereabouts_store::{HardNegatives, IndexState, MapStore};
 
-/// How often it is looked for maps that have changed.
-const LOOK: Duration = Duration::from_millis(500);
+/// Pause between two scans for maps that have changed.
+const SCAN_PAUSE: Duration = Duration::from_millis(500);
 
-/// Where a look takes long, because there are many maps, the pause is so many times as long.
-const PAUSE_PER_LOOK: u32 = 10;
+/// The pause is at least this many times the duration of the scan, so that many maps do not keep the store busy.
+const PAUSE_PER_SCAN: u32 = 10;
 
-/// But no longer than this: measuring takes long too.
-const LONGEST_PAUSE: Duration = Duration::from_secs(10);
+/// Maximum pause: calibration itself counts as part of the scan.
+const MAX_PAUSE: Duration = Duration::from_secs(10);
 
 /// The pause when those who refine jobs have no time, and how often that may happen for one image.
 const PAUSE: Duration = Duration::from_millis(200);
 const PAUSES: usize = 300;
 
-/// A map is measured again when its number of images has changed by one in so many.
-const CHANGED: usize = 5;
+/// A map is calibrated again when its number of images has changed by one in this many.
+const CHANGED_SHARE: usize = 5;
 
-/// Measures in each map how similar images of different places look, which confidence rests on.
+/// Calibrates maps: measures how similar images of different places look in each.
 pub struct Calibrator {
     /// The maps.
     pub store: Arc<dyn MapStore>,
-    /// The refiner, which is measured too.
+    /// The refiner, whose agreement is measured too, if one is configured.
     pub refiner: Option<Arc<dyn Refiner>>,
-    /// How many images are asked, and what counts as a place.
+    /// How many images are measured, and which count as the same place.
     pub settings: CalibrationSettings,
 }
 
 impl Calibrator {
-    /// Measures maps when their images have changed, until `shutdown`.
+    /// Calibrates maps after their images have changed, until `shutdown`.
     pub async fn run(&self, shutdown: CancellationToken) {
         let mut seen = BTreeMap::new();
-        let mut pause = LOOK;
+        let mut pause = SCAN_PAUSE;
         loop {
             tokio::select! {
                 () = shutdown.cancelled() => return,
@@ -55,14 +56,14 @@ impl Calibrator {
                 measured = self.calibrate_settled(&mut seen) => measured,
             };
             if let Err(error) = measured {
-                // A map was removed or reindexed meanwhile; the next look sees to it.
-                tracing::debug!(%error, "a map could not be measured");
+                // For example, a map was deleted or reindexed meanwhile. The next scan tries again.
+                tracing::debug!(%error, "a map could not be calibrated");
             }
-            pause = LOOK.max(began.elapsed() * PAUSE_PER_LOOK).min(LONGEST_PAUSE);
+            pause = SCAN_PAUSE.max(began.elapsed() * PAUSE_PER_SCAN).min(MAX_PAUSE);
         }
     }
 
-    /// Measures the maps that need it and have as many images as at the last look.
+    /// Calibrates the maps that need it and whose number of images is the same as in the last scan.
     async fn calibrate_settled(
         &self,
         seen: &mut BTreeMap<Uuid, usize>,
@@ -83,11 +84,11 @@ impl Calibrator {
         let Some(known) = self.store.calibration(map).await? else { return Ok(images > 1) };
         Ok(!known.complete
             || known.settings != self.settings
-            || known.images.abs_diff(images) * CHANGED > known.images)
+            || known.images.abs_diff(images) * CHANGED_SHARE > known.images)
     }
 
-    /// Measures a map: first by similarity, which takes a moment, then by what `refiner` says. What is
-    /// measured counts at once.
+    /// Calibrates a map: first similarity, which is fast, then the agreement that `refiner` finds. Each is in effect
+    /// as soon as it is measured.
     pub async fn calibrate(
         &self,
         map: &Map,
@@ -114,7 +115,7 @@ impl Calibrator {
         measured.complete = true;
         tracing::info!(
             map = %map.name, images, asked = measured.similarity.len(),
-            refined = measured.agreement.len(), "measured what chance resemblance is like"
+            refined = measured.agreement.len(), "the map was calibrated"
         );
         Ok(self.store.put_calibration(map, measured).await?)
     }

@@ -1,4 +1,6 @@
-//! Requests that are done once, however often they are sent.
+//! Idempotency keys: a request that is sent again is not processed again; its first response is replayed.
+//!
+//! Which responses are worth replaying is for the caller to decide.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,47 +13,47 @@ use super::retention::before;
 use whereabouts_core::Digest;
 use whereabouts_store::{IdempotencyRecord, IdempotencyStore, Progress, StoredResponse};
 
-/// What answers to requests with a key are kept for.
+/// Retention of responses to requests with an idempotency key.
 #[derive(Debug, Clone, Copy)]
 pub struct IdempotencySettings {
-    /// How long.
+    /// How long a response is kept.
     pub keep: Duration,
-    /// How many.
+    /// The maximum number of responses.
     pub most: usize,
 }
 
 impl IdempotencySettings {
-    /// Answers from before this moment count no more.
+    /// Responses stored before this time have expired.
     pub fn since(&self, now: Timestamp) -> Timestamp {
         before(now, self.keep)
     }
 }
 
-/// What is to be done with a request that has a key.
+/// What to do with a request that has an idempotency key.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Once {
-    /// It is the first: do it, and then say so with [`Idempotency::end`].
+    /// It is new: process it, and then call [`Idempotency::end`].
     First,
-    /// It was done: this was the answer.
+    /// It was processed before: replay this response.
     Again(StoredResponse),
-    /// It is being done.
+    /// It is being processed.
     Running,
-    /// The key was another request's.
+    /// The key was used for a different request.
     Other,
 }
 
-/// Requests with an `Idempotency-Key`: done once, answered as often as they are sent.
+/// Requests with an `Idempotency-Key`, each of which is processed once.
 pub struct Idempotency {
-    /// What is known of such requests.
+    /// Reservations and stored responses.
     pub store: Arc<dyn IdempotencyStore>,
-    /// This process: a request that a dead process began can be begun again.
+    /// This process; the reservation of a process that died is taken over.
     pub process: Uuid,
     /// How long and how many responses are kept.
     pub settings: IdempotencySettings,
 }
 
 impl Idempotency {
-    /// Takes up a request by the id that its sender gave it.
+    /// Reserves a request by its idempotency key. `fingerprint` tells it from other requests with the same key.
     pub async fn begin(&self, id: &str, fingerprint: Digest) -> Result<Once, ServiceError> {
         let now = Timestamp::now();
         let settings = self.settings;
@@ -60,25 +62,27 @@ impl Idempotency {
         Ok(match self.store.reserve_answer(id, reserved, settings.since(now)).await? {
             None => Once::First,
             Some(known) if known.fingerprint != fingerprint => Once::Other,
-            Some(IdempotencyRecord { progress: Progress::Answered(kept), .. }) => Once::Again(kept),
+            Some(IdempotencyRecord { progress: Progress::Answered(response), .. }) => {
+                Once::Again(response)
+            }
             Some(IdempotencyRecord { progress: Progress::Running { .. }, .. }) => Once::Running,
         })
     }
 
-    /// The request was done: `kept` is what is answered when it comes again; `None`, if it is to be done
-    /// anew then.
+    /// Ends the reservation of a request. `response` is replayed when the request is sent again; without one
+    /// it is then processed again.
     pub async fn end(
         &self,
         id: &str,
         fingerprint: Digest,
-        kept: Option<StoredResponse>,
+        response: Option<StoredResponse>,
     ) -> Result<(), ServiceError> {
-        match kept {
+        match response {
             None => self.store.forget_answer(id).await?,
-            Some(kept) => {
-                let progress = Progress::Answered(kept);
-                let answer = IdempotencyRecord { fingerprint, at: Timestamp::now(), progress };
-                self.store.keep_answer(id, answer).await?;
+            Some(response) => {
+                let progress = Progress::Answered(response);
+                let record = IdempotencyRecord { fingerprint, at: Timestamp::now(), progress };
+                self.store.keep_answer(id, record).await?;
             }
         }
         Ok(())

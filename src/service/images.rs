@@ -1,11 +1,12 @@
-//! Reference images: add, list, show, remove.
+//! Reference images: add one, list, show and delete. Many at once are for `bulk`, their copies in other
+//! stores for `transfer`.
 
 use std::sync::Arc;
 
 use bytes::Bytes;
 use jiff::Timestamp;
 
-use super::{BulkSettings, Keys, Maps, SUPERSEDED, ServiceError};
+use super::{BulkSettings, Keys, Maps, SUPERSEDED_RETRIES, ServiceError};
 use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
 use whereabouts_core::{Digest, Image, ImageId, Map, MapName, MediaType, Pose};
 use whereabouts_store::{Added, BlobStore, StoreError};
@@ -16,33 +17,33 @@ use whereabouts_vision::AdmissionRequest;
 pub struct NewImage {
     /// Its bytes: JPEG, PNG or WebP.
     pub bytes: Bytes,
-    /// What the caller says about it.
+    /// Its id, pose, time and tags.
     pub meta: ImageMeta,
-    /// How urgent it is.
+    /// Its priority and deadline in the admission queue.
     pub demand: AdmissionRequest,
 }
 
-/// Reference images: add, list, show, remove. Clones share the store.
+/// Reference images: add, list, show and delete. Clones share the store.
 #[derive(Clone)]
 pub struct Images {
-    /// The maps that they belong to.
+    /// The maps of the images.
     pub maps: Maps,
-    /// Their bytes.
+    /// The bytes of the images.
     pub blobs: Arc<dyn BlobStore>,
-    /// Keys, whose rate limits count each image of a bulk upload.
+    /// API keys, whose rate limits count each image of a bulk upload.
     pub keys: Arc<Keys>,
     /// Bounds of bulk uploads.
     pub bulk: BulkSettings,
 }
 
 impl Images {
-    /// Stores an image with its descriptor.
+    /// Extracts the descriptor of an image and stores both.
     pub async fn add(&self, map: &MapName, new: NewImage) -> Result<Added, ServiceError> {
         if new.bytes.is_empty() {
             return Err(empty_body());
         }
         let digest = Digest::of(&new.bytes);
-        let (mut pin, mut left) = (None, SUPERSEDED);
+        let (mut pin, mut retries) = (None, SUPERSEDED_RETRIES);
         loop {
             let (map, extractor) = self.maps.usable(map).await?;
             let meta = CheckedMeta::new(new.meta.clone(), &map)?;
@@ -65,20 +66,20 @@ impl Images {
                 pin = Some(self.blobs.put_blob(digest, new.bytes.clone()).await?);
             }
             match self.maps.store.add_image(&map, image, extraction.descriptor).await {
-                // Its descriptor is of the model that the map had a moment ago.
-                Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
+                // A reindex ended meanwhile: the descriptor is of the model before it.
+                Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
                 added => return Ok(added?),
             }
         }
     }
 
-    /// One image.
+    /// Returns an image without its bytes.
     pub async fn get(&self, map: &MapName, id: &ImageId) -> Result<Image, ServiceError> {
-        let map = self.maps.known(map).await?;
+        let map = self.maps.find(map).await?;
         self.maps.store.image(&map, id).await?.ok_or_else(|| no_image(&map.name, id))
     }
 
-    /// Images by id, a page at a time.
+    /// Returns a page of images, in the order of their ids.
     pub async fn list(
         &self,
         map: &MapName,
@@ -86,7 +87,7 @@ impl Images {
         limit: Option<usize>,
     ) -> Result<ImagePage, ServiceError> {
         let limit = page_size(limit)?;
-        let map = self.maps.known(map).await?;
+        let map = self.maps.find(map).await?;
         let mut images = self.maps.store.images(&map, cursor, limit + 1).await?;
         let next_cursor = (images.len() > limit)
             .then(|| images.get(limit - 1).map(|image| image.id.to_string()))
@@ -95,7 +96,8 @@ impl Images {
         Ok(ImagePage { images, next_cursor })
     }
 
-    /// The picture itself: as it was sent, or as a JPEG no larger than `max_edge` pixels.
+    /// Returns the bytes of an image as they were uploaded, or as a JPEG whose longer edge is at most `max_edge`
+    /// pixels.
     pub async fn content(
         &self,
         map: &MapName,
@@ -112,9 +114,9 @@ impl Images {
         self.maps.imaging.thumbnail(image.media_type, bytes, max_edge).await
     }
 
-    /// Removes an image.
+    /// Deletes an image.
     pub async fn delete(&self, map: &MapName, id: &ImageId) -> Result<(), ServiceError> {
-        let map = self.maps.known(map).await?;
+        let map = self.maps.find(map).await?;
         match self.maps.store.delete_image(&map, id).await? {
             true => Ok(()),
             false => Err(no_image(&map.name, id)),
@@ -122,7 +124,7 @@ impl Images {
     }
 }
 
-/// What remains of [`ImageMeta`] when it is in order.
+/// An [`ImageMeta`] that was validated against its map.
 struct CheckedMeta {
     id: Option<ImageId>,
     pose: Option<Pose>,
@@ -143,8 +145,8 @@ impl CheckedMeta {
 }
 
 pub(super) fn check_tags(tags: &[String]) -> Result<(), ServiceError> {
-    let misfit = |tag: &String| tag.is_empty() || tag.chars().count() > 64;
-    match tags.len() > 32 || tags.iter().any(misfit) {
+    let invalid = |tag: &String| tag.is_empty() || tag.chars().count() > 64;
+    match tags.len() > 32 || tags.iter().any(invalid) {
         true => Err(ServiceError::unprocessable(
             "an image has at most 32 tags, each of 1 to 64 characters",
         )),

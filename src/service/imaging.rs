@@ -1,4 +1,5 @@
-//! Images in memory: admission, decoding, extraction by the model of a map, and thumbnails.
+//! Images in memory: admission, decoding, extraction by a model, and thumbnails. Which model a map needs is
+//! for `models`.
 
 use std::sync::Arc;
 
@@ -15,59 +16,59 @@ use whereabouts_vision::{
 use super::models::unusable;
 use super::{ServiceError, ServiceMetrics};
 
-/// Decodes images and runs models on them, as many at a time as there are permits. Clones share the permits, the
-/// threads and the models.
+/// Decodes images and runs models on them, at most as many at a time as there are permits. Clones share the
+/// permits, the threads and the models.
 #[derive(Clone)]
 pub struct Imaging {
-    /// The maps, whose precision a model that is loaded must have.
+    /// The maps; a model is loaded at the precision of the maps that use it.
     pub maps: Arc<dyn MapStore>,
-    /// The models in memory.
+    /// The loaded models.
     pub models: LoadedModels,
-    /// Permits to decode and infer.
+    /// Permits to decode an image and run a model on it.
     pub admission: Arc<Admission>,
-    /// The threads that decode.
+    /// The threads for decoding.
     pub pool: CpuPool,
-    /// Counts rejections and stages.
+    /// Counts rejections.
     pub metrics: Arc<ServiceMetrics>,
 }
 
 impl Imaging {
-    /// Whether there is room for a picture; whoever is refused need not send it.
-    pub fn check_admission(&self, demand: AdmissionRequest) -> Result<(), ServiceError> {
-        self.admission.check(demand).map_err(|refused| self.counted(refused))
+    /// Rejects a picture that would not be admitted now, so that the caller need not send it.
+    pub fn check_admission(&self, request: AdmissionRequest) -> Result<(), ServiceError> {
+        self.admission.check(request).map_err(|rejected| self.counted(rejected))
     }
 
-    /// Waits for the permit to decode and infer one picture.
-    pub(crate) async fn admit(&self, demand: AdmissionRequest) -> Result<Permit, ServiceError> {
-        self.admission.enter(demand).await.map_err(|refused| self.counted(refused))
+    /// Waits for a permit to decode one picture and run a model on it.
+    pub(crate) async fn admit(&self, request: AdmissionRequest) -> Result<Permit, ServiceError> {
+        self.admission.enter(request).await.map_err(|rejected| self.counted(rejected))
     }
 
-    fn counted(&self, refused: Rejected) -> ServiceError {
-        self.metrics.refusals.count(refused.reason.into());
-        refused.into()
+    fn counted(&self, rejected: Rejected) -> ServiceError {
+        self.metrics.refusals.count(rejected.reason.into());
+        rejected.into()
     }
 
-    /// Decodes a picture, runs it through the model and makes its descriptor, once there is a permit
-    /// for it. A caller who leaves stops that at the next step.
+    /// Waits for a permit, decodes a picture and extracts its descriptor. Dropping the future stops the work
+    /// at the next step.
     pub(crate) async fn extract(
         &self,
         extractor: &Arc<Extractor>,
         bytes: Bytes,
         kind: DescriptorKind,
-        demand: AdmissionRequest,
+        request: AdmissionRequest,
     ) -> Result<Extraction, ServiceError> {
-        let permit = Arc::new(self.admit(demand).await?);
-        let gone = CancellationToken::new();
-        let _unless_dropped = gone.clone().drop_guard();
-        let (beginning, decoding) = (Arc::clone(extractor), Arc::clone(&permit));
-        let begin = move || {
-            // Whoever leaves now gives the permit back when the thread is free.
-            let _decoding = decoding;
-            beginning.begin(&bytes, || !gone.is_cancelled())
+        let permit = Arc::new(self.admit(request).await?);
+        let cancelled = CancellationToken::new();
+        let _cancel_on_drop = cancelled.clone().drop_guard();
+        let (decoder, decoding_permit) = (Arc::clone(extractor), Arc::clone(&permit));
+        let decode = move || {
+            // Held until the thread is free, even if the caller has gone.
+            let _permit = decoding_permit;
+            decoder.begin(&bytes, || !cancelled.is_cancelled())
         };
-        let extracting = self.on_pool(begin).await?;
-        let inferred = extracting.inferred().await?;
-        // Not by the pool, where it would wait although nearly all is done.
+        let pending = self.on_pool(decode).await?;
+        let inferred = pending.inferred().await?;
+        // Not on the pool, where a nearly finished extraction would queue behind new ones.
         let extractor = Arc::clone(extractor);
         let finishing = tokio::task::spawn_blocking(move || extractor.finish(inferred, kind)).await;
         let extraction = finishing
@@ -76,7 +77,7 @@ impl Imaging {
         Ok(extraction)
     }
 
-    /// A picture as it was sent, or as a JPEG no larger than `max_edge` pixels.
+    /// Returns a picture as it was uploaded, or as a JPEG whose longer edge is at most `max_edge` pixels.
     pub(crate) async fn thumbnail(
         &self,
         media_type: MediaType,
@@ -102,8 +103,8 @@ impl Imaging {
         Ok((MediaType::Jpeg, jpeg.into()))
     }
 
-    /// A model as it is installed, for descriptors yet to be made: at the precision that the
-    /// settings say, else at that of the maps which have it already.
+    /// Loads a model as it is installed now, for new descriptors: at the configured precision, else at that of
+    /// the maps that use it already.
     pub async fn installed_model(&self, name: &str) -> Result<Arc<Extractor>, ServiceError> {
         let precision = match self.models.precision() {
             Some(precision) => Some(precision),
@@ -115,10 +116,10 @@ impl Imaging {
         self.models.installed(name, precision).await.map_err(|error| unusable(name, error))
     }
 
-    /// What an installed model says about itself.
+    /// Reads the manifest of an installed model.
     pub(crate) async fn manifest(&self, name: &str) -> Result<Manifest, ServiceError> {
-        let (models, wanted) = (self.models.clone(), name.to_owned());
-        tokio::task::spawn_blocking(move || models.manifest(&wanted))
+        let (models, model) = (self.models.clone(), name.to_owned());
+        tokio::task::spawn_blocking(move || models.manifest(&model))
             .await
             .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))?
             .map_err(|error| unusable(name, error))

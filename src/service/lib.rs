@@ -1,10 +1,10 @@
-//! The use cases: what a request means, whoever brings it.
+//! The use cases, one type each. Each owns what it needs and knows the store by its traits only.
 //!
-//! HTTP and the command line convert to and from these calls and decide nothing. A [`Service`]
-//! knows the stores by their traits alone.
+//! HTTP, gRPC and the command line convert requests and responses; every decision is made here.
 
 mod bulk;
 mod calibration;
+mod cancellation;
 mod error;
 mod events;
 mod idempotency;
@@ -36,6 +36,7 @@ use uuid::Uuid;
 
 pub use self::bulk::{BulkImage, BulkResult, BulkSettings};
 pub use self::calibration::Calibrator;
+pub use self::cancellation::Deadline;
 pub use self::error::ServiceError;
 pub use self::events::{AnyJobEvent, JobEvent};
 pub use self::idempotency::{Idempotency, IdempotencySettings, Once};
@@ -44,7 +45,7 @@ pub use self::imaging::Imaging;
 pub use self::jobs::{Jobs, search_text, uuid};
 pub use self::keys::{Keys, Principal};
 pub use self::limits::{Allowance, Allowances, Limits};
-pub use self::localize::{Deadline, LocalizeRequest, LocalizeSettings, Localizer, Retrieved};
+pub use self::localize::{LocalizeRequest, LocalizeSettings, Localizer, Retrieved};
 pub use self::maps::Maps;
 pub use self::metrics::{AttemptOutcome, ServiceMetrics};
 pub use self::readiness::{Readiness, ReadinessPhase};
@@ -62,9 +63,9 @@ use whereabouts_refine::{DenseCache, JobServiceTime, Refiner};
 use whereabouts_store::{Retention, Store};
 use whereabouts_vision::{Admission, CpuPool, LoadedModels};
 
-/// How often a use case begins again because the map's descriptors were replaced meanwhile. Twice in
-/// a row would be strange; more often is a store that is broken.
-const SUPERSEDED: usize = 2;
+/// Retries of a use case whose map was reindexed meanwhile. Reindexes are rare: more in a row mean a broken
+/// store.
+const SUPERSEDED_RETRIES: usize = 2;
 
 /// The use cases of one process.
 pub struct Service {
@@ -76,47 +77,47 @@ pub struct Service {
     pub localizer: Localizer,
     /// Refinement jobs.
     pub jobs: Jobs,
-    /// New descriptors for whole maps.
+    /// Reindexing of maps.
     pub reindexer: Reindexer,
     /// Calibration of confidence.
     pub calibrator: Calibrator,
-    /// Maps from and to other stores.
+    /// Export and import of maps.
     pub transfer: Transfer,
-    /// Reports of what models cost.
+    /// Usage reports.
     pub usage: UsageReports,
-    /// Requests that are done once.
+    /// Idempotency keys.
     pub idempotency: Idempotency,
     /// API keys.
     pub keys: Arc<Keys>,
     /// Webhooks.
     pub webhooks: Webhooks,
-    /// Sizes on disk, and what is removed in the background.
+    /// Removal of expired records, and sizes on disk.
     pub retention: Arc<dyn Retention>,
-    /// Dense features in memory.
+    /// The cache of dense features.
     pub dense: Arc<DenseCache>,
     /// Metric families of the use cases.
     pub metrics: Arc<ServiceMetrics>,
 }
 
-/// What the use cases are made of.
+/// The dependencies of the use cases.
 pub struct ServiceParts {
     /// The store.
     pub store: Arc<dyn Store>,
-    /// This process.
+    /// The id of this process.
     pub process: Uuid,
     /// API keys.
     pub keys: Keys,
-    /// The models in memory.
+    /// The loaded models.
     pub models: LoadedModels,
-    /// Permits to decode and infer.
+    /// Permits to decode an image and run a model on it.
     pub admission: Admission,
-    /// The threads that decode.
+    /// The threads for decoding.
     pub pool: CpuPool,
-    /// What refines jobs, if anything does.
+    /// The refiner, if one is configured.
     pub refiner: Option<Arc<dyn Refiner>>,
-    /// Dense features that jobs need soon.
+    /// The cache of dense features.
     pub dense: Arc<DenseCache>,
-    /// How long jobs take.
+    /// The average time of a job.
     pub job_service_time: JobServiceTime,
     /// Metric families of the use cases.
     pub metrics: Arc<ServiceMetrics>,
@@ -129,19 +130,19 @@ pub struct ServiceSettings {
     pub localize: LocalizeSettings,
     /// Tracks.
     pub track: TrackSettings,
-    /// How maps are calibrated.
+    /// Calibration of confidence.
     pub calibration: CalibrationSettings,
-    /// The most jobs that wait or run.
+    /// Maximum number of jobs that are queued or running.
     pub job_queue: usize,
-    /// The share of the image queue from which on frames get no job.
+    /// Jobs are shed while more than this share of the admission queue is in use.
     pub shed_jobs_at: f64,
-    /// The longest wait for a job.
+    /// The longest time that a caller may wait for a job.
     pub max_wait: Duration,
-    /// The pause between two searches that are compared with exact search; `None` for no checks.
+    /// Pause between two comparisons of a search with exact search; `None` for none.
     pub recall_check: Option<Duration>,
-    /// Days for which usage is kept.
+    /// Retention of usage, in days.
     pub usage_days: u32,
-    /// Which responses are kept for requests that are sent again.
+    /// Retention of responses to requests with an idempotency key.
     pub idempotency: IdempotencySettings,
     /// Bounds of bulk uploads.
     pub bulk: BulkSettings,
@@ -150,7 +151,7 @@ pub struct ServiceSettings {
 }
 
 impl Service {
-    /// Wires the use cases together.
+    /// Builds all use cases over the same dependencies.
     pub fn new(parts: ServiceParts, settings: ServiceSettings) -> Self {
         let ServiceParts { store, process, keys, models, admission, pool, refiner, .. } = parts;
         let ServiceParts { dense, job_service_time, metrics, .. } = parts;

@@ -1,4 +1,4 @@
-//! Localize a frame: extract, search, answer, and queue its refinement.
+//! Localizes a frame: extracts its descriptor, searches the map, follows its track and queues its refinement.
 
 use std::time::{Duration, Instant};
 
@@ -8,7 +8,9 @@ use uuid::Uuid;
 
 use super::images::empty_body;
 use super::submit::{LocalizedFrame, Submission};
-use super::{Jobs, Maps, RecallCheck, SUPERSEDED, ServiceError, Submitter, TrackStep, Tracks};
+use super::{
+    Jobs, Maps, RecallCheck, SUPERSEDED_RETRIES, ServiceError, Submitter, TrackStep, Tracks,
+};
 use whereabouts_api::{Answer, JobLink, RefineMode, TimingMs};
 use whereabouts_core::confidence::COMPARED;
 use whereabouts_core::{Calibration, Candidate, Digest, Estimate, Map, MapName, Priority};
@@ -17,70 +19,66 @@ use whereabouts_store::StoreError;
 use whereabouts_telemetry::traces;
 use whereabouts_vision::{AdmissionRequest, Extraction, WorkClass};
 
-/// When a caller no longer wants the answer, if it said so.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Deadline(pub Option<Instant>);
-
 /// A frame to localize.
 #[derive(Debug)]
 pub struct LocalizeRequest {
-    /// In which map.
+    /// The map to search.
     pub map: MapName,
-    /// How many candidates to answer; by default the configured number.
+    /// Number of candidates in the answer; the configured number by default.
     pub k: Option<usize>,
-    /// What becomes of them.
+    /// Whether the candidates are refined, and whether the caller waits for it.
     pub refine: RefineMode,
-    /// How soon a job refines them.
+    /// The priority of the refinement job.
     pub priority: Priority,
     /// The bytes of the frame: JPEG, PNG or WebP.
     pub frame: Bytes,
-    /// When the caller no longer wants the answer.
+    /// Time after which the caller no longer wants the answer.
     pub deadline: Option<Instant>,
-    /// Which track the frame belongs to, if any.
+    /// The track that the frame belongs to, if any.
     pub track: Option<TrackStep>,
-    /// The id of the request, if it is done once however often it comes ([`Idempotency`](super::Idempotency)).
+    /// The id of a request with an idempotency key ([`Idempotency`](super::Idempotency)).
     pub once: Option<String>,
 }
 
-/// What the coarse retriever found for a frame.
+/// The result of coarse retrieval for a frame.
 #[derive(Debug)]
 pub struct Retrieved {
-    /// The map, as it was searched.
+    /// The map as it was searched.
     pub map: Map,
     /// The identity of the model.
     pub model: Digest,
     /// The most similar images, best first.
     pub candidates: Vec<Candidate>,
-    /// What was extracted from the frame.
+    /// The descriptor and dense features of the frame.
     pub extraction: Extraction,
-    /// How long the search took.
+    /// Duration of the search.
     pub searched: Duration,
 }
 
 /// Bounds and defaults of localization.
 #[derive(Debug, Clone, Copy)]
 pub struct LocalizeSettings {
-    /// Candidates in an answer, unless the caller says otherwise.
+    /// Default number of candidates in an answer.
     pub k: usize,
-    /// The most candidates in an answer.
+    /// Maximum number of candidates in an answer.
     pub max_k: usize,
-    /// Candidates that a job compares.
+    /// Number of candidates that a job compares.
     pub compared: usize,
-    /// The confidence from which on a place counts as known.
+    /// Minimum confidence of a known place.
     pub known_confidence: f64,
 }
 
-/// Localizes frames: coarse retrieval, the track that a frame belongs to, and the job that refines the answer.
+/// Localizes frames: coarse retrieval, tracks, and the jobs that refine the answers.
 pub struct Localizer {
     /// The maps.
     pub maps: Maps,
     /// The tracks of robots.
     pub tracks: Tracks,
-    /// Queues the refinement.
+    /// Queues refinement jobs.
     pub submitter: Submitter,
-    /// Waits for the refinement.
+    /// Waits for refinement jobs.
     pub jobs: Jobs,
-    /// Compares searches with exact ones now and then.
+    /// Compares a sample of the searches with exact search.
     pub recall: RecallCheck,
     /// Bounds and defaults.
     pub settings: LocalizeSettings,
@@ -94,17 +92,18 @@ impl Localizer {
         if request.frame.is_empty() {
             return Err(empty_body());
         }
-        let refined = request.refine != RefineMode::Off && self.submitter.refiner.is_some();
+        let is_refined = request.refine != RefineMode::Off && self.submitter.refiner.is_some();
         if request.refine == RefineMode::Wait {
-            // Before any work is done.
-            self.submitter.check().await?;
+            // Rejected before any work is done.
+            self.submitter.check_capacity().await?;
         }
-        let demand = AdmissionRequest { class: WorkClass::Localize, deadline: request.deadline };
-        let compared = if refined { self.settings.compared } else { 0 };
-        let followed = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
-        let wanted = k.max(compared).max(COMPARED).max(followed);
-        let Retrieved { map, model, extraction, mut candidates, searched } =
-            self.retrieve(&request.map, &request.frame, wanted, SearchMode::Fast, demand).await?;
+        let admission = AdmissionRequest { class: WorkClass::Localize, deadline: request.deadline };
+        let compared = if is_refined { self.settings.compared } else { 0 };
+        let tracked = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
+        let retrieved = k.max(compared).max(COMPARED).max(tracked);
+        let Retrieved { map, model, extraction, mut candidates, searched } = self
+            .retrieve(&request.map, &request.frame, retrieved, SearchMode::Fast, admission)
+            .await?;
 
         let calibration = self.maps.store.calibration(&map).await?.unwrap_or_default();
         let track = match request.track {
@@ -124,14 +123,14 @@ impl Localizer {
                 descriptor: extraction.descriptor,
                 dense: extraction.dense,
             };
-            let once = request.once.as_deref();
-            let submit = self.submitter.submit(&map, frame, compared, request.priority, once);
+            let id = request.once.as_deref();
+            let submit = self.submitter.submit(&map, frame, compared, request.priority, id);
             match submit.instrument(traces::stage("submit")).await? {
                 Submission::Queued(job) => (Some(job), None),
                 Submission::Declined(why)
                     if request.refine == RefineMode::Wait && why.is_shedding() =>
                 {
-                    return Err(self.submitter.refuse(&why));
+                    return Err(self.submitter.rejection(&why));
                 }
                 Submission::Declined(why) => (None, Some(why)),
             }
@@ -168,28 +167,28 @@ impl Localizer {
         })
     }
 
-    /// The coarse retriever: the `k` images of a map that look most like a frame, by the model that
-    /// the map's descriptors are of.
+    /// Coarse retrieval: the `k` images of a map that are most similar to a frame, by the model that made the
+    /// descriptors of the map.
     pub async fn retrieve(
         &self,
         map: &MapName,
         frame: &Bytes,
         k: usize,
         mode: SearchMode,
-        demand: AdmissionRequest,
+        admission: AdmissionRequest,
     ) -> Result<Retrieved, ServiceError> {
-        let mut left = SUPERSEDED;
+        let mut retries = SUPERSEDED_RETRIES;
         loop {
             let (map, extractor) = self.maps.usable(map).await?;
             let extracting =
-                self.maps.imaging.extract(&extractor, frame.clone(), map.descriptor, demand);
+                self.maps.imaging.extract(&extractor, frame.clone(), map.descriptor, admission);
             let extraction = extracting.instrument(traces::stage("extract")).await?;
             self.maps.imaging.metrics.observe_extraction(&extraction);
             let searching = Instant::now();
             let search = self.maps.store.search(&map, extraction.descriptor.clone(), k, mode);
             match search.instrument(traces::stage("search")).await {
-                // The frame's descriptor is of the model that the map had a moment ago.
-                Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
+                // A reindex ended meanwhile: the frame's descriptor is of the model before it.
+                Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
                 found => {
                     let (candidates, searched) = (found?, searching.elapsed());
                     self.maps.imaging.metrics.observe_search(searched);
@@ -220,20 +219,20 @@ impl Localizer {
         )))
     }
 
-    /// The first candidate, and how sure it is.
+    /// The estimate by coarse retrieval alone: the first candidate with its confidence.
     fn estimate(&self, candidates: &[Candidate], calibration: &Calibration) -> Option<Estimate> {
         let first = candidates.first()?;
         let confidence = calibration.refined_confidence(candidates, &first.image_id, None);
-        let known_from = self.settings.known_confidence;
-        Some(Estimate::new(&first.image_id, first.pose, confidence, known_from))
+        let min_known = self.settings.known_confidence;
+        Some(Estimate::new(&first.image_id, first.pose, confidence, min_known))
     }
 }
 
-/// The time that a caller's deadline leaves for waiting, no longer than `longest`.
+/// The time that a caller's deadline leaves for waiting, at most `longest`.
 fn time_left(longest: Duration, deadline: Option<Instant>) -> Duration {
     deadline.map_or(longest, |deadline| {
         let left = deadline.saturating_duration_since(Instant::now());
-        // The answer has still to be made and sent.
+        // A tenth is kept to build and send the answer.
         longest.min(left * 9 / 10)
     })
 }

@@ -1,4 +1,4 @@
-//! Maps: create, change, list, remove.
+//! Maps: create, change, list and delete. Their images are for `images`, new descriptors for `reindex`.
 
 use std::sync::Arc;
 
@@ -6,24 +6,24 @@ use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::models::dimension;
-use super::{Imaging, Reindexes, SUPERSEDED, ServiceError};
+use super::{Imaging, Reindexes, SUPERSEDED_RETRIES, ServiceError};
 use whereabouts_api::{CalibrationState, ErrorKind, IndexKind, MapChange, MapState};
 use whereabouts_core::{Map, MapName};
 use whereabouts_store::{IndexState, MapStore, StoreError};
 
-/// Maps: create, change, list, remove. Clones share the store.
+/// Maps: create, change, list and delete. Clones share the store.
 #[derive(Clone)]
 pub struct Maps {
-    /// Maps, images, descriptors.
+    /// Maps, images and descriptors.
     pub store: Arc<dyn MapStore>,
-    /// Models and what runs them.
+    /// Models and the threads that run them.
     pub imaging: Imaging,
-    /// The last reindex of each map.
+    /// The state of the last reindex of each map.
     pub reindexes: Arc<Reindexes>,
 }
 
 impl Maps {
-    /// Creates a map or changes it; also says whether it is new.
+    /// Creates or changes a map. Returns its state, and whether it is new.
     pub async fn put(
         &self,
         name: MapName,
@@ -32,13 +32,13 @@ impl Maps {
         if change.description.as_ref().is_some_and(|text| text.chars().count() > 2000) {
             return Err(ServiceError::unprocessable("the description exceeds 2,000 characters"));
         }
-        let mut left = SUPERSEDED;
+        let mut retries = SUPERSEDED_RETRIES;
         loop {
             let known = self.store.map(&name).await?;
-            let wanted = self.changed(&name, &change, known).await?;
-            match self.store.put_map(wanted).await {
-                // It was reindexed since it was looked up.
-                Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
+            let map = self.changed(&name, &change, known).await?;
+            match self.store.put_map(map).await {
+                // It was reindexed since it was read.
+                Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
                 put => {
                     let (map, new) = put?;
                     return Ok((self.state_of(&map.name).await?, new));
@@ -47,7 +47,7 @@ impl Maps {
         }
     }
 
-    /// The map as a change wants it.
+    /// Applies a change to a map, or to the defaults if the map is new.
     async fn changed(
         &self,
         name: &MapName,
@@ -59,7 +59,7 @@ impl Maps {
         let model = model.unwrap_or(self.imaging.models.default_model());
         let descriptor = change.descriptor.or(known.map(|map| map.descriptor)).unwrap_or_default();
         let (model_digest, precision, dim) = match known {
-            // Those of its images, whatever is installed by now.
+            // The images keep the model that made their descriptors, whatever is installed now.
             Some(map)
                 if (map.model.as_str(), map.descriptor) == (model, descriptor)
                     && self.store.index_state(map).await?.images > 0 =>
@@ -91,18 +91,18 @@ impl Maps {
         })
     }
 
-    /// One map.
+    /// Returns the state of a map.
     pub async fn get(&self, name: &MapName) -> Result<MapState, ServiceError> {
         self.state_of(name).await
     }
 
-    /// All maps, by name.
+    /// Returns the states of all maps, by name.
     pub async fn list(&self) -> Result<Vec<MapState>, ServiceError> {
         let mut states = Vec::new();
         for map in self.store.maps().await? {
             match self.state_of(&map.name).await {
                 Ok(state) => states.push(state),
-                // Removed since it was listed.
+                // Deleted since it was listed.
                 Err(error) if error.kind == ErrorKind::NotFound => {}
                 Err(error) => return Err(error),
             }
@@ -110,9 +110,9 @@ impl Maps {
         Ok(states)
     }
 
-    /// Removes a map with all its images.
+    /// Deletes a map with all its images.
     pub async fn delete(&self, name: &MapName) -> Result<(), ServiceError> {
-        let map = self.known(name).await?;
+        let map = self.find(name).await?;
         match self.store.delete_map(name).await? {
             true => {
                 self.reindexes.forget(map.uid);
@@ -122,14 +122,14 @@ impl Maps {
         }
     }
 
-    pub(crate) async fn known(&self, name: &MapName) -> Result<Map, ServiceError> {
+    pub(crate) async fn find(&self, name: &MapName) -> Result<Map, ServiceError> {
         self.store.map(name).await?.ok_or_else(|| no_map(name))
     }
 
     pub(crate) async fn state_of(&self, name: &MapName) -> Result<MapState, ServiceError> {
-        let reindex = self.reindexes.of(self.known(name).await?.uid);
-        // Looked up after that: when a reindex has succeeded, the map shows it.
-        let map = self.known(name).await?;
+        let reindex = self.reindexes.get(self.find(name).await?.uid);
+        // Read again after the reindex state: if that says succeeded, the map has the new model.
+        let map = self.find(name).await?;
         let IndexState { images, graph, behind, .. } = self.store.index_state(&map).await?;
         let calibration = self.store.calibration(&map).await?;
         let index = match (graph, behind) {

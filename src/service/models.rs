@@ -1,4 +1,4 @@
-//! Which model makes the descriptors of a map, and what to do if it cannot be used.
+//! The model that a map needs, and errors that tell the caller what to do if it cannot be used.
 
 use std::sync::Arc;
 
@@ -9,18 +9,19 @@ use whereabouts_vision::{Extractor, Manifest, ModelError};
 use super::{Maps, ServiceError};
 
 impl Maps {
-    /// The map, and the very model that made its descriptors.
+    /// Returns a map with the model that made its descriptors; a conflict if that model is not installed, or
+    /// only another version or precision of it.
     pub(crate) async fn usable(
         &self,
         name: &MapName,
     ) -> Result<(Map, Arc<Extractor>), ServiceError> {
-        let map = self.known(name).await?;
+        let map = self.find(name).await?;
         let extractor = self.imaging.models.of(&map).await.map_err(|error| match error {
             ModelError::NotInstalled(_) => ServiceError::new(
                 ErrorKind::Conflict,
                 format!(
                     "the map {name} needs the model {:?}, which is not installed on the server; \
-                     install it there ({}), or have another model make its descriptors anew ({})",
+                     install it there ({}), or reindex the map with another model ({})",
                     map.model,
                     how_to_install(&map.model),
                     how_to_reindex(name, "NAME"),
@@ -35,7 +36,7 @@ impl Maps {
     }
 }
 
-/// Numbers in a descriptor of that kind.
+/// The dimension of a descriptor of that kind.
 pub(super) fn dimension(manifest: &Manifest, kind: DescriptorKind) -> Result<usize, ServiceError> {
     manifest.dimension(kind).ok_or_else(|| {
         ServiceError::unprocessable(format!(
@@ -45,7 +46,7 @@ pub(super) fn dimension(manifest: &Manifest, kind: DescriptorKind) -> Result<usi
     })
 }
 
-/// Why the model in memory cannot serve the map, if it cannot.
+/// Explains why the loaded model cannot serve the map; `None` if it can.
 fn mismatch(map: &Map, extractor: &Extractor) -> Option<String> {
     if extractor.is_of(map) {
         return None;
@@ -55,21 +56,21 @@ fn mismatch(map: &Map, extractor: &Extractor) -> Option<String> {
     Some(if digest != map.model_digest {
         format!(
             "the map {name} was indexed with the model {model:?} of {}, but the one installed is \
-             {digest}; install the former again, or make the descriptors anew: {reindex}",
+             {digest}; install the former again, or reindex the map: {reindex}",
             map.model_digest
         )
     } else {
         format!(
             "the map {name} was indexed at {} precision, but the server runs the model at \
-             {precision} precision; start it with model.precision = {:?}, or make the descriptors \
-             anew: {reindex}",
+             {precision} precision; start it with model.precision = {:?}, or reindex the map: \
+             {reindex}",
             map.precision,
             map.precision.as_str()
         )
     })
 }
 
-/// A model that was named and cannot be used.
+/// The error for a model that a caller named and that cannot be used.
 pub(super) fn unusable(name: &str, error: ModelError) -> ServiceError {
     match error {
         ModelError::NotInstalled(_) => ServiceError::unprocessable(format!(

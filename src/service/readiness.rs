@@ -1,25 +1,26 @@
-//! The way in: a service once there is one, and until it drains.
+//! The readiness gate between the server and the service: closed while the service starts, open, and draining at
+//! shutdown. What a request does is for the use cases.
 
 use std::sync::{Arc, OnceLock};
-use whereabouts_api::ErrorKind;
 
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use super::{Deadline, Principal, Service, ServiceError};
+use super::{Service, ServiceError};
+use whereabouts_api::ErrorKind;
 
-/// Whether requests are answered.
+/// Phase of the server's life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ReadinessPhase {
-    /// Not yet.
+    /// The service is starting; requests are rejected.
     Starting,
-    /// They are.
+    /// Requests are answered.
     Open,
-    /// Those that were begun; new ones go to another server.
+    /// Requests in progress are finished; new ones should go to another server.
     Draining,
 }
 
-/// What stands between the callers and a service; clones share it.
+/// The gate through which requests reach the service. Clones share it.
 #[derive(Clone)]
 pub struct Readiness {
     service: Arc<OnceLock<Arc<Service>>>,
@@ -28,7 +29,7 @@ pub struct Readiness {
 }
 
 impl Default for Readiness {
-    /// A door without a service behind it.
+    /// A gate that is closed until [`Readiness::open`].
     fn default() -> Self {
         Self {
             service: Arc::default(),
@@ -38,62 +39,31 @@ impl Default for Readiness {
     }
 }
 
-impl Service {
-    /// Ends when what a caller has begun is to be ended: the server drains, the caller may ask no more, or
-    /// wants no more. Says why.
-    pub fn cancelled_by(
-        self: &Arc<Self>,
-        door: &Readiness,
-        caller: Principal,
-        deadline: Deadline,
-    ) -> impl Future<Output = ServiceError> + Send + use<> {
-        let (service, draining) = (Arc::clone(self), door.draining());
-        async move {
-            let deadline = async {
-                match deadline.0 {
-                    Some(end) => tokio::time::sleep_until(end.into()).await,
-                    None => std::future::pending().await,
-                }
-            };
-            let (kind, detail) = tokio::select! {
-                () = draining.cancelled() => {
-                    (ErrorKind::Unavailable, "the server ends; call again, perhaps another one answers")
-                }
-                () = service.keys.ended(caller) => {
-                    (ErrorKind::Unauthorized, "the key was revoked or has expired; ask an admin for another")
-                }
-                () = deadline => (ErrorKind::DeadlinePassed, "the deadline of the call has passed"),
-            };
-            ServiceError::new(kind, detail)
-        }
-    }
-}
-
 impl Readiness {
-    /// Lets callers in.
+    /// Opens the gate to a service. Does nothing if it was opened before.
     pub fn open(&self, service: Arc<Service>) {
         if self.service.set(service).is_ok() {
             self.phase.send_replace(ReadinessPhase::Open);
         }
     }
 
-    /// Says from now on that the service is not ready, while it answers what it has begun. Streams end.
+    /// Reports the server as not ready from now on, and ends streams. Requests in progress are finished.
     pub fn drain(&self) {
         self.phase.send_replace(ReadinessPhase::Draining);
         self.draining.cancel();
     }
 
-    /// Ends when the drain begins.
+    /// A token that is cancelled when the drain begins.
     pub fn draining(&self) -> CancellationToken {
         self.draining.clone()
     }
 
-    /// The phase, and every change of it.
+    /// Watches the phase.
     pub fn phases(&self) -> watch::Receiver<ReadinessPhase> {
         self.phase.subscribe()
     }
 
-    /// The service, once it is ready.
+    /// Returns the service; an error while it is starting.
     pub fn service(&self) -> Result<Arc<Service>, ServiceError> {
         self.service.get().cloned().ok_or_else(|| {
             let detail = "the server is starting; try again in a second";

@@ -1,4 +1,5 @@
-//! New descriptors for a whole map, by another model, while the old ones serve.
+//! Reindexing: computes new descriptors for a whole map, while the old ones answer searches. The switch to the
+//! new ones is one step of the store.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,29 +17,29 @@ use whereabouts_core::{Descriptor, DescriptorKind, Image, Map, MapName};
 use whereabouts_store::{BlobStore, Draft, DraftStore};
 use whereabouts_vision::{AdmissionRequest, Extractor};
 
-/// Images that are looked up at a time.
+/// Images that are read at a time.
 const PAGE: usize = 256;
 
-/// The pause while there is none.
-const PAUSE: Duration = Duration::from_millis(50);
+/// Pause between two attempts to load the model while all loaded models are in use.
+const LOAD_RETRY_PAUSE: Duration = Duration::from_millis(50);
 
-/// The last reindex of every map.
+/// The state of the last reindex of each map, in memory.
 #[derive(Debug)]
 pub struct Reindexes {
     /// By the uid of the map.
     known: Mutex<BTreeMap<Uuid, Reindex>>,
-    /// One image of all maps at a time: robots wait for the same sessions.
-    turn: Semaphore,
+    /// Limits reindexing to one image at a time over all maps, because it shares the model with robots.
+    extraction: Semaphore,
 }
 
 impl Default for Reindexes {
     fn default() -> Self {
-        Self { known: Mutex::default(), turn: Semaphore::new(1) }
+        Self { known: Mutex::default(), extraction: Semaphore::new(1) }
     }
 }
 
 impl Reindexes {
-    pub(super) fn of(&self, map_uid: Uuid) -> Option<Reindex> {
+    pub(super) fn get(&self, map_uid: Uuid) -> Option<Reindex> {
         self.known().get(&map_uid).cloned()
     }
 
@@ -46,12 +47,12 @@ impl Reindexes {
         self.known().remove(&map_uid);
     }
 
-    /// Begins one, unless one goes on.
+    /// Records the start of a reindex; a conflict if one of the same map is running.
     fn begin(&self, map: &Map, reindex: Reindex) -> Result<(), ServiceError> {
         let mut known = self.known();
         if known.get(&map.uid).is_some_and(|known| known.state == ReindexState::Running) {
             let detail = format!(
-                "the map {} is being reindexed; GET /maps/{} says how far that has come",
+                "the map {} is being reindexed; GET /maps/{} shows its progress",
                 map.name, map.name
             );
             return Err(ServiceError::new(ErrorKind::Conflict, detail));
@@ -83,26 +84,26 @@ impl Reindexes {
     }
 }
 
-/// Makes all descriptors of a map again, by another model or by its own as it is installed now, while the old
-/// ones serve. Clones share the state.
+/// Recomputes all descriptors of a map with another model, or with its own as it is installed now. Clones share
+/// the state.
 #[derive(Clone)]
 pub struct Reindexer {
     /// The maps.
     pub maps: Maps,
-    /// Sets of descriptors in the making.
+    /// Drafts of new descriptors.
     pub drafts: Arc<dyn DraftStore>,
-    /// The bytes of images.
+    /// The bytes of the images.
     pub blobs: Arc<dyn BlobStore>,
 }
 
 impl Reindexer {
-    /// Begins to make all descriptors of a map anew, and answers at once.
+    /// Starts a reindex in the background and returns the state of the map.
     pub async fn start(
         &self,
         name: &MapName,
         request: ReindexRequest,
     ) -> Result<MapState, ServiceError> {
-        let map = self.maps.known(name).await?;
+        let map = self.maps.find(name).await?;
         let model = request.model.unwrap_or_else(|| map.model.clone());
         let descriptor = request.descriptor.unwrap_or(map.descriptor);
         dimension(&self.maps.imaging.manifest(&model).await?, descriptor)?;
@@ -121,12 +122,12 @@ impl Reindexer {
         let (reindexer, name) = (self.clone(), name.clone());
         let state = self.maps.state_of(&name).await;
         tokio::spawn(async move {
-            let outcome = reindexer.run(&map, &model, descriptor).await;
-            match &outcome {
+            let result = reindexer.run(&map, &model, descriptor).await;
+            match &result {
                 Ok(()) => tracing::info!(map = %name, model, "reindexed"),
-                Err(error) => tracing::warn!(map = %name, model, %error, "not reindexed"),
+                Err(error) => tracing::warn!(map = %name, model, %error, "reindexing failed"),
             }
-            reindexer.maps.reindexes.end(map.uid, outcome.err().map(|error| error.detail));
+            reindexer.maps.reindexes.end(map.uid, result.err().map(|error| error.detail));
         });
         state
     }
@@ -137,7 +138,7 @@ impl Reindexer {
         model: &str,
         descriptor: DescriptorKind,
     ) -> Result<(), ServiceError> {
-        let extractor = patiently(|| self.maps.imaging.installed_model(model)).await?;
+        let extractor = retry_while_overloaded(|| self.maps.imaging.installed_model(model)).await?;
         let next = Map {
             model: model.to_owned(),
             model_digest: extractor.digest(),
@@ -168,9 +169,9 @@ impl Reindexer {
                 return Ok(());
             }
             for image in missing {
-                let made = self.new_descriptor(map, &image, extractor, descriptor).await?;
-                if let Some(made) = made {
-                    draft.write(&image, made).await?;
+                let extracted = self.new_descriptor(map, &image, extractor, descriptor).await?;
+                if let Some(extracted) = extracted {
+                    draft.write(&image, extracted).await?;
                     let images = self.maps.store.index_state(map).await?.images;
                     self.maps.reindexes.step(map.uid, images);
                 }
@@ -178,7 +179,7 @@ impl Reindexer {
         }
     }
 
-    /// The new descriptor of an image; `None` if it was removed meanwhile.
+    /// Extracts the new descriptor of an image; `None` if the image was deleted meanwhile.
     async fn new_descriptor(
         &self,
         map: &Map,
@@ -188,14 +189,13 @@ impl Reindexer {
     ) -> Result<Option<Descriptor>, ServiceError> {
         let Some(bytes) = self.blobs.blob(&image.digest).await? else {
             return match self.maps.store.image(map, &image.id).await? {
-                Some(still) if still.digest == image.digest => {
-                    Err(left_behind(image, "its bytes are missing from the store"))
+                Some(current) if current.digest == image.digest => {
+                    Err(cannot_reindex(image, "its bytes are missing from the store"))
                 }
                 _ => Ok(None),
             };
         };
-        let _turn = self.maps.reindexes.turn.acquire().await;
-        // It waits for as long as anybody else does.
+        let _permit = self.maps.reindexes.extraction.acquire().await;
         match self
             .maps
             .imaging
@@ -203,27 +203,29 @@ impl Reindexer {
             .await
         {
             Ok(extraction) => Ok(Some(extraction.descriptor)),
-            Err(error) => Err(left_behind(image, &error.detail)),
+            Err(error) => Err(cannot_reindex(image, &error.detail)),
         }
     }
 }
 
-/// Does it as soon as there is room among the models in memory.
-async fn patiently<T, F>(work: impl Fn() -> F) -> Result<T, ServiceError>
+/// Repeats `work` while it is overloaded: while all loaded models are in use.
+async fn retry_while_overloaded<T, F>(work: impl Fn() -> F) -> Result<T, ServiceError>
 where
     F: Future<Output = Result<T, ServiceError>>,
 {
     loop {
         match work().await {
-            Err(error) if error.kind == ErrorKind::Overloaded => tokio::time::sleep(PAUSE).await,
+            Err(error) if error.kind == ErrorKind::Overloaded => {
+                tokio::time::sleep(LOAD_RETRY_PAUSE).await
+            }
             ended => return ended,
         }
     }
 }
 
-fn left_behind(image: &Image, why: &str) -> ServiceError {
+fn cannot_reindex(image: &Image, why: &str) -> ServiceError {
     ServiceError::unprocessable(format!(
-        "the image {:?} cannot get a new descriptor: {why}; delete it, or put that right, and \
+        "the image {:?} cannot get a new descriptor: {why}; fix that or delete it, and then \
          reindex again",
         image.id.as_str()
     ))

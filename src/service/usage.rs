@@ -1,4 +1,4 @@
-//! What calls to models outside have cost.
+//! Reports of what calls to paid models cost. Spending and its budget are for the refiner.
 
 use std::sync::Arc;
 
@@ -12,16 +12,16 @@ use whereabouts_store::UsageStore;
 
 /// Reports what calls to paid models cost.
 pub struct UsageReports {
-    /// What was spent, by day and map.
+    /// Usage by day and map.
     pub store: Arc<dyn UsageStore>,
-    /// The refiner, which knows the budget of today.
+    /// The refiner, which knows today's budget.
     pub refiner: Option<Arc<dyn Refiner>>,
-    /// Days for which usage is kept.
+    /// Retention of usage, in days.
     pub keep_days: u32,
 }
 
 impl UsageReports {
-    /// What the last `days` days have cost (today included), in one map or in all.
+    /// Reports the cost of the last `days` days, today included, of one map or of all.
     pub async fn report(
         &self,
         map: Option<MapName>,
@@ -29,7 +29,7 @@ impl UsageReports {
     ) -> Result<UsageReport, ServiceError> {
         if days == 0 || days > self.keep_days {
             return Err(ServiceError::unprocessable(format!(
-                "days is {days}; it must be 1 to {}, for as long as usage is kept (data.usage_days)",
+                "days is {days}; it must be 1 to {}, the days for which usage is kept (data.usage_days)",
                 self.keep_days
             )));
         }
@@ -45,7 +45,7 @@ impl UsageReports {
         Ok(UsageReport { today: self.today(), days: spent, total })
     }
 
-    /// The budget of today, if the refiner asks models outside.
+    /// Returns today's spend and budget, if the refiner calls a paid model.
     pub fn today(&self) -> Option<Today> {
         let levels = self.refiner.as_ref()?.levels()?;
         Some(Today {
