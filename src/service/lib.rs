@@ -23,6 +23,8 @@ mod refused;
 mod reindex;
 mod retention;
 mod submit;
+#[cfg(test)]
+mod tests;
 mod track;
 mod transfer;
 mod usage;
