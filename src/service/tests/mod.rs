@@ -255,10 +255,10 @@ fn record(map: &str) -> JobRecord {
     }
 }
 
-/// A refiner that measures what it is told to, and refines nothing.
+/// A refiner with scripted measurements, which refines nothing.
 #[derive(Default)]
 struct ScriptedRefiner {
-    /// Results of the next measurements; each further one finds an agreement of 0.5.
+    /// Errors of the next measurements; each further one finds an agreement of 0.5.
     measurements: Mutex<VecDeque<RefineError>>,
     /// Images that were measured, failed attempts included.
     measured: Mutex<Vec<whereabouts_core::ImageId>>,
