@@ -50,7 +50,8 @@ async fn a_frame_gets_a_queued_job_with_its_candidates() {
 async fn without_a_refiner_or_candidates_there_is_no_job() {
     let fixture = Fixture::new().await;
     let submitter = fixture.service.localizer.submitter.clone();
-    let submission = submitter.submit(&map("yard"), frame(), vec![], Priority::default(), None);
+    let yard = map("yard");
+    let submission = submitter.submit(&yard, frame(), vec![], Priority::default(), None);
     assert_eq!(reason(submission.await.unwrap()), Some(NoJobReason::EmptyMap));
     let submitter = Submitter { refiner: None, ..submitter };
     let submission = submit(&submitter, None).await.unwrap();
