@@ -124,9 +124,9 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         whereabouts_telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
     let Parts { service, refiners, .. } = open(config.clone()).await?;
     let service = Arc::new(service);
-    let model = service.models.default_model().to_owned();
-    let execution = service.installed_model(&model).await?.execution().to_string();
-    let limits = service.models.limits();
+    let model = service.maps.imaging.models.default_model().to_owned();
+    let execution = service.maps.imaging.installed_model(&model).await?.execution().to_string();
+    let limits = service.maps.imaging.models.limits();
     let watch = Bars::default();
     let evaluator = Evaluator {
         refiners: args.refiners(&service, &refiners).await?,
@@ -276,7 +276,7 @@ impl Args {
     ) -> anyhow::Result<Vec<Arc<dyn Refiner>>> {
         let mut refiners: Vec<Arc<dyn Refiner>> = Vec::new();
         for entry in self.refine.iter().filter_map(|choice| choice.entry()) {
-            let running = service.refiner.as_ref().filter(|known| known.kind() == entry.kind);
+            let running = service.jobs.refiner.as_ref().filter(|known| known.kind() == entry.kind);
             refiners.push(match running {
                 Some(refiner) => Arc::clone(refiner),
                 None => (entry.build)(context).await?,

@@ -30,7 +30,11 @@ impl Evaluator<'_> {
     ) -> anyhow::Result<ReferenceMap> {
         let service = self.service.as_ref();
         // A model of its own for each map: descriptors of different models do not mix.
-        let extractor = service.installed_model(service.models.default_model()).await?;
+        let extractor = service
+            .maps
+            .imaging
+            .installed_model(service.maps.imaging.models.default_model())
+            .await?;
         let of = format!("{}\n{}", extractor.digest(), extractor.execution());
         let name = format!("{descriptor}-{}", &Digest::of(of.as_bytes()).hex()[..12]);
         let name: MapName = name.parse()?;
@@ -39,7 +43,7 @@ impl Evaluator<'_> {
             descriptor: Some(descriptor),
             ..MapChange::default()
         };
-        service.put_map(name.clone(), change).await?;
+        service.maps.put(name.clone(), change).await?;
 
         let known = known_images(service, &name).await?;
         self.watch.begin("references", references.len());
@@ -61,11 +65,12 @@ impl Evaluator<'_> {
         }
         drop(added);
         for gone in known.keys().filter(|id| !present.contains(id)) {
-            service.delete_image(&name, gone).await?;
+            service.images.delete(&name, gone).await?;
         }
         wait_for_index(service, &name).await?;
         self.watch.end();
-        let map = service.maps.map(&name).await?.context("the map of the references is gone")?;
+        let map =
+            service.maps.store.map(&name).await?.context("the map of the references is gone")?;
         Ok(ReferenceMap { map, digest: Digest::of(listing.as_bytes()) })
     }
 
@@ -80,12 +85,13 @@ impl Evaluator<'_> {
         let digest = Digest::of(&bytes);
         match before {
             Some(before) if before == digest => return Ok(digest),
-            Some(_) => self.service.delete_image(map, &picture.id).await?,
+            Some(_) => self.service.images.delete(map, &picture.id).await?,
             None => {}
         }
         let meta = ImageMeta { id: Some(picture.id.to_string()), ..ImageMeta::default() };
         self.service
-            .add_image(map, NewImage { bytes, meta, demand: AdmissionRequest::BACKGROUND })
+            .images
+            .add(map, NewImage { bytes, meta, demand: AdmissionRequest::BACKGROUND })
             .await
             .with_context(|| {
                 format!("{} cannot be a reference; repair it or take it out of the folder", named())
@@ -102,7 +108,7 @@ async fn known_images(
     let mut known = HashMap::new();
     let mut cursor: Option<ImageId> = None;
     loop {
-        let page = service.list_images(map, cursor.as_ref(), Some(PAGE)).await?;
+        let page = service.images.list(map, cursor.as_ref(), Some(PAGE)).await?;
         known.extend(page.images.into_iter().map(|image| (image.id, image.digest)));
         match page.next_cursor {
             Some(next) => cursor = Some(next.parse()?),
@@ -112,7 +118,7 @@ async fn known_images(
 }
 
 async fn wait_for_index(service: &Service, map: &MapName) -> anyhow::Result<()> {
-    while service.get_map(map).await?.index == IndexKind::Building {
+    while service.maps.get(map).await?.index == IndexKind::Building {
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
     Ok(())

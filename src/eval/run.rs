@@ -127,7 +127,7 @@ impl Evaluator<'_> {
             search: *search,
             k: *k,
             refinement: method.refiner.map(|_| (*scene, refiner_settings.as_str())),
-            calibration: self.service.settings.calibration,
+            calibration: self.service.calibrator.settings,
         }
         .text();
         let folder = work.join("outcomes");
@@ -141,8 +141,8 @@ impl Evaluator<'_> {
     /// be of other references.
     async fn calibrated(&self, map: &Map) -> anyhow::Result<Arc<Calibration>> {
         let measures = self.refiners.iter().find_map(|refiner| refiner.negative_evidence());
-        self.service.calibrate(map, measures).await?;
-        Ok(self.service.maps.calibration(map).await?.unwrap_or_default())
+        self.service.calibrator.calibrate(map, measures).await?;
+        Ok(self.service.maps.store.calibration(map).await?.unwrap_or_default())
     }
 
     /// The outcome of each method for one query; what is kept is not worked out again.
@@ -171,6 +171,7 @@ impl Evaluator<'_> {
         let search = (wanted, self.settings.search);
         let retrieved = self
             .service
+            .localizer
             .retrieve(&map.name, &frame, search, features, AdmissionRequest::BACKGROUND)
             .await
             .with_context(named)?;
@@ -178,7 +179,7 @@ impl Evaluator<'_> {
         let mut outcomes = Vec::with_capacity(kept.len());
         let input = self.input(map, digest, retrieved);
         // The refiners fetch the frame from the store; the pin keeps it there meanwhile.
-        let _pin = self.service.blobs.put_blob(digest, frame).await?;
+        let _pin = self.service.images.blobs.put_blob(digest, frame).await?;
         for (place, (known, kept)) in known.into_iter().zip(kept).enumerate() {
             let outcome = match (known, place.checked_sub(1)) {
                 (Some(known), _) => known,

@@ -1,4 +1,5 @@
-//! Many images, one after another, several of which are worked on at a time.
+//! Bulk uploads: stores a stream of images, several at a time. How a request is split into images is for the
+//! server.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -9,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
 
-use super::{NewImage, Principal, Service, ServiceError};
+use super::{Images, NewImage, Principal, ServiceError};
 use whereabouts_api::{ErrorKind, ImageMeta};
 use whereabouts_core::{ImageId, MapName};
 use whereabouts_store::Added;
@@ -19,13 +20,13 @@ use whereabouts_vision::{AdmissionRequest, WorkClass};
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BulkSettings {
-    /// Images of one upload that are worked on at a time: as many as keep decoding and inference busy.
+    /// Images of one upload that are processed at a time; enough to keep decoding and inference busy.
     pub in_flight: usize,
-    /// How long an image waits while frames and other images leave no room for it, in seconds.
+    /// Longest time that an image is retried while the admission queue is full, in seconds.
     pub patience_s: u64,
-    /// The most images in one upload.
+    /// Maximum number of images in one upload.
     pub max_images: usize,
-    /// The most memory for the images of all uploads, in bytes.
+    /// Memory budget for the images of all uploads, in bytes.
     pub memory_bytes: usize,
 }
 
@@ -34,33 +35,36 @@ pub struct BulkSettings {
 pub struct BulkImage {
     /// Its bytes: JPEG, PNG or WebP.
     pub bytes: Bytes,
-    /// What the caller says about it.
+    /// Its id, pose, time and tags.
     pub meta: ImageMeta,
-    /// The memory that it takes, which is given back when it is stored.
+    /// Its share of the memory budget, released when it is stored.
     pub memory: Option<OwnedSemaphorePermit>,
 }
 
-/// What became of an image of an upload: it is stored, or why not, with its id if the caller gave one.
+/// The result of one image of an upload: the stored image, or the id that the caller gave it, if any, and the
+/// error.
 pub type BulkResult = Result<Added, (Option<ImageId>, ServiceError)>;
 
-impl Service {
-    /// Stores images as they come; the results are in the same order. What is wrong with one image does
-    /// not keep the others back. An upload ends with the first image beyond the bound, with an error of the
-    /// stream itself, or when `until` does; those before are then done.
-    pub async fn add_images<E, O>(
+impl Images {
+    /// Stores images as they arrive and returns their results in the same order. The error of one image does not
+    /// affect the others. The upload ends with the first image over the maximum, with an error of the stream, or
+    /// when `until` ends; images that were read before that are still stored.
+    pub async fn add_many<E, O>(
         &self,
         map: &MapName,
         caller: &Principal,
         images: impl Stream<Item = Result<Result<BulkImage, ServiceError>, E>> + Send,
         until: impl Future<Output = O> + Send,
     ) -> Result<Vec<BulkResult>, E> {
-        let BulkSettings { in_flight, max_images, .. } = self.settings.bulk;
-        let mut broken = None;
-        // The last image so far of each id, and whether it is done: of two with one id the first counts.
+        let BulkSettings { in_flight, max_images, .. } = self.bulk;
+        let mut stream_error = None;
+        // The last image so far of each id, and when it is done: images of one id are stored in order, so that
+        // the first wins.
         let mut last_of: HashMap<ImageId, CancellationToken> = HashMap::new();
-        let whole = images
-            .scan((), |(), next| future::ready(next.map_err(|error| broken = Some(error)).ok()));
-        let results = whole
+        let until_error = images.scan((), |(), next| {
+            future::ready(next.map_err(|error| stream_error = Some(error)).ok())
+        });
+        let results = until_error
             .take_until(Box::pin(until))
             .take(max_images + 1)
             .enumerate()
@@ -75,21 +79,21 @@ impl Service {
                         before.cancelled().await;
                     }
                     let (image, id) = image?;
-                    // Each image counts as a request of the key, of which the first is counted already.
+                    // Each image counts as a request of the key; the first was counted with the upload.
                     if index > 0 {
                         let counted = self.keys.limits.take_one_more(caller).await;
                         counted.map_err(|error| (id.clone(), error))?;
                     }
-                    self.add_patiently(map, image).await.map_err(|error| (id, error))
+                    self.add_when_admitted(map, image).await.map_err(|error| (id, error))
                 }
             })
             .buffered(in_flight)
             .collect()
             .await;
-        broken.map_or(Ok(results), Err)
+        stream_error.map_or(Ok(results), Err)
     }
 
-    /// An image with the id that the caller gave it, if it is to be stored.
+    /// Parses the id that the caller gave an image, and enforces the maximum number of images.
     fn checked(
         &self,
         index: usize,
@@ -98,27 +102,31 @@ impl Service {
         let image = image.map_err(|error| (None, error))?;
         let id = image.meta.id.as_deref().map(str::parse::<ImageId>).transpose();
         let id = id.map_err(|error| (None, error.into()))?;
-        let max_images = self.settings.bulk.max_images;
+        let max_images = self.bulk.max_images;
         if index >= max_images {
             let detail = format!(
                 "an upload has at most {max_images} images (bulk.max_images); send this one and the rest in \
-                 another"
+                 another upload"
             );
             return Err((id, ServiceError::new(ErrorKind::TooLarge, detail)));
         }
         Ok((image, id))
     }
 
-    /// Stores an image when there is room for it.
-    async fn add_patiently(&self, map: &MapName, image: BulkImage) -> Result<Added, ServiceError> {
-        const LONGEST: Duration = Duration::from_secs(1);
+    /// Stores an image, and retries while the admission queue is full.
+    async fn add_when_admitted(
+        &self,
+        map: &MapName,
+        image: BulkImage,
+    ) -> Result<Added, ServiceError> {
+        const MAX_PAUSE: Duration = Duration::from_secs(1);
         let demand = AdmissionRequest { class: WorkClass::Index, deadline: None };
-        let until = Instant::now() + Duration::from_secs(self.settings.bulk.patience_s);
+        let until = Instant::now() + Duration::from_secs(self.bulk.patience_s);
         loop {
             let new = NewImage { bytes: image.bytes.clone(), meta: image.meta.clone(), demand };
-            match self.add_image(map, new).await {
+            match self.add(map, new).await {
                 Err(error) if error.kind == ErrorKind::Overloaded && Instant::now() < until => {
-                    tokio::time::sleep(error.retry_after.unwrap_or(LONGEST).min(LONGEST)).await;
+                    tokio::time::sleep(error.retry_after.unwrap_or(MAX_PAUSE).min(MAX_PAUSE)).await;
                 }
                 added => return added,
             }

@@ -1,25 +1,27 @@
-//! Measures in each map how far chance resemblance goes; see [`whereabouts_core::confidence`].
+//! Calibration: measures the null distributions of each map, on which confidence rests, in the background; see
+//! [`whereabouts_core::confidence`].
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::{Service, ServiceError};
+use super::ServiceError;
 use whereabouts_core::confidence::{COMPARED, NullDistribution};
-use whereabouts_core::{Calibration, Evidence, Map};
+use whereabouts_core::{Calibration, CalibrationSettings, Evidence, Map};
 use whereabouts_refine::{AttemptPolicy, NegativeEvidence, Refiner};
-use whereabouts_store::IndexState;
+use whereabouts_store::{IndexState, MapStore};
 
-/// How often it is looked for maps that have changed.
-const LOOK: Duration = Duration::from_millis(500);
+/// Pause between two scans for maps that have changed.
+const SCAN_PAUSE: Duration = Duration::from_millis(500);
 
-/// Where a look takes long, because there are many maps, the pause is so many times as long.
-const PAUSE_PER_LOOK: u32 = 10;
+/// The pause is at least this many times the duration of the scan, so that many maps do not keep the store busy.
+const PAUSE_PER_SCAN: u32 = 10;
 
-/// But no longer than this: measuring takes long too.
-const LONGEST_PAUSE: Duration = Duration::from_secs(10);
+/// Maximum pause: calibration itself counts as part of the scan.
+const MAX_PAUSE: Duration = Duration::from_secs(10);
 
 /// How long to wait for one image while the threads that refine are busy: jobs have priority.
 const ATTEMPTS: AttemptPolicy = AttemptPolicy {
@@ -28,14 +30,24 @@ const ATTEMPTS: AttemptPolicy = AttemptPolicy {
     longest_pause: Duration::from_millis(200),
 };
 
-/// A map is measured again when its number of images has changed by one in so many.
-const CHANGED: usize = 5;
+/// A map is calibrated again when its number of images has changed by one in this many.
+const CHANGED_SHARE: usize = 5;
 
-impl Service {
-    /// Measures maps when their images have changed, until `shutdown`.
-    pub async fn keep_calibrated(&self, shutdown: CancellationToken) {
+/// Calibrates maps: measures how similar images of different places look in each.
+pub struct Calibrator {
+    /// The maps.
+    pub store: Arc<dyn MapStore>,
+    /// The refiner, whose agreement is measured too, if one is configured.
+    pub refiner: Option<Arc<dyn Refiner>>,
+    /// How many images are measured, and which count as the same place.
+    pub settings: CalibrationSettings,
+}
+
+impl Calibrator {
+    /// Calibrates maps after their images have changed, until `shutdown`.
+    pub async fn run(&self, shutdown: CancellationToken) {
         let mut seen = BTreeMap::new();
-        let mut pause = LOOK;
+        let mut pause = SCAN_PAUSE;
         loop {
             tokio::select! {
                 () = shutdown.cancelled() => return,
@@ -47,22 +59,22 @@ impl Service {
                 measured = self.calibrate_settled(&mut seen) => measured,
             };
             if let Err(error) = measured {
-                // A map was removed or reindexed meanwhile; the next look sees to it.
-                tracing::debug!(%error, "a map could not be measured");
+                // For example, a map was deleted or reindexed meanwhile. The next scan tries again.
+                tracing::debug!(%error, "a map could not be calibrated");
             }
-            pause = LOOK.max(began.elapsed() * PAUSE_PER_LOOK).min(LONGEST_PAUSE);
+            pause = SCAN_PAUSE.max(began.elapsed() * PAUSE_PER_SCAN).min(MAX_PAUSE);
         }
     }
 
-    /// Measures the maps that need it and have as many images as at the last look.
+    /// Calibrates the maps that need it and whose number of images is the same as in the last scan.
     async fn calibrate_settled(
         &self,
         seen: &mut BTreeMap<Uuid, usize>,
     ) -> Result<(), ServiceError> {
-        let maps = self.maps.maps().await?;
+        let maps = self.store.maps().await?;
         seen.retain(|uid, _| maps.iter().any(|map| map.uid == *uid));
         for map in maps {
-            let IndexState { images, .. } = self.maps.index_state(&map).await?;
+            let IndexState { images, .. } = self.store.index_state(&map).await?;
             let settled = seen.insert(map.uid, images) == Some(images);
             if settled && self.is_due(&map, images).await? {
                 let refiner = self.refiner.as_deref();
@@ -73,28 +85,28 @@ impl Service {
     }
 
     async fn is_due(&self, map: &Map, images: usize) -> Result<bool, ServiceError> {
-        let Some(known) = self.maps.calibration(map).await? else { return Ok(images > 1) };
+        let Some(known) = self.store.calibration(map).await? else { return Ok(images > 1) };
         Ok(!known.complete
-            || known.settings != self.settings.calibration
-            || known.images.abs_diff(images) * CHANGED > known.images)
+            || known.settings != self.settings
+            || known.images.abs_diff(images) * CHANGED_SHARE > known.images)
     }
 
-    /// Measures a map: first by similarity, which takes a moment, then by the evidence of a refiner, if it
-    /// measures any. What is measured counts at once.
+    /// Calibrates a map: first similarity, which is fast, then the agreement that `refiner` finds. Each is in effect
+    /// as soon as it is measured.
     pub async fn calibrate(
         &self,
         map: &Map,
         refiner: Option<&dyn NegativeEvidence>,
     ) -> Result<(), ServiceError> {
-        let settings = self.settings.calibration;
-        let IndexState { images, .. } = self.maps.index_state(map).await?;
+        let settings = self.settings;
+        let IndexState { images, .. } = self.store.index_state(map).await?;
         let asked =
-            self.maps.hard_negatives(map, settings, COMPARED.max(settings.candidates)).await?;
+            self.store.hard_negatives(map, settings, COMPARED.max(settings.candidates)).await?;
         let similarity = NullDistribution::from(values(asked.iter().filter_map(|asked| {
             Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
         })));
         let mut measured = Calibration { images, settings, similarity, ..Calibration::default() };
-        self.maps.put_calibration(map, measured.clone()).await?;
+        self.store.put_calibration(map, measured.clone()).await?;
         if let Some(refiner) = refiner {
             let step = asked.len().div_ceil(settings.refined.max(1)).max(1);
             let mut found = Vec::new();
@@ -109,9 +121,9 @@ impl Service {
         measured.complete = true;
         tracing::info!(
             map = %map.name, images, asked = measured.similarity.len(),
-            refined = measured.agreement.len(), "measured what chance resemblance is like"
+            refined = measured.agreement.len(), "the map was calibrated"
         );
-        Ok(self.maps.put_calibration(map, measured).await?)
+        Ok(self.store.put_calibration(map, measured).await?)
     }
 }
 

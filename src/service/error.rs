@@ -1,4 +1,5 @@
-//! What can go wrong in a use case, and of which kind it is.
+//! The error of every use case: a kind, which HTTP and gRPC map to a status, and a sentence for the caller.
+//! Also the conversions from the errors of the layers below.
 
 use std::time::Duration;
 
@@ -7,35 +8,35 @@ use whereabouts_core::{InvalidName, PoseError};
 use whereabouts_store::StoreError;
 use whereabouts_vision::{ExtractError, Overloaded, RejectReason, Rejected};
 
-/// What went wrong, in a sentence for the caller.
+/// An error of a use case.
 #[derive(Debug, thiserror::Error)]
 #[error("{detail}")]
 pub struct ServiceError {
-    /// Of which kind it is.
+    /// The kind, which decides the status.
     pub kind: ErrorKind,
-    /// What happened and what to do next.
+    /// What happened and what the caller can do about it.
     pub detail: String,
-    /// When it is worth trying again, where that is known.
+    /// Pause before a retry is worthwhile, if known (`Retry-After`).
     pub retry_after: Option<Duration>,
 }
 
 impl ServiceError {
-    /// An error of the given kind.
+    /// An error of the given kind, with the default pause of that kind.
     pub fn new(kind: ErrorKind, detail: impl Into<String>) -> Self {
         Self { kind, detail: detail.into(), retry_after: kind.retry_after() }
     }
 
-    /// The same, with when it is worth trying again.
+    /// Sets the pause before a retry.
     pub fn retry_after(self, pause: Duration) -> Self {
         Self { retry_after: Some(pause), ..self }
     }
 
-    /// The request cannot be read.
+    /// The request cannot be parsed.
     pub fn malformed(detail: impl Into<String>) -> Self {
         Self::new(ErrorKind::Malformed, detail)
     }
 
-    /// There is no such thing.
+    /// The requested resource does not exist.
     pub fn not_found(detail: impl Into<String>) -> Self {
         Self::new(ErrorKind::NotFound, detail)
     }
@@ -67,13 +68,13 @@ impl From<Overloaded> for ServiceError {
 }
 
 impl From<Rejected> for ServiceError {
-    fn from(refused: Rejected) -> Self {
-        let advice = match refused.reason {
+    fn from(rejected: Rejected) -> Self {
+        let advice = match rejected.reason {
             RejectReason::DeadlineTooSoon => "allow more time, or try again after Retry-After",
             RejectReason::QueueFull | RejectReason::WaitTooLong => "try again after Retry-After",
         };
-        Self::new(ErrorKind::Overloaded, format!("{refused}; {advice}"))
-            .retry_after(refused.retry_after)
+        Self::new(ErrorKind::Overloaded, format!("{rejected}; {advice}"))
+            .retry_after(rejected.retry_after)
     }
 }
 

@@ -1,5 +1,5 @@
-//! A job as it goes on: every change of its state, every pair as it is described, and its end; and all jobs
-//! in short.
+//! Streams of job events: the states, described pairs and end of one job, or the changes of all jobs. How they are
+//! sent is for the server.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
@@ -10,64 +10,65 @@ use tokio::sync::broadcast::error::RecvError;
 use uuid::Uuid;
 
 use super::jobs::no_job;
-use super::{Service, ServiceError};
+use super::{Jobs, ServiceError};
 use whereabouts_api::{JobChange, JobStatus, Missed, PairDescribed};
 use whereabouts_core::{ImageId, Job, JobState, MapName};
 use whereabouts_store::{JobRecord, JobStore};
 
-/// Something that happened to a job.
+/// An event of one job.
 #[derive(Debug, Clone, PartialEq)]
 pub enum JobEvent {
-    /// It is in another state, or in another attempt.
+    /// Its state or its number of attempts changed.
     State(JobStatus),
-    /// One more pair is described.
+    /// One more pair was described.
     Described(PairDescribed),
-    /// It has ended; no event follows.
+    /// It has ended; the last event.
     Ended(Box<Job>),
 }
 
-/// Something that happened to any job.
+/// An event of any job.
 #[derive(Debug, Clone, PartialEq)]
 pub enum AnyJobEvent {
-    /// A job has come further, or has ended.
+    /// A job made progress or ended.
     Changed(JobChange),
-    /// Some of that was not told.
+    /// Events were lost because the stream was read too slowly.
     Missed(Missed),
 }
 
-impl Service {
-    /// What happens from now on to the jobs of a map, or of all. Never ends by itself.
-    pub fn follow_jobs(
+impl Jobs {
+    /// Streams the changes of the jobs of a map, or of all maps, from now on. Ends only when the store is closed or
+    /// fails.
+    pub fn follow_all(
         &self,
         map: Option<MapName>,
     ) -> impl Stream<Item = AnyJobEvent> + Send + use<> {
         let follower = AllFollower {
-            changes: self.jobs.changes(),
-            jobs: Arc::clone(&self.jobs),
+            changes: self.store.changes(),
+            jobs: Arc::clone(&self.store),
             map,
-            told: HashMap::new(),
+            reported: HashMap::new(),
         };
         stream::unfold(follower, |mut follower| async {
             follower.next().await.map(|event| (event, follower))
         })
     }
 
-    /// What has happened to a job, and then what happens to it until it has ended.
-    pub async fn follow_job(
+    /// Streams the events of a job from its beginning until it has ended.
+    pub async fn follow(
         &self,
         id: Uuid,
     ) -> Result<impl Stream<Item = JobEvent> + Send + use<>, ServiceError> {
         let mut follower = Follower {
-            changes: self.jobs.changes(),
-            jobs: Arc::clone(&self.jobs),
+            changes: self.store.changes(),
+            jobs: Arc::clone(&self.store),
             id,
             status: None,
-            told: HashSet::new(),
-            waiting: VecDeque::new(),
+            reported: HashSet::new(),
+            pending: VecDeque::new(),
             ended: false,
         };
-        match self.jobs.job(id).await? {
-            Some(record) => follower.look_at(record),
+        match self.store.job(id).await? {
+            Some(record) => follower.update(record),
             None => return Err(no_job(id)),
         }
         Ok(stream::unfold(follower, |mut follower| async {
@@ -76,13 +77,13 @@ impl Service {
     }
 }
 
-/// Follows all jobs.
+/// Turns notifications of changed jobs into events, without repeats.
 struct AllFollower {
     jobs: Arc<dyn JobStore>,
     changes: Receiver<Uuid>,
     map: Option<MapName>,
-    /// What was last told of jobs that have not ended: state, attempts, pairs.
-    told: HashMap<Uuid, (JobState, u32, usize)>,
+    /// What was last reported of jobs that have not ended: state, attempts, described pairs.
+    reported: HashMap<Uuid, (JobState, u32, usize)>,
 }
 
 impl AllFollower {
@@ -91,32 +92,32 @@ impl AllFollower {
             let id = match self.changes.recv().await {
                 Ok(id) => id,
                 Err(RecvError::Lagged(changes)) => {
-                    // What was told of some is old by now.
-                    self.told.clear();
+                    // What was reported may be out of date.
+                    self.reported.clear();
                     return Some(AnyJobEvent::Missed(Missed { changes }));
                 }
                 Err(RecvError::Closed) => return None,
             };
             let record = match self.jobs.job(id).await {
                 Ok(Some(record)) => record,
-                // It was removed, as ended jobs are after a while.
+                // Removed after it had ended.
                 Ok(None) => {
-                    self.told.remove(&id);
+                    self.reported.remove(&id);
                     continue;
                 }
                 Err(error) => {
-                    tracing::error!(job = %id, %error, "a job that is followed cannot be read");
+                    tracing::error!(job = %id, %error, "a followed job could not be read");
                     return None;
                 }
             };
             let JobRecord { job, candidates, .. } = record;
             let now = (job.state, job.attempts, job.descriptions.len());
             let before = match job.state.is_final() {
-                true => self.told.remove(&id),
-                false => self.told.insert(id, now),
+                true => self.reported.remove(&id),
+                false => self.reported.insert(id, now),
             };
-            let wanted = self.map.as_ref().is_none_or(|map| *map == job.map);
-            if wanted && before != Some(now) {
+            let is_followed = self.map.as_ref().is_none_or(|map| *map == job.map);
+            if is_followed && before != Some(now) {
                 return Some(AnyJobEvent::Changed(JobChange {
                     id,
                     map: job.map,
@@ -131,21 +132,21 @@ impl AllFollower {
     }
 }
 
-/// Tells apart what it has told from what is new.
+/// Turns notifications of one job into its events, without repeats.
 struct Follower {
     jobs: Arc<dyn JobStore>,
     changes: Receiver<Uuid>,
     id: Uuid,
     status: Option<JobStatus>,
-    told: HashSet<ImageId>,
-    waiting: VecDeque<JobEvent>,
+    reported: HashSet<ImageId>,
+    pending: VecDeque<JobEvent>,
     ended: bool,
 }
 
 impl Follower {
     async fn next(&mut self) -> Option<JobEvent> {
         loop {
-            if let Some(event) = self.waiting.pop_front() {
+            if let Some(event) = self.pending.pop_front() {
                 return Some(event);
             }
             if self.ended {
@@ -153,33 +154,33 @@ impl Follower {
             }
             match self.changes.recv().await {
                 Ok(changed) if changed != self.id => continue,
-                // After lost notices, any of which may have been the one, it is looked at too.
+                // A lost notification may have been of this job.
                 Ok(_) | Err(RecvError::Lagged(_)) => {}
                 Err(RecvError::Closed) => return None,
             }
             match self.jobs.job(self.id).await {
-                Ok(Some(record)) => self.look_at(record),
+                Ok(Some(record)) => self.update(record),
                 Ok(None) => return None,
                 Err(error) => {
-                    tracing::error!(job = %self.id, %error, "a job that is followed cannot be read");
+                    tracing::error!(job = %self.id, %error, "a followed job could not be read");
                     return None;
                 }
             }
         }
     }
 
-    fn look_at(&mut self, record: JobRecord) {
+    fn update(&mut self, record: JobRecord) {
         let JobRecord { job, candidates, .. } = record;
         let status =
             JobStatus { state: job.state, attempts: job.attempts, error: job.error.clone() };
         if !job.state.is_final() && self.status.as_ref() != Some(&status) {
-            self.waiting.push_back(JobEvent::State(status.clone()));
+            self.pending.push_back(JobEvent::State(status.clone()));
             self.status = Some(status);
         }
         for description in &job.descriptions {
-            if self.told.insert(description.image_id.clone()) {
-                self.waiting.push_back(JobEvent::Described(PairDescribed {
-                    described: self.told.len(),
+            if self.reported.insert(description.image_id.clone()) {
+                self.pending.push_back(JobEvent::Described(PairDescribed {
+                    described: self.reported.len(),
                     of: candidates.len(),
                     description: description.clone(),
                 }));
@@ -187,7 +188,7 @@ impl Follower {
         }
         if job.state.is_final() {
             self.ended = true;
-            self.waiting.push_back(JobEvent::Ended(Box::new(job)));
+            self.pending.push_back(JobEvent::Ended(Box::new(job)));
         }
     }
 }

@@ -1,97 +1,119 @@
-//! Jobs: look at them, wait for them, cancel and retry them.
+//! Refinement jobs: get, wait, list, cancel and retry. Queueing them is for `submit`, their events for `events`.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use jiff::Timestamp;
+use tokio::sync::Semaphore;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::RecvError;
 use uuid::Uuid;
 
 use super::images::page_size;
-use super::{Service, ServiceError};
+use super::{Imaging, ServiceError};
 use whereabouts_api::{ErrorKind, JobPage, PairRegions};
 use whereabouts_core::{ImageId, Job, MediaType, PairRegion};
-use whereabouts_refine::{RefineError, RefineInput, RegionMatcher};
-use whereabouts_store::{JobFilter, JobList, JobRecord};
+use whereabouts_refine::{RefineError, RefineInput, Refiner, RegionMatcher};
+use whereabouts_store::{BlobStore, JobFilter, JobList, JobRecord, JobStore};
 
-/// The longest text that jobs are searched for, in characters.
-const LONGEST_SEARCH: usize = 200;
+/// Maximum length of a search text, in characters.
+const MAX_SEARCH_CHARS: usize = 200;
 
-impl Service {
-    /// One job, at once or when it has ended, but after `wait` at the latest.
-    pub async fn get_job(&self, id: Uuid, wait: Option<Duration>) -> Result<Job, ServiceError> {
+/// Refinement jobs: get, wait, list, cancel and retry. Clones share the store.
+#[derive(Clone)]
+pub struct Jobs {
+    /// The jobs.
+    pub store: Arc<dyn JobStore>,
+    /// The bytes of the frames.
+    pub blobs: Arc<dyn BlobStore>,
+    /// Makes thumbnails.
+    pub imaging: Imaging,
+    /// The refiner, if one is configured.
+    pub refiner: Option<Arc<dyn Refiner>>,
+    /// Limits comparisons for display to one at a time, so that they do not slow jobs down.
+    pub matching: Arc<Semaphore>,
+    /// Limits text searches to one at a time: each reads many jobs.
+    pub searching: Arc<Semaphore>,
+    /// The longest time that a caller may wait for the end of a job.
+    pub max_wait: Duration,
+}
+
+impl Jobs {
+    /// Returns a job. With `wait`, waits until it has ended, for that long at most.
+    pub async fn get(&self, id: Uuid, wait: Option<Duration>) -> Result<Job, ServiceError> {
         match wait {
-            Some(wait) if wait > self.settings.max_wait => Err(ServiceError::unprocessable(
-                format!("wait must be at most {} seconds", self.settings.max_wait.as_secs()),
-            )),
+            Some(wait) if wait > self.max_wait => Err(ServiceError::unprocessable(format!(
+                "wait must be at most {} seconds",
+                self.max_wait.as_secs()
+            ))),
             Some(wait) => self.wait_for(id, wait).await,
-            None => self.known_job(id).await,
+            None => self.find(id).await,
         }
     }
 
-    /// Jobs, newest first, a page at a time. A search for a text ends its page early once it has looked at
-    /// as many jobs as the store looks at in one go.
-    pub async fn list_jobs(
+    /// Returns a page of jobs, newest first. A text search may end its page early, because the store bounds how
+    /// many jobs one search reads.
+    pub async fn list(
         &self,
         filter: JobFilter,
         cursor: Option<Uuid>,
         limit: Option<usize>,
     ) -> Result<JobPage, ServiceError> {
         let limit = page_size(limit)?;
-        let _turn = match filter.text {
+        let _permit = match filter.text {
             Some(_) => Some(self.searching.acquire().await),
             None => None,
         };
-        let JobList { mut jobs, searched_to } = self.jobs.jobs(&filter, cursor, limit + 1).await?;
+        let JobList { mut jobs, searched_to } = self.store.jobs(&filter, cursor, limit + 1).await?;
         let more = jobs.len() > limit;
         jobs.truncate(limit);
         let next_cursor = jobs.last().filter(|_| more).map(|job| job.id).or(searched_to);
         Ok(JobPage { jobs, next_cursor })
     }
 
-    /// Cancels a job; one that has ended stays as it is.
-    pub async fn cancel_job(&self, id: Uuid) -> Result<Job, ServiceError> {
-        Ok(self.jobs.cancel(id).await?)
+    /// Cancels a job. A job that has ended stays as it is.
+    pub async fn cancel(&self, id: Uuid) -> Result<Job, ServiceError> {
+        Ok(self.store.cancel(id).await?)
     }
 
     /// Queues a job again that ended without success.
-    pub async fn retry_job(&self, id: Uuid) -> Result<Job, ServiceError> {
-        Ok(self.jobs.retry(id).await?)
+    pub async fn retry(&self, id: Uuid) -> Result<Job, ServiceError> {
+        Ok(self.store.retry(id).await?)
     }
 
-    /// Jobs that wait or run.
-    pub async fn open_jobs(&self) -> Result<usize, ServiceError> {
-        Ok(self.jobs.queued().await?)
+    /// Returns the number of jobs that are queued or running.
+    pub async fn open(&self) -> Result<usize, ServiceError> {
+        Ok(self.store.queued().await?)
     }
 
-    /// How long ago the oldest of them was submitted; zero, if there is none.
-    pub async fn age_of_oldest_job(&self) -> Result<Duration, ServiceError> {
-        let submitted = self.jobs.oldest_unfinished().await?;
+    /// Returns the age of the oldest job that has not ended; zero if there is none.
+    pub async fn oldest_age(&self) -> Result<Duration, ServiceError> {
+        let submitted = self.store.oldest_unfinished().await?;
         let age = submitted.map(|submitted| Timestamp::now().duration_since(submitted));
-        // The clock of whoever submitted it may be ahead.
+        // Negative if the clock of the process that submitted it is ahead.
         Ok(age.and_then(|age| age.try_into().ok()).unwrap_or_default())
     }
 
-    /// The frame of a job: as it was sent, or as a JPEG no larger than `max_edge` pixels.
-    pub async fn frame_of(
+    /// Returns the frame of a job as it was sent, or as a JPEG whose longer edge is at most `max_edge` pixels.
+    pub async fn frame(
         &self,
         id: Uuid,
         max_edge: Option<u32>,
     ) -> Result<(MediaType, Bytes), ServiceError> {
-        let query = self.jobs.job(id).await?.ok_or_else(|| no_job(id))?.query;
+        let query = self.store.job(id).await?.ok_or_else(|| no_job(id))?.query;
         let bytes = self.blobs.blob(&query.digest).await?.ok_or_else(|| {
-            ServiceError::not_found(format!("the frame of the job {id} is no longer there"))
+            ServiceError::not_found(format!("the frame of the job {id} has been removed"))
         })?;
-        self.shown(query.media_type, bytes, max_edge).await
+        self.imaging.thumbnail(query.media_type, bytes, max_edge).await
     }
 
-    /// The regions that a job's frame and one of its candidates have in common, if its refiner compares
-    /// regions. They are compared anew, with the pictures as they are now.
+    /// Returns the regions that the frame of a job shares with one of its candidates, if its refiner compares
+    /// regions. They are computed on request, from the pictures as they are now.
     pub async fn matches(&self, id: Uuid, image: &ImageId) -> Result<PairRegions, ServiceError> {
-        let record = self.jobs.job(id).await?.ok_or_else(|| no_job(id))?;
+        let record = self.store.job(id).await?.ok_or_else(|| no_job(id))?;
         let refiner = self.refiner.as_ref().filter(|refiner| refiner.kind() == record.job.refiner);
-        let _turn = self.matching.acquire().await;
+        let _permit = self.matching.acquire().await;
         let regions = match refiner.and_then(|refiner| refiner.region_matcher()) {
             Some(matcher) => {
                 self.regions(&record, matcher, image).await.map_err(|error| match error {
@@ -105,8 +127,8 @@ impl Service {
         };
         let regions = regions.ok_or_else(|| {
             ServiceError::not_found(format!(
-                "the job {id} has no matches with {image}: it is not among its candidates any more, or the \
-                 refiner is not the one that compares regions (local)"
+                "the job {id} has no matches with {image}: the image is no longer one of its candidates, or \
+                 the refiner does not compare regions (only refine.refiner = \"local\" does)"
             ))
         })?;
         Ok(PairRegions { regions })
@@ -118,49 +140,49 @@ impl Service {
         matcher: &dyn RegionMatcher,
         image: &ImageId,
     ) -> Result<Option<Vec<PairRegion>>, RefineError> {
-        let input = RefineInput::of_job(record, self.maps.as_ref()).await?;
+        let input = RefineInput::of_job(record, self.imaging.maps.as_ref()).await?;
         matcher.regions(&input, image).await
     }
 
-    /// Waits until the job has ended, but no longer than `longest`; the job as it then is.
-    pub(super) async fn wait_for(&self, id: Uuid, longest: Duration) -> Result<Job, ServiceError> {
-        let mut changes = self.jobs.changes();
+    /// Waits until a job has ended, for `longest` at most, and returns it as it is then.
+    pub(crate) async fn wait_for(&self, id: Uuid, longest: Duration) -> Result<Job, ServiceError> {
+        let mut changes = self.store.changes();
         let ended = async {
             loop {
-                let job = self.known_job(id).await?;
+                let job = self.find(id).await?;
                 if job.state.is_final() {
                     return Ok(job);
                 }
-                // Other jobs change too; only this one's change is worth a look.
+                // Read the job again only after its own change, not after every other job's.
                 while next_change(&mut changes).await?.is_some_and(|changed| changed != id) {}
             }
         };
         match tokio::time::timeout(longest, ended).await {
             Ok(job) => job,
-            Err(_) => self.known_job(id).await,
+            Err(_) => self.find(id).await,
         }
     }
 
-    async fn known_job(&self, id: Uuid) -> Result<Job, ServiceError> {
-        match self.jobs.job(id).await? {
+    async fn find(&self, id: Uuid) -> Result<Job, ServiceError> {
+        match self.store.job(id).await? {
             Some(record) => Ok(record.job),
             None => Err(no_job(id)),
         }
     }
 }
 
-/// What jobs are searched for, if for anything.
+/// Trims a search text and checks its length; `None` if it is blank.
 pub fn search_text(text: &str) -> Result<Option<String>, ServiceError> {
     let length = text.chars().count();
-    if length > LONGEST_SEARCH {
+    if length > MAX_SEARCH_CHARS {
         return Err(ServiceError::malformed(format!(
-            "the text to search for has {length} characters; {LONGEST_SEARCH} are the most"
+            "the search text has {length} characters; the maximum is {MAX_SEARCH_CHARS}"
         )));
     }
     Ok(Some(text.trim()).filter(|text| !text.is_empty()).map(str::to_owned))
 }
 
-/// The id of a job, or of another thing, that a text is.
+/// Parses the id of a resource, whose kind `of` is named in the error.
 pub fn uuid(of: &str, text: &str) -> Result<Uuid, ServiceError> {
     text.parse().map_err(|_| {
         let shown: String = text.chars().take(80).collect();
@@ -170,12 +192,13 @@ pub fn uuid(of: &str, text: &str) -> Result<Uuid, ServiceError> {
 
 pub(super) fn no_job(id: Uuid) -> ServiceError {
     ServiceError::not_found(format!(
-        "there is no job {id}; one that has ended is removed in time (jobs.keep_days, \
+        "there is no job {id}; jobs that have ended are removed after a while (jobs.keep_days, \
          jobs.keep_count)"
     ))
 }
 
-/// The next job that changes; `None` if notices were lost, any of which may have been the one.
+/// Waits for the next change of any job and returns its id; `None` if notifications were lost, each of which may
+/// have been for any job.
 async fn next_change(changes: &mut Receiver<Uuid>) -> Result<Option<Uuid>, ServiceError> {
     match changes.recv().await {
         Ok(id) => Ok(Some(id)),

@@ -1,4 +1,5 @@
-//! API keys: making, listing and revoking them, and who a token belongs to.
+//! API keys: create, list, revoke and authenticate. How often a key may be used is for `limits`, what its role
+//! may do for the server.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
@@ -15,32 +16,32 @@ use whereabouts_api::{ErrorKind, MadeKey, NewKey};
 use whereabouts_core::{ApiKey, Digest, MapName, StoredKey, Token};
 use whereabouts_store::{KeyStore, StoreError};
 
-/// The most keys, revoked ones included: they are all held in memory.
-const MOST_KEYS: usize = 10_000;
+/// Maximum number of keys, revoked ones included: all are held in memory.
+const MAX_KEYS: usize = 10_000;
 
-/// The largest limit in bytes: the largest whole number of a structured header field (RFC 9651).
-const MOST_BYTES: u64 = 999_999_999_999_999;
+/// Maximum limit in bytes: the largest integer of a structured header field (RFC 9651).
+const MAX_BYTES_PER_MINUTE: u64 = 999_999_999_999_999;
 
-/// How long it is waited at a time for a key to expire.
-const LONGEST_SLEEP: Duration = Duration::from_secs(3600);
+/// Longest sleep until a key's expiry is checked again: timers cannot sleep for years.
+const MAX_EXPIRY_SLEEP: Duration = Duration::from_secs(3600);
 
-/// The pause before keys that changed and cannot be read are read again.
-const READ_AGAIN: Duration = Duration::from_secs(1);
+/// Pause before changed keys that could not be read are read again.
+const RELOAD_PAUSE: Duration = Duration::from_secs(1);
 
-/// The longest name of a key, in bytes.
-const MOST_NAME_BYTES: usize = 100;
+/// Maximum length of the name of a key, in bytes.
+const MAX_NAME_BYTES: usize = 100;
 
-/// Who asks.
+/// The caller of a request.
 #[derive(Debug, Clone)]
 pub enum Principal {
-    /// Keys are off: everybody may do everything.
+    /// Keys are off: every caller has full access.
     Anonymous,
-    /// The holder of a key.
+    /// A caller that was authenticated by this key.
     ApiKey(Arc<ApiKey>),
 }
 
 impl Principal {
-    /// A name for the caller, under which what is kept for one is not seen by another.
+    /// Namespace of what is kept for the caller (tracks, idempotency keys): the id of its key.
     pub fn scope(&self) -> &str {
         match self {
             Self::Anonymous => "-",
@@ -48,7 +49,7 @@ impl Principal {
         }
     }
 
-    /// Whether the caller may use that map.
+    /// Whether the caller may use the map.
     pub fn may_use(&self, map: &MapName) -> bool {
         match self {
             Self::Anonymous => true,
@@ -64,48 +65,48 @@ impl Principal {
         }
     }
 
-    /// Refuses a map that the caller may not use.
+    /// A `Forbidden` error if the caller may not use the map.
     pub fn check_map(&self, map: &MapName) -> Result<(), ServiceError> {
         match self.may_use(map) {
             true => Ok(()),
             false => Err(ServiceError::new(
                 ErrorKind::Forbidden,
-                format!("this key is not for the map {map}; ask an admin for another key"),
+                format!("this key has no access to the map {map}; ask an admin for another key"),
             )),
         }
     }
 }
 
-/// All keys, and what each may still ask for.
+/// All API keys, in memory and in the store.
 pub struct Keys {
     store: Arc<dyn KeyStore>,
-    known: Arc<Known>,
-    /// Told when a key was revoked.
+    known: Arc<KeysById>,
+    /// Notified when a key was revoked.
     revoked: Arc<watch::Sender<()>>,
-    /// How much each may ask for.
+    /// The rate limits of the keys.
     pub limits: Limits,
 }
 
 impl Keys {
-    /// The keys of a store.
+    /// Loads the keys of a store, and keeps up with changes by other processes.
     pub async fn load(store: Arc<dyn KeyStore>) -> Result<Self, ServiceError> {
-        // Before they are read, so that no change is missed.
+        // Subscribed before the keys are read, so that no change is missed.
         let changed = store.changed_keys();
         let known = Arc::new(RwLock::new(read_all(store.as_ref()).await?));
         let revoked = Arc::new(watch::Sender::new(()));
         if let Some(changed) = changed {
             let (known, revoked) = (Arc::downgrade(&known), Arc::clone(&revoked));
-            tokio::spawn(keep_up(Arc::clone(&store), known, revoked, changed));
+            tokio::spawn(reload_on_change(Arc::clone(&store), known, revoked, changed));
         }
         Ok(Self { store, known, revoked, limits: Limits::default() })
     }
 
-    /// Makes a key. What comes back is the only place where its token is.
-    pub async fn create(&self, wanted: NewKey) -> Result<MadeKey, ServiceError> {
-        let NewKey { name, role, mut maps, limits, expires_days } = wanted;
+    /// Creates a key. Only the returned value contains its token; the store has a digest.
+    pub async fn create(&self, new: NewKey) -> Result<MadeKey, ServiceError> {
+        let NewKey { name, role, mut maps, limits, expires_days } = new;
         let printable = !name.chars().any(char::is_control);
-        if !(1..=MOST_NAME_BYTES).contains(&name.trim().len()) || !printable {
-            let detail = format!("a key's name must have 1 to {MOST_NAME_BYTES} printable bytes");
+        if !(1..=MAX_NAME_BYTES).contains(&name.trim().len()) || !printable {
+            let detail = format!("a key's name must have 1 to {MAX_NAME_BYTES} printable bytes");
             return Err(ServiceError::unprocessable(detail));
         }
         if limits.requests_per_minute == Some(0) || limits.bytes_per_minute == Some(0) {
@@ -113,16 +114,18 @@ impl Keys {
                 "a limit of 0 allows nothing; revoke the key instead, or leave the limit out";
             return Err(ServiceError::unprocessable(detail));
         }
-        if limits.bytes_per_minute.is_some_and(|bytes| bytes > MOST_BYTES) {
-            let detail =
-                format!("bytes_per_minute must be at most {MOST_BYTES}; leave it out for no bound");
+        if limits.bytes_per_minute.is_some_and(|bytes| bytes > MAX_BYTES_PER_MINUTE) {
+            let detail = format!(
+                "bytes_per_minute must be at most {MAX_BYTES_PER_MINUTE}; leave it out for no limit"
+            );
             return Err(ServiceError::unprocessable(detail));
         }
         if expires_days.is_some_and(|days| !(1..=36_500).contains(&days)) {
             return Err(ServiceError::unprocessable("expires_days must be 1 to 36500"));
         }
-        if self.read().len() >= MOST_KEYS {
-            let detail = format!("there are {MOST_KEYS} keys, revoked ones included: the most");
+        if self.read().len() >= MAX_KEYS {
+            let detail =
+                format!("there are {MAX_KEYS} keys, revoked ones included, which is the maximum");
             return Err(ServiceError::new(ErrorKind::Conflict, detail));
         }
         maps.sort();
@@ -143,41 +146,41 @@ impl Keys {
             expires_at,
             revoked_at: None,
         };
-        self.keep(StoredKey { key: key.clone(), digest: token.digest() }).await?;
+        self.persist(StoredKey { key: key.clone(), digest: token.digest() }).await?;
         tracing::info!(target: "audit", made = %key.id, name = %key.name, role = %key.role, "a key was made");
         Ok(MadeKey { token: token.reveal().to_owned(), key })
     }
 
-    /// All keys, the newest first.
+    /// Returns all keys, newest first.
     pub fn list(&self) -> Vec<ApiKey> {
         let mut keys: Vec<_> = self.read().values().map(|stored| stored.key.clone()).collect();
         keys.sort_by(|a, b| b.created_at.cmp(&a.created_at).then_with(|| a.id.cmp(&b.id)));
         keys
     }
 
-    /// Ends a key for good; from the moment this returns nobody gets in with it. `id` may be the whole key.
+    /// Revokes a key for good; it is not accepted once this returns. `id` may be the id or the whole token.
     pub async fn revoke(&self, id: &str) -> Result<ApiKey, ServiceError> {
         let known = Token::id_of(id).and_then(|id| self.read().get(id).cloned());
         let Some(mut stored) = known else {
-            let detail = "there is no such key; `whereabouts keys list` shows those there are";
+            let detail = "there is no such key; `whereabouts keys list` lists all keys";
             return Err(ServiceError::new(ErrorKind::NotFound, detail));
         };
         if stored.key.revoked_at.is_none() {
             stored.key.revoked_at = Some(Timestamp::now());
-            self.keep(stored.clone()).await?;
+            self.persist(stored.clone()).await?;
             self.revoked.send_replace(());
             tracing::info!(target: "audit", revoked = %stored.key.id, "a key was revoked");
         }
         Ok(stored.key)
     }
 
-    /// Whether there is a key that lets somebody in.
+    /// Whether any key is valid now.
     pub fn any_valid(&self) -> bool {
         let now = Timestamp::now();
         self.read().values().any(|stored| stored.key.is_valid(now))
     }
 
-    /// Returns when a caller may ask no more: the key was revoked, or has expired.
+    /// Waits until the key of a caller is revoked or expires; never returns for an anonymous caller.
     pub async fn ended(&self, caller: Principal) {
         let Principal::ApiKey(key) = caller else { return std::future::pending().await };
         let mut revoked = self.revoked.subscribe();
@@ -189,20 +192,20 @@ impl Keys {
             let left = key.expires_at.map(|end| end.duration_since(now).unsigned_abs());
             tokio::select! {
                 _ = revoked.changed() => {}
-                () = tokio::time::sleep(left.unwrap_or(Duration::MAX).min(LONGEST_SLEEP)) => {}
+                () = tokio::time::sleep(left.unwrap_or(Duration::MAX).min(MAX_EXPIRY_SLEEP)) => {}
             }
         }
     }
 
-    /// Whose token this is.
+    /// Authenticates a token.
     pub fn holder(&self, token: &Token) -> Result<Arc<ApiKey>, ServiceError> {
         let known = self.read().get(token.id()).cloned();
-        // An id that is unknown takes as long as one that is known.
-        let is_right = match &known {
+        // An unknown id takes as long as a known one, so that the time does not tell them apart.
+        let is_match = match &known {
             Some(stored) => stored.matches(token),
             None => token.digest() == Digest::of(b""),
         };
-        match known.filter(|_| is_right) {
+        match known.filter(|_| is_match) {
             None => Err(ServiceError::new(ErrorKind::Unauthorized, "the key is unknown")),
             Some(StoredKey { key, .. }) if key.is_valid(Timestamp::now()) => Ok(Arc::new(key)),
             Some(StoredKey { key, .. }) => {
@@ -213,8 +216,8 @@ impl Keys {
         }
     }
 
-    /// Stores a key, and knows it; both, though the caller has gone meanwhile.
-    async fn keep(&self, stored: StoredKey) -> Result<(), ServiceError> {
+    /// Writes a key to the store and then to memory, even if the future is dropped in between.
+    async fn persist(&self, stored: StoredKey) -> Result<(), ServiceError> {
         let (store, known) = (Arc::clone(&self.store), Arc::clone(&self.known));
         let keeping = tokio::spawn(async move {
             store.put_key(stored.clone()).await?;
@@ -232,17 +235,17 @@ impl Keys {
     }
 }
 
-type Known = RwLock<HashMap<String, StoredKey>>;
+type KeysById = RwLock<HashMap<String, StoredKey>>;
 
 async fn read_all(store: &dyn KeyStore) -> Result<HashMap<String, StoredKey>, StoreError> {
     let known = store.keys().await?;
     Ok(known.into_iter().map(|stored| (stored.key.id.clone(), stored)).collect())
 }
 
-/// Reads the keys again whenever another process has changed some, as long as somebody needs them.
-async fn keep_up(
+/// Reloads the keys whenever another process has changed some, until the [`Keys`] are dropped.
+async fn reload_on_change(
     store: Arc<dyn KeyStore>,
-    known: Weak<Known>,
+    known: Weak<KeysById>,
     revoked: Arc<watch::Sender<()>>,
     mut changed: watch::Receiver<()>,
 ) {
@@ -256,8 +259,8 @@ async fn keep_up(
                     break;
                 }
                 Err(error) => {
-                    tracing::warn!(%error, "changed keys cannot be read; trying again");
-                    tokio::time::sleep(READ_AGAIN).await;
+                    tracing::warn!(%error, "changed keys could not be read; trying again");
+                    tokio::time::sleep(RELOAD_PAUSE).await;
                 }
             }
         }
@@ -268,11 +271,11 @@ fn random_token() -> Result<Token, ServiceError> {
     Ok(Token::new(&random("key")?))
 }
 
-/// Random bytes for a thing that is being made.
+/// Random bytes for a new key or webhook, which is named in the error.
 pub(super) fn random<const N: usize>(of: &str) -> Result<[u8; N], ServiceError> {
     let mut random = [0; N];
     SystemRandom::new().fill(&mut random).map_err(|_| {
-        let detail = format!("the system gives no random numbers; the {of} was not made");
+        let detail = format!("the system has no random numbers; the {of} was not created");
         ServiceError::new(ErrorKind::Internal, detail)
     })?;
     Ok(random)
@@ -286,10 +289,10 @@ mod tests {
     use whereabouts_core::{KeyLimits, Role};
 
     #[derive(Default)]
-    struct Drawer(Mutex<Vec<StoredKey>>);
+    struct InMemoryKeys(Mutex<Vec<StoredKey>>);
 
     #[async_trait]
-    impl KeyStore for Drawer {
+    impl KeyStore for InMemoryKeys {
         async fn put_key(&self, key: StoredKey) -> Result<(), StoreError> {
             let mut kept = self.0.lock();
             kept.retain(|other| other.key.id != key.key.id);
@@ -302,16 +305,16 @@ mod tests {
         }
     }
 
-    fn wanted(role: Role, limits: KeyLimits) -> NewKey {
+    fn new_key(role: Role, limits: KeyLimits) -> NewKey {
         NewKey { name: "n".into(), role, maps: Vec::new(), limits, expires_days: Some(1) }
     }
 
     #[tokio::test]
-    async fn a_key_is_known_by_its_token_alone_until_it_is_revoked_and_after_a_restart() {
-        let store = Arc::new(Drawer::default());
+    async fn a_token_authenticates_until_its_key_is_revoked_and_across_restarts() {
+        let store = Arc::new(InMemoryKeys::default());
         let keys = Keys::load(store.clone()).await.unwrap();
         assert!(!keys.any_valid());
-        let made = keys.create(wanted(Role::Robot, KeyLimits::default())).await.unwrap();
+        let made = keys.create(new_key(Role::Robot, KeyLimits::default())).await.unwrap();
         let token: Token = made.token.parse().unwrap();
         assert_eq!(keys.holder(&token).unwrap().id, made.key.id);
         let kept = serde_json::to_string(&*store.0.lock()).unwrap();
@@ -329,14 +332,14 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_limit_is_kept_and_says_when_to_come_again() {
-        let keys = Keys::load(Arc::new(Drawer::default())).await.unwrap();
+    async fn a_used_up_limit_rejects_with_the_time_until_a_retry_succeeds() {
+        let keys = Keys::load(Arc::new(InMemoryKeys::default())).await.unwrap();
         let limits = KeyLimits { requests_per_minute: Some(3), bytes_per_minute: Some(1000) };
-        let key = keys.create(wanted(Role::Robot, limits)).await.unwrap().key;
-        for left in [2, 1, 0] {
-            let (allowances, taken) = keys.limits.take_request(&key).await;
-            taken.unwrap();
-            assert_eq!(allowances.requests.unwrap().remaining, left);
+        let key = keys.create(new_key(Role::Robot, limits)).await.unwrap().key;
+        for remaining in [2, 1, 0] {
+            let (allowances, result) = keys.limits.take_request(&key).await;
+            result.unwrap();
+            assert_eq!(allowances.requests.unwrap().remaining, remaining);
         }
         let refused = keys.limits.take_request(&key).await.1.unwrap_err();
         assert_eq!(refused.kind, ErrorKind::Overloaded);
@@ -344,7 +347,7 @@ mod tests {
         assert!((15.0..=20.0).contains(&pause), "{pause}");
 
         let limits = KeyLimits { requests_per_minute: None, ..limits };
-        let key = keys.create(wanted(Role::Robot, limits)).await.unwrap().key;
+        let key = keys.create(new_key(Role::Robot, limits)).await.unwrap().key;
         keys.limits.take_request(&key).await.1.unwrap();
         keys.limits.take_bytes(&key, 3000).await;
         let (allowances, refused) = keys.limits.take_request(&key).await;
@@ -354,17 +357,17 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_key_that_cannot_be_is_refused() {
-        let keys = Keys::load(Arc::new(Drawer::default())).await.unwrap();
-        let plain = wanted(Role::Admin, KeyLimits::default());
+    async fn a_key_with_invalid_attributes_is_unprocessable() {
+        let keys = Keys::load(Arc::new(InMemoryKeys::default())).await.unwrap();
+        let valid = new_key(Role::Admin, KeyLimits::default());
         for bad in [
-            NewKey { name: " ".into(), ..plain.clone() },
-            NewKey { name: "a\nb".into(), ..plain.clone() },
-            NewKey { name: "n".repeat(101), ..plain.clone() },
-            NewKey { expires_days: Some(0), ..plain.clone() },
+            NewKey { name: " ".into(), ..valid.clone() },
+            NewKey { name: "a\nb".into(), ..valid.clone() },
+            NewKey { name: "n".repeat(101), ..valid.clone() },
+            NewKey { expires_days: Some(0), ..valid.clone() },
             NewKey {
                 limits: KeyLimits { requests_per_minute: Some(0), bytes_per_minute: None },
-                ..plain.clone()
+                ..valid.clone()
             },
         ] {
             assert_eq!(keys.create(bad).await.unwrap_err().kind, ErrorKind::Unprocessable);

@@ -1,15 +1,15 @@
-//! The use cases: what a request means, whoever brings it.
+//! The use cases, one type each. Each owns what it needs and knows the store by its traits only.
 //!
-//! HTTP and the command line convert to and from these calls and decide nothing. A [`Service`]
-//! knows the stores by their traits alone.
+//! HTTP, gRPC and the command line convert requests and responses; every decision is made here.
 
-mod admission;
 mod bulk;
 mod calibration;
-mod door;
+mod cancellation;
 mod error;
 mod events;
+mod idempotency;
 mod images;
+mod imaging;
 mod jobs;
 mod keys;
 mod limits;
@@ -17,124 +17,216 @@ mod localize;
 mod maps;
 mod metrics;
 mod models;
-mod once;
+mod readiness;
 mod recall;
 mod refused;
 mod reindex;
 mod retention;
 mod submit;
+#[cfg(test)]
+mod tests;
 mod track;
 mod transfer;
 mod usage;
 mod webhooks;
 
 use std::sync::Arc;
+use std::time::Duration;
 
+use tokio::sync::Semaphore;
 use uuid::Uuid;
 
 pub use self::bulk::{BulkImage, BulkResult, BulkSettings};
-pub use self::door::{Readiness, ReadinessPhase};
+pub use self::calibration::Calibrator;
+pub use self::cancellation::Deadline;
 pub use self::error::ServiceError;
 pub use self::events::{AnyJobEvent, JobEvent};
-pub use self::images::NewImage;
-pub use self::jobs::{search_text, uuid};
+pub use self::idempotency::{Idempotency, IdempotencySettings, Once};
+pub use self::images::{Images, NewImage};
+pub use self::imaging::Imaging;
+pub use self::jobs::{Jobs, search_text, uuid};
 pub use self::keys::{Keys, Principal};
 pub use self::limits::{Allowance, Allowances, Limits};
-pub use self::localize::{Deadline, LocalizeRequest, Retrieved};
+pub use self::localize::{LocalizeRequest, LocalizeSettings, Localizer, Retrieved};
+pub use self::maps::Maps;
 pub use self::metrics::{AttemptOutcome, ServiceMetrics};
-pub use self::once::{IdempotencySettings, Once};
+pub use self::readiness::{Readiness, ReadinessPhase};
 pub use self::recall::RecallCheck;
 pub use self::refused::{Rejection, Rejections};
-pub use self::reindex::Reindexes;
+pub use self::reindex::{Reindexer, Reindexes};
 pub use self::retention::{Janitor, RetentionSettings};
+pub use self::submit::Submitter;
 pub use self::track::{TrackSettings, TrackStep, Tracks};
+pub use self::transfer::Transfer;
+pub use self::usage::UsageReports;
 pub use self::webhooks::{Dispatcher, WebhookSettings, Webhooks};
 use whereabouts_core::CalibrationSettings;
 use whereabouts_refine::{DenseCache, JobServiceTime, Refiner};
-use whereabouts_store::{
-    BlobStore, DraftStore, ExportStore, IdempotencyStore, JobStore, MapStore, Retention, UsageStore,
-};
+use whereabouts_store::{Retention, Store};
 use whereabouts_vision::{Admission, CpuPool, LoadedModels};
+
+/// Retries of a use case whose map was reindexed meanwhile. Reindexes are rare: more in a row mean a broken
+/// store.
+const SUPERSEDED_RETRIES: usize = 2;
+
+/// The use cases of one process.
+pub struct Service {
+    /// Maps.
+    pub maps: Maps,
+    /// Reference images.
+    pub images: Images,
+    /// Localization of frames.
+    pub localizer: Localizer,
+    /// Refinement jobs.
+    pub jobs: Jobs,
+    /// Reindexing of maps.
+    pub reindexer: Reindexer,
+    /// Calibration of confidence.
+    pub calibrator: Calibrator,
+    /// Export and import of maps.
+    pub transfer: Transfer,
+    /// Usage reports.
+    pub usage: UsageReports,
+    /// Idempotency keys.
+    pub idempotency: Idempotency,
+    /// API keys.
+    pub keys: Arc<Keys>,
+    /// Webhooks.
+    pub webhooks: Webhooks,
+    /// Removal of expired records, and sizes on disk.
+    pub retention: Arc<dyn Retention>,
+    /// The cache of dense features.
+    pub dense: Arc<DenseCache>,
+    /// Metric families of the use cases.
+    pub metrics: Arc<ServiceMetrics>,
+}
+
+/// The dependencies of the use cases.
+pub struct ServiceParts {
+    /// The store.
+    pub store: Arc<dyn Store>,
+    /// The id of this process.
+    pub process: Uuid,
+    /// API keys.
+    pub keys: Keys,
+    /// The loaded models.
+    pub models: LoadedModels,
+    /// Permits to decode an image and run a model on it.
+    pub admission: Admission,
+    /// The threads for decoding.
+    pub pool: CpuPool,
+    /// The refiner, if one is configured.
+    pub refiner: Option<Arc<dyn Refiner>>,
+    /// The cache of dense features.
+    pub dense: Arc<DenseCache>,
+    /// The average time of a job.
+    pub job_service_time: JobServiceTime,
+    /// Metric families of the use cases.
+    pub metrics: Arc<ServiceMetrics>,
+}
 
 /// Bounds and defaults of the use cases.
 #[derive(Debug, Clone)]
 pub struct ServiceSettings {
-    /// Candidates in an answer by default.
-    pub k: usize,
-    /// Candidates in an answer at the most.
-    pub max_k: usize,
-    /// The least confidence of a known place.
-    pub known_confidence: f64,
-    /// How maps are measured.
+    /// Localization.
+    pub localize: LocalizeSettings,
+    /// Tracks.
+    pub track: TrackSettings,
+    /// Calibration of confidence.
     pub calibration: CalibrationSettings,
-    /// Candidates that a job compares.
-    pub candidates: usize,
-    /// Jobs that may wait or run.
+    /// Maximum number of jobs that are queued or running.
     pub job_queue: usize,
-    /// The share of the queue before decoding from which frames get no job.
+    /// Jobs are shed while more than this share of the admission queue is in use.
     pub shed_jobs_at: f64,
-    /// The longest wait for a job.
-    pub max_wait: std::time::Duration,
-    /// For how many days it is known what was spent.
+    /// The longest time that a caller may wait for a job.
+    pub max_wait: Duration,
+    /// Pause between two comparisons of a search with exact search; `None` for none.
+    pub recall_check: Option<Duration>,
+    /// Retention of usage, in days.
     pub usage_days: u32,
-    /// What is kept of requests that may be sent again.
-    pub once: IdempotencySettings,
+    /// Retention of responses to requests with an idempotency key.
+    pub idempotency: IdempotencySettings,
     /// Bounds of bulk uploads.
     pub bulk: BulkSettings,
+    /// Bounds of webhooks.
+    pub webhooks: WebhookSettings,
 }
 
-/// How often a use case begins again because the map's descriptors were replaced meanwhile. Twice in
-/// a row would be strange; more often is a store that is broken.
-const SUPERSEDED: usize = 2;
-
-/// Everything a use case needs.
-pub struct Service {
-    /// Maps, images, descriptors.
-    pub maps: Arc<dyn MapStore>,
-    /// Descriptors in the making.
-    pub drafts: Arc<dyn DraftStore>,
-    /// How far that has come.
-    pub reindexes: Reindexes,
-    /// The frames of each robot, one after another.
-    pub tracks: Tracks,
-    /// Images with their descriptors.
-    pub exports: Arc<dyn ExportStore>,
-    /// Image bytes.
-    pub blobs: Arc<dyn BlobStore>,
-    /// Jobs.
-    pub jobs: Arc<dyn JobStore>,
-    /// First answers to requests that may be sent again.
-    pub answers: Arc<dyn IdempotencyStore>,
-    /// Tells this process from those before it.
-    pub process: Uuid,
-    /// What calls to models outside have cost.
-    pub accounts: Arc<dyn UsageStore>,
-    /// API keys.
-    pub keys: Keys,
-    /// Who is told of the ends of jobs.
-    pub webhooks: Webhooks,
-    /// The models in memory.
-    pub models: LoadedModels,
-    /// When a search was last held against exact search.
-    pub recall: RecallCheck,
-    /// Who may have a picture decoded and inferred.
-    pub admission: Admission,
-    /// Where pictures are decoded.
-    pub pool: CpuPool,
-    /// How fast jobs are done.
-    pub job_pace: JobServiceTime,
-    /// Who refines, if anybody.
-    pub refiner: Option<Arc<dyn Refiner>>,
-    /// Dense features that a job will need soon.
-    pub dense: Arc<DenseCache>,
-    /// Matches are compared one pair after another: jobs go first.
-    pub matching: tokio::sync::Semaphore,
-    /// Jobs are searched for one text after another: each looks at many of them.
-    pub searching: tokio::sync::Semaphore,
-    /// Where they are all kept.
-    pub retention: Arc<dyn Retention>,
-    /// What is counted.
-    pub metrics: Arc<ServiceMetrics>,
-    /// Bounds and defaults.
-    pub settings: ServiceSettings,
+impl Service {
+    /// Builds all use cases over the same dependencies.
+    pub fn new(parts: ServiceParts, settings: ServiceSettings) -> Self {
+        let ServiceParts { store, process, keys, models, admission, pool, refiner, .. } = parts;
+        let ServiceParts { dense, job_service_time, metrics, .. } = parts;
+        let (keys, admission) = (Arc::new(keys), Arc::new(admission));
+        let imaging = Imaging {
+            maps: store.clone(),
+            models,
+            admission: Arc::clone(&admission),
+            pool,
+            metrics: Arc::clone(&metrics),
+        };
+        let maps =
+            Maps { store: store.clone(), imaging: imaging.clone(), reindexes: Arc::default() };
+        let jobs = Jobs {
+            store: store.clone(),
+            blobs: store.clone(),
+            imaging,
+            refiner: refiner.clone(),
+            matching: Arc::new(Semaphore::new(1)),
+            searching: Arc::new(Semaphore::new(1)),
+            max_wait: settings.max_wait,
+        };
+        let submitter = Submitter {
+            jobs: store.clone(),
+            blobs: store.clone(),
+            dense: Arc::clone(&dense),
+            refiner: refiner.clone(),
+            admission,
+            service_time: job_service_time,
+            metrics: Arc::clone(&metrics),
+            queue: settings.job_queue,
+            shed_at: settings.shed_jobs_at,
+        };
+        let place_m = settings.calibration.place_m;
+        Self {
+            images: Images {
+                maps: maps.clone(),
+                blobs: store.clone(),
+                keys: Arc::clone(&keys),
+                bulk: settings.bulk,
+            },
+            localizer: Localizer {
+                maps: maps.clone(),
+                tracks: Tracks::new(store.clone(), place_m, settings.track),
+                submitter,
+                jobs: jobs.clone(),
+                recall: RecallCheck::new(settings.recall_check),
+                settings: settings.localize,
+            },
+            jobs,
+            reindexer: Reindexer {
+                maps: maps.clone(),
+                drafts: store.clone(),
+                blobs: store.clone(),
+            },
+            calibrator: Calibrator {
+                store: store.clone(),
+                refiner: refiner.clone(),
+                settings: settings.calibration,
+            },
+            transfer: Transfer { maps: maps.clone(), exports: store.clone(), blobs: store.clone() },
+            usage: UsageReports { store: store.clone(), refiner, keep_days: settings.usage_days },
+            idempotency: Idempotency {
+                store: store.clone(),
+                process,
+                settings: settings.idempotency,
+            },
+            keys,
+            webhooks: Webhooks { store: store.clone(), settings: settings.webhooks },
+            retention: store,
+            dense,
+            metrics,
+            maps,
+        }
+    }
 }

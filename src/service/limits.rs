@@ -1,4 +1,4 @@
-//! How much each API key may ask for.
+//! Rate limits of API keys: token buckets of requests and bytes, each with a minute's worth.
 
 use std::time::Duration;
 
@@ -7,54 +7,54 @@ use whereabouts_api::ErrorKind;
 use whereabouts_core::ApiKey;
 use whereabouts_store::{TokenBuckets, TokenGrant, TokenRequest};
 
-/// A bucket of a key fills up in this time.
+/// Time in which an empty bucket fills up.
 const WINDOW: Duration = Duration::from_secs(60);
 
-/// As good as nothing.
-const SOME: f64 = 0.01;
+/// Tokens that a bucket of bytes must hold for a request whose size is not known yet.
+const ANY_BYTES: f64 = 0.01;
 
-/// What is left to a key, of one of its limits.
+/// What remains of one limit of a key (`RateLimit` header fields).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Allowance {
-    /// The limit.
+    /// The limit per minute.
     pub limit: u64,
-    /// What is left of it.
+    /// Tokens that remain.
     pub remaining: u64,
-    /// When all of it is there again.
+    /// Time until the bucket is full again.
     pub reset: Duration,
 }
 
-/// What is left to a key.
+/// What remains of the limits of a key; `None` where it has no limit.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Allowances {
-    /// Of requests.
+    /// Requests.
     pub requests: Option<Allowance>,
-    /// Of bytes.
+    /// Bytes of request bodies.
     pub bytes: Option<Allowance>,
 }
 
-/// What each key has asked for lately, by its id.
+/// The token buckets of all keys, by the id of the key.
 #[derive(Debug, Default)]
 pub struct Limits(TokenBuckets);
 
 impl Limits {
-    /// Limits that these buckets keep.
+    /// Limits kept in these buckets.
     pub fn new(buckets: TokenBuckets) -> Self {
         Self(buckets)
     }
 
-    /// Takes a request from what is left to a key.
+    /// Takes one request from the buckets of a key. Also returns what remains.
     pub async fn take_request(&self, key: &ApiKey) -> (Allowances, Result<(), ServiceError>) {
-        let draws = [requests(key), bytes(key, SOME, 0.0)];
-        if draws.iter().all(|draw| draw.per_minute == 0.0) {
+        let tokens = [requests(key), bytes(key, ANY_BYTES, 0.0)];
+        if tokens.iter().all(|bucket| bucket.per_minute == 0.0) {
             return (Allowances::default(), Ok(()));
         }
-        let TokenGrant { granted, remaining } = match self.0.take(&key.id, draws).await {
-            Ok(drawn) => drawn,
+        let TokenGrant { granted, remaining } = match self.0.take(&key.id, tokens).await {
+            Ok(grant) => grant,
             Err(error) => return (Allowances::default(), Err(error.into())),
         };
         let [requests, bytes] = [0, 1].map(|index| {
-            let limit = draws[index].per_minute;
+            let limit = tokens[index].per_minute;
             (limit > 0.0).then(|| (limit, remaining[index]))
         });
         let allowances = Allowances {
@@ -74,15 +74,15 @@ impl Limits {
             }
         };
         let detail = format!(
-            "the key {} has used up its {what} a minute; wait as Retry-After says, or have an admin make \
-             one with another limit",
+            "the key {} has used up its {what} per minute; wait as Retry-After says, or ask an admin for \
+             a key with a higher limit",
             key.id
         );
         let error = ServiceError::new(ErrorKind::Overloaded, detail).retry_after(pause);
         (allowances, Err(error))
     }
 
-    /// Takes one of several things that came in one request from the requests left to a key.
+    /// Takes one more request from the buckets of a caller, for each item of a request after the first.
     pub async fn take_one_more(&self, caller: &Principal) -> Result<(), ServiceError> {
         match caller {
             Principal::Anonymous => Ok(()),
@@ -90,7 +90,7 @@ impl Limits {
         }
     }
 
-    /// Takes bytes that have come from what is left to a key.
+    /// Takes the bytes of a request body that was received from the bucket of a key.
     pub async fn take_bytes(&self, key: &ApiKey, count: usize) {
         if key.limits.bytes_per_minute.is_none() || count == 0 {
             return;
@@ -99,7 +99,7 @@ impl Limits {
         if let Err(error) =
             self.0.take(&key.id, [requests, bytes(key, f64::MIN, count as f64)]).await
         {
-            tracing::warn!(%error, "the bytes of a body are not counted");
+            tracing::warn!(%error, "the bytes of a request body could not be counted");
         }
     }
 }
@@ -112,7 +112,7 @@ fn requests(key: &ApiKey) -> TokenRequest {
     })
 }
 
-/// A body may be larger than what is left: then there is less than nothing for a while.
+/// A body may be larger than what remains: the bucket then goes below zero.
 fn bytes(key: &ApiKey, required: f64, amount: f64) -> TokenRequest {
     let bytes = |limit| TokenRequest { per_minute: limit as f64, required, amount };
     key.limits.bytes_per_minute.map_or(TokenRequest::UNLIMITED, bytes)
@@ -122,7 +122,7 @@ fn allowance(limit: f64, left: f64) -> Allowance {
     let missing = (limit - left) / limit;
     Allowance {
         limit: limit as u64,
-        // As a draw rounds.
+        // Rounded as the buckets round.
         remaining: (left.max(0.0) + 1e-3) as u64,
         reset: WINDOW.mul_f64(missing.max(0.0)),
     }

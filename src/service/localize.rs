@@ -1,4 +1,4 @@
-//! Localize a frame: extract, search, answer, and queue its refinement.
+//! Localizes a frame: extracts its descriptor, searches the map, follows its track and queues its refinement.
 
 use std::time::{Duration, Instant};
 
@@ -7,8 +7,10 @@ use tracing::Instrument;
 use uuid::Uuid;
 
 use super::images::empty_body;
-use super::submit::Frame;
-use super::{SUPERSEDED, Service, ServiceError, TrackStep};
+use super::submit::{LocalizedFrame, Submission};
+use super::{
+    Jobs, Maps, RecallCheck, SUPERSEDED_RETRIES, ServiceError, Submitter, TrackStep, Tracks,
+};
 use whereabouts_api::{Answer, JobLink, RefineMode, TimingMs};
 use whereabouts_core::confidence::COMPARED;
 use whereabouts_core::{Calibration, Candidate, Digest, Estimate, Map, MapName, Priority};
@@ -17,47 +19,72 @@ use whereabouts_store::StoreError;
 use whereabouts_telemetry::traces;
 use whereabouts_vision::{AdmissionRequest, Extraction, FeatureSet, WorkClass};
 
-/// When a caller no longer wants the answer, if it said so.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Deadline(pub Option<Instant>);
-
 /// A frame to localize.
 #[derive(Debug)]
 pub struct LocalizeRequest {
-    /// In which map.
+    /// The map to search.
     pub map: MapName,
-    /// How many candidates to answer; by default the configured number.
+    /// Number of candidates in the answer; the configured number by default.
     pub k: Option<usize>,
-    /// What becomes of them.
+    /// Whether the candidates are refined, and whether the caller waits for it.
     pub refine: RefineMode,
-    /// How soon a job refines them.
+    /// The priority of the refinement job.
     pub priority: Priority,
     /// The bytes of the frame: JPEG, PNG or WebP.
     pub frame: Bytes,
-    /// When the caller no longer wants the answer.
+    /// Time after which the caller no longer wants the answer.
     pub deadline: Option<Instant>,
-    /// Which track the frame belongs to, if any.
+    /// The track that the frame belongs to, if any.
     pub track: Option<TrackStep>,
-    /// The id of the request, if it is done once however often it comes ([`Service::begin_once`]).
+    /// The id of a request with an idempotency key ([`Idempotency`](super::Idempotency)).
     pub once: Option<String>,
 }
 
-/// What the coarse retriever found for a frame.
+/// The result of coarse retrieval for a frame.
 #[derive(Debug)]
 pub struct Retrieved {
-    /// The map, as it was searched.
+    /// The map as it was searched.
     pub map: Map,
     /// The identity of the model.
     pub model: Digest,
     /// The most similar images, best first.
     pub candidates: Vec<Candidate>,
-    /// What was extracted from the frame.
+    /// The descriptor and dense features of the frame.
     pub extraction: Extraction,
-    /// How long the search took.
+    /// Duration of the search.
     pub searched: Duration,
 }
 
-impl Service {
+/// Bounds and defaults of localization.
+#[derive(Debug, Clone, Copy)]
+pub struct LocalizeSettings {
+    /// Default number of candidates in an answer.
+    pub k: usize,
+    /// Maximum number of candidates in an answer.
+    pub max_k: usize,
+    /// Number of candidates that a job compares.
+    pub compared: usize,
+    /// Minimum confidence of a known place.
+    pub known_confidence: f64,
+}
+
+/// Localizes frames: coarse retrieval, tracks, and the jobs that refine the answers.
+pub struct Localizer {
+    /// The maps.
+    pub maps: Maps,
+    /// The tracks of robots.
+    pub tracks: Tracks,
+    /// Queues refinement jobs.
+    pub submitter: Submitter,
+    /// Waits for refinement jobs.
+    pub jobs: Jobs,
+    /// Compares a sample of the searches with exact search.
+    pub recall: RecallCheck,
+    /// Bounds and defaults.
+    pub settings: LocalizeSettings,
+}
+
+impl Localizer {
     /// Answers with the most similar images and queues their refinement.
     pub async fn localize(&self, request: LocalizeRequest) -> Result<Answer, ServiceError> {
         let start = Instant::now();
@@ -65,32 +92,32 @@ impl Service {
         if request.frame.is_empty() {
             return Err(empty_body());
         }
-        let refined = request.refine != RefineMode::Off && self.refiner.is_some();
+        let is_refined = request.refine != RefineMode::Off && self.submitter.refiner.is_some();
         if request.refine == RefineMode::Wait {
-            // Before any work is done.
-            self.check_submission().await?;
+            // Rejected before any work is done.
+            self.submitter.check_capacity().await?;
         }
-        let demand = AdmissionRequest { class: WorkClass::Localize, deadline: request.deadline };
-        let compared = if refined { self.settings.candidates } else { 0 };
-        let followed = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
-        let wanted = k.max(compared).max(COMPARED).max(followed);
+        let admission = AdmissionRequest { class: WorkClass::Localize, deadline: request.deadline };
+        let compared = if is_refined { self.settings.compared } else { 0 };
+        let tracked = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
+        let retrieved = k.max(compared).max(COMPARED).max(tracked);
         let features =
-            if refined { FeatureSet::DescriptorAndDense } else { FeatureSet::DescriptorOnly };
-        let search = (wanted, SearchMode::Fast);
+            if is_refined { FeatureSet::DescriptorAndDense } else { FeatureSet::DescriptorOnly };
+        let search = (retrieved, SearchMode::Fast);
         let Retrieved { map, model, extraction, mut candidates, searched } =
-            self.retrieve(&request.map, &request.frame, search, features, demand).await?;
+            self.retrieve(&request.map, &request.frame, search, features, admission).await?;
 
-        let calibration = self.maps.calibration(&map).await?.unwrap_or_default();
+        let calibration = self.maps.store.calibration(&map).await?.unwrap_or_default();
         let track = match request.track {
-            Some(step) => Some(self.follow(&map, step, &candidates, &calibration).await?),
+            Some(step) => Some(self.tracks.follow(&map, step, &candidates, &calibration).await?),
             None => None,
         };
         let query_id = Uuid::now_v7();
         let (mut job, no_job) = if request.refine == RefineMode::Off {
             (None, None)
         } else {
-            let compared = candidates.iter().take(self.settings.candidates).cloned().collect();
-            let frame = Frame {
+            let compared = candidates.iter().take(self.settings.compared).cloned().collect();
+            let frame = LocalizedFrame {
                 query_id,
                 bytes: request.frame,
                 model,
@@ -99,14 +126,16 @@ impl Service {
                 descriptor: extraction.descriptor,
                 dense: extraction.dense,
             };
-            let once = request.once.as_deref();
-            let submit = self.submit(&map, frame, compared, request.priority, once);
+            let id = request.once.as_deref();
+            let submit = self.submitter.submit(&map, frame, compared, request.priority, id);
             match submit.instrument(traces::stage("submit")).await? {
-                Ok(job) => (Some(job), None),
-                Err(why) if request.refine == RefineMode::Wait && why.is_shedding() => {
-                    return Err(self.refuse_job(&why));
+                Submission::Queued(job) => (Some(job), None),
+                Submission::Declined(why)
+                    if request.refine == RefineMode::Wait && why.is_shedding() =>
+                {
+                    return Err(self.submitter.rejection(&why));
                 }
-                Err(why) => (None, Some(why)),
+                Submission::Declined(why) => (None, Some(why)),
             }
         };
         let mut estimate = self.estimate(&candidates, &calibration);
@@ -114,8 +143,8 @@ impl Service {
         if request.refine == RefineMode::Wait
             && let Some(queued) = &mut job
         {
-            let longest = Self::time_left(self.settings.max_wait, request.deadline);
-            *queued = self.wait_for(queued.id, longest).await?;
+            let longest = time_left(self.jobs.max_wait, request.deadline);
+            *queued = self.jobs.wait_for(queued.id, longest).await?;
             estimate = queued.estimate.clone().or(estimate);
         }
         let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
@@ -141,33 +170,40 @@ impl Service {
         })
     }
 
-    /// The coarse retriever: the `k` images of a map that look most like a frame, by the model that
-    /// the map's descriptors are of.
+    /// Coarse retrieval: the `k` images of a map that are most similar to a frame, by the model that made the
+    /// descriptors of the map.
     pub async fn retrieve(
         &self,
         map: &MapName,
         frame: &Bytes,
         (k, mode): (usize, SearchMode),
         features: FeatureSet,
-        demand: AdmissionRequest,
+        admission: AdmissionRequest,
     ) -> Result<Retrieved, ServiceError> {
-        let mut left = SUPERSEDED;
+        let mut retries = SUPERSEDED_RETRIES;
         loop {
-            let (map, extractor) = self.usable_map(map).await?;
+            let (map, extractor) = self.maps.usable(map).await?;
             let (frame, kind) = (frame.clone(), map.descriptor);
-            let extracting = self.extract(&extractor, frame, kind, features, demand);
+            let extracting =
+                self.maps.imaging.extract(&extractor, frame, kind, features, admission);
             let extraction = extracting.instrument(traces::stage("extract")).await?;
-            self.metrics.observe_extraction(&extraction);
+            self.maps.imaging.metrics.observe_extraction(&extraction);
             let searching = Instant::now();
-            let search = self.maps.search(&map, extraction.descriptor.clone(), k, mode);
+            let search = self.maps.store.search(&map, extraction.descriptor.clone(), k, mode);
             match search.instrument(traces::stage("search")).await {
-                // The frame's descriptor is of the model that the map had a moment ago.
-                Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
+                // A reindex ended meanwhile: the frame's descriptor is of the model before it.
+                Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
                 found => {
                     let (candidates, searched) = (found?, searching.elapsed());
-                    self.metrics.observe_search(searched);
+                    self.maps.imaging.metrics.observe_search(searched);
                     if mode == SearchMode::Fast {
-                        self.check_search(&map, &extraction.descriptor, &candidates);
+                        self.recall.check(
+                            &self.maps.store,
+                            &self.maps.imaging.metrics,
+                            &map,
+                            &extraction.descriptor,
+                            &candidates,
+                        );
                     }
                     let model = extractor.identity();
                     return Ok(Retrieved { map, model, extraction, candidates, searched });
@@ -187,11 +223,20 @@ impl Service {
         )))
     }
 
-    /// The first candidate, and how sure it is.
+    /// The estimate by coarse retrieval alone: the first candidate with its confidence.
     fn estimate(&self, candidates: &[Candidate], calibration: &Calibration) -> Option<Estimate> {
         let first = candidates.first()?;
         let confidence = calibration.refined_confidence(candidates, &first.image_id, None);
-        let known_from = self.settings.known_confidence;
-        Some(Estimate::new(&first.image_id, first.pose, confidence, known_from))
+        let min_known = self.settings.known_confidence;
+        Some(Estimate::new(&first.image_id, first.pose, confidence, min_known))
     }
+}
+
+/// The time that a caller's deadline leaves for waiting, at most `longest`.
+fn time_left(longest: Duration, deadline: Option<Instant>) -> Duration {
+    deadline.map_or(longest, |deadline| {
+        let left = deadline.saturating_duration_since(Instant::now());
+        // A tenth is kept to build and send the answer.
+        longest.min(left * 9 / 10)
+    })
 }

@@ -1,17 +1,30 @@
-//! Maps: create, change, list, remove.
+//! Maps: create, change, list and delete. Their images are for `images`, new descriptors for `reindex`.
+
+use std::sync::Arc;
 
 use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::models::dimension;
-use super::{SUPERSEDED, Service, ServiceError};
+use super::{Imaging, Reindexes, SUPERSEDED_RETRIES, ServiceError};
 use whereabouts_api::{CalibrationState, ErrorKind, IndexKind, MapChange, MapState};
 use whereabouts_core::{Map, MapName};
-use whereabouts_store::{IndexState, StoreError};
+use whereabouts_store::{IndexState, MapStore, StoreError};
 
-impl Service {
-    /// Creates a map or changes it; also says whether it is new.
-    pub async fn put_map(
+/// Maps: create, change, list and delete. Clones share the store.
+#[derive(Clone)]
+pub struct Maps {
+    /// Maps, images and descriptors.
+    pub store: Arc<dyn MapStore>,
+    /// Models and the threads that run them.
+    pub imaging: Imaging,
+    /// The state of the last reindex of each map.
+    pub reindexes: Arc<Reindexes>,
+}
+
+impl Maps {
+    /// Creates or changes a map. Returns its state, and whether it is new.
+    pub async fn put(
         &self,
         name: MapName,
         change: MapChange,
@@ -19,13 +32,13 @@ impl Service {
         if change.description.as_ref().is_some_and(|text| text.chars().count() > 2000) {
             return Err(ServiceError::unprocessable("the description exceeds 2,000 characters"));
         }
-        let mut left = SUPERSEDED;
+        let mut retries = SUPERSEDED_RETRIES;
         loop {
-            let known = self.maps.map(&name).await?;
-            let wanted = self.changed(&name, &change, known).await?;
-            match self.maps.put_map(wanted).await {
-                // It was reindexed since it was looked up.
-                Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
+            let known = self.store.map(&name).await?;
+            let map = self.changed(&name, &change, known).await?;
+            match self.store.put_map(map).await {
+                // It was reindexed since it was read.
+                Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
                 put => {
                     let (map, new) = put?;
                     return Ok((self.state_of(&map.name).await?, new));
@@ -34,7 +47,7 @@ impl Service {
         }
     }
 
-    /// The map as a change wants it.
+    /// Applies a change to a map, or to the defaults if the map is new.
     async fn changed(
         &self,
         name: &MapName,
@@ -43,18 +56,18 @@ impl Service {
     ) -> Result<Map, ServiceError> {
         let known = known.as_ref();
         let model = change.model.as_deref().or(known.map(|map| map.model.as_str()));
-        let model = model.unwrap_or(self.models.default_model());
+        let model = model.unwrap_or(self.imaging.models.default_model());
         let descriptor = change.descriptor.or(known.map(|map| map.descriptor)).unwrap_or_default();
         let (model_digest, precision, dim) = match known {
-            // Those of its images, whatever is installed by now.
+            // The images keep the model that made their descriptors, whatever is installed now.
             Some(map)
                 if (map.model.as_str(), map.descriptor) == (model, descriptor)
-                    && self.maps.index_state(map).await?.images > 0 =>
+                    && self.store.index_state(map).await?.images > 0 =>
             {
                 (map.model_digest, map.precision, map.dim)
             }
             _ => {
-                let extractor = self.installed_model(model).await?;
+                let extractor = self.imaging.installed_model(model).await?;
                 let dim = dimension(extractor.manifest(), descriptor)?;
                 (extractor.digest(), extractor.execution().precision, dim)
             }
@@ -78,18 +91,18 @@ impl Service {
         })
     }
 
-    /// One map.
-    pub async fn get_map(&self, name: &MapName) -> Result<MapState, ServiceError> {
+    /// Returns the state of a map.
+    pub async fn get(&self, name: &MapName) -> Result<MapState, ServiceError> {
         self.state_of(name).await
     }
 
-    /// All maps, by name.
-    pub async fn list_maps(&self) -> Result<Vec<MapState>, ServiceError> {
+    /// Returns the states of all maps, by name.
+    pub async fn list(&self) -> Result<Vec<MapState>, ServiceError> {
         let mut states = Vec::new();
-        for map in self.maps.maps().await? {
+        for map in self.store.maps().await? {
             match self.state_of(&map.name).await {
                 Ok(state) => states.push(state),
-                // Removed since it was listed.
+                // Deleted since it was listed.
                 Err(error) if error.kind == ErrorKind::NotFound => {}
                 Err(error) => return Err(error),
             }
@@ -97,10 +110,10 @@ impl Service {
         Ok(states)
     }
 
-    /// Removes a map with all its images.
-    pub async fn delete_map(&self, name: &MapName) -> Result<(), ServiceError> {
-        let map = self.known_map(name).await?;
-        match self.maps.delete_map(name).await? {
+    /// Deletes a map with all its images.
+    pub async fn delete(&self, name: &MapName) -> Result<(), ServiceError> {
+        let map = self.find(name).await?;
+        match self.store.delete_map(name).await? {
             true => {
                 self.reindexes.forget(map.uid);
                 Ok(())
@@ -109,16 +122,16 @@ impl Service {
         }
     }
 
-    pub(super) async fn known_map(&self, name: &MapName) -> Result<Map, ServiceError> {
-        self.maps.map(name).await?.ok_or_else(|| no_map(name))
+    pub(crate) async fn find(&self, name: &MapName) -> Result<Map, ServiceError> {
+        self.store.map(name).await?.ok_or_else(|| no_map(name))
     }
 
-    pub(super) async fn state_of(&self, name: &MapName) -> Result<MapState, ServiceError> {
-        let reindex = self.reindexes.of(self.known_map(name).await?.uid);
-        // Looked up after that: when a reindex has succeeded, the map shows it.
-        let map = self.known_map(name).await?;
-        let IndexState { images, graph, behind, .. } = self.maps.index_state(&map).await?;
-        let calibration = self.maps.calibration(&map).await?;
+    pub(crate) async fn state_of(&self, name: &MapName) -> Result<MapState, ServiceError> {
+        let reindex = self.reindexes.get(self.find(name).await?.uid);
+        // Read again after the reindex state: if that says succeeded, the map has the new model.
+        let map = self.find(name).await?;
+        let IndexState { images, graph, behind, .. } = self.store.index_state(&map).await?;
+        let calibration = self.store.calibration(&map).await?;
         let index = match (graph, behind) {
             (false, _) => IndexKind::Exact,
             (true, true) => IndexKind::Building,

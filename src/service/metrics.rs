@@ -1,4 +1,4 @@
-//! Metric families of the use cases: stages of localization, checked searches, retention and webhooks.
+//! Metric families of the use cases: stages of localization, recall checks, retention and webhooks.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -27,14 +27,14 @@ pub struct ServiceMetrics {
     webhook_attempts: Family<OutcomeLabels, Counter>,
 }
 
-/// What came of an attempt to deliver a message.
+/// The outcome of an attempt to deliver a message to a webhook.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AttemptOutcome {
-    /// It was taken.
+    /// The receiver accepted it.
     Delivered,
-    /// It is tried again.
+    /// It will be retried.
     Failed,
-    /// It is given up.
+    /// It will not be retried.
     Dead,
 }
 
@@ -60,7 +60,7 @@ struct OutcomeLabels {
 }
 
 impl ServiceMetrics {
-    /// Registers the families; all counts are zero.
+    /// Registers the families.
     pub fn register(registry: &mut Registry, refusals: Arc<Rejections>) -> Self {
         Self {
             refusals,
@@ -73,21 +73,21 @@ impl ServiceMetrics {
             batch_pictures: register(
                 registry,
                 "batch_pictures",
-                "Pictures that the model was run on together, counted for each picture",
+                "Size of the inference batch of each picture",
                 Histogram::new(exponential_buckets(1.0, 2.0, 7)),
             ),
             neighbours_checked: register(
                 registry,
                 "neighbours_checked",
-                "Nearest images, by exact search, of frames whose search was checked: whether the index had \
-                 found them (index.check_s)",
+                "Nearest images by exact search of the frames whose search was checked (index.check_s), by \
+                 whether the index had found them",
                 Family::default(),
             ),
             submitted_jobs: register(registry, "jobs_submitted", "Jobs queued", Counter::default()),
             removed_jobs: register(
                 registry,
                 "jobs_removed",
-                "Ended jobs that were removed, because of their age or of their number (count)",
+                "Ended jobs that were removed, by reason: their age, or their number (count)",
                 Family::default(),
             ),
             removed_frame_bytes: register(
@@ -99,14 +99,14 @@ impl ServiceMetrics {
             webhook_attempts: register(
                 registry,
                 "webhook_attempts",
-                "Attempts to deliver a message to a webhook: delivered, failed (it is tried again) or dead \
-                 (it is given up)",
+                "Attempts to deliver a message to a webhook: delivered, failed (will be retried) or dead \
+                 (will not be retried)",
                 Family::default(),
             ),
         }
     }
 
-    /// Counts one extraction.
+    /// Observes the stages of an extraction.
     pub fn observe_extraction(&self, extraction: &Extraction) {
         self.batch_pictures.observe(extraction.batch as f64);
         let times = extraction.times;
@@ -115,13 +115,13 @@ impl ServiceMetrics {
         }
     }
 
-    /// Counts a search.
+    /// Observes the duration of a search.
     pub fn observe_search(&self, took: Duration) {
         let stage = StageLabels { stage: "search" };
         self.stage_seconds.get_or_create(&stage).observe(took.as_secs_f64());
     }
 
-    /// Counts the nearest images of a frame whose search was checked, and those of them that it had found.
+    /// Counts the nearest images of a frame whose search was checked, and how many of them it had found.
     pub fn search_checked(&self, map: &str, nearest: usize, found: usize) {
         for (word, count) in [("yes", found), ("no", nearest.saturating_sub(found))] {
             let labels = CheckLabels { map: map.to_owned(), found: word };
@@ -134,7 +134,7 @@ impl ServiceMetrics {
         self.submitted_jobs.inc();
     }
 
-    /// Counts jobs that had their time.
+    /// Counts jobs that the janitor removed.
     pub fn jobs_removed(&self, removed: &RemovedJobs) {
         for (why, jobs) in [("age", removed.by_age), ("count", removed.by_count)] {
             self.removed_jobs.get_or_create(&RemovedLabels { why }).inc_by(jobs as u64);

@@ -1,25 +1,27 @@
-//! Which model makes the descriptors of a map.
+//! The model that a map needs, and errors that tell the caller what to do if it cannot be used.
 
 use std::sync::Arc;
 
-use super::{Service, ServiceError};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::{DescriptorKind, Map, MapName};
 use whereabouts_vision::{Extractor, Manifest, ModelError};
 
-impl Service {
-    /// The map, and the very model that made its descriptors.
-    pub(super) async fn usable_map(
+use super::{Maps, ServiceError};
+
+impl Maps {
+    /// Returns a map with the model that made its descriptors; a conflict if that model is not installed, or
+    /// only another version or precision of it.
+    pub(crate) async fn usable(
         &self,
         name: &MapName,
     ) -> Result<(Map, Arc<Extractor>), ServiceError> {
-        let map = self.known_map(name).await?;
-        let extractor = self.models.of(&map).await.map_err(|error| match error {
+        let map = self.find(name).await?;
+        let extractor = self.imaging.models.of(&map).await.map_err(|error| match error {
             ModelError::NotInstalled(_) => ServiceError::new(
                 ErrorKind::Conflict,
                 format!(
                     "the map {name} needs the model {:?}, which is not installed on the server; \
-                     install it there ({}), or have another model make its descriptors anew ({})",
+                     install it there ({}), or reindex the map with another model ({})",
                     map.model,
                     how_to_install(&map.model),
                     how_to_reindex(name, "NAME"),
@@ -27,36 +29,14 @@ impl Service {
             ),
             error => unusable(&map.model, error),
         })?;
-        match validate(&map, &extractor) {
+        match mismatch(&map, &extractor) {
             Some(detail) => Err(ServiceError::new(ErrorKind::Conflict, detail)),
             None => Ok((map, extractor)),
         }
     }
-
-    /// A model as it is installed, for descriptors yet to be made: at the precision that the
-    /// settings say, else at that of the maps which have it already.
-    pub async fn installed_model(&self, name: &str) -> Result<Arc<Extractor>, ServiceError> {
-        let precision = match self.models.precision() {
-            Some(precision) => Some(precision),
-            None => {
-                let maps = self.maps.maps().await?;
-                maps.iter().find(|map| map.model == name).map(|map| map.precision)
-            }
-        };
-        self.models.installed(name, precision).await.map_err(|error| unusable(name, error))
-    }
-
-    /// What an installed model says about itself.
-    pub(super) async fn manifest(&self, name: &str) -> Result<Manifest, ServiceError> {
-        let (models, wanted) = (self.models.clone(), name.to_owned());
-        tokio::task::spawn_blocking(move || models.manifest(&wanted))
-            .await
-            .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))?
-            .map_err(|error| unusable(name, error))
-    }
 }
 
-/// Numbers in a descriptor of that kind.
+/// The dimension of a descriptor of that kind.
 pub(super) fn dimension(manifest: &Manifest, kind: DescriptorKind) -> Result<usize, ServiceError> {
     manifest.dimension(kind).ok_or_else(|| {
         ServiceError::unprocessable(format!(
@@ -66,8 +46,8 @@ pub(super) fn dimension(manifest: &Manifest, kind: DescriptorKind) -> Result<usi
     })
 }
 
-/// Why the model in memory cannot serve the map, if it cannot.
-fn validate(map: &Map, extractor: &Extractor) -> Option<String> {
+/// Explains why the loaded model cannot serve the map; `None` if it can.
+fn mismatch(map: &Map, extractor: &Extractor) -> Option<String> {
     if extractor.is_of(map) {
         return None;
     }
@@ -76,22 +56,22 @@ fn validate(map: &Map, extractor: &Extractor) -> Option<String> {
     Some(if digest != map.model_digest {
         format!(
             "the map {name} was indexed with the model {model:?} of {}, but the one installed is \
-             {digest}; install the former again, or make the descriptors anew: {reindex}",
+             {digest}; install the former again, or reindex the map: {reindex}",
             map.model_digest
         )
     } else {
         format!(
             "the map {name} was indexed at {} precision, but the server runs the model at \
-             {precision} precision; start it with model.precision = {:?}, or make the descriptors \
-             anew: {reindex}",
+             {precision} precision; start it with model.precision = {:?}, or reindex the map: \
+             {reindex}",
             map.precision,
             map.precision.as_str()
         )
     })
 }
 
-/// A model that was named and cannot be used.
-fn unusable(name: &str, error: ModelError) -> ServiceError {
+/// The error for a model that a caller named and that cannot be used.
+pub(super) fn unusable(name: &str, error: ModelError) -> ServiceError {
     match error {
         ModelError::NotInstalled(_) => ServiceError::unprocessable(format!(
             "the model {name:?} is not installed on the server; install it there ({}), or name one \

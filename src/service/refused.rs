@@ -1,4 +1,4 @@
-//! Reasons for which something is refused, as metrics name them.
+//! Reasons for rejections, and the metric that counts them. The server counts into it too.
 
 use prometheus_client::encoding::EncodeLabelSet;
 use prometheus_client::metrics::counter::Counter;
@@ -6,29 +6,29 @@ use prometheus_client::metrics::family::Family;
 use whereabouts_telemetry::metrics::{Registry, register};
 use whereabouts_vision::RejectReason;
 
-/// Why a request, a part of one or a connection was refused.
+/// Why a request, a job or a connection was rejected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Rejection {
-    /// As many pictures wait for a permit as may.
+    /// The admission queue is full.
     Queue,
-    /// A picture would have waited for too long, or has.
+    /// A picture waited too long for admission, or would have.
     Wait,
-    /// The answer would come after the caller's deadline, or it passed meanwhile.
+    /// The caller's deadline passed, or would have before the answer.
     Deadline,
     /// A frame was answered without a job.
     Jobs,
-    /// As many requests are in progress as may be.
+    /// Too many requests are in progress.
     Requests,
-    /// Bodies take as much memory as they may.
+    /// The memory budget for bodies is used up.
     Bodies,
-    /// A head or a body came too slowly.
+    /// A request head or body arrived too slowly.
     Slow,
-    /// As many connections are open as may be.
+    /// Too many connections are open.
     Connections,
 }
 
 impl Rejection {
-    /// Its label.
+    /// The value of the metric label.
     fn as_str(self) -> &'static str {
         match self {
             Self::Queue => "queue",
@@ -44,8 +44,8 @@ impl Rejection {
 }
 
 impl From<RejectReason> for Rejection {
-    fn from(refusal: RejectReason) -> Self {
-        match refusal {
+    fn from(reason: RejectReason) -> Self {
+        match reason {
             RejectReason::QueueFull => Self::Queue,
             RejectReason::WaitTooLong => Self::Wait,
             RejectReason::DeadlineTooSoon => Self::Deadline,
@@ -54,13 +54,13 @@ impl From<RejectReason> for Rejection {
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
-struct RefusedLabels {
+struct RejectionLabels {
     reason: &'static str,
 }
 
 /// The metric family of rejections, shared by the service and the server.
 #[derive(Debug)]
-pub struct Rejections(Family<RefusedLabels, Counter>);
+pub struct Rejections(Family<RejectionLabels, Counter>);
 
 impl Rejections {
     /// Registers the family.
@@ -68,13 +68,13 @@ impl Rejections {
         Self(register(
             registry,
             "refused",
-            "Requests, jobs and connections that were refused or broken off, by reason",
+            "Requests, jobs and connections that were rejected or aborted, by reason",
             Family::default(),
         ))
     }
 
     /// Counts one rejection.
     pub fn count(&self, reason: Rejection) {
-        self.0.get_or_create(&RefusedLabels { reason: reason.as_str() }).inc();
+        self.0.get_or_create(&RejectionLabels { reason: reason.as_str() }).inc();
     }
 }

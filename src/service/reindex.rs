@@ -1,4 +1,5 @@
-//! New descriptors for a whole map, by another model, while the old ones serve.
+//! Reindexing: computes new descriptors for a whole map, while the old ones answer searches. The switch to the
+//! new ones is one step of the store.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,35 +11,35 @@ use tokio::sync::Semaphore;
 use uuid::Uuid;
 
 use super::models::dimension;
-use super::{Service, ServiceError};
+use super::{Maps, ServiceError};
 use whereabouts_api::{ErrorKind, MapState, Reindex, ReindexRequest, ReindexState};
 use whereabouts_core::{Descriptor, DescriptorKind, Image, Map, MapName};
-use whereabouts_store::Draft;
+use whereabouts_store::{BlobStore, Draft, DraftStore};
 use whereabouts_vision::{AdmissionRequest, Extractor, FeatureSet};
 
-/// Images that are looked up at a time.
+/// Images that are read at a time.
 const PAGE: usize = 256;
 
-/// The pause while there is none.
-const PAUSE: Duration = Duration::from_millis(50);
+/// Pause between two attempts to load the model while all loaded models are in use.
+const LOAD_RETRY_PAUSE: Duration = Duration::from_millis(50);
 
-/// The last reindex of every map.
+/// The state of the last reindex of each map, in memory.
 #[derive(Debug)]
 pub struct Reindexes {
     /// By the uid of the map.
     known: Mutex<BTreeMap<Uuid, Reindex>>,
-    /// One image of all maps at a time: robots wait for the same sessions.
-    turn: Semaphore,
+    /// Limits reindexing to one image at a time over all maps, because it shares the model with robots.
+    extraction: Semaphore,
 }
 
 impl Default for Reindexes {
     fn default() -> Self {
-        Self { known: Mutex::default(), turn: Semaphore::new(1) }
+        Self { known: Mutex::default(), extraction: Semaphore::new(1) }
     }
 }
 
 impl Reindexes {
-    pub(super) fn of(&self, map_uid: Uuid) -> Option<Reindex> {
+    pub(super) fn get(&self, map_uid: Uuid) -> Option<Reindex> {
         self.known().get(&map_uid).cloned()
     }
 
@@ -46,12 +47,12 @@ impl Reindexes {
         self.known().remove(&map_uid);
     }
 
-    /// Begins one, unless one goes on.
+    /// Records the start of a reindex; a conflict if one of the same map is running.
     fn begin(&self, map: &Map, reindex: Reindex) -> Result<(), ServiceError> {
         let mut known = self.known();
         if known.get(&map.uid).is_some_and(|known| known.state == ReindexState::Running) {
             let detail = format!(
-                "the map {} is being reindexed; GET /maps/{} says how far that has come",
+                "the map {} is being reindexed; GET /maps/{} shows its progress",
                 map.name, map.name
             );
             return Err(ServiceError::new(ErrorKind::Conflict, detail));
@@ -83,49 +84,61 @@ impl Reindexes {
     }
 }
 
-impl Service {
-    /// Begins to make all descriptors of a map anew, and answers at once.
-    pub async fn reindex(
-        self: &Arc<Self>,
+/// Recomputes all descriptors of a map with another model, or with its own as it is installed now. Clones share
+/// the state.
+#[derive(Clone)]
+pub struct Reindexer {
+    /// The maps.
+    pub maps: Maps,
+    /// Drafts of new descriptors.
+    pub drafts: Arc<dyn DraftStore>,
+    /// The bytes of the images.
+    pub blobs: Arc<dyn BlobStore>,
+}
+
+impl Reindexer {
+    /// Starts a reindex in the background and returns the state of the map.
+    pub async fn start(
+        &self,
         name: &MapName,
         request: ReindexRequest,
     ) -> Result<MapState, ServiceError> {
-        let map = self.known_map(name).await?;
+        let map = self.maps.find(name).await?;
         let model = request.model.unwrap_or_else(|| map.model.clone());
         let descriptor = request.descriptor.unwrap_or(map.descriptor);
-        dimension(&self.manifest(&model).await?, descriptor)?;
+        dimension(&self.maps.imaging.manifest(&model).await?, descriptor)?;
         let begun = Reindex {
             model: model.clone(),
             descriptor,
             state: ReindexState::Running,
             done: 0,
-            total: self.maps.index_state(&map).await?.images,
+            total: self.maps.store.index_state(&map).await?.images,
             error: None,
             started_at: Timestamp::now(),
             finished_at: None,
         };
-        self.reindexes.begin(&map, begun)?;
+        self.maps.reindexes.begin(&map, begun)?;
         tracing::info!(map = %name, from = map.model, to = model, "reindexing");
-        let (service, name) = (Arc::clone(self), name.clone());
-        let state = self.state_of(&name).await;
+        let (reindexer, name) = (self.clone(), name.clone());
+        let state = self.maps.state_of(&name).await;
         tokio::spawn(async move {
-            let outcome = service.make_anew(&map, &model, descriptor).await;
-            match &outcome {
+            let result = reindexer.run(&map, &model, descriptor).await;
+            match &result {
                 Ok(()) => tracing::info!(map = %name, model, "reindexed"),
-                Err(error) => tracing::warn!(map = %name, model, %error, "not reindexed"),
+                Err(error) => tracing::warn!(map = %name, model, %error, "reindexing failed"),
             }
-            service.reindexes.end(map.uid, outcome.err().map(|error| error.detail));
+            reindexer.maps.reindexes.end(map.uid, result.err().map(|error| error.detail));
         });
         state
     }
 
-    async fn make_anew(
+    async fn run(
         &self,
         map: &Map,
         model: &str,
         descriptor: DescriptorKind,
     ) -> Result<(), ServiceError> {
-        let extractor = patiently(|| self.installed_model(model)).await?;
+        let extractor = retry_while_overloaded(|| self.maps.imaging.installed_model(model)).await?;
         let next = Map {
             model: model.to_owned(),
             model_digest: extractor.digest(),
@@ -156,18 +169,18 @@ impl Service {
                 return Ok(());
             }
             for image in missing {
-                let made = self.descriptor_anew(map, &image, extractor, descriptor).await?;
-                if let Some(made) = made {
-                    draft.write(&image, made).await?;
-                    let images = self.maps.index_state(map).await?.images;
-                    self.reindexes.step(map.uid, images);
+                let extracted = self.new_descriptor(map, &image, extractor, descriptor).await?;
+                if let Some(extracted) = extracted {
+                    draft.write(&image, extracted).await?;
+                    let images = self.maps.store.index_state(map).await?.images;
+                    self.maps.reindexes.step(map.uid, images);
                 }
             }
         }
     }
 
-    /// The new descriptor of an image; `None` if it was removed meanwhile.
-    async fn descriptor_anew(
+    /// Extracts the new descriptor of an image; `None` if the image was deleted meanwhile.
+    async fn new_descriptor(
         &self,
         map: &Map,
         image: &Image,
@@ -175,39 +188,40 @@ impl Service {
         descriptor: DescriptorKind,
     ) -> Result<Option<Descriptor>, ServiceError> {
         let Some(bytes) = self.blobs.blob(&image.digest).await? else {
-            return match self.maps.image(map, &image.id).await? {
-                Some(still) if still.digest == image.digest => {
-                    Err(left_behind(image, "its bytes are missing from the store"))
+            return match self.maps.store.image(map, &image.id).await? {
+                Some(current) if current.digest == image.digest => {
+                    Err(cannot_reindex(image, "its bytes are missing from the store"))
                 }
                 _ => Ok(None),
             };
         };
-        let _turn = self.reindexes.turn.acquire().await;
-        // It waits for as long as anybody else does.
-        let (features, demand) = (FeatureSet::DescriptorOnly, AdmissionRequest::BACKGROUND);
-        match self.extract(extractor, bytes, descriptor, features, demand).await {
+        let _permit = self.maps.reindexes.extraction.acquire().await;
+        let (features, request) = (FeatureSet::DescriptorOnly, AdmissionRequest::BACKGROUND);
+        match self.maps.imaging.extract(extractor, bytes, descriptor, features, request).await {
             Ok(extraction) => Ok(Some(extraction.descriptor)),
-            Err(error) => Err(left_behind(image, &error.detail)),
+            Err(error) => Err(cannot_reindex(image, &error.detail)),
         }
     }
 }
 
-/// Does it as soon as there is room among the models in memory.
-async fn patiently<T, F>(work: impl Fn() -> F) -> Result<T, ServiceError>
+/// Repeats `work` while it is overloaded: while all loaded models are in use.
+async fn retry_while_overloaded<T, F>(work: impl Fn() -> F) -> Result<T, ServiceError>
 where
     F: Future<Output = Result<T, ServiceError>>,
 {
     loop {
         match work().await {
-            Err(error) if error.kind == ErrorKind::Overloaded => tokio::time::sleep(PAUSE).await,
+            Err(error) if error.kind == ErrorKind::Overloaded => {
+                tokio::time::sleep(LOAD_RETRY_PAUSE).await
+            }
             ended => return ended,
         }
     }
 }
 
-fn left_behind(image: &Image, why: &str) -> ServiceError {
+fn cannot_reindex(image: &Image, why: &str) -> ServiceError {
     ServiceError::unprocessable(format!(
-        "the image {:?} cannot get a new descriptor: {why}; delete it, or put that right, and \
+        "the image {:?} cannot get a new descriptor: {why}; fix that or delete it, and then \
          reindex again",
         image.id.as_str()
     ))

@@ -1,4 +1,5 @@
-//! Forgetting, in the background, what has had its time.
+//! Retention: removes old jobs, usage and idempotency records in the background. Deliveries of webhooks are
+//! removed by their dispatcher.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,43 +12,43 @@ use crate::ServiceMetrics;
 use whereabouts_core::utc_day;
 use whereabouts_store::{IdempotencyStore, JobRetention, RemovedJobs, Retention, StoreError};
 
-/// How long what is kept, and how it is removed.
+/// Retention periods, and the pace of removal.
 #[derive(Debug, Clone, Copy)]
 pub struct RetentionSettings {
-    /// How long a job is kept after it has ended; `None`: for ever.
+    /// How long a job is kept after it has ended; `None` for no limit.
     pub keep: Option<Duration>,
-    /// The most jobs that have ended; `None`: any number.
+    /// Maximum number of jobs that have ended; `None` for no limit.
     pub most: Option<usize>,
-    /// Kept in any case for so long, so that whoever waits for a job sees its end.
+    /// Minimum time that a job is kept after it has ended, so that callers that wait for it see its end.
     pub settle: Duration,
-    /// The pause between two looks.
+    /// Pause between two sweeps.
     pub pause: Duration,
-    /// The most jobs removed in one change.
+    /// Maximum number of jobs removed in one transaction.
     pub batch: usize,
-    /// For how many days it is known what was spent.
+    /// Retention of usage, in days.
     pub usage_days: u32,
-    /// Which answers to requests that may be sent again are kept.
+    /// Retention of responses to requests with an idempotency key.
     pub once: IdempotencySettings,
 }
 
-/// Removes jobs that have ended, with their queries and frames, and old accounts.
+/// Removes jobs that have ended, with their queries and frames, and expired usage and idempotency records.
 pub struct Janitor {
-    /// Where they are.
+    /// Jobs and usage.
     pub store: Arc<dyn Retention>,
-    /// Where answers are that may be given again.
+    /// Idempotency records.
     pub answers: Arc<dyn IdempotencyStore>,
-    /// What is counted.
+    /// Counts removed jobs and frames.
     pub metrics: Arc<ServiceMetrics>,
-    /// What is kept.
+    /// Retention periods.
     pub settings: RetentionSettings,
 }
 
 impl Janitor {
-    /// Works until `shutdown`.
+    /// Sweeps after each pause until `shutdown`.
     pub async fn run(&self, shutdown: CancellationToken) {
         while !shutdown.is_cancelled() {
-            if let Err(error) = self.look(&shutdown).await {
-                tracing::error!(%error, "what has had its time cannot be removed");
+            if let Err(error) = self.sweep(&shutdown).await {
+                tracing::error!(%error, "expired records could not be removed");
             }
             tokio::select! {
                 () = shutdown.cancelled() => {}
@@ -56,13 +57,14 @@ impl Janitor {
         }
     }
 
-    async fn look(&self, shutdown: &CancellationToken) -> Result<(), StoreError> {
+    /// Removes everything that has expired; stops between two batches at `shutdown`.
+    pub(crate) async fn sweep(&self, shutdown: &CancellationToken) -> Result<(), StoreError> {
         let now = Timestamp::now();
         let days = SignedDuration::from_hours(24 * i64::from(self.settings.usage_days));
         self.store.forget_usage(utc_day(now).saturating_sub(days)).await?;
         self.store.collect_garbage().await?;
-        let once = self.settings.once;
-        self.answers.prune_responses(once.since(now), once.most).await?;
+        let idempotency = self.settings.once;
+        self.answers.prune_responses(idempotency.since(now), idempotency.most).await?;
         let keep = JobRetention {
             since: self.settings.keep.map(|keep| before(now, keep)),
             most: self.settings.most,
@@ -85,7 +87,7 @@ impl Janitor {
     }
 }
 
-/// The moment so long before another; the epoch, if that is out of reach.
+/// The time `duration` before `now`; the epoch if that cannot be represented.
 pub(super) fn before(now: Timestamp, duration: Duration) -> Timestamp {
     let duration = SignedDuration::try_from(duration).unwrap_or(SignedDuration::MAX);
     now.saturating_sub(duration).unwrap_or(Timestamp::UNIX_EPOCH)

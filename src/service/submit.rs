@@ -1,32 +1,32 @@
-//! The job of a frame, or why it has none: jobs are given up before frames are refused.
+//! Queues the refinement job of a localized frame, or says why the frame gets none. Under load, jobs are shed
+//! before frames are rejected.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use jiff::Timestamp;
 use uuid::Uuid;
 
-use super::{Service, ServiceError};
-use crate::Rejection;
+use super::{Rejection, ServiceError, ServiceMetrics};
 use whereabouts_api::{ErrorKind, NoJob, NoJobReason};
 use whereabouts_core::{
     Candidate, DenseFeatures, Descriptor, Digest, Job, Map, MediaType, Priority,
 };
-use whereabouts_refine::DenseKey;
-use whereabouts_store::{JobRecord, Query, StoreError};
+use whereabouts_refine::{DenseCache, DenseKey, JobServiceTime, Refiner};
+use whereabouts_store::{BlobStore, JobRecord, JobStore, Query, StoreError};
 use whereabouts_telemetry::traces;
+use whereabouts_vision::Admission;
 
 fn queue_full(limit: usize) -> NoJob {
     let full = StoreError::QueueFull { limit };
     NoJob::new(NoJobReason::QueueFull, format!("{full}; post a later frame for a refinement"))
 }
 
-/// A frame that has been localized.
-pub(super) struct Frame {
+/// A frame that was localized, with what a job needs of it.
+pub(super) struct LocalizedFrame {
     pub query_id: Uuid,
     pub bytes: Bytes,
-    /// The identity of the model that looked at it.
+    /// The identity of the model that its descriptor is of.
     pub model: Digest,
     /// SHA-256 of the bytes.
     pub digest: Digest,
@@ -35,34 +35,67 @@ pub(super) struct Frame {
     pub dense: Option<DenseFeatures>,
 }
 
-impl Service {
-    /// Refuses a caller who wants nothing but the refined answer, while frames get no job.
-    pub(super) async fn check_submission(&self) -> Result<(), ServiceError> {
+/// Whether a frame got a refinement job.
+#[derive(Debug)]
+pub(super) enum Submission {
+    /// The queued job; that of an earlier attempt, if the request was sent again.
+    Queued(Job),
+    /// The frame got no job, for this reason.
+    Declined(NoJob),
+}
+
+/// Queues jobs for frames, and sheds them under load. Clones share the queue.
+#[derive(Clone)]
+pub struct Submitter {
+    /// The job queue.
+    pub jobs: Arc<dyn JobStore>,
+    /// The bytes of frames.
+    pub blobs: Arc<dyn BlobStore>,
+    /// The cache of dense features, which the job will need soon.
+    pub dense: Arc<DenseCache>,
+    /// The refiner, if one is configured.
+    pub refiner: Option<Arc<dyn Refiner>>,
+    /// Admission of images, whose queue length is the measure of load.
+    pub admission: Arc<Admission>,
+    /// The average time of a job, for `Retry-After`.
+    pub service_time: JobServiceTime,
+    /// Counts jobs and rejections.
+    pub metrics: Arc<ServiceMetrics>,
+    /// Maximum number of jobs that are queued or running.
+    pub queue: usize,
+    /// Jobs are shed while more than this share of the admission queue is in use.
+    pub shed_at: f64,
+}
+
+impl Submitter {
+    /// Rejects a caller that waits for the refined answer, if its frame would get no job now.
+    pub(super) async fn check_capacity(&self) -> Result<(), ServiceError> {
         if self.refiner.is_none() {
             return Ok(());
         }
-        self.obstacle().await?.map_or(Ok(()), |why| Err(self.refuse_job(&why)))
+        self.reason_to_shed().await?.map_or(Ok(()), |why| Err(self.rejection(&why)))
     }
 
-    /// Queues the refinement of a frame, unless something speaks against it.
+    /// Queues the refinement of a frame, or declines it. `request` is the id of a request with an idempotency key:
+    /// an attempt to process it again gets the job that the first attempt queued.
     pub(super) async fn submit(
         &self,
         map: &Map,
-        frame: Frame,
+        frame: LocalizedFrame,
         candidates: Vec<Candidate>,
         priority: Priority,
-        once: Option<&str>,
-    ) -> Result<Result<Job, NoJob>, ServiceError> {
+        request: Option<&str>,
+    ) -> Result<Submission, ServiceError> {
         let Some(refiner) = &self.refiner else {
-            let detail = "the server refines nothing (refine.refiner)";
-            return Ok(Err(NoJob::new(NoJobReason::NoRefiner, detail)));
+            let detail = "the server has no refiner (refine.refiner)";
+            return Ok(Submission::Declined(NoJob::new(NoJobReason::NoRefiner, detail)));
         };
         if candidates.is_empty() {
             let detail = "the map has no images yet; add some with `whereabouts index`";
-            return Ok(Err(NoJob::new(NoJobReason::EmptyMap, detail)));
+            return Ok(Submission::Declined(NoJob::new(NoJobReason::EmptyMap, detail)));
         }
-        if let Some(why) = self.obstacle().await? {
-            return Ok(Err(why));
+        if let Some(why) = self.reason_to_shed().await? {
+            return Ok(Submission::Declined(why));
         }
         let query = Query {
             id: frame.query_id,
@@ -94,64 +127,55 @@ impl Service {
             Ok(pin) => pin,
             Err(full @ StoreError::Full { .. }) => {
                 let why = NoJob::new(NoJobReason::DiskFull, full.to_string());
-                return Ok(Err(self.counted_job(why)));
+                return Ok(Submission::Declined(self.counted(why)));
             }
             Err(error) => return Err(error.into()),
         };
-        let limit = self.settings.job_queue;
-        let submitted = match once {
+        let limit = self.queue;
+        let submitted = match request {
             Some(request) => self.jobs.submit_once(record, limit, request).await,
             None => self.jobs.submit(record, limit).await.map(|()| None),
         };
         match submitted {
-            // A process that ended before it could answer has queued it.
-            Ok(Some(before)) => return Ok(Ok(before)),
+            // Queued by an attempt whose process ended before it could respond.
+            Ok(Some(earlier)) => return Ok(Submission::Queued(earlier)),
             Ok(None) => self.metrics.job_submitted(),
             Err(StoreError::QueueFull { limit }) => {
-                return Ok(Err(self.counted_job(queue_full(limit))));
+                return Ok(Submission::Declined(self.counted(queue_full(limit))));
             }
             Err(error) => return Err(error.into()),
         }
-        Ok(Ok(job))
+        Ok(Submission::Queued(job))
     }
 
-    /// Why no job should be submitted now, if so.
-    async fn obstacle(&self) -> Result<Option<NoJob>, ServiceError> {
-        if self.jobs.queued().await? >= self.settings.job_queue {
-            return Ok(Some(self.counted_job(queue_full(self.settings.job_queue))));
+    /// Returns why no job should be queued now; `None` if one may.
+    async fn reason_to_shed(&self) -> Result<Option<NoJob>, ServiceError> {
+        if self.jobs.queued().await? >= self.queue {
+            return Ok(Some(self.counted(queue_full(self.queue))));
         }
-        if self.admission.pressure() <= self.settings.shed_jobs_at {
+        if self.admission.pressure() <= self.shed_at {
             return Ok(None);
         }
-        let detail = "so many pictures wait that no frame gets a job (jobs.shed_at); post a later \
+        let detail = "the queue of pictures is too long for frames to get jobs (jobs.shed_at); post a later \
                       frame for a refinement";
-        Ok(Some(self.counted_job(NoJob::new(NoJobReason::Overload, detail))))
+        Ok(Some(self.counted(NoJob::new(NoJobReason::Overload, detail))))
     }
 
-    fn counted_job(&self, why: NoJob) -> NoJob {
+    fn counted(&self, why: NoJob) -> NoJob {
         self.metrics.refusals.count(Rejection::Jobs);
         why
     }
 
-    /// What a caller hears who wants nothing but the refined answer.
-    pub(super) fn refuse_job(&self, why: &NoJob) -> ServiceError {
+    /// The error for a caller that waits for the refined answer of a frame without a job.
+    pub(super) fn rejection(&self, why: &NoJob) -> ServiceError {
         let pause = match why.reason {
             NoJobReason::QueueFull => {
-                let pace = self.job_pace.lock();
-                self.admission.clamp_pause(pace.until_done(1))
+                let service_time = self.service_time.lock();
+                self.admission.clamp_pause(service_time.until_done(1))
             }
             _ => self.admission.retry_after(),
         };
         let detail = format!("{}, or ask with refine=async or refine=off", why.detail);
         ServiceError::new(ErrorKind::Overloaded, detail).retry_after(pause)
-    }
-
-    /// The time that a caller's deadline leaves for waiting, no longer than `longest`.
-    pub(super) fn time_left(longest: Duration, deadline: Option<Instant>) -> Duration {
-        deadline.map_or(longest, |deadline| {
-            let left = deadline.saturating_duration_since(Instant::now());
-            // The answer has still to be made and sent.
-            longest.min(left * 9 / 10)
-        })
     }
 }

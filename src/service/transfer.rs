@@ -1,21 +1,33 @@
-//! Maps that come from another store or go there, with the descriptors that their images have.
+//! Export and import: copies maps between stores with their descriptors, so that no image is extracted again.
+//! Archives and their progress are for the client.
+
+use std::sync::Arc;
 
 use bytes::Bytes;
 use uuid::Uuid;
 
 use super::images::{check_tags, page_size};
-use super::{SUPERSEDED, Service, ServiceError};
+use super::{Maps, SUPERSEDED_RETRIES, ServiceError};
 use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
-use whereabouts_core::ExportedImage;
-use whereabouts_core::{Digest, Image, ImageId, Map, MapName, MediaType};
-use whereabouts_store::{Added, StoreError};
+use whereabouts_core::{Digest, ExportedImage, Image, ImageId, Map, MapName, MediaType};
+use whereabouts_store::{Added, BlobStore, ExportStore, StoreError};
 use whereabouts_vision::{AdmissionRequest, FeatureSet};
 
-/// The most numbers in a descriptor that comes from elsewhere.
+/// Maximum dimension of an imported descriptor.
 const MAX_DIM: usize = 1 << 16;
 
-impl Service {
-    /// Images of a map with their descriptors, a page at a time.
+/// Copies maps between stores with their descriptors.
+pub struct Transfer {
+    /// The maps.
+    pub maps: Maps,
+    /// Images with their descriptors.
+    pub exports: Arc<dyn ExportStore>,
+    /// The bytes of the images.
+    pub blobs: Arc<dyn BlobStore>,
+}
+
+impl Transfer {
+    /// Returns a page of the images of a map with their descriptors.
     pub async fn export(
         &self,
         name: &MapName,
@@ -23,12 +35,12 @@ impl Service {
         limit: Option<usize>,
     ) -> Result<ExportPage, ServiceError> {
         let limit = page_size(limit)?;
-        let mut left = SUPERSEDED;
+        let mut retries = SUPERSEDED_RETRIES;
         loop {
-            let map = self.known_map(name).await?;
+            let map = self.maps.find(name).await?;
             let mut images = match self.exports.export(&map, cursor, limit + 1).await {
-                Err(StoreError::Superseded(_)) if left > 0 => {
-                    left -= 1;
+                Err(StoreError::Superseded(_)) if retries > 0 => {
+                    retries -= 1;
                     continue;
                 }
                 images => images?,
@@ -40,50 +52,50 @@ impl Service {
         }
     }
 
-    /// Makes a map like one of another store, or finds that it is there; also says whether it is new.
-    /// Its model need not be installed.
+    /// Creates a map like one of another store, unless there is one already. Returns its state, and whether it is
+    /// new. The model of the map need not be installed.
     pub async fn import_map(
         &self,
         name: &MapName,
         from: Map,
     ) -> Result<(MapState, bool), ServiceError> {
         check_map(&from)?;
-        let mut left = SUPERSEDED;
+        let mut retries = SUPERSEDED_RETRIES;
         loop {
-            let known = self.maps.map(name).await?;
+            let known = self.maps.store.map(name).await?;
             let revision = match &known {
-                Some(known) if fits(known, &from) => {
-                    return Ok((self.state_of(name).await?, false));
+                Some(known) if is_compatible(known, &from) => {
+                    return Ok((self.maps.state_of(name).await?, false));
                 }
-                Some(known) if self.maps.index_state(known).await?.images > 0 => {
-                    return Err(unlike(known, &from));
+                Some(known) if self.maps.store.index_state(known).await?.images > 0 => {
+                    return Err(incompatible(known, &from));
                 }
                 Some(known) => known.revision,
                 None => 0,
             };
-            let wanted = Map { uid: Uuid::now_v7(), name: name.clone(), revision, ..from.clone() };
-            match self.maps.put_map(wanted).await {
-                Err(StoreError::Superseded(_)) if left > 0 => left -= 1,
+            let new_map = Map { uid: Uuid::now_v7(), name: name.clone(), revision, ..from.clone() };
+            match self.maps.store.put_map(new_map).await {
+                Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
                 put => {
                     let (_, new) = put?;
-                    return Ok((self.state_of(name).await?, new));
+                    return Ok((self.maps.state_of(name).await?, new));
                 }
             }
         }
     }
 
-    /// Stores an image with the descriptor that it has elsewhere.
+    /// Stores an image with the descriptor that it has in another store.
     pub async fn import_image(
         &self,
         name: &MapName,
         from: ImportedImage,
         bytes: Bytes,
-        demand: AdmissionRequest,
+        admission: AdmissionRequest,
     ) -> Result<Added, ServiceError> {
         let ImportedImage { map: source, image: ExportedImage { image, descriptor } } = from;
-        let map = self.known_map(name).await?;
-        if !fits(&map, &source) {
-            return Err(unlike(&map, &source));
+        let map = self.maps.find(name).await?;
+        if !is_compatible(&map, &source) {
+            return Err(incompatible(&map, &source));
         }
         check_image(&image, &map, &bytes)?;
         let descriptor = match descriptor {
@@ -97,23 +109,27 @@ impl Service {
                 )));
             }
             None => {
-                let (_, extractor) = self.usable_map(name).await?;
+                let (_, extractor) = self.maps.usable(name).await?;
                 let (bytes, features) = (bytes.clone(), FeatureSet::DescriptorOnly);
-                self.extract(&extractor, bytes, map.descriptor, features, demand).await?.descriptor
+                let imaging = &self.maps.imaging;
+                imaging
+                    .extract(&extractor, bytes, map.descriptor, features, admission)
+                    .await?
+                    .descriptor
             }
         };
         let _pin = self.blobs.put_blob(image.digest, bytes).await?;
-        // Superseded, if it was reindexed since it was looked up: its descriptors are of another model.
-        Ok(self.maps.add_image(&map, image, descriptor).await?)
+        // Not retried if the map was reindexed meanwhile: its descriptors are now of another model than this one.
+        Ok(self.maps.store.add_image(&map, image, descriptor).await?)
     }
 }
 
-fn fits(map: &Map, from: &Map) -> bool {
+fn is_compatible(map: &Map, from: &Map) -> bool {
     map.is_compatible_with(from) && map.frame == from.frame
 }
 
-fn unlike(map: &Map, from: &Map) -> ServiceError {
-    let said = |map: &Map| {
+fn incompatible(map: &Map, from: &Map) -> ServiceError {
+    let shown = |map: &Map| {
         format!(
             "{} ({}, {}, {} precision, {} frame)",
             map.model, map.model_digest, map.descriptor, map.precision, map.frame
@@ -123,10 +139,10 @@ fn unlike(map: &Map, from: &Map) -> ServiceError {
         ErrorKind::Conflict,
         format!(
             "the map {} has images whose descriptors are of {}, but these are of {}: restore under \
-             another name, or remove that map first",
+             another name, or delete that map first",
             map.name,
-            said(map),
-            said(from)
+            shown(map),
+            shown(from)
         ),
     )
 }
@@ -136,7 +152,7 @@ fn check_map(map: &Map) -> Result<(), ServiceError> {
     let model = &map.model;
     if !(1..=64).contains(&model.len()) || !model.bytes().all(plain) || model.starts_with('.') {
         return Err(ServiceError::unprocessable(format!(
-            "{:?} cannot be the name of a model",
+            "{:?} is not a valid model name",
             model.chars().take(80).collect::<String>()
         )));
     }
@@ -153,20 +169,22 @@ fn check_map(map: &Map) -> Result<(), ServiceError> {
 }
 
 fn check_image(image: &Image, map: &Map, bytes: &Bytes) -> Result<(), ServiceError> {
-    let refuse = |why: &str| {
+    let invalid = |why: &str| {
         let id = image.id.as_str();
-        Err(ServiceError::unprocessable(format!("the image {id:?} is refused: {why}")))
+        Err(ServiceError::unprocessable(format!("the image {id:?} cannot be imported: {why}")))
     };
     if Digest::of(bytes) != image.digest {
-        return refuse("its bytes are not those of its digest");
+        return invalid("its bytes do not match its digest");
     }
     if MediaType::sniff(bytes) != Some(image.media_type) {
-        return refuse("its bytes are not of its media type");
+        return invalid("its bytes do not match its media type");
     }
     check_tags(&image.tags)?;
     match image.pose.map(|pose| pose.checked()) {
-        Some(Err(error)) => refuse(&error.to_string()),
-        Some(Ok(pose)) if pose.frame() != map.frame => refuse("its pose is of another frame"),
+        Some(Err(error)) => invalid(&error.to_string()),
+        Some(Ok(pose)) if pose.frame() != map.frame => {
+            invalid("its pose is in another coordinate frame than the map")
+        }
         _ => Ok(()),
     }
 }

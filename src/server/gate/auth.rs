@@ -132,7 +132,7 @@ async fn check(
             let id = path_parameter(request, "id").await.and_then(|id| id.parse().ok());
             // The handler answers 404 for an id that is malformed or unknown.
             let Some(id) = id else { return Ok(()) };
-            match service.get_job(id, None).await {
+            match service.jobs.get(id, None).await {
                 Ok(job) => Some(job.map.to_string()),
                 Err(error) if error.kind == ErrorKind::NotFound => return Ok(()),
                 Err(error) => return Err(error),

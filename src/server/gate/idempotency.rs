@@ -69,7 +69,7 @@ async fn answer(gate: Gate, request: Request, next: Next) -> Result<Response, Pr
     let (parts, body) = request.into_parts();
     let body = read_whole(body, gate.settings.body_limit_bytes).await?;
     let fingerprint = fingerprint(&parts, &body).await?;
-    match service.begin_once(&id, fingerprint).await? {
+    match service.idempotency.begin(&id, fingerprint).await? {
         Once::Again(stored) => Ok(replay(stored)),
         Once::Other => Err(Problem::new(
             ErrorKind::Unprocessable,
@@ -153,7 +153,7 @@ async fn run_and_store(
             .and_then(|kind| Some(kind.to_str().ok()?.to_owned())),
         body: body.to_owned(),
     });
-    if let Err(error) = service.end_once(&id, fingerprint, stored).await {
+    if let Err(error) = service.idempotency.end(&id, fingerprint, stored).await {
         // The request itself has succeeded.
         tracing::error!(%error, "an answer could not be stored for an Idempotency-Key");
     }

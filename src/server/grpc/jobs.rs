@@ -43,7 +43,7 @@ impl JobService for Api {
         let context = self.context(request.extensions()).map_err(status::of)?;
         let watching = async {
             let id = context.job(&request.into_inner().id, 0.0).await?.id;
-            context.service.follow_job(id).await
+            context.service.jobs.follow(id).await
         };
         let events = watching.await.map_err(status::of)?;
         let events = events.map(|event| {
@@ -81,7 +81,7 @@ impl JobService for Api {
         let context = self.context(request.extensions()).map_err(status::of)?;
         let cancelling = async {
             let id = context.job(&request.into_inner().id, 0.0).await?.id;
-            context.service.cancel_job(id).await
+            context.service.jobs.cancel(id).await
         };
         let job = cancelling.await.map_err(status::of)?;
         Ok(Response::new(CancelJobResponse { job: Some(job.into()) }))
@@ -94,7 +94,7 @@ impl JobService for Api {
         let context = self.context(request.extensions()).map_err(status::of)?;
         let retrying = async {
             let id = context.job(&request.into_inner().id, 0.0).await?.id;
-            context.service.retry_job(id).await
+            context.service.jobs.retry(id).await
         };
         let job = retrying.await.map_err(status::of)?;
         Ok(Response::new(RetryJobResponse { job: Some(job.into()) }))
@@ -105,7 +105,7 @@ impl CallContext {
     /// Returns a job of a map that the caller may use; with `wait_s`, once it has ended or the time is up.
     async fn job(&self, id: &str, wait_s: f64) -> Result<Job, ServiceError> {
         let id = uuid("job", id)?;
-        let job = self.service.get_job(id, None).await?;
+        let job = self.service.jobs.get(id, None).await?;
         self.caller.check_map(&job.map)?;
         if wait_s == 0.0 {
             return Ok(job);
@@ -113,7 +113,7 @@ impl CallContext {
         let wait = Duration::try_from_secs_f64(wait_s).map_err(|_| {
             ServiceError::unprocessable(format!("wait_s is {wait_s}; it must be 0 or more"))
         })?;
-        self.service.get_job(id, Some(wait)).await
+        self.service.jobs.get(id, Some(wait)).await
     }
 
     async fn jobs(&self, request: ListJobsRequest) -> Result<ListJobsResponse, ServiceError> {
@@ -133,7 +133,7 @@ impl CallContext {
             0 => PAGE_SIZE,
             size => size as usize,
         };
-        let page = self.service.list_jobs(filter, cursor, Some(limit)).await?;
+        let page = self.service.jobs.list(filter, cursor, Some(limit)).await?;
         Ok(ListJobsResponse {
             jobs: page.jobs.into_iter().map(Into::into).collect(),
             next_page_token: page.next_cursor.map(|id| id.to_string()).unwrap_or_default(),

@@ -65,7 +65,7 @@ impl CallContext {
             track,
             once: None,
         };
-        Ok(self.service.localize(request).await?.into())
+        Ok(self.service.localizer.localize(request).await?.into())
     }
 
     fn step(&self, track: proto::Track) -> Result<TrackStep, ServiceError> {

@@ -24,7 +24,7 @@ impl MapService for Api {
         request: Request<ListMapsRequest>,
     ) -> Result<Response<ListMapsResponse>, Status> {
         let context = self.context(request.extensions()).map_err(status::of)?;
-        let maps = context.service.list_maps().await.map_err(status::of)?.into_iter();
+        let maps = context.service.maps.list().await.map_err(status::of)?.into_iter();
         let maps = maps.filter(|map| context.caller.may_use(&map.name));
         Ok(Response::new(ListMapsResponse { maps: maps.map(Into::into).collect() }))
     }
@@ -35,7 +35,7 @@ impl MapService for Api {
     ) -> Result<Response<GetMapResponse>, Status> {
         let context = self.context(request.extensions()).map_err(status::of)?;
         let name = context.map(&request.get_ref().map).map_err(status::of)?;
-        let map = context.service.get_map(&name).await.map_err(status::of)?;
+        let map = context.service.maps.get(&name).await.map_err(status::of)?;
         Ok(Response::new(GetMapResponse { map: Some(map.into()) }))
     }
 
@@ -54,7 +54,7 @@ impl MapService for Api {
     ) -> Result<Response<DeleteMapResponse>, Status> {
         let context = self.context(request.extensions()).map_err(status::of)?;
         let name = context.map(&request.get_ref().map).map_err(status::of)?;
-        context.service.delete_map(&name).await.map_err(status::of)?;
+        context.service.maps.delete(&name).await.map_err(status::of)?;
         Ok(Response::new(DeleteMapResponse {}))
     }
 
@@ -68,11 +68,12 @@ impl MapService for Api {
             return Ok(Response::new(AddImagesResponse { results: Vec::new() }));
         };
         let map = context.map(&first.map).map_err(status::of)?;
-        context.service.get_map(&map).await.map_err(status::of)?;
+        context.service.maps.get(&map).await.map_err(status::of)?;
         let images = stream::iter([Ok(first)]).chain(incoming);
         let images = images.map_ok(|next| image(&map, next, context.budget.take()));
-        let until = context.service.over(&self.readiness, context.caller.clone(), context.deadline);
-        let results = context.service.add_images(&map, &context.caller, images, until).await?;
+        let until =
+            context.service.cancelled_by(&self.readiness, context.caller.clone(), context.deadline);
+        let results = context.service.images.add_many(&map, &context.caller, images, until).await?;
         Ok(Response::new(AddImagesResponse { results: results.into_iter().map(result).collect() }))
     }
 }
@@ -87,7 +88,7 @@ impl CallContext {
             model,
             description,
         };
-        let (map, created) = self.service.put_map(self.map(&map)?, change).await?;
+        let (map, created) = self.service.maps.put(self.map(&map)?, change).await?;
         Ok(PutMapResponse { map: Some(map.into()), created })
     }
 }

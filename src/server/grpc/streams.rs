@@ -18,7 +18,7 @@ pub(super) fn until_over<T: Send + 'static>(
     context: CallContext,
 ) -> ResponseStream<T> {
     let CallContext { service, caller, deadline, .. } = context;
-    let over = service.over(readiness, caller, deadline).map(|why| Err(status::of(why)));
+    let over = service.cancelled_by(readiness, caller, deadline).map(|why| Err(status::of(why)));
     // The end of either stream ends both; the reason is sent once.
     let responses = responses.map(Some).chain(stream::iter([None]));
     let over = stream::once(over).map(Some).chain(stream::iter([None]));

@@ -129,11 +129,11 @@ pub(super) async fn add_images(
     request: Request,
 ) -> Result<Json<BatchAnswer>, Problem> {
     let map = map_name(&map)?;
-    service.get_map(&map).await?;
-    let until = service.over(&state.gate.readiness, caller.clone(), deadline);
+    service.maps.get(&map).await?;
+    let until = service.cancelled_by(&state.gate.readiness, caller.clone(), deadline);
     let (settings, memory) = (state.gate.settings, state.gate.bulk_memory);
     let images = images(request, Room { settings, memory, allowance: Arc::default() }).await?;
-    let results = service.add_images(&map, &caller, images, until).await?;
+    let results = service.images.add_many(&map, &caller, images, until).await?;
     let results: Vec<BatchResult> = results.into_iter().map(batch_result).collect();
     let count = |of| results.iter().filter(|result| result.outcome == of).count();
     Ok(Json(BatchAnswer {

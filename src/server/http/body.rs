@@ -73,7 +73,7 @@ impl PictureBody {
         service: &Service,
         demand: AdmissionRequest,
     ) -> Result<Self, Problem> {
-        if let Err(rejected) = service.check_admission(demand) {
+        if let Err(rejected) = service.maps.imaging.check_admission(demand) {
             throw_away(request);
             return Err(rejected.into());
         }

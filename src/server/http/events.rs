@@ -38,7 +38,7 @@ pub(super) async fn follow_job(
     Segments(id): Segments<String>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let permit = state.gate.stream_permit()?;
-    let events = service.follow_job(job_id(&id)?).await?.map(move |event| {
+    let events = service.jobs.follow(job_id(&id)?).await?.map(move |event| {
         // Released when the stream ends or the client has gone.
         let _permit = &permit;
         match event {
@@ -47,7 +47,7 @@ pub(super) async fn follow_job(
             JobEvent::Ended(job) => Event::default().event("end").json_data(job),
         }
     });
-    Ok(streamed(events, service.over(&state.gate.readiness, caller, Deadline::default())))
+    Ok(streamed(events, service.cancelled_by(&state.gate.readiness, caller, Deadline::default())))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -77,7 +77,7 @@ pub(super) async fn follow_jobs(
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let map = params.map.as_deref().map(map_name).transpose()?;
     let permit = state.gate.stream_permit()?;
-    let events = service.follow_jobs(map).map(move |event| {
+    let events = service.jobs.follow_all(map).map(move |event| {
         let _permit = &permit;
         match event {
             AnyJobEvent::Changed(change) => Event::default().event("job").json_data(change),
@@ -87,7 +87,7 @@ pub(super) async fn follow_jobs(
     let opened = stream::once(async { Ok(Event::default().comment("open")) });
     Ok(streamed(
         opened.chain(events),
-        service.over(&state.gate.readiness, caller, Deadline::default()),
+        service.cancelled_by(&state.gate.readiness, caller, Deadline::default()),
     ))
 }
 

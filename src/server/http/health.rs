@@ -57,18 +57,22 @@ pub(super) async fn docs() -> impl IntoResponse {
 
 /// Encodes all metrics, with gauges as of now.
 async fn metrics_text(metrics: &Metrics, service: &Service) -> Result<String, ServiceError> {
-    let maps = service.list_maps().await?.into_iter();
+    let maps = service.maps.list().await?.into_iter();
     let index_bytes = service.retention.index_bytes().await?.into_iter();
     metrics.set_levels(&Levels {
         maps: maps.map(|map| (map.name.to_string(), map.images)).collect(),
         index_bytes: index_bytes.map(|(map, bytes)| (map.to_string(), bytes)).collect(),
-        queued: service.jobs.queued().await?,
-        oldest_job: service.age_of_oldest_job().await?,
+        queued: service.jobs.store.queued().await?,
+        oldest_job: service.jobs.oldest_age().await?,
         waiting_deliveries: service.webhooks.store.waiting_deliveries().await?,
         db_bytes: service.retention.db_bytes().await?,
         dense_cache_bytes: service.dense.bytes(),
-        admission: service.admission.levels(),
-        mllm: service.refiner.as_ref().and_then(|refiner| Some(refiner.paid_calls()?.levels())),
+        admission: service.maps.imaging.admission.levels(),
+        mllm: service
+            .jobs
+            .refiner
+            .as_ref()
+            .and_then(|refiner| Some(refiner.paid_calls()?.levels())),
     });
     metrics.encode().map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))
 }

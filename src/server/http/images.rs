@@ -130,7 +130,7 @@ pub(super) async fn add_image(
         None => params.into_meta(),
     };
     let new = NewImage { bytes: body.picture, meta, demand };
-    Ok(match service.add_image(&map_name(&map)?, new).await? {
+    Ok(match service.images.add(&map_name(&map)?, new).await? {
         Added::Created(image) => (StatusCode::CREATED, Json(image)),
         Added::Present(image) => (StatusCode::OK, Json(image)),
     })
@@ -177,7 +177,7 @@ pub(super) async fn list_images(
     Params(page): Params<PageParams>,
 ) -> Result<Json<ImagePage>, Problem> {
     let cursor = page.cursor.as_deref().map(image_id).transpose()?;
-    Ok(Json(service.list_images(&map_name(&map)?, cursor.as_ref(), page.limit).await?))
+    Ok(Json(service.images.list(&map_name(&map)?, cursor.as_ref(), page.limit).await?))
 }
 
 /// One image
@@ -190,7 +190,7 @@ pub(super) async fn get_image(
     Ready(service): Ready,
     Segments((map, id)): Segments<(String, String)>,
 ) -> Result<Json<Image>, Problem> {
-    Ok(Json(service.get_image(&map_name(&map)?, &image_id(&id)?).await?))
+    Ok(Json(service.images.get(&map_name(&map)?, &image_id(&id)?).await?))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -215,7 +215,7 @@ pub(super) async fn image_content(
     Params(content): Params<ContentParams>,
 ) -> Result<impl IntoResponse, Problem> {
     let (media_type, bytes) =
-        service.image_content(&map_name(&map)?, &image_id(&id)?, content.max_edge).await?;
+        service.images.content(&map_name(&map)?, &image_id(&id)?, content.max_edge).await?;
     Ok(picture(media_type, bytes))
 }
 
@@ -235,7 +235,7 @@ pub(super) async fn delete_image(
     Ready(service): Ready,
     Segments((map, id)): Segments<(String, String)>,
 ) -> Result<StatusCode, Problem> {
-    service.delete_image(&map_name(&map)?, &image_id(&id)?).await?;
+    service.images.delete(&map_name(&map)?, &image_id(&id)?).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 

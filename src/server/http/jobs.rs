@@ -57,7 +57,7 @@ pub(super) async fn list_jobs(
         text: params.q.as_deref().map(whereabouts_service::search_text).transpose()?.flatten(),
     };
     let cursor = params.cursor.as_deref().map(job_id).transpose()?;
-    let mut page = service.list_jobs(filter, cursor, params.limit).await?;
+    let mut page = service.jobs.list(filter, cursor, params.limit).await?;
     if params.brief {
         page.jobs = page.jobs.into_iter().map(Job::summary).collect();
     }
@@ -85,7 +85,7 @@ pub(super) async fn get_job(
     Params(params): Params<WaitParams>,
 ) -> Result<Json<Job>, Problem> {
     let wait = params.wait.map(seconds).transpose()?;
-    Ok(Json(service.get_job(job_id(&id)?, wait).await?))
+    Ok(Json(service.jobs.get(job_id(&id)?, wait).await?))
 }
 
 /// The frame of a job
@@ -101,7 +101,7 @@ pub(super) async fn frame(
     Segments(id): Segments<String>,
     Params(params): Params<ContentParams>,
 ) -> Result<impl IntoResponse, Problem> {
-    let (media_type, bytes) = service.frame_of(job_id(&id)?, params.max_edge).await?;
+    let (media_type, bytes) = service.jobs.frame(job_id(&id)?, params.max_edge).await?;
     Ok(picture(media_type, bytes))
 }
 
@@ -119,7 +119,7 @@ pub(super) async fn matches(
     Ready(service): Ready,
     Segments((id, image)): Segments<(String, String)>,
 ) -> Result<Json<PairRegions>, Problem> {
-    Ok(Json(service.matches(job_id(&id)?, &image_id(&image)?).await?))
+    Ok(Json(service.jobs.matches(job_id(&id)?, &image_id(&image)?).await?))
 }
 
 /// Cancel a job
@@ -133,7 +133,7 @@ pub(super) async fn cancel_job(
     Ready(service): Ready,
     Segments(id): Segments<String>,
 ) -> Result<Json<Job>, Problem> {
-    Ok(Json(service.cancel_job(job_id(&id)?).await?))
+    Ok(Json(service.jobs.cancel(job_id(&id)?).await?))
 }
 
 /// Queue a failed, degraded or cancelled job again
@@ -146,7 +146,7 @@ pub(super) async fn retry_job(
     Ready(service): Ready,
     Segments(id): Segments<String>,
 ) -> Result<Json<Job>, Problem> {
-    Ok(Json(service.retry_job(job_id(&id)?).await?))
+    Ok(Json(service.jobs.retry(job_id(&id)?).await?))
 }
 
 pub(super) fn job_id(text: &str) -> Result<Uuid, Problem> {

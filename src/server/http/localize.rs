@@ -117,5 +117,5 @@ pub(super) async fn localize(
         track,
         once: idempotency_id,
     };
-    Ok(Json(service.localize(request).await?))
+    Ok(Json(service.localizer.localize(request).await?))
 }

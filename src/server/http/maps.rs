@@ -34,7 +34,7 @@ pub(super) async fn list_maps(
     Ready(service): Ready,
     Extension(caller): Extension<Principal>,
 ) -> Result<Json<MapList>, Problem> {
-    let mut maps = service.list_maps().await?;
+    let mut maps = service.maps.list().await?;
     maps.retain(|map| caller.may_use(&map.name));
     Ok(Json(MapList { maps }))
 }
@@ -48,7 +48,7 @@ pub(super) async fn get_map(
     Ready(service): Ready,
     Segments(map): Segments<String>,
 ) -> Result<Json<MapState>, Problem> {
-    Ok(Json(service.get_map(&map_name(&map)?).await?))
+    Ok(Json(service.maps.get(&map_name(&map)?).await?))
 }
 
 /// Create or change a map
@@ -66,7 +66,7 @@ pub(super) async fn put_map(
     Segments(map): Segments<String>,
     JsonBody(change): JsonBody<MapChange>,
 ) -> Result<(StatusCode, Json<MapState>), Problem> {
-    let (state, new) = service.put_map(map_name(&map)?, change).await?;
+    let (state, new) = service.maps.put(map_name(&map)?, change).await?;
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(state)))
 }
 
@@ -88,7 +88,7 @@ pub(super) async fn reindex(
     Segments(map): Segments<String>,
     JsonBody(request): JsonBody<ReindexRequest>,
 ) -> Result<(StatusCode, Json<MapState>), Problem> {
-    let state = service.reindex(&map_name(&map)?, request).await?;
+    let state = service.reindexer.start(&map_name(&map)?, request).await?;
     Ok((StatusCode::ACCEPTED, Json(state)))
 }
 
@@ -101,6 +101,6 @@ pub(super) async fn delete_map(
     Ready(service): Ready,
     Segments(map): Segments<String>,
 ) -> Result<StatusCode, Problem> {
-    service.delete_map(&map_name(&map)?).await?;
+    service.maps.delete(&map_name(&map)?).await?;
     Ok(StatusCode::NO_CONTENT)
 }

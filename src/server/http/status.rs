@@ -112,29 +112,31 @@ pub(super) async fn status(
 ) -> Result<Json<Status>, Problem> {
     let now = Timestamp::now();
     let db_bytes = service.retention.db_bytes().await.map_err(ServiceError::from)?;
-    let waiting = service.admission.levels();
-    let models = service.models.in_memory().into_iter().map(|(name, execution)| ModelInMemory {
-        name,
-        provider: execution.provider.to_string(),
-        precision: execution.precision.to_string(),
+    let waiting = service.maps.imaging.admission.levels();
+    let models = service.maps.imaging.models.in_memory().into_iter().map(|(name, execution)| {
+        ModelInMemory {
+            name,
+            provider: execution.provider.to_string(),
+            precision: execution.precision.to_string(),
+        }
     });
     let about = &state.about;
     Ok(Json(Status {
         version: env!("CARGO_PKG_VERSION"),
         started_at: about.started_at,
         now,
-        refiner: service.refiner.as_ref().map(|refiner| refiner.kind()),
+        refiner: service.jobs.refiner.as_ref().map(|refiner| refiner.kind()),
         keys_required: state.gate.settings.keys_required,
-        default_model: service.models.default_model().to_owned(),
+        default_model: service.maps.imaging.models.default_model().to_owned(),
         models: models.collect(),
-        jobs: OpenOf { open: service.open_jobs().await?, limit: service.settings.job_queue },
+        jobs: OpenOf { open: service.jobs.open().await?, limit: service.localizer.submitter.queue },
         pictures: OpenOf {
             open: waiting.localize + waiting.index + waiting.background,
             limit: about.pictures,
         },
         db_bytes,
         free_bytes: service.retention.free_bytes().await,
-        today: service.today(),
+        today: service.usage.today(),
         tiles: about.tiles.clone(),
         minutes: state.gate.metrics.last_hour.minutes(now),
         errors: about.troubles.last(),

@@ -32,7 +32,7 @@ pub(super) async fn export(
     Params(page): Params<PageParams>,
 ) -> Result<Json<ExportPage>, Problem> {
     let cursor = page.cursor.as_deref().map(image_id).transpose()?;
-    Ok(Json(service.export(&map_name(&map)?, cursor.as_ref(), page.limit).await?))
+    Ok(Json(service.transfer.export(&map_name(&map)?, cursor.as_ref(), page.limit).await?))
 }
 
 /// Create a map like one that was exported
@@ -52,7 +52,7 @@ pub(super) async fn import_map(
     Segments(map): Segments<String>,
     JsonBody(from): JsonBody<Map>,
 ) -> Result<(StatusCode, Json<MapState>), Problem> {
-    let (state, new) = service.import_map(&map_name(&map)?, from).await?;
+    let (state, new) = service.transfer.import_map(&map_name(&map)?, from).await?;
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(state)))
 }
 
@@ -97,7 +97,7 @@ pub(super) async fn import_image(
         let detail = format!("the part \"meta\" is not the JSON expected: {error}");
         Problem::new(ErrorKind::Malformed, detail)
     })?;
-    Ok(match service.import_image(&map_name(&map)?, from, body.picture, demand).await? {
+    Ok(match service.transfer.import_image(&map_name(&map)?, from, body.picture, demand).await? {
         Added::Created(image) => (StatusCode::CREATED, Json(image)),
         Added::Present(image) => (StatusCode::OK, Json(image)),
     })

@@ -33,5 +33,5 @@ pub(super) async fn usage(
     Params(params): Params<UsageParams>,
 ) -> Result<Json<UsageReport>, Problem> {
     let map = params.map.as_deref().map(map_name).transpose()?;
-    Ok(Json(service.usage(map, params.days.unwrap_or(30)).await?))
+    Ok(Json(service.usage.report(map, params.days.unwrap_or(30)).await?))
 }

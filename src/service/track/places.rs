@@ -1,47 +1,47 @@
-//! Where the images of a map were taken, as the filter of a track asks: which are near which.
+//! The positions of the images of a map in a plane, and which images are near which.
 
 use std::collections::HashMap;
 
 use whereabouts_core::{EARTH_RADIUS_M, ImageId, Pose};
 
-/// The least that a place is wide, in metres: maps that have many images of one spot say nothing of it.
-const LEAST_SPACING_M: f64 = 0.5;
+/// Minimum spacing in metres, for maps that have several images of each spot.
+const MIN_SPACING_M: f64 = 0.5;
 
-/// The images of a map that have a pose, by a number, with their positions in a plane.
+/// The images of a map that have a pose, numbered, with a grid for neighbourhood queries.
 #[derive(Debug)]
 pub(super) struct Places {
     ids: Vec<ImageId>,
     poses: Vec<Pose>,
-    /// Metres in a plane; for geographic poses in the equirectangular one about the first image, good to
-    /// a metre over some tens of kilometres.
+    /// Metres in a plane; for geographic poses in the equirectangular projection around the first image, which is
+    /// accurate to a metre over some tens of kilometres.
     positions: Vec<[f64; 2]>,
     /// The median distance from an image to the nearest other one, in metres.
     spacing: f64,
     numbers: HashMap<ImageId, u32>,
-    /// Which images are in which square of so many metres.
-    squares: HashMap<[i64; 2], Vec<u32>>,
+    /// The images in each cell of the grid.
+    cells: HashMap<[i64; 2], Vec<u32>>,
+    /// Edge of a cell in metres.
     edge: f64,
 }
 
 impl Places {
-    /// Lays out the images of a map.
+    /// Builds the grid over the images of a map.
     pub fn new(images: Vec<(ImageId, Pose)>) -> Self {
         let (ids, poses): (Vec<_>, Vec<_>) = images.into_iter().unzip();
         let positions = in_a_plane(&poses);
         let numbers = ids.iter().cloned().zip(0..).collect();
-        // About one image in each square, whatever the map's size.
-        let edge =
-            (extent(&positions) / (positions.len().max(1) as f64).sqrt()).max(LEAST_SPACING_M);
+        // About one image in each cell, whatever the size of the map.
+        let edge = (extent(&positions) / (positions.len().max(1) as f64).sqrt()).max(MIN_SPACING_M);
         let mut places =
-            Self { ids, poses, positions, spacing: 0.0, numbers, squares: HashMap::new(), edge };
+            Self { ids, poses, positions, spacing: 0.0, numbers, cells: HashMap::new(), edge };
         for (number, position) in (0..).zip(&places.positions) {
-            places.squares.entry(square(*position, edge)).or_default().push(number);
+            places.cells.entry(cell(*position, edge)).or_default().push(number);
         }
         places.spacing = places.median_spacing();
         places
     }
 
-    /// How many there are.
+    /// The number of images.
     pub fn len(&self) -> usize {
         self.ids.len()
     }
@@ -63,44 +63,44 @@ impl Places {
         self.numbers.get(id).copied()
     }
 
-    /// Metres between two images.
+    /// The distance between two images, in metres.
     pub fn distance(&self, one: u32, other: u32) -> f64 {
         between(self.positions[one as usize], self.positions[other as usize])
     }
 
-    /// Images within `radius` metres of one, itself included, with their distances, in no order;
-    /// `None` if there are more than `most`, and for a circle so large that there probably are.
-    pub fn near(&self, one: u32, radius: f64, most: usize) -> Option<Vec<(u32, f64)>> {
+    /// Returns the images within `radius` metres of one, itself included, with their distances, in no order;
+    /// `None` if there are more than `max`, or if the circle is so large that there probably are.
+    pub fn near(&self, one: u32, radius: f64, max: usize) -> Option<Vec<(u32, f64)>> {
         let edges = (2.0 * radius / self.edge).ceil() + 1.0;
-        let squares = edges * edges;
+        let cells = edges * edges;
         let mut found = Vec::new();
         let mut take = |number: u32| {
             let distance = self.distance(one, number);
             if distance <= radius {
                 found.push((number, distance));
             }
-            found.len() <= most
+            found.len() <= max
         };
-        let all_taken = if squares < (self.len().min(2 * most)) as f64 {
+        let all_taken = if cells < (self.len().min(2 * max)) as f64 {
             let centre = self.positions[one as usize];
-            let corner = |way: f64| square([centre[0] + way, centre[1] + way], self.edge);
+            let corner = |offset: f64| cell([centre[0] + offset, centre[1] + offset], self.edge);
             let [low, high] = [corner(-radius), corner(radius)];
-            let mut wanted =
+            let mut in_reach =
                 (low[0]..=high[0]).flat_map(|x| (low[1]..=high[1]).map(move |y| [x, y]));
-            wanted.all(|square| {
-                self.squares.get(&square).is_none_or(|numbers| numbers.iter().all(|n| take(*n)))
+            in_reach.all(|cell| {
+                self.cells.get(&cell).is_none_or(|numbers| numbers.iter().all(|n| take(*n)))
             })
         } else {
-            // A small map is looked at as a whole. A circle over so much of a large one holds too many.
-            self.len() <= 4 * most && (0..self.len() as u32).all(take)
+            // A small map is scanned. A circle over this much of a large map holds too many images.
+            self.len() <= 4 * max && (0..self.len() as u32).all(take)
         };
         all_taken.then_some(found)
     }
 
-    /// Of some hundred images, spread over the map.
+    /// Estimates the median distance to the nearest image, from a sample spread over the map.
     fn median_spacing(&self) -> f64 {
-        const ASKED: usize = 200;
-        let step = self.len().div_ceil(ASKED).max(1);
+        const SAMPLE: usize = 200;
+        let step = self.len().div_ceil(SAMPLE).max(1);
         let mut spacings: Vec<f64> = (0..self.len())
             .step_by(step)
             .filter_map(|one| {
@@ -109,7 +109,7 @@ impl Places {
             })
             .collect();
         spacings.sort_by(f64::total_cmp);
-        spacings.get(spacings.len() / 2).copied().unwrap_or(0.0).max(LEAST_SPACING_M)
+        spacings.get(spacings.len() / 2).copied().unwrap_or(0.0).max(MIN_SPACING_M)
     }
 }
 
@@ -117,11 +117,11 @@ fn between(a: [f64; 2], b: [f64; 2]) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
 }
 
-fn square(position: [f64; 2], edge: f64) -> [i64; 2] {
+fn cell(position: [f64; 2], edge: f64) -> [i64; 2] {
     position.map(|metres| (metres / edge).floor() as i64)
 }
 
-/// The longer edge of the box around all positions, in metres.
+/// The longer edge of the bounding box of all positions, in metres.
 fn extent(positions: &[[f64; 2]]) -> f64 {
     let span = |axis: usize| {
         let (low, high) = positions.iter().fold((f64::MAX, f64::MIN), |(low, high), position| {
@@ -141,7 +141,7 @@ fn in_a_plane(poses: &[Pose]) -> Vec<[f64; 2]> {
     let place = |pose: &Pose| match pose {
         Pose::Metric(pose) => [pose.x, pose.y],
         Pose::Geographic(pose) => {
-            // Across the date line the shorter way.
+            // The shorter way around, across the date line.
             let east = (pose.lon - lon + 540.0).rem_euclid(360.0) - 180.0;
             let scale = EARTH_RADIUS_M * lat.to_radians().cos();
             [east.to_radians() * scale, (pose.lat - lat).to_radians() * EARTH_RADIUS_M]
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn those_within_the_radius_are_near() {
+    fn images_within_the_radius_are_near() {
         let places = row(1000, 2.0);
         assert_eq!(places.spacing(), 2.0);
         let mut near = places.near(500, 4.5, 100).unwrap();
@@ -180,14 +180,14 @@ mod tests {
     }
 
     #[test]
-    fn a_map_of_one_spot_has_a_least_spacing() {
-        assert_eq!(row(50, 0.0).spacing(), LEAST_SPACING_M);
+    fn a_map_of_one_spot_has_the_minimum_spacing() {
+        assert_eq!(row(50, 0.0).spacing(), MIN_SPACING_M);
         assert_eq!(row(1, 0.0).near(0, 1.0, 5), Some(vec![(0, 0.0)]));
-        assert_eq!(row(0, 0.0).spacing(), LEAST_SPACING_M);
+        assert_eq!(row(0, 0.0).spacing(), MIN_SPACING_M);
     }
 
     #[test]
-    fn positions_on_the_globe_are_metres_and_the_date_line_is_no_border() {
+    fn geographic_positions_are_in_metres_also_across_the_date_line() {
         let at = |lat, lon| Pose::Geographic(GeographicPose { lat, lon, alt: None, heading: None });
         let poses = [at(-17.0, 179.9995), at(-17.0, -179.9995), at(-17.001, 179.9995)];
         let images = poses.iter().enumerate();

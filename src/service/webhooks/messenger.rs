@@ -1,4 +1,4 @@
-//! One attempt: the message as it is posted, and what came of it.
+//! One attempt to deliver a message: the POST request and its outcome. Retries are for `dispatcher`.
 
 use std::time::Duration;
 
@@ -11,29 +11,29 @@ use super::WebhookSettings;
 use super::address::{PublicOnly, check};
 use super::signature::sign;
 use whereabouts_core::StoredWebhook;
-use whereabouts_refine::mllm::retry_after;
+use whereabouts_refine::mllm::retry_after as parse_retry_after;
 
 const USER_AGENT: &str = concat!("whereabouts/", env!("CARGO_PKG_VERSION"));
 
-/// What is read of an answer's body, in bytes, and for how long. Nobody looks at it: it is read so that
-/// the other end sees its answer taken.
-const ANSWER_BYTES: usize = 16 << 10;
-const ANSWER_PATIENCE: Duration = Duration::from_secs(1);
+/// How much of a response body is read, in bytes, and for how long. The body is discarded; it is read so that the
+/// receiver can finish its response.
+const DRAINED_BYTES: usize = 16 << 10;
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// What came of an attempt.
+/// The outcome of an attempt.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Reply {
-    /// The other end took the message.
-    Taken(StatusCode),
-    /// It wants no message any more.
+    /// The receiver accepted the message.
+    Accepted(StatusCode),
+    /// The receiver wants no more messages (410 Gone).
     Gone,
-    /// It did not take it this time.
+    /// The message was not accepted.
     Failed {
-        /// Its answer, if there was one.
+        /// The status of the response, if there was one.
         status: Option<StatusCode>,
         /// What went wrong.
         why: String,
-        /// When it wants to be asked again.
+        /// The pause that the receiver asks for.
         retry_after: Option<Duration>,
     },
 }
@@ -44,9 +44,9 @@ impl Reply {
     }
 }
 
-/// Posts messages.
+/// The HTTP client that posts messages.
 pub(super) struct Messenger {
-    /// Or why there is none; a server that has no webhook can do without.
+    /// The client, or why there is none; a server without webhooks works without one.
     http: Result<Client, String>,
     timeout: Duration,
     allow_private: bool,
@@ -54,39 +54,36 @@ pub(super) struct Messenger {
 
 impl Messenger {
     pub fn new(settings: &WebhookSettings) -> Self {
-        // reqwest panics without one. Only the first call sets it; a library user may have chosen
-        // another.
+        // reqwest panics without a provider. Fails if the process has chosen one already, which is fine.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let allow_private = settings.allow_private;
         let http = Client::builder()
             .user_agent(USER_AGENT)
             .dns_resolver(PublicOnly { allow_private })
-            // A redirect could lead to where the message must not go, and so could a proxy, which looks
-            // names up by itself.
+            // A redirect could lead to a non-public address, and so could a proxy, which resolves names itself.
             .redirect(redirect::Policy::none())
             .no_proxy()
-            // Each try is noted.
+            // Each attempt is recorded.
             .retry(retry::never())
-            // Messages to one webhook are rare; each looks its address up anew.
+            // Messages to one webhook are rare; each one resolves and checks the address again.
             .pool_max_idle_per_host(0)
             .build()
             .map_err(|error| {
                 format!(
-                    "no message can be sent from this machine: {}; see to it that it has CA \
-                     certificates, and start the server again",
-                    cause(error)
+                    "no message can be sent from this machine: {}; install CA certificates and restart \
+                     the server",
+                    describe(error)
                 )
             });
         Self { http, timeout: settings.timeout(), allow_private }
     }
 
-    /// Posts a message.
+    /// Posts a message once.
     pub async fn post(&self, to: &StoredWebhook, id: Uuid, body: Vec<u8>) -> Reply {
         let Ok(url) = Url::parse(&to.webhook.url) else {
-            return Reply::failed("the url cannot be read; make the webhook anew");
+            return Reply::failed("the url cannot be parsed; create the webhook again");
         };
-        // The settings may be others than when the webhook was made, and an address that stands in the
-        // URL is not looked up.
+        // The settings may have changed since the webhook was created, and an address in the URL is not resolved.
         if let Err(why) = check(&url, self.allow_private) {
             return Reply::failed(why);
         }
@@ -104,49 +101,49 @@ impl Messenger {
             .body(body);
         match tokio::time::timeout(self.timeout, request.send()).await {
             Ok(Ok(response)) => {
-                let reply = judge(&response);
-                hear_out(response).await;
+                let reply = outcome(&response);
+                drain(response).await;
                 reply
             }
-            Ok(Err(error)) => Reply::failed(cause(error)),
+            Ok(Err(error)) => Reply::failed(describe(error)),
             Err(_) => Reply::failed(format!(
-                "no answer within {} s (webhooks.timeout_s)",
+                "no response within {} s (webhooks.timeout_s)",
                 self.timeout.as_secs()
             )),
         }
     }
 }
 
-fn judge(response: &Response) -> Reply {
+fn outcome(response: &Response) -> Reply {
     let status = response.status();
     match status {
-        _ if status.is_success() => Reply::Taken(status),
+        _ if status.is_success() => Reply::Accepted(status),
         StatusCode::GONE => Reply::Gone,
         _ => {
             let advice = if status.is_redirection() {
-                "; redirects are not followed: make a webhook with the url it leads to"
+                "; redirects are not followed: create a webhook with the url that it leads to"
             } else {
                 ""
             };
-            let patience = match status {
+            let retry_after = match status {
                 StatusCode::TOO_MANY_REQUESTS | StatusCode::SERVICE_UNAVAILABLE => response
                     .headers()
                     .get(RETRY_AFTER)
-                    .and_then(|value| retry_after(value.to_str().ok()?, Timestamp::now())),
+                    .and_then(|value| parse_retry_after(value.to_str().ok()?, Timestamp::now())),
                 _ => None,
             };
             Reply::Failed {
                 status: Some(status),
-                why: format!("the answer was {status}{advice}"),
-                retry_after: patience,
+                why: format!("the response was {status}{advice}"),
+                retry_after,
             }
         }
     }
 }
 
-async fn hear_out(mut response: Response) {
+async fn drain(mut response: Response) {
     let reading = async {
-        let mut left = ANSWER_BYTES;
+        let mut left = DRAINED_BYTES;
         while let Ok(Some(chunk)) = response.chunk().await {
             match left.checked_sub(chunk.len()) {
                 Some(rest) => left = rest,
@@ -154,13 +151,12 @@ async fn hear_out(mut response: Response) {
             }
         }
     };
-    // Whatever comes of it: the status has said what counts.
-    let _ = tokio::time::timeout(ANSWER_PATIENCE, reading).await;
+    // Errors do not matter: the status has decided the outcome.
+    let _ = tokio::time::timeout(DRAIN_TIMEOUT, reading).await;
 }
 
-/// What went wrong. The URL, which may hold credentials, is left out, and of the chain of causes only the
-/// end is news.
-fn cause(error: reqwest::Error) -> String {
+/// Describes an error with its root cause. The URL is left out, because it may contain credentials.
+fn describe(error: reqwest::Error) -> String {
     let error = error.without_url();
     let mut cause: &dyn std::error::Error = &error;
     while let Some(deeper) = cause.source() {

@@ -1,7 +1,7 @@
-//! Webhooks: who is told of the ends of jobs, and what became of that.
+//! Webhooks: create, list, delete and test them, and list their deliveries.
 //!
-//! The store queues deliveries in the change that ends a job; the [`Dispatcher`] brings them to where they
-//! belong, as `messenger` posts them and `signature` signs them; `address` says where none may go.
+//! The store queues a delivery in the transaction that ends a job. The [`Dispatcher`] delivers it: `messenger` posts
+//! it, `signature` signs it, and `address` keeps it out of private networks.
 
 mod address;
 mod dispatcher;
@@ -16,6 +16,8 @@ use uuid::Uuid;
 
 pub use self::dispatcher::Dispatcher;
 pub use self::settings::WebhookSettings;
+#[cfg(test)]
+pub(crate) use self::settings::tests::defaults;
 use super::ServiceError;
 use super::images::page_size;
 use super::keys::random;
@@ -27,23 +29,23 @@ use whereabouts_store::{StoredDelivery, WebhookStore};
 
 /// All webhooks.
 pub struct Webhooks {
-    /// Where they are kept.
+    /// Webhooks and their deliveries.
     pub store: Arc<dyn WebhookStore>,
-    /// Their bounds.
+    /// Bounds of webhooks.
     pub settings: WebhookSettings,
 }
 
 impl Webhooks {
-    /// Makes a webhook. What comes back is the only place where its secret is shown.
-    pub async fn create(&self, wanted: NewWebhook) -> Result<MadeWebhook, ServiceError> {
-        let NewWebhook { url, mut events, map } = wanted;
+    /// Creates a webhook. Its secret is in the returned value only and cannot be read again.
+    pub async fn create(&self, new: NewWebhook) -> Result<MadeWebhook, ServiceError> {
+        let NewWebhook { url, mut events, map } = new;
         let url = address::parse(&url, self.settings.allow_private)
             .map_err(ServiceError::unprocessable)?;
         events.sort();
         events.dedup();
         if events.is_empty() || events.contains(&WebhookEvent::Ping) {
             let detail = "events must name ends of jobs, such as \"job.succeeded\", or be left out for all \
-                          of them; a ping is sent by POST /webhooks/{id}/test";
+                          of them; POST /webhooks/{id}/test sends a ping";
             return Err(ServiceError::unprocessable(detail));
         }
         let webhook = Webhook {
@@ -62,19 +64,19 @@ impl Webhooks {
         Ok(MadeWebhook { webhook, secret })
     }
 
-    /// All webhooks, the newest first.
+    /// Returns all webhooks, newest first.
     pub async fn list(&self) -> Result<Vec<Webhook>, ServiceError> {
         let stored = self.store.webhooks().await?;
         Ok(stored.into_iter().rev().map(|stored| stored.webhook).collect())
     }
 
-    /// One webhook.
+    /// Returns a webhook.
     pub async fn get(&self, id: Uuid) -> Result<Webhook, ServiceError> {
         let stored = self.store.webhook(id).await?;
         stored.map(|stored| stored.webhook).ok_or_else(|| no_webhook(id))
     }
 
-    /// Removes a webhook with its deliveries. A message that is on its way arrives.
+    /// Deletes a webhook with its deliveries. An attempt in progress is not aborted.
     pub async fn delete(&self, id: Uuid) -> Result<(), ServiceError> {
         if !self.store.delete_webhook(id).await? {
             return Err(no_webhook(id));
@@ -83,7 +85,7 @@ impl Webhooks {
         Ok(())
     }
 
-    /// Queues a ping.
+    /// Queues a ping message to a webhook.
     pub async fn test(&self, id: Uuid) -> Result<Delivery, ServiceError> {
         let (webhook, now) = (self.get(id).await?, Timestamp::now());
         let message = Message { event: WebhookEvent::Ping, timestamp: now, data: &webhook };
@@ -94,7 +96,7 @@ impl Webhooks {
         Ok(delivery)
     }
 
-    /// Deliveries of a webhook, newest first, a page at a time.
+    /// Returns a page of the deliveries of a webhook, newest first.
     pub async fn deliveries(
         &self,
         id: Uuid,
@@ -111,14 +113,12 @@ impl Webhooks {
         Ok(DeliveryPage { deliveries, next_cursor })
     }
 
-    /// Queues a delivery again that does not wait. Its attempts begin anew.
+    /// Queues a delivery again that has ended, with no attempts counted.
     pub async fn redeliver(&self, id: Uuid, delivery: Uuid) -> Result<Delivery, ServiceError> {
         Ok(self.store.queue_again(id, delivery, Timestamp::now()).await?)
     }
 }
 
 fn no_webhook(id: Uuid) -> ServiceError {
-    ServiceError::not_found(format!(
-        "there is no webhook {id}; GET /webhooks lists those there are"
-    ))
+    ServiceError::not_found(format!("there is no webhook {id}; GET /webhooks lists all webhooks"))
 }

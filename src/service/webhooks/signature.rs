@@ -1,4 +1,4 @@
-//! How a message is signed: *Standard Webhooks* 1.0.0, symmetric.
+//! Signatures of messages: *Standard Webhooks* 1.0.0, symmetric.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -7,8 +7,8 @@ use ring::hmac;
 
 use whereabouts_core::WebhookSecret;
 
-/// The value of `webhook-signature`: HMAC-SHA256 over the id, the time in seconds since 1970, and the body.
-/// Neither of the first two may have a full stop in it.
+/// Computes the value of `webhook-signature`: HMAC-SHA256 over the id, the Unix time in seconds and the body,
+/// separated by full stops. The id must not contain one.
 pub(super) fn sign(secret: &WebhookSecret, id: &str, at: Timestamp, body: &[u8]) -> String {
     let mut signing = hmac::Context::with_key(&hmac::Key::new(hmac::HMAC_SHA256, secret.bytes()));
     signing.update(format!("{id}.{}.", at.as_second()).as_bytes());
@@ -21,7 +21,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_message_is_signed_as_the_standard_has_it() {
+    fn a_signature_equals_the_example_of_the_standard() {
         let secret = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw".parse().unwrap();
         let at = Timestamp::from_second(1_614_265_330).unwrap();
         let body = br#"{"test": 2432232314}"#;

@@ -1,0 +1,90 @@
+//! Idempotency keys: a request that is sent again is not processed again; its first response is replayed.
+//!
+//! Which responses are worth replaying is for the caller to decide.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use uuid::Uuid;
+
+use super::ServiceError;
+use super::retention::before;
+use whereabouts_core::Digest;
+use whereabouts_store::{IdempotencyRecord, IdempotencyStore, Progress, StoredResponse};
+
+/// Retention of responses to requests with an idempotency key.
+#[derive(Debug, Clone, Copy)]
+pub struct IdempotencySettings {
+    /// How long a response is kept.
+    pub keep: Duration,
+    /// The maximum number of responses.
+    pub most: usize,
+}
+
+impl IdempotencySettings {
+    /// Responses stored before this time have expired.
+    pub fn since(&self, now: Timestamp) -> Timestamp {
+        before(now, self.keep)
+    }
+}
+
+/// What to do with a request that has an idempotency key.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Once {
+    /// It is new: process it, and then call [`Idempotency::end`].
+    First,
+    /// It was processed before: replay this response.
+    Again(StoredResponse),
+    /// It is being processed.
+    Running,
+    /// The key was used for a different request.
+    Other,
+}
+
+/// Requests with an `Idempotency-Key`, each of which is processed once.
+pub struct Idempotency {
+    /// Reservations and stored responses.
+    pub store: Arc<dyn IdempotencyStore>,
+    /// This process; the reservation of a process that died is taken over.
+    pub process: Uuid,
+    /// How long and how many responses are kept.
+    pub settings: IdempotencySettings,
+}
+
+impl Idempotency {
+    /// Reserves a request by its idempotency key. `fingerprint` tells it from other requests with the same key.
+    pub async fn begin(&self, id: &str, fingerprint: Digest) -> Result<Once, ServiceError> {
+        let now = Timestamp::now();
+        let settings = self.settings;
+        let progress = Progress::Running { process: self.process, job: None };
+        let reserved = IdempotencyRecord { fingerprint, at: now, progress };
+        Ok(match self.store.reserve_request(id, reserved, settings.since(now)).await? {
+            None => Once::First,
+            Some(known) if known.fingerprint != fingerprint => Once::Other,
+            Some(IdempotencyRecord { progress: Progress::Answered(response), .. }) => {
+                Once::Again(response)
+            }
+            Some(IdempotencyRecord { progress: Progress::Running { .. }, .. }) => Once::Running,
+        })
+    }
+
+    /// Ends the reservation of a request. `response` is replayed when the request is sent again; without one
+    /// it is then processed again.
+    pub async fn end(
+        &self,
+        id: &str,
+        fingerprint: Digest,
+        response: Option<StoredResponse>,
+    ) -> Result<(), ServiceError> {
+        match response {
+            None => self.store.forget_request(id).await?,
+            Some(response) => {
+                let progress = Progress::Answered(response);
+                let record = IdempotencyRecord { fingerprint, at: Timestamp::now(), progress };
+                self.store.store_response(id, record).await?;
+            }
+        }
+        Ok(())
+    }
+}

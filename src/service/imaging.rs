@@ -1,0 +1,136 @@
+//! Images in memory: admission, decoding, extraction by a model, and thumbnails. Which model a map needs is
+//! for `models`.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use tokio_util::sync::CancellationToken;
+use whereabouts_api::ErrorKind;
+use whereabouts_core::{DescriptorKind, MediaType};
+use whereabouts_store::MapStore;
+use whereabouts_vision::{
+    Admission, AdmissionRequest, CpuPool, ExtractError, Extraction, Extractor, FeatureSet,
+    LoadedModels, Manifest, Permit, PoolError, Rejected, WorkClass, decode, preprocess,
+};
+
+use super::models::unusable;
+use super::{ServiceError, ServiceMetrics};
+
+/// Decodes images and runs models on them, at most as many at a time as there are permits. Clones share the
+/// permits, the threads and the models.
+#[derive(Clone)]
+pub struct Imaging {
+    /// The maps; a model is loaded at the precision of the maps that use it.
+    pub maps: Arc<dyn MapStore>,
+    /// The loaded models.
+    pub models: LoadedModels,
+    /// Permits to decode an image and run a model on it.
+    pub admission: Arc<Admission>,
+    /// The threads for decoding.
+    pub pool: CpuPool,
+    /// Counts rejections.
+    pub metrics: Arc<ServiceMetrics>,
+}
+
+impl Imaging {
+    /// Rejects a picture that would not be admitted now, so that the caller need not send it.
+    pub fn check_admission(&self, request: AdmissionRequest) -> Result<(), ServiceError> {
+        self.admission.check(request).map_err(|rejected| self.counted(rejected))
+    }
+
+    /// Waits for a permit to decode one picture and run a model on it.
+    pub(crate) async fn admit(&self, request: AdmissionRequest) -> Result<Permit, ServiceError> {
+        self.admission.acquire(request).await.map_err(|rejected| self.counted(rejected))
+    }
+
+    fn counted(&self, rejected: Rejected) -> ServiceError {
+        self.metrics.refusals.count(rejected.reason.into());
+        rejected.into()
+    }
+
+    /// Waits for a permit, decodes a picture and extracts its descriptor. Dropping the future stops the work
+    /// at the next step.
+    pub(crate) async fn extract(
+        &self,
+        extractor: &Arc<Extractor>,
+        bytes: Bytes,
+        kind: DescriptorKind,
+        features: FeatureSet,
+        request: AdmissionRequest,
+    ) -> Result<Extraction, ServiceError> {
+        let permit = Arc::new(self.admit(request).await?);
+        let cancelled = CancellationToken::new();
+        let _cancel_on_drop = cancelled.clone().drop_guard();
+        let (decoder, decoding_permit) = (Arc::clone(extractor), Arc::clone(&permit));
+        let decode = move || {
+            // Held until the thread is free, even if the caller has gone.
+            let _permit = decoding_permit;
+            decoder.begin(&bytes, kind, features, || !cancelled.is_cancelled())
+        };
+        let extraction = self.on_pool(decode).await?.result().await?;
+        permit.complete();
+        Ok(extraction)
+    }
+
+    /// Returns a picture as it was uploaded, or as a JPEG whose longer edge is at most `max_edge` pixels.
+    pub(crate) async fn thumbnail(
+        &self,
+        media_type: MediaType,
+        bytes: Bytes,
+        max_edge: Option<u32>,
+    ) -> Result<(MediaType, Bytes), ServiceError> {
+        let Some(max_edge) = max_edge else { return Ok((media_type, bytes)) };
+        if !(16..=4096).contains(&max_edge) {
+            return Err(ServiceError::unprocessable("max_edge must be between 16 and 4096 pixels"));
+        }
+        let limits = self.models.limits();
+        let permit =
+            self.admit(AdmissionRequest { class: WorkClass::Index, deadline: None }).await?;
+        let jpeg = self
+            .on_pool(move || {
+                let _permit = permit;
+                let picture =
+                    decode::decode(&bytes, limits, decode::Needed::LongestEdge(max_edge))?;
+                let small = preprocess::shrink_to(&picture.pixels, max_edge)?;
+                Ok(decode::encode_jpeg(&small)?)
+            })
+            .await?;
+        Ok((MediaType::Jpeg, jpeg.into()))
+    }
+
+    /// Loads a model as it is installed now, for new descriptors: at the configured precision, else at that of
+    /// the maps that use it already.
+    pub async fn installed_model(&self, name: &str) -> Result<Arc<Extractor>, ServiceError> {
+        let precision = match self.models.precision() {
+            Some(precision) => Some(precision),
+            None => {
+                let maps = self.maps.maps().await?;
+                maps.iter().find(|map| map.model == name).map(|map| map.precision)
+            }
+        };
+        self.models.installed(name, precision).await.map_err(|error| unusable(name, error))
+    }
+
+    /// Reads the manifest of an installed model.
+    pub(crate) async fn manifest(&self, name: &str) -> Result<Manifest, ServiceError> {
+        let (models, model) = (self.models.clone(), name.to_owned());
+        tokio::task::spawn_blocking(move || models.manifest(&model))
+            .await
+            .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))?
+            .map_err(|error| unusable(name, error))
+    }
+
+    async fn on_pool<T, F>(&self, work: F) -> Result<T, ServiceError>
+    where
+        T: Send + 'static,
+        F: FnOnce() -> Result<T, ExtractError> + Send + 'static,
+    {
+        match self.pool.run(work).await {
+            Ok(result) => Ok(result?),
+            Err(PoolError::Overloaded(overloaded)) => Err(overloaded.into()),
+            Err(error @ PoolError::Aborted) => {
+                Err(ServiceError::new(ErrorKind::Internal, error.to_string()))
+            }
+        }
+    }
+}

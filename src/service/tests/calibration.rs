@@ -1,0 +1,66 @@
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::Fixture;
+use whereabouts_core::{Calibration, Map};
+use whereabouts_refine::{NegativeEvidence, RefineError};
+use whereabouts_store::MapStore;
+
+const IMAGES: usize = 6;
+
+async fn road(fixture: &Fixture) -> Map {
+    let poses: Vec<_> = (0..IMAGES).map(|number| Some(number as f64 * 100.0)).collect();
+    fixture.map("road", &poses).await
+}
+
+/// What a map's calibration is after it was measured with the scripted refiner, or with none.
+async fn calibrated(fixture: &Fixture, with_refiner: bool) -> Arc<Calibration> {
+    let map = road(fixture).await;
+    let refiner: &dyn NegativeEvidence = fixture.refiner.as_ref();
+    let refiner = Some(refiner).filter(|_| with_refiner);
+    fixture.service.calibrator.calibrate(&map, refiner).await.unwrap();
+    fixture.store.calibration(&map).await.unwrap().unwrap()
+}
+
+#[tokio::test]
+async fn without_a_refiner_similarity_alone_is_measured() {
+    let fixture = Fixture::new().await;
+    let measured = calibrated(&fixture, false).await;
+    assert!(measured.complete);
+    assert_eq!((measured.images, measured.similarity.len()), (IMAGES, IMAGES));
+    assert!(measured.agreement.is_empty());
+    assert!(fixture.refiner.measured.lock().is_empty());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_transient_failure_of_the_refiner_is_retried() {
+    let fixture = Fixture::new().await;
+    fixture.refiner.measurements.lock().extend([
+        RefineError::Transient("busy".into()),
+        RefineError::Deferred { why: "budget".into(), after: Duration::from_secs(1) },
+    ]);
+    let measured = calibrated(&fixture, true).await;
+    assert!(measured.complete);
+    assert_eq!(measured.agreement.len(), IMAGES);
+    assert_eq!(measured.agreement.mean(), Some(0.5));
+    let asked = fixture.refiner.measured.lock();
+    assert_eq!(asked.len(), IMAGES + 2);
+    assert!(asked[..3].iter().all(|image| *image == asked[0]), "{asked:?}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_image_on_which_the_refiner_fails_for_good_is_left_out() {
+    let fixture = Fixture::new().await;
+    fixture.refiner.measurements.lock().push_back(RefineError::Permanent("no picture".into()));
+    let measured = calibrated(&fixture, true).await;
+    assert!(measured.complete);
+    assert_eq!(measured.agreement.len(), IMAGES - 1);
+    assert_eq!(fixture.refiner.measured.lock().len(), IMAGES);
+}
+
+#[tokio::test]
+async fn at_most_the_configured_number_of_images_is_refined() {
+    let fixture = Fixture::with(0, |settings| settings.calibration.refined = 2).await;
+    let measured = calibrated(&fixture, true).await;
+    assert_eq!((measured.similarity.len(), measured.agreement.len()), (IMAGES, 2));
+}

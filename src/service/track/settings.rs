@@ -1,0 +1,57 @@
+//! Bounds and parameters of tracks.
+
+use serde::{Deserialize, Serialize};
+
+/// Maximum speed that can be configured, in metres per second.
+const MAX_SPEED_M_S: f64 = 1000.0;
+
+/// `[track]`
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrackSettings {
+    /// Maximum number of tracks in memory; the least recently used is evicted.
+    pub max: usize,
+    /// How long a track is kept after its last frame, in seconds.
+    pub idle_s: u64,
+    /// Maximum speed of a robot without odometry, in metres per second.
+    pub max_speed_m_s: f64,
+    /// Standard deviation of the odometry error, as a share of the distance moved.
+    pub odometry_error: f64,
+    /// Share of frames that carry no information about the place: ω of the filter.
+    pub outliers: f64,
+    /// Probability that a robot was carried anywhere since its last frame: ε of the filter.
+    pub jump: f64,
+    /// Weight of similarity: β of the filter.
+    pub sharpness: f64,
+    /// Most similar images of a frame whose similarities are told apart; the others count as the last of these.
+    pub candidates: usize,
+    /// Maximum number of likely images that are kept between frames.
+    pub states: usize,
+    /// Minimum probability of a known place.
+    pub known_probability: f64,
+}
+
+impl TrackSettings {
+    /// Returns what is invalid; `None` if the settings are valid.
+    pub fn validate(&self) -> Option<String> {
+        let share = |name: &str, value: f64| {
+            let wrong = !(value > 0.0 && value < 1.0);
+            wrong.then(|| format!("track.{name} = {value} must be above 0 and below 1"))
+        };
+        let above_zero = |name: &str, value: f64| {
+            let wrong = !(value > 0.0 && value.is_finite());
+            wrong.then(|| format!("track.{name} = {value} must be above 0"))
+        };
+        if self.max_speed_m_s > MAX_SPEED_M_S {
+            return Some(format!("track.max_speed_m_s must be at most {MAX_SPEED_M_S}"));
+        }
+        let counts = [("max", self.max), ("candidates", self.candidates), ("states", self.states)];
+        let zero = counts.into_iter().find(|(_, count)| *count == 0);
+        zero.map(|(name, _)| format!("track.{name} must be at least 1"))
+            .or_else(|| share("outliers", self.outliers))
+            .or_else(|| share("jump", self.jump))
+            .or_else(|| above_zero("max_speed_m_s", self.max_speed_m_s))
+            .or_else(|| above_zero("odometry_error", self.odometry_error))
+            .or_else(|| above_zero("sharpness", self.sharpness))
+    }
+}
