@@ -81,7 +81,7 @@ impl Images {
                     let (image, id) = image?;
                     // Each image counts as a request of the key; the first was counted with the upload.
                     if index > 0 {
-                        let counted = self.keys.limits.take_one_more(caller).await;
+                        let counted = self.keys.limits.take_extra_request(caller).await;
                         counted.map_err(|error| (id.clone(), error))?;
                     }
                     self.add_when_admitted(map, image).await.map_err(|error| (id, error))

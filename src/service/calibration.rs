@@ -11,7 +11,7 @@ use uuid::Uuid;
 use super::ServiceError;
 use whereabouts_core::confidence::{COMPARED, NullDistribution};
 use whereabouts_core::{Calibration, CalibrationSettings, Evidence, Map};
-use whereabouts_refine::{AttemptPolicy, NegativeEvidence, Refiner};
+use whereabouts_refine::{AttemptPolicy, NegativeEvidence, RefineError, Refiner};
 use whereabouts_store::{IndexState, MapStore};
 
 /// Pause between two scans for maps that have changed.
@@ -113,7 +113,8 @@ impl Calibrator {
             for mut asked in asked.into_iter().step_by(step) {
                 asked.others.truncate(settings.candidates);
                 // A map that cannot be measured completely is measured as far as possible.
-                let measure = || refiner.best_negative(map, &asked);
+                let measure =
+                    || async { refiner.best_negative(map, &asked).await.map_err(retried_soon) };
                 found.extend(ATTEMPTS.run(measure).await.ok().flatten());
             }
             measured.agreement = NullDistribution::from(values(found.into_iter()));
@@ -133,4 +134,12 @@ fn values(evidence: impl Iterator<Item = Evidence>) -> Vec<f32> {
             Evidence::Similarity(value) | Evidence::Agreement(value) => value,
         })
         .collect()
+}
+
+/// Makes a deferred measurement transient: calibration has nothing else to do meanwhile.
+fn retried_soon(error: RefineError) -> RefineError {
+    match error {
+        RefineError::Deferred { why, .. } => RefineError::Transient(why),
+        error => error,
+    }
 }

@@ -31,15 +31,15 @@ impl IdempotencySettings {
 
 /// What to do with a request that has an idempotency key.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Once {
+pub enum IdempotencyOutcome {
     /// It is new: process it, and then call [`Idempotency::end`].
     First,
     /// It was processed before: replay this response.
-    Again(StoredResponse),
+    Replay(StoredResponse),
     /// It is being processed.
-    Running,
+    InProgress,
     /// The key was used for a different request.
-    Other,
+    KeyReused,
 }
 
 /// Requests with an `Idempotency-Key`, each of which is processed once.
@@ -54,18 +54,24 @@ pub struct Idempotency {
 
 impl Idempotency {
     /// Reserves a request by its idempotency key. `fingerprint` tells it from other requests with the same key.
-    pub async fn begin(&self, id: &str, fingerprint: Digest) -> Result<Once, ServiceError> {
+    pub async fn begin(
+        &self,
+        id: &str,
+        fingerprint: Digest,
+    ) -> Result<IdempotencyOutcome, ServiceError> {
         let now = Timestamp::now();
         let settings = self.settings;
         let progress = Progress::Running { process: self.process, job: None };
         let reserved = IdempotencyRecord { fingerprint, at: now, progress };
         Ok(match self.store.reserve_request(id, reserved, settings.since(now)).await? {
-            None => Once::First,
-            Some(known) if known.fingerprint != fingerprint => Once::Other,
+            None => IdempotencyOutcome::First,
+            Some(known) if known.fingerprint != fingerprint => IdempotencyOutcome::KeyReused,
             Some(IdempotencyRecord { progress: Progress::Answered(response), .. }) => {
-                Once::Again(response)
+                IdempotencyOutcome::Replay(response)
             }
-            Some(IdempotencyRecord { progress: Progress::Running { .. }, .. }) => Once::Running,
+            Some(IdempotencyRecord { progress: Progress::Running { .. }, .. }) => {
+                IdempotencyOutcome::InProgress
+            }
         })
     }
 

@@ -172,7 +172,7 @@ impl Jobs {
 }
 
 /// Trims a search text and checks its length; `None` if it is blank.
-pub fn search_text(text: &str) -> Result<Option<String>, ServiceError> {
+pub fn parse_search_text(text: &str) -> Result<Option<String>, ServiceError> {
     let length = text.chars().count();
     if length > MAX_SEARCH_CHARS {
         return Err(ServiceError::malformed(format!(

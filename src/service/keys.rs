@@ -198,7 +198,7 @@ impl Keys {
     }
 
     /// Authenticates a token.
-    pub fn holder(&self, token: &Token) -> Result<Arc<ApiKey>, ServiceError> {
+    pub fn authenticate(&self, token: &Token) -> Result<Arc<ApiKey>, ServiceError> {
         let known = self.read().get(token.id()).cloned();
         // An unknown id takes as long as a known one, so that the time does not tell them apart.
         let is_match = match &known {
@@ -316,17 +316,17 @@ mod tests {
         assert!(!keys.any_valid());
         let made = keys.create(new_key(Role::Robot, KeyLimits::default())).await.unwrap();
         let token: Token = made.token.parse().unwrap();
-        assert_eq!(keys.holder(&token).unwrap().id, made.key.id);
+        assert_eq!(keys.authenticate(&token).unwrap().id, made.key.id);
         let kept = serde_json::to_string(&*store.0.lock()).unwrap();
         assert!(!kept.contains(&made.token[17..]), "the secret is stored");
 
         let mut other = made.token.clone();
         other.replace_range(80..81, if made.token.ends_with('0') { "1" } else { "0" });
-        assert!(keys.holder(&other.parse().unwrap()).is_err());
+        assert!(keys.authenticate(&other.parse().unwrap()).is_err());
         let again = Keys::load(store).await.unwrap();
-        assert!(again.any_valid() && again.holder(&token).is_ok());
+        assert!(again.any_valid() && again.authenticate(&token).is_ok());
         again.revoke(&made.key.id).await.unwrap();
-        assert!(again.holder(&token).unwrap_err().detail.contains("revoked"));
+        assert!(again.authenticate(&token).unwrap_err().detail.contains("revoked"));
         assert!(!again.any_valid());
         assert_eq!(again.revoke("000000000000").await.unwrap_err().kind, ErrorKind::NotFound);
     }

@@ -15,7 +15,7 @@ const ANY_BYTES: f64 = 0.01;
 
 /// What remains of one limit of a key (`RateLimit` header fields).
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Allowance {
+pub struct RemainingLimit {
     /// The limit per minute.
     pub limit: u64,
     /// Tokens that remain.
@@ -26,11 +26,11 @@ pub struct Allowance {
 
 /// What remains of the limits of a key; `None` where it has no limit.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Allowances {
+pub struct RemainingLimits {
     /// Requests.
-    pub requests: Option<Allowance>,
+    pub requests: Option<RemainingLimit>,
     /// Bytes of request bodies.
-    pub bytes: Option<Allowance>,
+    pub bytes: Option<RemainingLimit>,
 }
 
 /// The token buckets of all keys, by the id of the key.
@@ -44,20 +44,20 @@ impl Limits {
     }
 
     /// Takes one request from the buckets of a key. Also returns what remains.
-    pub async fn take_request(&self, key: &ApiKey) -> (Allowances, Result<(), ServiceError>) {
+    pub async fn take_request(&self, key: &ApiKey) -> (RemainingLimits, Result<(), ServiceError>) {
         let tokens = [requests(key), bytes(key, ANY_BYTES, 0.0)];
         if tokens.iter().all(|bucket| bucket.per_minute == 0.0) {
-            return (Allowances::default(), Ok(()));
+            return (RemainingLimits::default(), Ok(()));
         }
         let TokenGrant { granted, remaining } = match self.0.take(&key.id, tokens).await {
             Ok(grant) => grant,
-            Err(error) => return (Allowances::default(), Err(error.into())),
+            Err(error) => return (RemainingLimits::default(), Err(error.into())),
         };
         let [requests, bytes] = [0, 1].map(|index| {
             let limit = tokens[index].per_minute;
             (limit > 0.0).then(|| (limit, remaining[index]))
         });
-        let allowances = Allowances {
+        let allowances = RemainingLimits {
             requests: requests.map(|(limit, left)| allowance(limit, left)),
             bytes: bytes.map(|(limit, left)| allowance(limit, left)),
         };
@@ -83,7 +83,7 @@ impl Limits {
     }
 
     /// Takes one more request from the buckets of a caller, for each item of a request after the first.
-    pub async fn take_one_more(&self, caller: &Principal) -> Result<(), ServiceError> {
+    pub async fn take_extra_request(&self, caller: &Principal) -> Result<(), ServiceError> {
         match caller {
             Principal::Anonymous => Ok(()),
             Principal::ApiKey(key) => self.take_request(key).await.1,
@@ -118,9 +118,9 @@ fn bytes(key: &ApiKey, required: f64, amount: f64) -> TokenRequest {
     key.limits.bytes_per_minute.map_or(TokenRequest::UNLIMITED, bytes)
 }
 
-fn allowance(limit: f64, left: f64) -> Allowance {
+fn allowance(limit: f64, left: f64) -> RemainingLimit {
     let missing = (limit - left) / limit;
-    Allowance {
+    RemainingLimit {
         limit: limit as u64,
         // Rounded as the buckets round.
         remaining: (left.max(0.0) + 1e-3) as u64,

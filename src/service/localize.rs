@@ -37,7 +37,7 @@ pub struct LocalizeRequest {
     /// The track that the frame belongs to, if any.
     pub track: Option<TrackStep>,
     /// The id of a request with an idempotency key ([`Idempotency`](super::Idempotency)).
-    pub once: Option<String>,
+    pub idempotency_id: Option<String>,
 }
 
 /// The result of coarse retrieval for a frame.
@@ -126,7 +126,7 @@ impl Localizer {
                 descriptor: extraction.descriptor,
                 dense: extraction.dense,
             };
-            let id = request.once.as_deref();
+            let id = request.idempotency_id.as_deref();
             let submit = self.submitter.submit(&map, frame, compared, request.priority, id);
             match submit.instrument(traces::stage("submit")).await? {
                 Submission::Queued(job) => (Some(job), None),

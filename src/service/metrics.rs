@@ -11,7 +11,7 @@ use whereabouts_store::RemovedJobs;
 use whereabouts_telemetry::metrics::{Registry, latency, register};
 use whereabouts_vision::Extraction;
 
-use crate::refused::Rejections;
+use crate::rejections::Rejections;
 
 /// Metric families of the use cases.
 #[derive(Debug)]

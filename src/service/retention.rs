@@ -28,7 +28,7 @@ pub struct RetentionSettings {
     /// Retention of usage, in days.
     pub usage_days: u32,
     /// Retention of responses to requests with an idempotency key.
-    pub once: IdempotencySettings,
+    pub idempotency: IdempotencySettings,
 }
 
 /// Removes jobs that have ended, with their queries and frames, and expired usage and idempotency records.
@@ -63,7 +63,7 @@ impl Janitor {
         let days = SignedDuration::from_hours(24 * i64::from(self.settings.usage_days));
         self.store.forget_usage(utc_day(now).saturating_sub(days)).await?;
         self.store.collect_garbage().await?;
-        let idempotency = self.settings.once;
+        let idempotency = self.settings.idempotency;
         self.answers.prune_responses(idempotency.since(now), idempotency.most).await?;
         let keep = JobRetention {
             since: self.settings.keep.map(|keep| before(now, keep)),

@@ -99,7 +99,7 @@ fn authenticate(service: &Service, headers: &HeaderMap) -> Result<Arc<ApiKey>, S
     }
     // The error does not repeat the text, which may be a real key with a typing error.
     let token: Token = token.trim().parse().map_err(|_| unauthorized("the key is unknown"))?;
-    service.keys.holder(&token)
+    service.keys.authenticate(&token)
 }
 
 /// Checks that the caller has the role of the route, and may use the map that the request is about.

@@ -21,7 +21,7 @@ use super::problem::{Problem, defect};
 use super::state::Gate;
 use whereabouts_api::ErrorKind;
 use whereabouts_core::Digest;
-use whereabouts_service::{Once, Principal, Service};
+use whereabouts_service::{IdempotencyOutcome, Principal, Service};
 use whereabouts_store::StoredResponse;
 
 const IDEMPOTENCY_KEY: HeaderName = HeaderName::from_static("idempotency-key");
@@ -70,19 +70,19 @@ async fn answer(gate: Gate, request: Request, next: Next) -> Result<Response, Pr
     let body = read_whole(body, gate.settings.body_limit_bytes).await?;
     let fingerprint = fingerprint(&parts, &body).await?;
     match service.idempotency.begin(&id, fingerprint).await? {
-        Once::Again(stored) => Ok(replay(stored)),
-        Once::Other => Err(Problem::new(
+        IdempotencyOutcome::Replay(stored) => Ok(replay(stored)),
+        IdempotencyOutcome::KeyReused => Err(Problem::new(
             ErrorKind::Unprocessable,
             "this Idempotency-Key was used for another request; use a new key for each request",
         )),
-        Once::Running => {
+        IdempotencyOutcome::InProgress => {
             let detail =
                 "a request with this Idempotency-Key is in progress; try again in a second";
             let mut response = Problem::new(ErrorKind::Conflict, detail).into_response();
             response.headers_mut().insert(RETRY_AFTER, HeaderValue::from_static("1"));
             Ok(response)
         }
-        Once::First => {
+        IdempotencyOutcome::First => {
             let mut request = Request::from_parts(parts, Body::from(body));
             request.extensions_mut().insert(IdempotencyId(id.clone()));
             // Continues when the client disconnects, because it will ask again.

@@ -8,7 +8,7 @@ use axum::extract::Request;
 use axum::http::{HeaderMap, HeaderName, HeaderValue};
 use futures_util::TryStreamExt;
 use whereabouts_core::ApiKey;
-use whereabouts_service::{Allowances, Service};
+use whereabouts_service::{RemainingLimits, Service};
 
 const RATE_LIMIT: HeaderName = HeaderName::from_static("ratelimit");
 const RATE_LIMIT_POLICY: HeaderName = HeaderName::from_static("ratelimit-policy");
@@ -33,7 +33,7 @@ pub(super) fn charge_body(request: Request, service: &Arc<Service>, key: &Arc<Ap
 
 /// Writes what is left of the key's rate limits into the headers of
 /// draft-ietf-httpapi-ratelimit-headers-10 (*RateLimit header fields for HTTP*).
-pub(super) fn write_headers(allowances: &Allowances, headers: &mut HeaderMap) {
+pub(super) fn write_headers(allowances: &RemainingLimits, headers: &mut HeaderMap) {
     let (mut policy, mut remaining) = (String::new(), String::new());
     for (name, unit, allowance) in [
         ("requests", "", allowances.requests),
@@ -62,14 +62,15 @@ mod tests {
 
     #[test]
     fn remaining_allowances_are_written_in_the_standard_headers() {
-        let requests = whereabouts_service::Allowance {
+        let requests = whereabouts_service::RemainingLimit {
             limit: 600,
             remaining: 12,
             reset: std::time::Duration::from_millis(58_800),
         };
-        let bytes = whereabouts_service::Allowance { limit: 1_000_000, remaining: 0, ..requests };
+        let bytes =
+            whereabouts_service::RemainingLimit { limit: 1_000_000, remaining: 0, ..requests };
         let mut headers = HeaderMap::new();
-        let both = Allowances { requests: Some(requests), bytes: Some(bytes) };
+        let both = RemainingLimits { requests: Some(requests), bytes: Some(bytes) };
         write_headers(&both, &mut headers);
         assert_eq!(
             headers["ratelimit-policy"],
@@ -77,7 +78,7 @@ mod tests {
         );
         assert_eq!(headers["ratelimit"], "\"requests\";r=12;t=59, \"bytes\";r=0;t=59");
         let mut none = HeaderMap::new();
-        write_headers(&Allowances::default(), &mut none);
+        write_headers(&RemainingLimits::default(), &mut none);
         assert!(none.is_empty());
     }
 }

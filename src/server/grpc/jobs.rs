@@ -16,7 +16,7 @@ use super::streams::{ResponseStream, until_over};
 use super::{Api, CallContext, convert, status};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::Job;
-use whereabouts_service::{JobEvent, ServiceError, search_text, uuid};
+use whereabouts_service::{JobEvent, ServiceError, parse_search_text, uuid};
 use whereabouts_store::JobFilter;
 
 /// Default page size. By default, gRPC clients accept messages of four megabytes at most.
@@ -126,7 +126,7 @@ impl CallContext {
                  an admin for another key",
             ));
         }
-        let (state, text) = (convert::job_state(state)?, search_text(&text)?);
+        let (state, text) = (convert::job_state(state)?, parse_search_text(&text)?);
         let filter = JobFilter { map, state, text };
         let cursor = (!page_token.is_empty()).then(|| uuid("job", &page_token)).transpose()?;
         let limit = match page_size {

@@ -63,7 +63,7 @@ impl CallContext {
             frame: image,
             deadline: self.deadline.0,
             track,
-            once: None,
+            idempotency_id: None,
         };
         Ok(self.service.localizer.localize(request).await?.into())
     }
@@ -110,7 +110,7 @@ impl Frames {
         let mut working = std::pin::pin!(async move {
             // Each frame counts as one request of the key; the gate has charged the first.
             if charged {
-                context.service.keys.limits.take_one_more(&context.caller).await?;
+                context.service.keys.limits.take_extra_request(&context.caller).await?;
             }
             context.localize(frame.unwrap_or_default()).await
         });

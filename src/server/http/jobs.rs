@@ -54,7 +54,12 @@ pub(super) async fn list_jobs(
     let filter = JobFilter {
         map: params.map.as_deref().map(map_name).transpose()?,
         state: params.state,
-        text: params.q.as_deref().map(whereabouts_service::search_text).transpose()?.flatten(),
+        text: params
+            .q
+            .as_deref()
+            .map(whereabouts_service::parse_search_text)
+            .transpose()?
+            .flatten(),
     };
     let cursor = params.cursor.as_deref().map(job_id).transpose()?;
     let mut page = service.jobs.list(filter, cursor, params.limit).await?;

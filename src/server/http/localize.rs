@@ -115,7 +115,7 @@ pub(super) async fn localize(
         frame: body.picture,
         deadline,
         track,
-        once: idempotency_id,
+        idempotency_id,
     };
     Ok(Json(service.localizer.localize(request).await?))
 }

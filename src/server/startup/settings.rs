@@ -67,7 +67,7 @@ pub fn retention(config: &Config) -> RetentionSettings {
         pause: Duration::from_secs(config.jobs.sweep_s),
         batch: config.jobs.sweep_batch,
         usage_days: config.data.usage_days,
-        once: idempotency(config),
+        idempotency: idempotency(config),
     }
 }
 

@@ -3,7 +3,7 @@ use std::time::Duration;
 use uuid::Uuid;
 
 use super::Fixture;
-use crate::{Idempotency, IdempotencySettings, Once};
+use crate::{Idempotency, IdempotencyOutcome, IdempotencySettings};
 use whereabouts_core::Digest;
 use whereabouts_store::StoredResponse;
 
@@ -16,13 +16,13 @@ async fn a_request_is_processed_once_and_its_response_replayed() {
     let fixture = Fixture::new().await;
     let requests = &fixture.service.idempotency;
     let (body, other) = (Digest::of(b"body"), Digest::of(b"other"));
-    assert_eq!(requests.begin("key", body).await.unwrap(), Once::First);
-    assert_eq!(requests.begin("key", body).await.unwrap(), Once::Running);
-    assert_eq!(requests.begin("key", other).await.unwrap(), Once::Other);
+    assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::First);
+    assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::InProgress);
+    assert_eq!(requests.begin("key", other).await.unwrap(), IdempotencyOutcome::KeyReused);
     requests.end("key", body, Some(response())).await.unwrap();
-    assert_eq!(requests.begin("key", body).await.unwrap(), Once::Again(response()));
-    assert_eq!(requests.begin("key", other).await.unwrap(), Once::Other);
-    assert_eq!(requests.begin("another key", body).await.unwrap(), Once::First);
+    assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::Replay(response()));
+    assert_eq!(requests.begin("key", other).await.unwrap(), IdempotencyOutcome::KeyReused);
+    assert_eq!(requests.begin("another key", body).await.unwrap(), IdempotencyOutcome::First);
 }
 
 #[tokio::test]
@@ -30,9 +30,9 @@ async fn a_request_that_failed_is_processed_when_it_is_sent_again() {
     let fixture = Fixture::new().await;
     let requests = &fixture.service.idempotency;
     let body = Digest::of(b"body");
-    assert_eq!(requests.begin("key", body).await.unwrap(), Once::First);
+    assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::First);
     requests.end("key", body, None).await.unwrap();
-    assert_eq!(requests.begin("key", body).await.unwrap(), Once::First);
+    assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::First);
 }
 
 #[tokio::test]
@@ -41,10 +41,10 @@ async fn a_request_of_a_process_that_died_is_taken_over() {
     let Idempotency { store, settings, .. } = &fixture.service.idempotency;
     let dead = Idempotency { store: store.clone(), process: Uuid::now_v7(), settings: *settings };
     let body = Digest::of(b"body");
-    assert_eq!(dead.begin("key", body).await.unwrap(), Once::First);
+    assert_eq!(dead.begin("key", body).await.unwrap(), IdempotencyOutcome::First);
     let requests = &fixture.service.idempotency;
-    assert_eq!(requests.begin("key", body).await.unwrap(), Once::First);
-    assert_eq!(requests.begin("key", body).await.unwrap(), Once::Running);
+    assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::First);
+    assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::InProgress);
 }
 
 #[tokio::test]
@@ -57,5 +57,5 @@ async fn an_expired_response_is_not_replayed() {
     let settings = IdempotencySettings { keep: Duration::ZERO, ..requests.settings };
     let expiring =
         Idempotency { store: requests.store.clone(), process: requests.process, settings };
-    assert_eq!(expiring.begin("key", body).await.unwrap(), Once::First);
+    assert_eq!(expiring.begin("key", body).await.unwrap(), IdempotencyOutcome::First);
 }

@@ -5,7 +5,7 @@ use tokio::time::Instant;
 use uuid::Uuid;
 
 use super::Fixture;
-use crate::{AnyJobEvent, JobEvent, search_text, uuid};
+use crate::{AnyJobEvent, JobEvent, parse_search_text, uuid};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::JobState;
 use whereabouts_store::JobFilter;
@@ -103,10 +103,10 @@ async fn jobs_are_listed_newest_first_a_page_at_a_time() {
 
 #[test]
 fn a_search_text_is_trimmed_and_bounded() {
-    assert_eq!(search_text(" door ").unwrap().as_deref(), Some("door"));
-    assert_eq!(search_text("  ").unwrap(), None);
-    assert!(search_text(&"ö".repeat(200)).unwrap().is_some());
-    assert_eq!(search_text(&"ö".repeat(201)).unwrap_err().kind, ErrorKind::Malformed);
+    assert_eq!(parse_search_text(" door ").unwrap().as_deref(), Some("door"));
+    assert_eq!(parse_search_text("  ").unwrap(), None);
+    assert!(parse_search_text(&"ö".repeat(200)).unwrap().is_some());
+    assert_eq!(parse_search_text(&"ö".repeat(201)).unwrap_err().kind, ErrorKind::Malformed);
 }
 
 #[test]

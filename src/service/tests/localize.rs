@@ -14,7 +14,7 @@ fn request(k: Option<usize>, frame: &'static [u8]) -> LocalizeRequest {
         frame: Bytes::from_static(frame),
         deadline: None,
         track: None,
-        once: None,
+        idempotency_id: None,
     }
 }
 

@@ -25,7 +25,7 @@ use parking_lot::Mutex;
 use tempfile::TempDir;
 use uuid::Uuid;
 
-use crate::refused::Rejections;
+use crate::rejections::Rejections;
 use crate::*;
 use whereabouts_core::{
     Candidate, CoordinateFrame, Descriptor, DescriptorKind, Digest, Evidence, Image, Job, Map,

@@ -4,7 +4,7 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::Fixture;
-use crate::{IdempotencySettings, Janitor, Once, RetentionSettings};
+use crate::{IdempotencyOutcome, IdempotencySettings, Janitor, RetentionSettings};
 use whereabouts_core::Digest;
 use whereabouts_store::{JobFilter, StoredResponse};
 
@@ -21,7 +21,7 @@ fn janitor(fixture: &Fixture) -> Janitor {
             pause: Duration::from_secs(60),
             batch: 1,
             usage_days: 1,
-            once: IdempotencySettings { keep: Duration::from_secs(3600), most: 100 },
+            idempotency: IdempotencySettings { keep: Duration::from_secs(3600), most: 100 },
         },
     }
 }
@@ -105,8 +105,8 @@ async fn expired_responses_are_removed() {
     requests.end("key", body, Some(response.clone())).await.unwrap();
     let mut janitor = janitor(&fixture);
     janitor.sweep(&CancellationToken::new()).await.unwrap();
-    assert_eq!(requests.begin("key", body).await.unwrap(), Once::Again(response));
-    janitor.settings.once.keep = Duration::ZERO;
+    assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::Replay(response));
+    janitor.settings.idempotency.keep = Duration::ZERO;
     janitor.sweep(&CancellationToken::new()).await.unwrap();
-    assert_eq!(requests.begin("key", body).await.unwrap(), Once::First);
+    assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::First);
 }
