@@ -281,7 +281,7 @@ async fn an_interrupted_backup_goes_on() {
     }
     same(&answers(&to, "m").await, &answers(&from, "m").await);
     let why = refused(&run(&from, &["backup", again.to_str().unwrap()]));
-    assert!(why.contains("is there already"), "{why}");
+    assert!(why.contains("already exists"), "{why}");
 
     // One of a map that was made anew meanwhile does not go on with the old images.
     std::fs::write(&partial, &bytes[..bytes.len() / 2]).unwrap();

@@ -84,7 +84,7 @@ async fn a_picture_is_localized_and_its_job_is_shown() {
     let found = json(&whereabouts(&["jobs", "--search", "PLACE-3", "--json", "--server", url]));
     assert_eq!((&found["jobs"][0]["id"], &found["next_cursor"]), (&id.into(), &().into()));
     let none = whereabouts(&["jobs", "--search", "no such thing", "--server", url]);
-    assert!(String::from_utf8_lossy(&none.stdout).contains("no job contains that"));
+    assert!(String::from_utf8_lossy(&none.stdout).contains("no job contains that text"));
     let shown = whereabouts(&["jobs", id, "--wait", "10", "--server", url]);
     assert!(String::from_utf8_lossy(&shown.stdout).contains("place-"), "{}", error(&shown));
     assert_eq!(whereabouts(&["healthcheck", "--server", url]).status.code(), Some(0));

@@ -48,7 +48,10 @@ async fn a_folder_that_is_in_order_is_said_to_be_so() {
     let output = doctor(dir.path(), &["--deep"]);
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(output.status.success(), "{said}");
-    assert!(said.contains("all is in order") && said.contains("m: 4 images by xfeat"), "{said}");
+    assert!(
+        said.contains("no problems found") && said.contains("m: 4 images, model xfeat"),
+        "{said}"
+    );
     let (report, code) = report(dir.path(), &[]);
     assert_eq!((code, &report["version"]), (0, &2.into()));
     assert_eq!(report["jobs"]["succeeded"], 1);

@@ -403,7 +403,7 @@ async fn the_commands_take_the_key_from_the_environment() {
     }
     let absent = dir.path().join("absent");
     let (ok, _, said) = run(None, &["keys", "list", "--data", absent.to_str().unwrap()]);
-    assert!(!ok && said.contains("no data folder") && !absent.exists(), "{said}");
+    assert!(!ok && said.contains("not a data folder") && !absent.exists(), "{said}");
     // The folder belongs to the server while it runs.
     let data = dir.path().to_str().unwrap();
     let (ok, _, said) = run(None, &["keys", "list", "--data", data]);
