@@ -36,7 +36,7 @@ pub struct Args {
 enum Action {
     /// Create a key and print it; it is shown only once
     Create {
-        /// Name of the key, for people
+        /// Display name of the key
         #[arg(long)]
         name: String,
         /// robot: localize; operator: also jobs and images; admin: everything

@@ -21,8 +21,8 @@ pub struct Args {
     /// Data folder
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Address to listen on; port 0 picks a free port
-    #[arg(long, value_name = "HOST:PORT")]
+    /// IP address and port to listen on; port 0 picks a free port
+    #[arg(long, value_name = "IP:PORT", value_parser = listen_address)]
     listen: Option<SocketAddr>,
     /// Write the bound address to this file once the server is ready
     #[arg(long, value_name = "FILE")]
@@ -44,6 +44,10 @@ pub struct Args {
     /// WHEREABOUTS_MLLM__API_KEY
     #[arg(long, value_name = "URL")]
     mllm_base_url: Option<String>,
+}
+
+fn listen_address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| "expected an IP address and a port, such as 127.0.0.1:8080".into())
 }
 
 pub async fn run(role: Role, args: Args) -> anyhow::Result<()> {

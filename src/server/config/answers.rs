@@ -100,9 +100,9 @@ impl Refine {
 pub enum Refiner {
     /// Geometric matching of dense features.
     Local,
-    /// A multimodal LLM ([mllm] says which).
+    /// A multimodal LLM, configured in `[mllm]`.
     Mllm,
-    /// Nobody.
+    /// No refinement.
     Off,
 }
 
