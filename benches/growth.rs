@@ -25,7 +25,8 @@ use whereabouts_core::{
 use whereabouts_index::IndexSettings;
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore, Examination, compact, examine};
 use whereabouts_store::{
-    BlobStore, DescriptionBounds, JobRecord, JobStore, KeepJobs, MapStore, Query, Retention, Step,
+    BlobStore, DescriptionBounds, JobRecord, JobRetention, JobStore, MapStore, Query, Retention,
+    Step,
 };
 
 const KEPT: usize = 1000;
@@ -52,7 +53,9 @@ fn settings(dir: &Path) -> EmbeddedSettings {
             m: 16,
             ef_construction: 200,
             ef_search: 96,
+            threads: 0,
             max_dead_share: 0.3,
+            check_s: 0,
         },
         index_threads: 1,
         min_free_bytes: 0,
@@ -134,7 +137,7 @@ async fn job_cycles(jobs: usize) {
 
 async fn sweep(store: &EmbeddedStore) {
     loop {
-        let keep = KeepJobs { since: None, most: Some(KEPT), settled: Timestamp::now() };
+        let keep = JobRetention { since: None, most: Some(KEPT), settled: Timestamp::now() };
         if store.remove_ended(keep, 64).await.unwrap().jobs() < 64 {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }

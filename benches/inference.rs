@@ -38,7 +38,7 @@ fn main() -> anyhow::Result<()> {
     println!("{MODEL} at {SIZE}×{SIZE}, {:.2} GFLOP a picture, {threads} threads", flop / 1e9);
     let execution =
         fastest(&run_ours(&bench, ProviderPreference::default(), threads, 1)?)?.execution;
-    let wanted = ProviderPreference {
+    let preference = ProviderPreference {
         provider: Some(execution.provider),
         precision: Some(execution.precision),
     };
@@ -47,10 +47,10 @@ fn main() -> anyhow::Result<()> {
         println!("\nbatch {batch}; whereabouts by {execution}");
         let (mut more, mut longer) = (Vec::new(), Vec::new());
         for _ in 0..ROUNDS {
-            let rows = run_ours(&bench, wanted, threads, batch)?;
+            let rows = run_ours(&bench, preference, threads, batch)?;
             let most = fastest(&rows)?;
-            let figures = most.right().context("no descriptors were right")?;
-            let alone = rows.iter().filter_map(|row| Some(row.right()?.alone)).min();
+            let figures = most.accepted().context("no descriptors were right")?;
+            let alone = rows.iter().filter_map(|row| Some(row.accepted()?.alone)).min();
             let alone = alone.context("no descriptors were right")?.as_secs_f64() * 1e3;
             print!(
                 "  whereabouts {:.1}/s (runs of {}, {} side by side, {:.0} % of GEMM), alone {alone:.1} ms",
@@ -89,7 +89,7 @@ fn median(mut numbers: Vec<f64>) -> f64 {
 /// is configured by `whereabouts model bench --write`.
 fn run_ours(
     bench: &Bench,
-    wanted: ProviderPreference,
+    preference: ProviderPreference,
     threads: usize,
     max_batch: usize,
 ) -> anyhow::Result<Vec<BenchRow>> {
@@ -97,12 +97,12 @@ fn run_ours(
     let layout = |max_batch| [1, threads].map(|sessions| Layout { threads, sessions, max_batch });
     let layouts = batches.into_iter().flat_map(layout).collect();
     let duration = Duration::from_secs_f64(SECONDS);
-    Ok(bench.run(&BenchSettings { wanted, layouts, duration }, |_| {})?)
+    Ok(bench.run(&BenchSettings { preference, layouts, duration }, |_| {})?)
 }
 
 /// The row with the most pictures a second.
 fn fastest(rows: &[BenchRow]) -> anyhow::Result<&BenchRow> {
-    let rate = |row: &&BenchRow| row.right().map_or(0.0, |figures| figures.per_second);
+    let rate = |row: &&BenchRow| row.accepted().map_or(0.0, |figures| figures.per_second);
     rows.iter().max_by(|a, b| rate(a).total_cmp(&rate(b))).context("nothing was run")
 }
 

@@ -12,7 +12,7 @@ use whereabouts_town::{Town, TownSpec};
 use whereabouts_vision::decode::{decode, encode_jpeg};
 use whereabouts_vision::manifest::{Input, Interpolation, Resize};
 use whereabouts_vision::preprocess::{needed, preprocess};
-use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Needed};
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, FeatureSet, ImageLimits, Needed};
 
 const PICTURES: usize = 12;
 const ROUNDS: usize = 15;
@@ -82,7 +82,9 @@ fn say_similarity(files: &[Vec<u8>]) -> anyhow::Result<()> {
     let mut similarities = Vec::new();
     for file in files {
         let descriptor = |extractor: &Extractor| {
-            extractor.extract(file, DescriptorKind::Gem).map(|extraction| extraction.descriptor)
+            extractor
+                .extract(file, DescriptorKind::Gem, FeatureSet::DescriptorOnly)
+                .map(|extraction| extraction.descriptor)
         };
         similarities.push(descriptor(&exact)?.similarity(&descriptor(&fast)?));
     }

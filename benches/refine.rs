@@ -7,12 +7,13 @@ use std::hint::black_box;
 use std::path::Path;
 use std::time::Instant;
 
+use anyhow::Context;
 use ndarray::ArrayView2;
 use whereabouts_core::{DenseFeatures, DescriptorKind};
 use whereabouts_refine::local::LocalMatcher;
 use whereabouts_town::{Town, TownSpec};
 use whereabouts_vision::decode::encode_jpeg;
-use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits};
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, FeatureSet, ImageLimits};
 
 const CANDIDATES: usize = 20;
 const ROUNDS: usize = 30;
@@ -23,7 +24,9 @@ fn main() -> anyhow::Result<()> {
     let assets = Assets::locate(Some(&Path::new(env!("CARGO_MANIFEST_DIR")).join("assets")));
     let extractor = Extractor::load(&assets, &ExtractorSettings::plain("xfeat", 1, LIMITS))?;
     let features = |pixels: &image::RgbImage| -> anyhow::Result<DenseFeatures> {
-        Ok(extractor.extract(&encode_jpeg(pixels)?, DescriptorKind::Gem)?.dense)
+        let (picture, features) = (encode_jpeg(pixels)?, FeatureSet::DescriptorAndDense);
+        let extraction = extractor.extract(&picture, DescriptorKind::Gem, features)?;
+        extraction.dense.context("dense features were requested")
     };
     let query = features(&town.query(0, 0).image)?;
     let candidates = (0..CANDIDATES)

@@ -38,7 +38,9 @@ const INDEX: IndexSettings = IndexSettings {
     m: 16,
     ef_construction: 200,
     ef_search: 96,
+    threads: 0,
     max_dead_share: 1.0,
+    check_s: 0,
 };
 
 #[tokio::main]

@@ -34,7 +34,9 @@ fn settings(ef_search: usize) -> IndexSettings {
         m: M,
         ef_construction: EF_CONSTRUCTION,
         ef_search,
+        threads: 0,
         max_dead_share: 1.0,
+        check_s: 0,
     }
 }
 

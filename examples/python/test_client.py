@@ -481,7 +481,7 @@ class ScriptedServer(unittest.TestCase):
 
     def test_a_draining_server_is_not_ready(self) -> None:
         with Script(problem(503, 2)).serving() as url, Whereabouts(url) as service:
-            self.assertEqual(service.health(), client.Health(False, "as told"))
+            self.assertEqual(service.health(), client.Health(False, "as scripted"))
 
     def test_unknown_events_and_comments_are_skipped(self) -> None:
         state = 'event: state\ndata: {"state": "running",\ndata: "attempts": 1, "error": null}\n\n'

@@ -1,54 +1,54 @@
-//! Answers to bulk uploads.
+//! Responses to bulk uploads.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-/// What became of many images.
+/// The result of a bulk upload.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
 pub struct BatchAnswer {
-    /// Images that are new.
+    /// Number of images that were stored.
     pub stored: usize,
-    /// Images that were there already.
+    /// Number of images that were already present.
     pub present: usize,
-    /// Images that could not be stored.
+    /// Number of images that could not be stored.
     pub failed: usize,
-    /// One for each image, in the order in which they came.
+    /// One result per image, in upload order.
     pub results: Vec<BatchResult>,
 }
 
-/// What became of one of many images.
+/// The result for one image of a bulk upload.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
 pub struct BatchResult {
-    /// Its id, where one is known.
+    /// Id of the image, if known.
     #[schema(nullable)]
     pub id: Option<String>,
-    /// What became of it.
+    /// Whether the image was stored.
     pub outcome: BatchOutcome,
-    /// Why it could not be stored; else null.
+    /// Why the image could not be stored; null if it was.
     #[schema(nullable)]
     pub problem: Option<BatchProblem>,
 }
 
-/// What became of one of many images.
+/// Whether an image of a bulk upload was stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum BatchOutcome {
-    /// It is stored.
+    /// The image was stored.
     Stored,
-    /// It was there already.
+    /// The image was already present.
     Present,
-    /// It could not be stored.
+    /// The image could not be stored.
     Failed,
 }
 
 /// Why an image could not be stored.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
 pub struct BatchProblem {
-    /// The kind: the word that ends the `type` of a problem.
+    /// Kind of the problem: the last segment of its `type`.
     pub kind: String,
     /// What happened and what to do next.
     pub detail: String,
-    /// When it is worth trying again, in seconds, where that is known.
+    /// Seconds after which a retry may succeed, if known.
     #[schema(nullable)]
     pub retry_after_s: Option<f64>,
 }

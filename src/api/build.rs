@@ -1,14 +1,17 @@
 //! Compiles the gRPC contract, without a protoc on the machine.
 
-use std::error::Error;
-use std::path::PathBuf;
-use std::{env, fs};
-
-use prost::Message as _;
-
+#[cfg(feature = "grpc")]
 const CONTRACT: [&str; 4] = ["types", "job", "localization", "map"];
 
-fn main() -> Result<(), Box<dyn Error>> {
+#[cfg(not(feature = "grpc"))]
+fn main() {
+    println!("cargo::rerun-if-changed=build.rs");
+}
+
+#[cfg(feature = "grpc")]
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    use prost::Message as _;
+
     println!("cargo::rerun-if-changed=../../proto");
     let files = CONTRACT.map(|name| format!("../../proto/whereabouts/v1/{name}.proto"));
     let mut compiler = protox::Compiler::new(["../../proto"])?;
@@ -18,9 +21,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         .build_transport(false)
         .bytes(".whereabouts.v1")
         .compile_fds(compiler.file_descriptor_set())?;
-    // What reflection tells, without the comments.
-    let mut told = compiler.file_descriptor_set();
-    told.file.iter_mut().for_each(|file| file.source_code_info = None);
-    let out = PathBuf::from(env::var("OUT_DIR")?).join("whereabouts.v1.bin");
-    Ok(fs::write(out, told.encode_to_vec())?)
+    // Reflection serves the descriptors without the comments of the source.
+    let mut descriptors = compiler.file_descriptor_set();
+    descriptors.file.iter_mut().for_each(|file| file.source_code_info = None);
+    let out = std::path::PathBuf::from(std::env::var("OUT_DIR")?).join("whereabouts.v1.bin");
+    Ok(std::fs::write(out, descriptors.encode_to_vec())?)
 }

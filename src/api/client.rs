@@ -1,4 +1,4 @@
-//! The HTTP client: errors carry the server's explanation; an overloaded server is asked again.
+//! The HTTP client. Errors carry the server's explanation, and requests are retried while the server is overloaded.
 
 use std::time::Duration;
 
@@ -8,26 +8,28 @@ use reqwest::{RequestBuilder, Response, StatusCode};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
-/// Talks to one server. Clones share its connections.
+/// A client of one server. Clones share its connections.
 #[derive(Debug, Clone)]
 pub struct Client {
     base: String,
     http: reqwest::Client,
 }
 
-/// How often a request is sent again while the server says that it is overloaded.
-pub const PATIENCE: usize = 60;
+/// Maximum attempts while the server is overloaded.
+pub const MAX_ATTEMPTS: usize = 60;
 
-/// The longest pause before that.
-pub const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+/// Maximum pause between attempts.
+pub const MAX_PAUSE: Duration = Duration::from_secs(30);
 
 impl Client {
-    /// A client of the server at a base URL, with an API key if one is given.
+    /// Creates a client of the server at a base URL, with an optional API key.
     pub fn new(server: &str, api_key: Option<&str>) -> anyhow::Result<Self> {
         let mut headers = HeaderMap::new();
         if let Some(key) = api_key {
-            let mut bearer = HeaderValue::from_str(&format!("Bearer {}", key.trim()))
-                .map_err(|_| anyhow!("WHEREABOUTS_API_KEY is no key: one begins with \"wab_\""))?;
+            let mut bearer =
+                HeaderValue::from_str(&format!("Bearer {}", key.trim())).map_err(|_| {
+                    anyhow!("WHEREABOUTS_API_KEY is not an API key: keys begin with \"wab_\"")
+                })?;
             bearer.set_sensitive(true);
             headers.insert(AUTHORIZATION, bearer);
         }
@@ -39,38 +41,38 @@ impl Client {
         Ok(Self { base: server.trim_end_matches('/').to_owned(), http })
     }
 
-    /// A GET request to a path of the API.
+    /// Builds a GET request to a path of the API.
     pub fn get(&self, path: &str) -> RequestBuilder {
         self.http.get(format!("{}{path}", self.base))
     }
 
-    /// A DELETE request to a path of the API.
+    /// Builds a DELETE request to a path of the API.
     pub fn delete(&self, path: &str) -> RequestBuilder {
         self.http.delete(format!("{}{path}", self.base))
     }
 
-    /// A PUT request to a path of the API.
+    /// Builds a PUT request to a path of the API.
     pub fn put(&self, path: &str) -> RequestBuilder {
         self.http.put(format!("{}{path}", self.base))
     }
 
-    /// A POST request to a path of the API.
+    /// Builds a POST request to a path of the API.
     pub fn post(&self, path: &str) -> RequestBuilder {
         self.http.post(format!("{}{path}", self.base))
     }
 
-    /// Sends a request and reads its JSON answer.
+    /// Sends a request and deserializes its JSON response.
     pub async fn json<T: DeserializeOwned>(&self, request: RequestBuilder) -> anyhow::Result<T> {
         let response = self.send(request).await?;
-        response.json().await.context("the server's answer is not the JSON expected")
+        response.json().await.context("the server's response is not the expected JSON")
     }
 
-    /// Sends a request and reads its answer as text.
+    /// Sends a request and reads its response as text.
     pub async fn text(&self, request: RequestBuilder) -> anyhow::Result<String> {
-        self.send(request).await?.text().await.context("the server's answer broke off")
+        self.send(request).await?.text().await.context("the server's response was interrupted")
     }
 
-    /// Sends a request; any status but success is an error with the server's explanation.
+    /// Sends a request. A status other than success is an error with the server's explanation.
     pub async fn send(&self, request: RequestBuilder) -> anyhow::Result<Response> {
         let response = request.send().await.map_err(|error| self.unreachable(error))?;
         match response.status().is_success() {
@@ -79,32 +81,31 @@ impl Client {
         }
     }
 
-    /// As [`Self::send`], for a request that `make` can make again: waits and repeats it while
-    /// the server is overloaded.
-    pub async fn send_patiently(
+    /// Like [`Self::send`], but retries the request built by `make` while the server is overloaded.
+    pub async fn send_with_retries(
         &self,
         make: impl Fn() -> anyhow::Result<RequestBuilder>,
     ) -> anyhow::Result<Response> {
-        let response = self.answer_patiently(make).await?;
+        let response = self.response_with_retries(make).await?;
         match response.status().is_success() {
             true => Ok(response),
             false => Err(explained(response).await),
         }
     }
 
-    /// As [`Self::send_patiently`], with an answer of any other status.
-    pub async fn answer_patiently(
+    /// Like [`Self::send_with_retries`], but also returns responses with an error status.
+    pub async fn response_with_retries(
         &self,
         make: impl Fn() -> anyhow::Result<RequestBuilder>,
     ) -> anyhow::Result<Response> {
-        for _ in 0..PATIENCE {
+        for _ in 0..MAX_ATTEMPTS {
             let response = make()?.send().await.map_err(|error| self.unreachable(error))?;
             match response.status() {
                 StatusCode::TOO_MANY_REQUESTS => tokio::time::sleep(retry_after(&response)).await,
                 _ => return Ok(response),
             }
         }
-        bail!("the server stayed overloaded")
+        bail!("the server is still overloaded after {MAX_ATTEMPTS} attempts")
     }
 
     fn unreachable(&self, error: reqwest::Error) -> anyhow::Error {
@@ -119,7 +120,7 @@ impl Client {
     }
 }
 
-/// A file or map name as one segment of a path.
+/// Percent-encodes a file or map name as one path segment.
 pub fn segment(text: &str) -> String {
     text.bytes()
         .map(|byte| match byte {
@@ -134,10 +135,10 @@ pub fn segment(text: &str) -> String {
 fn retry_after(response: &Response) -> Duration {
     let header = response.headers().get(reqwest::header::RETRY_AFTER);
     let seconds = header.and_then(|value| value.to_str().ok()?.parse().ok()).unwrap_or(1);
-    Duration::from_secs(seconds).min(LONGEST_PAUSE)
+    Duration::from_secs(seconds).min(MAX_PAUSE)
 }
 
-/// What the server says went wrong.
+/// Converts an error response to an error with the server's explanation.
 pub async fn explained(response: Response) -> anyhow::Error {
     #[derive(Deserialize)]
     struct Problem {

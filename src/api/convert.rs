@@ -1,4 +1,4 @@
-//! From the types of the service to the messages of the contract.
+//! Conversions from domain and wire types to gRPC messages.
 
 use jiff::Timestamp;
 use whereabouts_core::{
@@ -8,7 +8,7 @@ use whereabouts_core::{
 
 use crate::{Answer, IndexKind, MapState, NoJob, NoJobReason, TimingMs, TrackEstimate, proto};
 
-/// A job state in the contract.
+/// Converts a job state to its gRPC message.
 pub fn job_state_to(state: JobState) -> proto::JobState {
     match state {
         JobState::Queued => proto::JobState::Queued,
@@ -20,13 +20,13 @@ pub fn job_state_to(state: JobState) -> proto::JobState {
     }
 }
 
-/// A point in time in the contract.
+/// Converts a timestamp to its gRPC message.
 pub fn moment_to(moment: Timestamp) -> prost_types::Timestamp {
-    const SECOND: i128 = 1_000_000_000;
+    const NANOS_PER_SECOND: i128 = 1_000_000_000;
     let nanos = moment.as_nanosecond();
     prost_types::Timestamp {
-        seconds: nanos.div_euclid(SECOND) as i64,
-        nanos: nanos.rem_euclid(SECOND) as i32,
+        seconds: nanos.div_euclid(NANOS_PER_SECOND) as i64,
+        nanos: nanos.rem_euclid(NANOS_PER_SECOND) as i32,
     }
 }
 

@@ -1,42 +1,42 @@
-//! Kinds of errors.
+//! Error kinds shared by HTTP and gRPC.
 
 use std::time::Duration;
 
-/// The kinds that a caller can tell apart; HTTP and gRPC map each to one status.
+/// The kind of an error. HTTP and gRPC each map a kind to one status.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ErrorKind {
-    /// The request cannot be read.
+    /// The request is malformed.
     Malformed,
-    /// It is not known who asks.
+    /// The caller is not authenticated.
     Unauthorized,
-    /// Who asks may not do this.
+    /// The caller lacks the permission.
     Forbidden,
-    /// There is no such thing.
+    /// The resource does not exist.
     NotFound,
-    /// It contradicts what is stored.
+    /// The request conflicts with the stored state.
     Conflict,
-    /// The body is larger than the bound.
+    /// The request body exceeds the limit.
     TooLarge,
-    /// The body is not of a type that is taken.
+    /// The media type is not supported.
     UnsupportedMedia,
-    /// The request can be read, but a value is out of range or a picture cannot be decoded.
+    /// A value is out of range, or a picture cannot be decoded.
     Unprocessable,
-    /// A queue is full.
+    /// A queue or rate limit is exhausted.
     Overloaded,
     /// The disk is full.
     Full,
-    /// The body came too slowly.
+    /// The request body arrived too slowly.
     TooSlow,
     /// The caller's deadline has passed.
     DeadlinePassed,
     /// The service is starting or draining.
     Unavailable,
-    /// The service failed.
+    /// An internal error.
     Internal,
 }
 
 impl ErrorKind {
-    /// The kind in a word, for programs.
+    /// The machine-readable name of the kind.
     pub fn word(self) -> &'static str {
         match self {
             Self::Malformed => "malformed",
@@ -56,7 +56,7 @@ impl ErrorKind {
         }
     }
 
-    /// When it is worth trying again, where nothing better is known.
+    /// Default for when a retry may succeed; `None` if a retry is not expected to help.
     pub fn retry_after(self) -> Option<Duration> {
         match self {
             Self::Overloaded => Some(Duration::from_secs(1)),

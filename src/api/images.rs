@@ -1,57 +1,56 @@
-//! Reference images: their metadata and pages of them.
+//! Reference images: metadata and pages.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use utoipa::ToSchema;
-use whereabouts_core::{ExportedImage, Image, Map, Pose};
+use whereabouts_core::{ExportedImage, Image, Map, Pose, PoseInput};
 
-/// What a caller says about an image.
+/// Metadata of an image to be added.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ImageMeta {
-    /// Its id; without one, the head of the digest of its bytes.
+    /// Id of the image; by default, derived from the digest of its bytes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub id: Option<String>,
-    /// Where it was taken from, in the frame of the map.
+    /// Pose of the camera, in the coordinate frame of the map.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Pose>)]
-    pub pose: Option<Value>,
-    /// When it was taken.
+    pub pose: Option<PoseInput>,
+    /// When the picture was taken.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub captured_at: Option<Timestamp>,
-    /// Up to 32 words, each up to 64 characters.
+    /// Up to 32 tags of up to 64 characters each.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub tags: Vec<String>,
 }
 
-/// Some images, by id.
+/// A page of images, sorted by id.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct ImagePage {
-    /// The images.
+    /// Images on this page.
     pub images: Vec<Image>,
-    /// Where the next page starts: `cursor=` of the next request. Null on the last page.
+    /// `cursor=` of the request for the next page; null on the last page.
     pub next_cursor: Option<String>,
 }
 
-/// Some images of a map with their descriptors, by id.
+/// A page of images with their descriptors, sorted by id.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
 pub struct ExportPage {
-    /// The map as it is stored. If `uid` or `revision` is another than on the page before, the map was
-    /// made anew or reindexed, and the pages do not belong together.
+    /// The record of the map. If `uid` or `revision` differs from the previous page, the map was recreated or
+    /// reindexed in between, and the pages are inconsistent.
     pub map: Map,
-    /// The images.
+    /// Images on this page.
     pub images: Vec<ExportedImage>,
-    /// Where the next page starts: `cursor=` of the next request. Null on the last page.
+    /// `cursor=` of the request for the next page; null on the last page.
     pub next_cursor: Option<String>,
 }
 
-/// An image that comes from another store; its bytes come beside.
+/// An image to be imported; its bytes are sent as a separate part.
 #[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ImportedImage {
-    /// The map that it was part of, as `export` gave it.
+    /// The map that the image was exported from, as returned by `export`.
     pub map: Map,
-    /// The image with its descriptor. Without one, the model makes one from the bytes.
+    /// The image with its descriptor. Without a descriptor, the model computes one from the bytes.
     pub image: ExportedImage,
 }

@@ -1,72 +1,71 @@
-//! Jobs: pages of them, their events, and the regions that two pictures share.
+//! Jobs: pages, events, and matching regions of a pair.
 
 use serde::Serialize;
 use utoipa::ToSchema;
 use uuid::Uuid;
 use whereabouts_core::{Description, Job, JobState, MapName, PairRegion};
 
-/// Some jobs, newest first.
+/// A page of jobs, newest first.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct JobPage {
-    /// The jobs.
+    /// Jobs on this page.
     pub jobs: Vec<Job>,
-    /// Where the next page starts: `cursor=` of the next request. Null on the last page. A search (`q=`)
-    /// looks at some thousand jobs for one page, so that a page may be short, even empty, and yet not be
-    /// the last.
+    /// `cursor=` of the request for the next page; null on the last page. A search (`q=`) examines a few
+    /// thousand jobs per page, so a page may be short or even empty without being the last.
     pub next_cursor: Option<Uuid>,
 }
 
-/// The regions that two pictures have in common, the most telling first.
+/// Matching regions of a frame and a reference image, most significant first.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct PairRegions {
-    /// The pairs of regions.
+    /// Pairs of matching regions.
     pub regions: Vec<PairRegion>,
 }
 
-/// How far a job has come.
+/// The state of a job.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 pub struct JobStatus {
-    /// Its state.
+    /// State of the job.
     pub state: JobState,
-    /// How often a worker has taken it.
+    /// How often a worker has claimed the job.
     pub attempts: u32,
-    /// What went wrong, or what it waits for.
+    /// Why the job failed or was degraded, or why it was queued again.
     pub error: Option<String>,
 }
 
-/// One more pair of a job is described.
+/// A pair of a job has been described.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 pub struct PairDescribed {
     /// Pairs described so far.
     pub described: usize,
-    /// Pairs of the job.
+    /// Number of pairs of the job.
     pub of: usize,
-    /// The pair.
+    /// Description of the pair.
     pub description: Description,
 }
 
-/// A job has come further, or has ended.
+/// A job has progressed or finished.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 pub struct JobChange {
-    /// The job.
+    /// Id of the job.
     pub id: Uuid,
-    /// Its map.
+    /// Map of the job.
     pub map: MapName,
-    /// Its state.
+    /// State of the job.
     pub state: JobState,
-    /// How often a worker has taken it.
+    /// How often a worker has claimed the job.
     pub attempts: u32,
     /// Pairs described so far.
     pub described: usize,
-    /// Pairs of the job.
+    /// Number of pairs of the job.
     pub of: usize,
-    /// What went wrong, or what it waits for.
+    /// Why the job failed or was degraded, or why it was queued again.
     pub error: Option<String>,
 }
 
-/// Changes that were not told, because they came faster than they were taken.
+/// Events that were dropped because the client was too slow to receive them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ToSchema)]
 pub struct Missed {
-    /// How many. `GET /jobs` says how the jobs are now.
+    /// Number of dropped events. `GET /jobs` returns the current state of the jobs.
     pub changes: u64,
 }

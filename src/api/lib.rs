@@ -1,4 +1,4 @@
-//! The contract in types: what travels between clients and the server.
+//! The contract between clients and the server as types: requests, responses, gRPC messages and the HTTP client.
 
 mod batch;
 #[cfg(feature = "client")]
@@ -16,7 +16,7 @@ mod webhooks;
 
 pub use self::batch::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 #[cfg(feature = "client")]
-pub use self::client::{Client, LONGEST_PAUSE, PATIENCE, explained, segment};
+pub use self::client::{Client, MAX_ATTEMPTS, MAX_PAUSE, explained, segment};
 #[cfg(feature = "grpc")]
 pub use self::convert::{job_state_to, moment_to};
 pub use self::error::ErrorKind;
@@ -32,7 +32,7 @@ pub use self::maps::{
 pub use self::usage::{Today, Total, UsageReport};
 pub use self::webhooks::{DeliveryPage, MadeWebhook, NewWebhook};
 
-/// The messages and services of the contract in `proto/`, as generated.
+/// The messages and services generated from `proto/`.
 #[cfg(feature = "grpc")]
 #[allow(missing_docs, clippy::all, clippy::pedantic)]
 pub mod proto {

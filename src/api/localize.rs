@@ -1,80 +1,80 @@
-//! Localization: the answer to a frame.
+//! Localization of a frame.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 use whereabouts_core::{Candidate, Estimate, ImageId, JobState, MapName, Pose};
 
-/// What becomes of the candidates after the first answer.
+/// How the candidates are refined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum RefineMode {
-    /// A job refines them; the answer does not wait.
+    /// A job refines the candidates; the response does not wait for it.
     #[default]
     Async,
-    /// A job refines them; the answer waits for it, and its estimate follows the refined order.
+    /// A job refines the candidates; the response waits for it, and its estimate is based on the refined order.
     Wait,
-    /// Nothing.
+    /// The candidates are not refined.
     Off,
 }
 
 /// Where the frame was probably taken.
 #[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 pub struct Answer {
-    /// The id of this query.
+    /// Id of the query.
     pub query_id: Uuid,
-    /// The map.
+    /// Map that was searched.
     pub map: MapName,
-    /// The model that made the descriptor.
+    /// Model that computed the descriptor.
     pub model: String,
     /// The most similar images, best first.
     pub candidates: Vec<Candidate>,
-    /// The best guess; null in an empty map.
+    /// The most likely place; null in an empty map.
     #[schema(nullable)]
     pub estimate: Option<Estimate>,
-    /// Where the robot is, given all frames of its track; null for a frame of none.
+    /// Position of the robot based on all frames of its track; null if the frame belongs to no track.
     #[serde(default)]
     #[schema(nullable)]
     pub track: Option<TrackEstimate>,
-    /// The refinement; null if there is none.
+    /// The refinement job; null if there is none.
     #[schema(nullable)]
     pub job: Option<JobLink>,
-    /// Why there is no refinement, if one was asked for; else null.
+    /// Why there is no job although one was requested; otherwise null.
     #[serde(default)]
     #[schema(nullable)]
     pub no_job: Option<NoJob>,
-    /// How long the stages took.
+    /// Durations of the stages.
     pub timing_ms: TimingMs,
 }
 
-/// Where to find a job.
+/// A reference to a job.
 #[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 pub struct JobLink {
-    /// Its id.
+    /// Id of the job.
     pub id: Uuid,
-    /// Its address.
+    /// Path of the job.
     pub href: String,
-    /// How far it has come.
+    /// State of the job.
     pub state: JobState,
 }
 
-/// How long the stages of an answer took, in milliseconds.
+/// Durations of the stages of a localization in milliseconds.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize, ToSchema)]
 pub struct TimingMs {
     /// Decoding and resizing.
     pub decode: f64,
-    /// Inference and pooling, including the wait for a free session.
+    /// Inference and pooling, including queueing for a session.
     pub extract: f64,
     /// Search.
     pub search: f64,
-    /// Everything until the answer, including the wait for a free thread and for the disk.
+    /// Total until the response, including queueing and disk writes.
     pub total: f64,
 }
 
-/// Why an answer has no job, although one was asked for.
+/// Why a response has no job although one was requested.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct NoJob {
-    /// The reason, for programs.
+    /// Machine-readable reason.
     pub reason: NoJobReason,
     /// What happened and what to do next.
     pub detail: String,
@@ -84,20 +84,20 @@ pub struct NoJob {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum NoJobReason {
-    /// The server refines nothing.
+    /// Refinement is disabled on the server.
     NoRefiner,
-    /// The map has no images to compare with.
+    /// The map has no images.
     EmptyMap,
-    /// As many jobs wait or run as may (`jobs.queue`).
+    /// The job queue is full (`jobs.queue`).
     QueueFull,
-    /// So many pictures wait that no frame gets a job (`jobs.shed_at`).
+    /// Jobs are shed because too many pictures are waiting (`jobs.shed_at`).
     Overload,
     /// The disk has no room for the frame (`data.min_free_bytes`).
     DiskFull,
 }
 
 impl NoJob {
-    /// A reason with its explanation.
+    /// Combines a reason with its explanation.
     pub fn new(reason: NoJobReason, detail: impl Into<String>) -> Self {
         Self { reason, detail: detail.into() }
     }
@@ -108,22 +108,22 @@ impl NoJob {
     }
 }
 
-/// Where the robot is, given all frames of its track.
+/// Position of a robot, based on all frames of its track.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct TrackEstimate {
-    /// The track.
+    /// Id of the track.
     pub id: String,
-    /// Its frames so far, this one included.
+    /// Number of frames so far, including this one.
     pub frames: u64,
-    /// The most probable image; null as long as no image with a pose is likely.
+    /// Most probable image; null while no image with a pose is likely.
     #[schema(nullable)]
     pub image_id: Option<ImageId>,
-    /// Its pose.
+    /// Pose of that image.
     #[schema(nullable)]
     pub pose: Option<Pose>,
-    /// The probability that the robot is within the size of a place (`confidence.place_m`) of that
-    /// image, 0 to 1, as far as the motion and the share of useless frames are as they are set.
+    /// Probability, 0 to 1, that the robot is within `confidence.place_m` of that image, assuming that the
+    /// motion and the share of useless frames match the settings.
     pub probability: f64,
-    /// Whether the probability reaches the configured bound.
+    /// Whether the probability reaches the configured threshold.
     pub known: bool,
 }

@@ -1,4 +1,4 @@
-//! Maps: what to set, and a map as callers see it.
+//! Maps: changes, state and reindexing.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -7,64 +7,64 @@ use whereabouts_core::{
     Calibration, CoordinateFrame, DescriptorKind, Digest, MapName, Precision, Scene,
 };
 
-/// What to set on a map. What is left out keeps its value, or its default in a new map.
+/// A change of a map. Omitted fields keep their value, or get their default in a new map.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MapChange {
-    /// Indoor or outdoor (default).
+    /// `indoor` or `outdoor` (default).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scene: Option<Scene>,
-    /// `gem` (default) or `cls`; once the map has images, only a reindex changes it.
+    /// `gem` (default) or `cls`. Once the map has images, only a reindex changes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub descriptor: Option<DescriptorKind>,
-    /// `wgs84` (default) or `metric`; fixed once the map has images.
+    /// `wgs84` (default) or `metric`. Fixed once the map has images.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frame: Option<CoordinateFrame>,
-    /// The model, one that is installed; in a new map by default the one that the server was
-    /// started with. Once the map has images, only a reindex changes it.
+    /// Name of an installed model. A new map gets the server's default model if omitted. Once the map has
+    /// images, only a reindex changes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub model: Option<String>,
-    /// For people, up to 2,000 characters.
+    /// Free text for people, up to 2,000 characters.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub description: Option<String>,
 }
 
-/// A map as callers see it.
+/// The state of a map.
 #[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 pub struct MapState {
-    /// Its name.
+    /// Name of the map.
     pub name: MapName,
     /// Indoor or outdoor.
     pub scene: Scene,
-    /// Which descriptor it compares.
+    /// Kind of descriptor that is compared.
     pub descriptor: DescriptorKind,
-    /// The frame of its poses.
+    /// Coordinate frame of the poses.
     pub frame: CoordinateFrame,
-    /// The model that makes its descriptors.
+    /// Model that computes the descriptors.
     pub model: String,
-    /// The digest of that model's weights and of how they are fed and pooled.
+    /// Digest of the model's weights, preprocessing and pooling.
     #[schema(value_type = String)]
     pub model_digest: Digest,
-    /// The arithmetic that the model runs in; descriptors of another do not mix with them.
+    /// Precision at which the model runs. Descriptors of different precisions are not comparable.
     pub precision: Precision,
-    /// Numbers in a descriptor.
+    /// Dimension of the descriptors.
     pub dim: usize,
-    /// Images in the map.
+    /// Number of images in the map.
     pub images: usize,
-    /// How it is searched: `exact`, `building` (a graph for part of it, the rest exactly), or
-    /// `hnsw`.
+    /// How the map is searched: `exact`, `building` (a graph covers part of the map, the rest is searched
+    /// exactly), or `hnsw`.
     pub index: IndexKind,
-    /// The reindex that goes on, or the last one since the server was started.
+    /// The running reindex, or the last one since the server started.
     #[serde(default)]
     #[schema(nullable)]
     pub reindex: Option<Reindex>,
-    /// What confidence rests on; null until it is measured, a moment after images were added.
+    /// Calibration of confidence; null until it has run, shortly after images were added.
     #[serde(default)]
     #[schema(nullable)]
     pub calibration: Option<CalibrationState>,
-    /// What a person wrote about it.
+    /// Free text for people.
     pub description: Option<String>,
-    /// When it was created.
+    /// When the map was created.
     pub created_at: Timestamp,
 }
 
@@ -72,75 +72,78 @@ pub struct MapState {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum IndexKind {
-    /// Every descriptor is compared.
+    /// Exact search over every descriptor.
     Exact,
-    /// A graph covers part of the map; the rest is compared.
+    /// A graph covers part of the map; the rest is searched exactly.
     Building,
     /// A graph covers the whole map.
     Hnsw,
 }
 
-/// Which descriptors to make.
+/// A request to recompute the descriptors of a map.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ReindexRequest {
-    /// The model that makes them; by default the one that the map has, as it is installed now.
+    /// Model that computes the new descriptors; by default the map's model as currently installed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub model: Option<String>,
-    /// `gem` or `cls`; by default the one that the map has.
+    /// `gem` or `cls`; by default the map's kind.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub descriptor: Option<DescriptorKind>,
 }
 
-/// How far the last reindex of a map has come. It is forgotten when the server ends; the map has its
-/// old descriptors until the reindex has succeeded.
+/// The progress of the last reindex of a map. It is lost when the server restarts. The map keeps its old descriptors
+/// until the reindex has succeeded.
 #[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 pub struct Reindex {
-    /// The model that makes the new descriptors.
+    /// Model that computes the new descriptors.
     pub model: String,
-    /// Which descriptors.
+    /// Kind of the new descriptors.
     pub descriptor: DescriptorKind,
-    /// Whether it has ended, and how.
+    /// State of the reindex.
     pub state: ReindexState,
-    /// Images that have their new descriptor.
+    /// Number of images that have their new descriptor.
     pub done: usize,
-    /// Images of the map.
+    /// Number of images in the map.
     pub total: usize,
-    /// Why it failed.
+    /// Why the reindex failed.
     pub error: Option<String>,
-    /// When it began.
+    /// When the reindex started.
     pub started_at: Timestamp,
-    /// When it ended.
+    /// When the reindex finished.
     pub finished_at: Option<Timestamp>,
 }
 
-/// Whether a reindex has ended, and how.
+/// The state of a reindex.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ReindexState {
-    /// It goes on; the old descriptors serve.
+    /// Running; the old descriptors are in use.
     Running,
-    /// The new descriptors serve.
+    /// Succeeded; the new descriptors are in use.
     Succeeded,
-    /// It was given up; the old descriptors serve.
+    /// Failed; the old descriptors are in use.
     Failed,
 }
 
-/// What confidence in a map rests on.
+/// The calibration of confidence in a map.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize, ToSchema)]
 pub struct CalibrationState {
-    /// Images that the map had when it was measured.
+    /// Number of images in the map when it was calibrated.
     pub images: usize,
-    /// Images that were asked as if they were frames: the confidence of an answer at once is at most
-    /// n / (n + 1).
+    /// Number n of images used as queries. The confidence of an unrefined estimate is at most n / (n + 1).
     pub asked: usize,
-    /// Of these, how many were refined too: the same for a refined answer. Where it is 0, the
-    /// confidence of a refined answer rests on similarity.
+    /// Number of these queries that were also refined, which bounds the confidence of a refined estimate in
+    /// the same way. If it is 0, the confidence of a refined estimate is based on similarity.
     pub refined: usize,
 }
 
 impl From<&Calibration> for CalibrationState {
-    fn from(known: &Calibration) -> Self {
-        Self { images: known.images, asked: known.similarity.len(), refined: known.agreement.len() }
+    fn from(calibration: &Calibration) -> Self {
+        Self {
+            images: calibration.images,
+            asked: calibration.similarity.len(),
+            refined: calibration.agreement.len(),
+        }
     }
 }

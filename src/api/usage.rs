@@ -1,36 +1,36 @@
-//! What calls to paid models cost.
+//! Usage and cost of external models.
 
 use jiff::civil::Date;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use whereabouts_core::{DayUsage, Usage};
 
-/// What calls to models outside have cost.
+/// Usage and cost of calls to external models.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
 pub struct UsageReport {
-    /// The budget of today; null if the refiner asks no model outside.
+    /// Today's budget; null if the refiner does not call an external model.
     #[schema(nullable)]
     pub today: Option<Today>,
-    /// By day and map, the newest day first. A day on which nothing was asked has no entry.
+    /// Usage by day and map, newest day first. Days without calls have no entry.
     pub days: Vec<DayUsage>,
-    /// All of `days` together.
+    /// Sum over `days`.
     pub total: Total,
 }
 
-/// The budget of today.
+/// Today's budget.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
 pub struct Today {
-    /// Today, in UTC.
+    /// Today's date in UTC.
     pub date: Date,
-    /// Tokens spent in all maps, calls in progress included with the most they may cost.
+    /// Tokens spent in all maps, including the reservations of calls in progress.
     pub tokens: u64,
-    /// The most tokens; null for no limit.
+    /// Daily token limit; null for unlimited.
     pub token_limit: Option<u64>,
     /// Money spent in all maps, in the currency of the configured prices.
     pub money: f64,
-    /// The most money; null for no limit.
+    /// Daily money limit; null for unlimited.
     pub money_limit: Option<f64>,
-    /// Whether calls are suspended because the last ones failed.
+    /// Whether the circuit breaker has suspended calls because recent ones failed.
     pub suspended: bool,
 }
 
@@ -39,6 +39,6 @@ pub struct Today {
 pub struct Total {
     /// The calls and their tokens.
     pub usage: Usage,
-    /// Money, in the currency of the configured prices.
+    /// Cost in the currency of the configured prices.
     pub money: f64,
 }

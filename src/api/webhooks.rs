@@ -5,43 +5,43 @@ use utoipa::ToSchema;
 use uuid::Uuid;
 use whereabouts_core::{Delivery, MapName, Webhook, WebhookEvent, WebhookSecret};
 
-/// A webhook that is wanted.
+/// A request to create a webhook.
 #[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NewWebhook {
-    /// Where messages are to be posted: https or http, without credentials and fragment.
+    /// URL to which messages are posted: https or http, without credentials and fragment.
     #[schema(format = "uri", min_length = 1, max_length = 2048)]
     pub url: String,
-    /// What it is to be told; all ends of jobs, if nothing is said.
-    #[serde(default = "all_ends")]
+    /// Events that the webhook receives; by default, every event of a finished job.
+    #[serde(default = "all_final_events")]
     #[schema(min_items = 1)]
     pub events: Vec<WebhookEvent>,
-    /// Only of jobs of this map, which need not be there yet; null for all.
+    /// Restricts the events to jobs of this map, which need not exist yet; null for all maps.
     #[serde(default)]
     #[schema(nullable)]
     pub map: Option<MapName>,
 }
 
-/// A webhook that was made.
+/// A newly created webhook.
 #[derive(Debug, Clone, Serialize, ToSchema)]
 pub struct MadeWebhook {
-    /// What is known of it.
+    /// The stored properties of the webhook.
     #[serde(flatten)]
     pub webhook: Webhook,
-    /// What its messages are signed with: `whsec_` and 32 bytes in base64. It is shown this once.
+    /// Signing secret: `whsec_` and 32 bytes in base64. It is shown only in this response.
     #[schema(value_type = String)]
     pub secret: WebhookSecret,
 }
 
-/// Some deliveries, newest first.
+/// A page of deliveries, newest first.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct DeliveryPage {
-    /// The deliveries.
+    /// Deliveries on this page.
     pub deliveries: Vec<Delivery>,
-    /// Where the next page starts: `cursor=` of the next request. Null on the last page.
+    /// `cursor=` of the request for the next page; null on the last page.
     pub next_cursor: Option<Uuid>,
 }
 
-fn all_ends() -> Vec<WebhookEvent> {
+fn all_final_events() -> Vec<WebhookEvent> {
     WebhookEvent::ENDS.to_vec()
 }

@@ -1,18 +1,18 @@
-//! The backup archive: maps with their images, poses, descriptors and bytes in one tar file, which no
-//! store and no machine is needed to read.
+//! The backup archive: maps with their images, poses, descriptors and picture bytes in one tar file that is independent
+//! of the store and the machine.
 //!
 //! ```text
-//! manifest.json             format, version, which maps
-//! maps/NAME/map.json        the map, with the identity of the model that made its descriptors
-//! maps/NAME/SHA256.json     an image and its descriptor; named by the SHA-256 of these bytes
-//! maps/NAME/SHA256.jpg      the bytes of that image; named by their SHA-256
-//! maps/NAME/left-out.json   in the place of an image that could not be saved: which, and why
+//! manifest.json             format, version, and the list of maps
+//! maps/NAME/map.json        the map, with the digest of the model that computed its descriptors
+//! maps/NAME/SHA256.json     an image record with its descriptor, named by the SHA-256 of this entry
+//! maps/NAME/SHA256.jpg      the picture of that image, named by its SHA-256
+//! maps/NAME/left-out.json   instead of an image that could not be saved: its id and the reason
 //! …
-//! end.json                  what is in the archive, and the SHA-256 of all bytes before this entry
+//! end.json                  summary of the archive, and the SHA-256 of all bytes before this entry
 //! ```
 //!
-//! Images are in the order of their ids. A file without its end is not whole: it can be continued, but
-//! not restored. A reader takes entries of these names in this order, and nothing else.
+//! Images are sorted by id. A file without `end.json` is incomplete: it can be resumed, but not restored. A reader
+//! accepts exactly these entries in this order.
 
 mod read;
 mod write;
@@ -21,35 +21,35 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 pub use self::read::{Item, Reader};
-pub use self::write::{Checkpoint, Resumed, Writer, growing};
+pub use self::write::{Checkpoint, Resumed, Writer, partial_path};
 use whereabouts_core::{Digest, ImageId, MapName, MediaType};
 
-/// What `manifest.json` calls the format.
+/// Name of the format in `manifest.json`.
 pub const FORMAT: &str = "whereabouts-backup";
-/// The version of the format that this program writes and reads.
+/// Version of the format that is written and read.
 pub const VERSION: u32 = 1;
 
 const MANIFEST: &str = "manifest.json";
 const END: &str = "end.json";
 const BLOCK: usize = 512;
 
-/// The first entry.
+/// The first entry of an archive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
-    /// [`FORMAT`].
+    /// Always [`FORMAT`].
     pub format: String,
-    /// [`VERSION`].
+    /// Format version; see [`VERSION`].
     pub version: u32,
-    /// The version of the program that wrote it.
+    /// Version of the program that wrote the archive.
     pub made_by: String,
-    /// When the backup was begun.
+    /// When the backup was started.
     pub created_at: Timestamp,
-    /// The maps that were asked for, in the order of the archive.
+    /// The maps that were requested, in the order of the archive.
     pub maps: Vec<MapName>,
 }
 
 impl Manifest {
-    /// The manifest of a backup that begins now.
+    /// Creates the manifest of a backup that starts now.
     pub fn new(maps: Vec<MapName>) -> Self {
         Self {
             format: FORMAT.to_owned(),
@@ -61,66 +61,64 @@ impl Manifest {
     }
 }
 
-/// The last entry.
+/// The last entry of an archive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct End {
     /// When the backup was complete.
     pub finished_at: Timestamp,
-    /// The maps in it.
+    /// Maps in the archive.
     pub maps: Vec<ArchivedMap>,
-    /// Entries before this one.
+    /// Number of entries before this one.
     pub entries: u64,
-    /// Bytes before this entry, and their SHA-256.
+    /// Number of bytes before this entry.
     pub bytes: u64,
-    /// See `bytes`.
+    /// SHA-256 of the bytes before this entry.
     pub sha256: Digest,
 }
 
-/// A map in the archive.
+/// Summary of a map in the archive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ArchivedMap {
-    /// Its name.
+    /// Name of the map.
     pub name: MapName,
-    /// Its images in the archive.
+    /// Number of images in the archive.
     pub images: usize,
-    /// Images that were in the map and could not be saved.
+    /// Images of the map that could not be saved.
     pub left_out: Vec<LeftOut>,
 }
 
 /// An image that could not be saved.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LeftOut {
-    /// Its id.
+    /// Id of the image.
     pub id: ImageId,
-    /// Why not.
+    /// Why the image could not be saved.
     pub why: String,
 }
 
 /// Why an archive cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum ArchiveError {
-    /// The disk failed.
+    /// A file operation failed.
     #[error("cannot {what}: {source}")]
     Disk {
-        /// What could not be done.
+        /// The operation.
         what: String,
-        /// Why not.
+        /// Cause.
         source: std::io::Error,
     },
-    /// It ends too early.
-    #[error(
-        "the archive breaks off after {0} bytes: it was cut short, or its backup has not ended"
-    )]
+    /// The archive is incomplete.
+    #[error("the archive ends after {0} bytes: it was truncated, or its backup was not finished")]
     Truncated(u64),
-    /// Its bytes are not those that were written.
+    /// The bytes differ from those that were written.
     #[error("the archive is damaged at byte {at}: {why}")]
     Damaged {
-        /// Where.
+        /// Position in the archive.
         at: u64,
         /// What is wrong.
         why: String,
     },
-    /// It is not an archive of this kind.
+    /// The file is not a valid archive.
     #[error("this is not a backup that can be restored: {0}")]
     Refused(String),
 }
@@ -146,5 +144,7 @@ fn map_name(map: &MapName) -> String {
     format!("maps/{map}/map.json")
 }
 
+#[cfg(test)]
+mod round_trip;
 #[cfg(test)]
 mod tests;

@@ -1,4 +1,4 @@
-//! Reading an archive, of which nothing is believed: what is not exactly as it was written ends it.
+//! Reading an archive. The input is untrusted: any deviation from the format is an error.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read};
@@ -17,23 +17,23 @@ use super::{
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, ImageId, Map, MapName};
 
-/// The largest JSON entry, in bytes: `end.json` names images that were left out.
+/// Maximum size of a JSON entry in bytes. `end.json` lists all images that were left out.
 const MAX_JSON_BYTES: u64 = 64 << 20;
-/// The largest picture, in bytes.
+/// Maximum size of a picture in bytes.
 const MAX_PICTURE_BYTES: u64 = 1 << 30;
-/// So much is asked of the allocator before that many bytes have been seen.
-const FIRST_BYTES: usize = 1 << 20;
+/// Maximum initial allocation for an entry; more is allocated as bytes arrive, because sizes are untrusted.
+const INITIAL_BYTES: usize = 1 << 20;
 
-/// Reads an archive from its beginning, an item at a time.
+/// Reads an archive sequentially, one item at a time.
 pub struct Reader<R = BufReader<File>> {
     file: R,
     hash: Sha256,
     bytes: u64,
     entries: u64,
     maps: Vec<MapName>,
-    /// The maps so far.
+    /// Maps read so far.
     found: Vec<ArchivedMap>,
-    /// The map whose images come now, and the last of them.
+    /// The map whose images are being read, and the id of the last image.
     current: Option<(Map, Option<ImageId>)>,
     state: State,
 }
@@ -45,18 +45,18 @@ enum State {
     Ended,
 }
 
-/// A part of an archive that is whole and as it was written.
+/// A verified part of an archive.
 #[derive(Debug)]
 pub enum Item {
-    /// The first.
+    /// The first item.
     Manifest(Manifest),
-    /// The images that follow are of this map.
+    /// A map; its images follow.
     Map(Map),
-    /// An image with its bytes.
+    /// An image and the bytes of its picture.
     Image(ExportedImage, Bytes),
     /// An image of the map that could not be saved.
     LeftOut(LeftOut),
-    /// The last: nothing is missing, and every byte before was as it was written.
+    /// The last item: the archive is complete and undamaged.
     End(End),
 }
 
@@ -66,7 +66,7 @@ struct Entry {
 }
 
 impl Reader {
-    /// Opens an archive.
+    /// Opens an archive file.
     pub fn open(path: &Path) -> Result<Self, ArchiveError> {
         let file = File::open(path).map_err(disk("read", path))?;
         Ok(Self::new(BufReader::with_capacity(1 << 17, file)))
@@ -74,7 +74,7 @@ impl Reader {
 }
 
 impl<R: Read> Reader<R> {
-    /// Reads an archive from wherever it is.
+    /// Reads an archive from any source.
     pub fn new(file: R) -> Self {
         Self {
             file,
@@ -88,22 +88,22 @@ impl<R: Read> Reader<R> {
         }
     }
 
-    /// Bytes read so far.
+    /// Number of bytes read so far.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    /// The maps so far, with what they have so far.
+    /// Maps read so far, with their counts so far.
     pub(super) fn found(&self) -> &[ArchivedMap] {
         &self.found
     }
 
-    /// Where the last item ended.
-    pub(super) fn mark(&self) -> Checkpoint {
+    /// The position after the last item.
+    pub(super) fn checkpoint(&self) -> Checkpoint {
         Checkpoint::new(self.hash.clone(), self.bytes, self.entries)
     }
 
-    /// The next item; `None` after the end.
+    /// Reads the next item; `None` after the end.
     pub fn next_item(&mut self) -> Result<Option<Item>, ArchiveError> {
         match self.state {
             State::Ended => Ok(None),
@@ -125,12 +125,12 @@ impl<R: Read> Reader<R> {
         };
         let manifest: Manifest = self.json(&entry)?;
         if manifest.format != FORMAT {
-            return refuse("its manifest is of another format");
+            return refuse("its manifest names another format");
         }
         if manifest.version != VERSION {
             return refuse(&format!(
-                "it is of version {}, and this program reads version {VERSION}; restore it with \
-                 the whereabouts that made it ({}), or a later one",
+                "it has version {}, but this program reads version {VERSION}; restore it with \
+                 the version of whereabouts that made it ({}), or a later one",
                 manifest.version, manifest.made_by
             ));
         }
@@ -140,14 +140,14 @@ impl<R: Read> Reader<R> {
     }
 
     fn next_of_open(&mut self) -> Result<Item, ArchiveError> {
-        let before = self.mark();
+        let before = self.checkpoint();
         let Some(entry) = self.entry()? else {
             return Err(ArchiveError::Truncated(self.bytes));
         };
         if entry.name == END {
             return self.end(&entry, before);
         }
-        if let Some(name) = self.begins(&entry.name) {
+        if let Some(name) = self.map_starting_with(&entry.name) {
             return self.map(name, &entry);
         }
         match self.current.take() {
@@ -159,18 +159,18 @@ impl<R: Read> Reader<R> {
         }
     }
 
-    /// The map that begins with an entry of this name: one that was asked for and has not come yet.
-    fn begins(&self, entry: &str) -> Option<MapName> {
+    /// The requested map that starts with the entry `entry`, if it has not been read yet.
+    fn map_starting_with(&self, entry: &str) -> Option<MapName> {
         let last = self.found.last().map(|last| &last.name);
-        let next = last.and_then(|last| self.maps.iter().position(|map| map == last));
-        let rest = &self.maps[next.map_or(0, |place| place + 1)..];
+        let position = last.and_then(|last| self.maps.iter().position(|map| map == last));
+        let rest = &self.maps[position.map_or(0, |position| position + 1)..];
         rest.iter().find(|map| map_name(map) == entry).cloned()
     }
 
     fn map(&mut self, name: MapName, entry: &Entry) -> Result<Item, ArchiveError> {
         let map: Map = self.json(entry)?;
         if map.name != name {
-            return Err(self.damaged("a map has the place of another"));
+            return Err(self.damaged("a map is stored under the name of another"));
         }
         self.found.push(ArchivedMap { name, images: 0, left_out: Vec::new() });
         self.current = Some((map.clone(), None));
@@ -229,11 +229,11 @@ impl<R: Read> Reader<R> {
 
     fn end(&mut self, entry: &Entry, before: Checkpoint) -> Result<Item, ArchiveError> {
         let end: End = self.json(entry)?;
-        if (end.sha256, end.bytes, end.entries) != before.of_whole() {
+        if (end.sha256, end.bytes, end.entries) != before.totals() {
             return Err(self.damaged("the checksum of the whole archive is wrong"));
         }
         if end.maps != self.found {
-            return Err(self.damaged("it does not hold what its end says"));
+            return Err(self.damaged("its contents differ from the summary in end.json"));
         }
         let mut rest = Vec::new();
         let read = (&mut self.file).take(2 * BLOCK as u64 + 1).read_to_end(&mut rest);
@@ -242,20 +242,20 @@ impl<R: Read> Reader<R> {
             return Err(ArchiveError::Truncated(self.bytes + rest.len() as u64));
         }
         if rest != [0; 2 * BLOCK] {
-            return Err(self.damaged("there is something after its end"));
+            return Err(self.damaged("there is data after the end"));
         }
         self.state = State::Ended;
         Ok(Item::End(end))
     }
 
-    /// The next entry; `None` where the tar file ends.
+    /// Reads the next entry; `None` at the end of the tar file.
     fn entry(&mut self) -> Result<Option<Entry>, ArchiveError> {
         let block = self.take(BLOCK)?;
         if block.iter().all(|byte| *byte == 0) {
             return Ok(None);
         }
         let header = Header::from_byte_slice(&block);
-        // The checksum is the sum of the header's bytes, with spaces in its own place.
+        // The checksum is the sum of the header's bytes, with its own field counted as spaces.
         let sum = |bytes: &[u8]| bytes.iter().map(|byte| u32::from(*byte)).sum::<u32>();
         let expected = sum(&block[..148]) + 8 * u32::from(b' ') + sum(&block[156..]);
         if header.cksum().ok() != Some(expected) {
@@ -263,27 +263,27 @@ impl<R: Read> Reader<R> {
         }
         if header.entry_type() != EntryType::Regular {
             return Err(ArchiveError::Refused(
-                "it holds something that is not a plain file".into(),
+                "it contains an entry that is not a regular file".into(),
             ));
         }
         let name = String::from_utf8(header.path_bytes().into_owned())
-            .map_err(|_| self.damaged("a name is not text"))?;
-        let most = if name.ends_with(".json") { MAX_JSON_BYTES } else { MAX_PICTURE_BYTES };
+            .map_err(|_| self.damaged("a name is not UTF-8"))?;
+        let max = if name.ends_with(".json") { MAX_JSON_BYTES } else { MAX_PICTURE_BYTES };
         let size = header.entry_size().map_err(|_| self.damaged("a size is not a number"))?;
-        if size > most {
+        if size > max {
             return Err(ArchiveError::Refused(format!("its entry {name:?} has {size} bytes")));
         }
         let bytes = self.take(size as usize)?;
         let padding = bytes.len().next_multiple_of(BLOCK) - bytes.len();
         if self.take(padding)?.iter().any(|byte| *byte != 0) {
-            return Err(self.damaged("the space between two entries is not empty"));
+            return Err(self.damaged("the padding between two entries is not zero"));
         }
         self.entries += 1;
         Ok(Some(Entry { name, bytes }))
     }
 
     fn take(&mut self, length: usize) -> Result<Vec<u8>, ArchiveError> {
-        let mut bytes = Vec::with_capacity(length.min(FIRST_BYTES));
+        let mut bytes = Vec::with_capacity(length.min(INITIAL_BYTES));
         (&mut self.file).take(length as u64).read_to_end(&mut bytes).map_err(failed)?;
         self.hash.update(&bytes);
         self.bytes += bytes.len() as u64;
@@ -308,7 +308,7 @@ impl<R: Read> Reader<R> {
 
     fn misplaced(&self, name: &str) -> ArchiveError {
         let name: String = name.chars().take(200).collect();
-        self.damaged(&format!("{name:?} has no place there"))
+        self.damaged(&format!("the entry {name:?} is not expected here"))
     }
 }
 

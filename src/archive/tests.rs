@@ -1,4 +1,4 @@
-//! Archives that are whole, continued, cut, flipped and forged.
+//! Archives that are complete, resumed, truncated, corrupted and forged.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use super::*;
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{CoordinateFrame, Descriptor, DescriptorKind, Image, Map, Precision, Scene};
 
-fn map(name: &str) -> Map {
+pub(super) fn map(name: &str) -> Map {
     Map {
         uid: Uuid::nil(),
         name: name.parse().unwrap(),
@@ -28,7 +28,7 @@ fn map(name: &str) -> Map {
     }
 }
 
-fn image(id: &str) -> (ExportedImage, Bytes) {
+pub(super) fn image(id: &str) -> (ExportedImage, Bytes) {
     let bytes = Bytes::from(format!("picture of {id}"));
     let image = Image {
         id: id.parse().unwrap(),
@@ -50,7 +50,7 @@ fn archived(name: &str, images: usize) -> ArchivedMap {
     ArchivedMap { name: name.parse().unwrap(), images, left_out }
 }
 
-/// Between the images of the map a.
+/// An image that sorts between the two images of map a.
 fn left_out() -> LeftOut {
     LeftOut { id: "1-damaged".parse().unwrap(), why: "damaged".into() }
 }
@@ -64,7 +64,7 @@ fn add(writer: &mut Writer, map: &str, id: &str) {
     writer.image(&map.parse().unwrap(), &image, &bytes).unwrap();
 }
 
-/// Two images in the map a, one in b.
+/// Writes an archive with two images in map a and one in map b.
 fn write(dir: &TempDir) -> PathBuf {
     let path = dir.path().join("backup.tar");
     let mut writer = Writer::begin(&path, &Manifest::new(names(&["a", "b"]))).unwrap();
@@ -78,7 +78,7 @@ fn write(dir: &TempDir) -> PathBuf {
     path
 }
 
-fn read(path: &Path) -> Result<Vec<Item>, ArchiveError> {
+pub(super) fn read(path: &Path) -> Result<Vec<Item>, ArchiveError> {
     let (mut reader, mut items) = (Reader::open(path)?, Vec::new());
     while let Some(item) = reader.next_item()? {
         items.push(item);
@@ -87,10 +87,10 @@ fn read(path: &Path) -> Result<Vec<Item>, ArchiveError> {
 }
 
 #[test]
-fn what_was_written_is_read() {
+fn an_archive_reads_back_what_was_written() {
     let dir = TempDir::new().unwrap();
     let path = write(&dir);
-    assert!(!growing(&path).exists());
+    assert!(!partial_path(&path).exists());
     let items = read(&path).unwrap();
     let images = items.iter().filter_map(|item| match item {
         Item::Image(image, bytes) => Some((image.clone(), bytes.clone())),
@@ -101,7 +101,7 @@ fn what_was_written_is_read() {
 }
 
 #[test]
-fn a_byte_that_was_flipped_anywhere_is_noticed() {
+fn a_corrupted_byte_is_detected() {
     let dir = TempDir::new().unwrap();
     let path = write(&dir);
     let bytes = fs::read(&path).unwrap();
@@ -110,14 +110,14 @@ fn a_byte_that_was_flipped_anywhere_is_noticed() {
         damaged[at] ^= 0x20;
         let path = dir.path().join("damaged.tar");
         fs::write(&path, damaged).unwrap();
-        // When the backup ended stands outside all checksums, but is nothing to restore by.
+        // The checksum does not cover end.json itself, whose timestamp a restore does not use.
         let in_last_entry = at > bytes.len() - 4 * BLOCK;
         assert!(read(&path).is_err() || in_last_entry, "byte {at}");
     }
 }
 
 #[test]
-fn an_archive_that_was_cut_anywhere_is_refused_and_can_be_gone_on_with() {
+fn a_truncated_archive_is_rejected_and_can_be_resumed() {
     let dir = TempDir::new().unwrap();
     let path = write(&dir);
     let bytes = fs::read(&path).unwrap();
@@ -126,18 +126,18 @@ fn an_archive_that_was_cut_anywhere_is_refused_and_can_be_gone_on_with() {
         fs::write(&path, &bytes[..length]).unwrap();
         assert!(read(&path).is_err(), "{length} bytes");
 
-        fs::rename(&path, growing(&path)).unwrap();
-        let Some((mut writer, _, resumed)) = Writer::go_on(&path, &names(&["a", "b"])).unwrap()
+        fs::rename(&path, partial_path(&path)).unwrap();
+        let Some((mut writer, _, resumed)) = Writer::resume(&path, &names(&["a", "b"])).unwrap()
         else {
             assert!(length < 2 * BLOCK, "{length} bytes");
             continue;
         };
         let last = resumed.last.as_ref().map(ImageId::as_str);
-        let begun: Vec<_> = resumed.maps.iter().map(|map| map.name.as_str()).collect();
-        if begun.is_empty() {
+        let started: Vec<_> = resumed.maps.iter().map(|map| map.name.as_str()).collect();
+        if started.is_empty() {
             writer.map(&map("a")).unwrap();
         }
-        if begun.len() < 2 {
+        if started.len() < 2 {
             let rest = ["1", "1-damaged", "2"].into_iter();
             for id in rest.filter(|id| last.is_none_or(|last| *id > last)) {
                 match id {
@@ -147,7 +147,7 @@ fn an_archive_that_was_cut_anywhere_is_refused_and_can_be_gone_on_with() {
             }
             writer.map(&map("b")).unwrap();
         }
-        if begun.len() < 2 || last.is_none() {
+        if started.len() < 2 || last.is_none() {
             add(&mut writer, "b", "1");
         }
         writer.finish(vec![archived("a", 2), archived("b", 1)]).unwrap();
@@ -156,30 +156,30 @@ fn an_archive_that_was_cut_anywhere_is_refused_and_can_be_gone_on_with() {
 }
 
 #[test]
-fn other_maps_begin_anew() {
+fn a_backup_of_other_maps_is_not_resumed() {
     let dir = TempDir::new().unwrap();
     let path = write(&dir);
-    fs::rename(&path, growing(&path)).unwrap();
-    assert!(Writer::go_on(&path, &names(&["a"])).unwrap().is_none());
+    fs::rename(&path, partial_path(&path)).unwrap();
+    assert!(Writer::resume(&path, &names(&["a"])).unwrap().is_none());
 }
 
 #[test]
-fn a_map_is_taken_back() {
+fn rewinding_discards_a_map() {
     let dir = TempDir::new().unwrap();
     let path = dir.path().join("backup.tar");
     let mut writer = Writer::begin(&path, &Manifest::new(names(&["a", "b"]))).unwrap();
     writer.map(&map("a")).unwrap();
     add(&mut writer, "a", "1");
     writer.left_out(&"a".parse().unwrap(), &left_out()).unwrap();
-    let mark = writer.mark();
+    let checkpoint = writer.checkpoint();
     writer.map(&map("b")).unwrap();
     add(&mut writer, "b", "1");
-    writer.go_back(&mark).unwrap();
+    writer.rewind(&checkpoint).unwrap();
     writer.finish(vec![archived("a", 1)]).unwrap();
     assert_eq!(read(&path).unwrap().len(), 5);
 }
 
-/// A tar file of these entries, made by the library itself.
+/// Writes a tar file of these entries with the tar library.
 fn forged(path: &Path, entries: &[(tar::EntryType, &str, &[u8])]) {
     let mut tar = tar::Builder::new(fs::File::create(path).unwrap());
     for (kind, name, bytes) in entries {
@@ -194,14 +194,14 @@ fn forged(path: &Path, entries: &[(tar::EntryType, &str, &[u8])]) {
 }
 
 #[test]
-fn what_is_no_backup_is_refused() {
+fn a_forged_archive_is_rejected() {
     let dir = TempDir::new().unwrap();
     let path = dir.path().join("forged.tar");
     let manifest = serde_json::to_vec(&Manifest::new(names(&["a"]))).unwrap();
     let regular = tar::EntryType::Regular;
     let first = (regular, MANIFEST, manifest.as_slice());
     let record = serde_json::to_vec(&map("a")).unwrap();
-    let begun = (regular, "maps/a/map.json", record.as_slice());
+    let started = (regular, "maps/a/map.json", record.as_slice());
     let other = serde_json::to_vec(&map("b")).unwrap();
     let cases: &[&[(tar::EntryType, &str, &[u8])]] = &[
         &[],
@@ -215,15 +215,15 @@ fn what_is_no_backup_is_refused() {
         &[first, (tar::EntryType::GNUSparse, "maps/a/map.json", b"")],
         &[first, (regular, "maps/b/map.json", &other)],
         &[first, (regular, "maps/a/map.json", &other)],
-        &[first, begun, begun],
-        &[first, begun, (regular, "maps/a/00.json", b"{}")],
+        &[first, started, started],
+        &[first, started, (regular, "maps/a/00.json", b"{}")],
     ];
     for (number, case) in cases.iter().enumerate() {
         forged(&path, case);
         assert!(read(&path).is_err(), "case {number}");
     }
-    // A size that lies: terabytes are said, and a few bytes are there.
-    forged(&path, &[first, begun]);
+    // A header that claims a terabyte, or 60 MB, followed by a few bytes.
+    forged(&path, &[first, started]);
     let mut bytes = fs::read(&path).unwrap();
     let at = 2 * BLOCK;
     let mut header = tar::Header::from_byte_slice(&bytes[at..at + BLOCK]).clone();

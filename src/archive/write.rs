@@ -1,4 +1,4 @@
-//! Writing an archive, or more of one that was interrupted.
+//! Writing an archive, and resuming one that was interrupted.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
@@ -17,16 +17,16 @@ use super::{
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, ImageId, Map, MapName};
 
-/// Writes an archive beside its place; it is there when it is whole.
+/// Writes an archive to a partial file, which is renamed to its final path once it is complete.
 pub struct Writer {
     file: BufWriter<File>,
     path: PathBuf,
-    mark: Checkpoint,
-    /// What entries say about when they were changed, in seconds since 1970.
+    position: Checkpoint,
+    /// Modification time of all entries, in Unix seconds.
     made_at: u64,
 }
 
-/// A place in the archive to which the writer can go back.
+/// A position in the archive to which the writer can rewind.
 #[derive(Clone)]
 pub struct Checkpoint {
     hash: Sha256,
@@ -34,45 +34,44 @@ pub struct Checkpoint {
     entries: u64,
 }
 
-/// How far an interrupted backup had come.
+/// The state of an interrupted backup.
 #[derive(Default)]
 pub struct Resumed {
-    /// The maps that were begun, with their images so far; the last one may have more.
+    /// The maps that were started, with their images so far. The last map may be incomplete.
     pub maps: Vec<ArchivedMap>,
-    /// The last map, as its server described it, and its last image.
+    /// The last map, as recorded in the archive.
     pub map: Option<Map>,
-    /// See `map`.
+    /// The last image of that map.
     pub last: Option<ImageId>,
-    /// Where the last map begins.
-    pub begins: Option<Checkpoint>,
+    /// Start of the last map.
+    pub map_start: Option<Checkpoint>,
 }
 
-/// Where an archive grows until it is whole.
-pub fn growing(path: &Path) -> PathBuf {
+/// Path of the partial file of an archive.
+pub fn partial_path(path: &Path) -> PathBuf {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".partial");
     path.with_file_name(name)
 }
 
 impl Writer {
-    /// Begins an archive. What an interrupted backup left is overwritten.
+    /// Starts an archive. Overwrites the partial file of an interrupted backup.
     pub fn begin(path: &Path, manifest: &Manifest) -> Result<Self, ArchiveError> {
-        let partial = growing(path);
+        let partial = partial_path(path);
         let file = File::create(&partial).map_err(disk("write", &partial))?;
-        let mark = Checkpoint { hash: Sha256::new(), bytes: 0, entries: 0 };
+        let position = Checkpoint { hash: Sha256::new(), bytes: 0, entries: 0 };
         let (file, made_at) = (BufWriter::new(file), seconds(manifest));
-        let mut writer = Self { file, path: path.to_owned(), mark, made_at };
+        let mut writer = Self { file, path: path.to_owned(), position, made_at };
         writer.json(MANIFEST, manifest)?;
         Ok(writer)
     }
 
-    /// Goes on where an interrupted backup of the same maps left off; `None` if there is none.
-    /// What it wrote last and did not finish is written anew.
-    pub fn go_on(
+    /// Resumes an interrupted backup of the same maps, if there is one, after its last complete item.
+    pub fn resume(
         path: &Path,
         maps: &[MapName],
     ) -> Result<Option<(Self, Manifest, Resumed)>, ArchiveError> {
-        let partial = growing(path);
+        let partial = partial_path(path);
         if !partial.is_file() {
             return Ok(None);
         }
@@ -81,46 +80,47 @@ impl Writer {
         if manifest.maps != maps {
             return Ok(None);
         }
-        let (mut resumed, mut mark) = (Resumed::default(), reader.mark());
-        // Whatever is wrong with the rest, up to there it is right.
+        let (mut resumed, mut checkpoint) = (Resumed::default(), reader.checkpoint());
+        // Everything before the first damaged or incomplete item is kept.
         while let Ok(Some(item)) = reader.next_item() {
             match item {
                 Item::Map(map) => {
                     (resumed.map, resumed.last) = (Some(map), None);
-                    resumed.begins = Some(mark);
+                    resumed.map_start = Some(checkpoint);
                 }
                 Item::Image(image, _) => resumed.last = Some(image.image.id),
                 Item::LeftOut(left_out) => resumed.last = Some(left_out.id),
                 Item::Manifest(_) | Item::End(_) => break,
             }
-            mark = reader.mark();
+            checkpoint = reader.checkpoint();
             resumed.maps = reader.found().to_vec();
         }
         let file = File::options().write(true).open(&partial).map_err(disk("write", &partial))?;
         let (file, made_at) = (BufWriter::new(file), seconds(&manifest));
-        let mut writer = Self { file, path: path.to_owned(), mark: mark.clone(), made_at };
-        writer.go_back(&mark)?;
+        let position = checkpoint.clone();
+        let mut writer = Self { file, path: path.to_owned(), position, made_at };
+        writer.rewind(&checkpoint)?;
         Ok(Some((writer, manifest, resumed)))
     }
 
-    /// The place that the archive has come to.
-    pub fn mark(&self) -> Checkpoint {
-        self.mark.clone()
+    /// The current position in the archive.
+    pub fn checkpoint(&self) -> Checkpoint {
+        self.position.clone()
     }
 
-    /// Takes back what was written since.
-    pub fn go_back(&mut self, mark: &Checkpoint) -> Result<(), ArchiveError> {
-        let mut rewind = || {
+    /// Discards everything that was written after the checkpoint.
+    pub fn rewind(&mut self, checkpoint: &Checkpoint) -> Result<(), ArchiveError> {
+        let mut truncate = || {
             self.file.flush()?;
-            self.file.get_ref().set_len(mark.bytes)?;
-            self.file.seek(SeekFrom::Start(mark.bytes))
+            self.file.get_ref().set_len(checkpoint.bytes)?;
+            self.file.seek(SeekFrom::Start(checkpoint.bytes))
         };
-        rewind().map_err(disk("write", &self.path))?;
-        self.mark = mark.clone();
+        truncate().map_err(disk("write", &self.path))?;
+        self.position = checkpoint.clone();
         Ok(())
     }
 
-    /// Begins a map.
+    /// Starts a map.
     pub fn map(&mut self, map: &Map) -> Result<(), ArchiveError> {
         self.json(&map_name(&map.name), map)
     }
@@ -138,18 +138,18 @@ impl Writer {
         self.entry(&bytes_name(map, digest, image.image.media_type), bytes)
     }
 
-    /// Says that an image of a map could not be saved.
+    /// Records that an image of a map could not be saved.
     pub fn left_out(&mut self, map: &MapName, left_out: &LeftOut) -> Result<(), ArchiveError> {
         self.json(&left_out_name(map), left_out)
     }
 
-    /// Ends the archive and puts it in its place, for good.
+    /// Completes the archive: makes it durable and renames it to its final path.
     pub fn finish(mut self, maps: Vec<ArchivedMap>) -> Result<End, ArchiveError> {
-        let (sha256, bytes, entries) = self.mark.clone().of_whole();
+        let (sha256, bytes, entries) = self.position.clone().totals();
         let end = End { finished_at: Timestamp::now(), maps, entries, bytes, sha256 };
         self.json(END, &end)?;
-        let place = self.path.clone();
-        let folder = match place.parent() {
+        let path = self.path.clone();
+        let folder = match path.parent() {
             Some(folder) if folder != Path::new("") => folder,
             _ => Path::new("."),
         };
@@ -157,10 +157,10 @@ impl Writer {
             self.file.write_all(&[0; 2 * BLOCK])?;
             self.file.flush()?;
             self.file.get_ref().sync_all()?;
-            fs::rename(growing(&place), &place)?;
+            fs::rename(partial_path(&path), &path)?;
             File::open(folder)?.sync_all()
         };
-        done().map_err(disk("write", &place))?;
+        done().map_err(disk("write", &path))?;
         Ok(end)
     }
 
@@ -185,13 +185,13 @@ impl Writer {
             self.write(bytes)?;
             self.write(&[0; BLOCK][..padding])
         });
-        self.mark.entries += 1;
-        written.map_err(disk("write", &growing(&self.path)))
+        self.position.entries += 1;
+        written.map_err(disk("write", &partial_path(&self.path)))
     }
 
     fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.file.write_all(bytes)?;
-        self.mark.take(bytes);
+        self.position.advance(bytes);
         Ok(())
     }
 }
@@ -201,12 +201,12 @@ impl Checkpoint {
         Self { hash, bytes, entries }
     }
 
-    /// The SHA-256 of all bytes before it, how many they are, and of how many entries.
-    pub(super) fn of_whole(self) -> (Digest, u64, u64) {
+    /// The SHA-256 and number of all bytes before the checkpoint, and the number of entries.
+    pub(super) fn totals(self) -> (Digest, u64, u64) {
         (Digest::from(<[u8; 32]>::from(self.hash.finalize())), self.bytes, self.entries)
     }
 
-    fn take(&mut self, bytes: &[u8]) {
+    fn advance(&mut self, bytes: &[u8]) {
         self.hash.update(bytes);
         self.bytes += bytes.len() as u64;
     }

@@ -1,6 +1,6 @@
 //! The arguments of client commands that say which server to talk to.
 
-pub use whereabouts_api::{Client, LONGEST_PAUSE, PATIENCE, explained, segment};
+pub use whereabouts_api::{Client, MAX_ATTEMPTS, MAX_PAUSE, explained, segment};
 
 /// The server that a client command talks to.
 #[derive(Debug, Clone, clap::Args)]

@@ -255,7 +255,7 @@ async fn list_images(client: &Client, path: &str) -> anyhow::Result<HashMap<Imag
         let cursor_parameter = cursor.iter().map(|cursor| ("cursor", cursor.clone()));
         let query: Vec<_> = cursor_parameter.chain([("limit", PAGE_SIZE.to_string())]).collect();
         let request = || Ok(client.get(&format!("{path}/images")).query(&query));
-        let page: Page = client.send_patiently(request).await?.json().await?;
+        let page: Page = client.send_with_retries(request).await?.json().await?;
         images.extend(page.images.into_iter().map(|image| (image.id, image.digest)));
         cursor = page.next_cursor;
         if cursor.is_none() {
@@ -277,7 +277,7 @@ async fn send(
     let media_type = image.image.media_type.as_str();
     let meta = serde_json::to_string(&ImportedImage { map: target.map.clone(), image })?;
     let response = client
-        .answer_patiently(|| {
+        .response_with_retries(|| {
             let part = Part::stream(bytes.clone()).mime_str(media_type)?;
             let form = Form::new().part("image", part).text("meta", meta.clone());
             Ok(client.post(&format!("{}/import", target.path)).multipart(form))

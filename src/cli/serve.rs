@@ -8,7 +8,8 @@ use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-use whereabouts_server::config::{Config, Overrides, Refiner};
+use whereabouts_refine::{REFINERS, RefinerEntry};
+use whereabouts_server::config::{Config, Overrides, RefinerChoice};
 use whereabouts_server::startup;
 use whereabouts_server::startup::Role;
 
@@ -32,7 +33,7 @@ pub struct Args {
     model: Option<String>,
     /// Refiner of the candidates
     #[arg(long)]
-    refiner: Option<Refiner>,
+    refiner: Option<RefinerChoice>,
     /// Require no API key, whatever address the server listens on: anyone who can reach it has full access
     #[arg(long)]
     no_keys: bool,
@@ -89,9 +90,11 @@ fn check_worker(config: &Config) -> anyhow::Result<()> {
             "this worker would refine nothing: remove --no-workers and set jobs.workers to 1 or more"
         );
     }
-    if config.refine.refiner == Refiner::Off {
+    if config.refine.refiner == RefinerChoice::OFF {
+        let refiners: Vec<&str> = REFINERS.iter().map(RefinerEntry::name).collect();
         bail!(
-            "this worker would refine nothing: set refine.refiner to local or mllm, as on the servers"
+            "this worker would refine nothing: set refine.refiner to {}, as on the servers",
+            refiners.join(" or ")
         );
     }
     Ok(())

@@ -1,41 +1,41 @@
-//! How sure an answer is, measured against the map itself.
+//! Confidence of an answer, calibrated on the map itself.
 //!
-//! Some of the map's own images are asked as if they were frames, with the images of their own place
-//! left out. Whatever answers them is wrong, and only as good as chance resemblance makes it in this
-//! map. The [`Evidence`] for the first answer to a frame is held against those: its confidence is the
-//! share of them that it exceeds,
+//! Calibration queries the map with a sample of its own images, excluding all images of the same place
+//! (hard negatives). Every answer to these queries is wrong, so the [`Evidence`] for them samples the null
+//! distribution of this map. The confidence of an answer is the share of the null distribution that its
+//! evidence exceeds,
 //!
 //! > c = #{x < e} / (n + 1)
 //!
-//! for evidence e and n chance values x. This is one less the conformal p-value of the frame
-//! (Vovk, Gammerman and Shafer, *Algorithmic Learning in a Random World*, 2005): of frames that show no
-//! place of the map, and are otherwise like its images, at most a share of 1 − c reach a confidence
-//! of c. Nothing is assumed about the distribution, and no frame needs a ground truth.
+//! for evidence e and n null values x. This is one minus the conformal p-value of the frame (Vovk,
+//! Gammerman and Shafer, *Algorithmic Learning in a Random World*, 2005): of frames that show no place of
+//! the map but otherwise resemble its images, at most a fraction 1 − c reaches confidence c. The bound is
+//! distribution-free and needs no ground truth.
 //!
-//! Evidence is relative to the other candidates of the same frame. A frame at night is less similar
-//! to every image of the map, the right one and the wrong ones.
+//! Evidence is relative to the other candidates of the same frame, because conditions such as night lower
+//! the similarity to right and wrong images alike.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::{Candidate, ImageId, Pose};
 
-/// Candidates that the similarity of one is compared with, itself included.
+/// Number of top candidates among which similarities are compared.
 pub const COMPARED: usize = 10;
 
-/// What speaks for a candidate.
+/// Evidence that a candidate shows the place of the frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Evidence {
-    /// By how much its similarity exceeds the median of the other candidates'.
+    /// Similarity of the candidate minus the median similarity of the other candidates.
     Similarity(f32),
-    /// ln((a + 1) / (m + 1)) for a regions that agree with the frame, and a median of m that do among the
-    /// other candidates.
+    /// ln((a + 1) / (m + 1)), where a regions of the candidate match the frame and m is the median of that
+    /// count over the other candidates.
     Agreement(f32),
 }
 
 impl Evidence {
-    /// What the similarities of the first [`COMPARED`] candidates say for one of them; `None` for one
-    /// that is not among them, and where there is no other.
+    /// Computes the evidence for the image `of` from the similarities of the first [`COMPARED`]
+    /// candidates. Returns `None` if the image is not among them or is the only one.
     pub fn similarity(candidates: &[Candidate], of: &ImageId) -> Option<Self> {
         let compared = &candidates[..candidates.len().min(COMPARED)];
         let one = compared.iter().find(|candidate| candidate.image_id == *of)?;
@@ -44,17 +44,17 @@ impl Evidence {
         Some(Self::Similarity(one.similarity - median))
     }
 
-    /// What the numbers of agreeing regions of all candidates say for the one at `of`; `None` where
-    /// there is no other.
-    pub fn agreement(agreeing: &[usize], of: usize) -> Option<Self> {
-        let one = *agreeing.get(of)?;
-        let others = agreeing.iter().enumerate().filter(|(index, _)| *index != of);
-        let median = median(others.map(|(_, &agreeing)| agreeing as f32).collect())?;
+    /// Computes the evidence for the candidate at index `of` from the number of matching regions of every
+    /// candidate. Returns `None` if there is no other candidate.
+    pub fn agreement(matches: &[usize], of: usize) -> Option<Self> {
+        let one = *matches.get(of)?;
+        let others = matches.iter().enumerate().filter(|(index, _)| *index != of);
+        let median = median(others.map(|(_, &count)| count as f32).collect())?;
         Some(Self::Agreement(((one as f32 + 1.0) / (median + 1.0)).ln()))
     }
 }
 
-/// The middle value, or the mean of the two in the middle; `None` of nothing.
+/// The median; `None` if `values` is empty.
 fn median(mut values: Vec<f32>) -> Option<f32> {
     values.sort_by(f32::total_cmp);
     let (low, high) =
@@ -62,7 +62,7 @@ fn median(mut values: Vec<f32>) -> Option<f32> {
     Some((low + high) / 2.0)
 }
 
-/// Evidence that chance gave to wrong answers, in ascending order.
+/// Evidence values of wrong answers, sorted ascending.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(from = "Vec<f32>", into = "Vec<f32>")]
 pub struct NullDistribution(Vec<f32>);
@@ -75,80 +75,80 @@ impl From<Vec<f32>> for NullDistribution {
 }
 
 impl From<NullDistribution> for Vec<f32> {
-    fn from(chance: NullDistribution) -> Self {
-        chance.0
+    fn from(null: NullDistribution) -> Self {
+        null.0
     }
 }
 
 impl NullDistribution {
-    /// How many wrong answers it was measured with.
+    /// Number of samples.
     pub fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// Whether nothing was measured.
+    /// Whether there are no samples.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Their mean; `None` of nothing.
+    /// Mean of the samples; `None` if there are none.
     pub fn mean(&self) -> Option<f32> {
         let sum: f32 = self.0.iter().sum();
         (!self.is_empty()).then(|| sum / self.len() as f32)
     }
 
-    /// c = #{x < e} / (n + 1), 0 to below 1.
+    /// c = #{x < e} / (n + 1), in [0, 1).
     fn confidence(&self, evidence: f32) -> f32 {
         let below = self.0.partition_point(|value| *value < evidence);
         below as f32 / (self.len() + 1) as f32
     }
 }
 
-/// What chance resemblance looks like in one map.
+/// Null distributions of one map.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Calibration {
-    /// Images that the map had when it was measured.
+    /// Number of images in the map when it was calibrated.
     pub images: usize,
-    /// The settings it was measured with.
+    /// Settings of the calibration.
     pub settings: CalibrationSettings,
-    /// Whether all of it was measured; else that was broken off, or goes on.
+    /// Whether the calibration is complete; `false` while it is running or after it was interrupted.
     pub complete: bool,
-    /// Of [`Evidence::Similarity`].
+    /// Null distribution of [`Evidence::Similarity`].
     pub similarity: NullDistribution,
-    /// Of [`Evidence::Agreement`]; empty until it is measured, and where there is no refiner.
+    /// Null distribution of [`Evidence::Agreement`]; empty without a refiner or until it is measured.
     pub agreement: NullDistribution,
 }
 
-/// How a map is measured.
+/// How a map is calibrated.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CalibrationSettings {
-    /// Images that are asked as if they were frames, at most.
+    /// Maximum number of images used as queries.
     pub images: usize,
-    /// Of these, how many are also refined.
+    /// Number of these queries that are also refined.
     pub refined: usize,
-    /// Candidates of a job.
+    /// Candidates per job.
     pub candidates: usize,
-    /// An image shows the place of those that were added up to so many before or after it; less in a
-    /// map of less than ten times as many images.
+    /// Images added within this distance, in order of addition, count as the same place. Reduced in maps
+    /// with fewer than ten times as many images.
     pub place_images: usize,
-    /// And of those whose pose is so close, in metres.
+    /// Images whose poses are within this many metres count as the same place.
     pub place_m: f64,
 }
 
 impl CalibrationSettings {
-    /// Images on either side that show the same place, in a map of so many.
-    pub fn place_images_of(&self, images: usize) -> usize {
+    /// How many images before and after an image count as the same place, in a map with `images` images.
+    pub fn place_radius(&self, images: usize) -> usize {
         self.place_images.min(images / 10)
     }
 
-    /// One of so many images is asked, in a map of so many.
+    /// Stride at which a map with `images` images is sampled.
     pub fn step(&self, images: usize) -> usize {
         images.div_ceil(self.images.max(1)).max(1)
     }
 
-    /// Whether two images show different places, in a map of so many. Of each, where it stands in the order
-    /// of addition, and its pose.
+    /// Whether two images of a map with `images` images show different places. Each is given by its index
+    /// in order of addition and its pose.
     pub fn are_apart(
         &self,
         images: usize,
@@ -156,26 +156,26 @@ impl CalibrationSettings {
         other: (usize, Option<Pose>),
     ) -> bool {
         let distance = one.1.zip(other.1).and_then(|(a, b)| a.distance_m(&b));
-        one.0.abs_diff(other.0) > self.place_images_of(images)
+        one.0.abs_diff(other.0) > self.place_radius(images)
             && distance.is_none_or(|distance| distance > self.place_m)
     }
 }
 
 impl Calibration {
-    /// The confidence in one of the candidates of a frame: by what the refiner found, if it found
-    /// something and that was measured, else by similarity.
+    /// Confidence that the image `of` shows the place of the frame. Uses the evidence of the refiner if
+    /// there is any and agreement is calibrated, and similarity otherwise.
     pub fn refined_confidence(
         &self,
         candidates: &[Candidate],
         of: &ImageId,
-        found: Option<Evidence>,
+        refined: Option<Evidence>,
     ) -> f32 {
-        let found = found.filter(|_| !self.agreement.is_empty());
-        let evidence = found.or_else(|| Evidence::similarity(candidates, of));
+        let refined = refined.filter(|_| !self.agreement.is_empty());
+        let evidence = refined.or_else(|| Evidence::similarity(candidates, of));
         evidence.map_or(0.0, |evidence| self.confidence(evidence))
     }
 
-    /// The confidence in an answer for which this speaks, 0 to below 1; 0 where nothing was measured.
+    /// Confidence of an answer with this evidence, in [0, 1); 0 in a map that is not calibrated.
     pub fn confidence(&self, evidence: Evidence) -> f32 {
         match evidence {
             Evidence::Similarity(value) => self.similarity.confidence(value),
@@ -184,23 +184,22 @@ impl Calibration {
     }
 }
 
-/// The best guess of where a frame was taken.
+/// The most likely place of a frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Estimate {
-    /// The image that shows the place.
+    /// Image that shows the place.
     pub image_id: ImageId,
-    /// Its pose, if known.
+    /// Pose of that image, if known.
     pub pose: Option<Pose>,
-    /// How sure it is, 0 to 1: of frames from outside the map, at most the rest to 1 get so much. It is
-    /// measured in the map itself, and 0 until that is done, a moment after images were added.
+    /// Confidence c, 0 to 1: of frames taken outside the map, at most a fraction 1 − c reaches it. It is
+    /// calibrated on the map itself and 0 until calibration has run, shortly after images were added.
     pub confidence: f32,
-    /// Whether the confidence reaches the configured bound, below which the place is perhaps not in
-    /// the map.
+    /// Whether the confidence reaches the configured threshold. Below it, the place may not be in the map.
     pub known: bool,
 }
 
 impl Estimate {
-    /// The guess that this image shows the place; known from a confidence of `known_from` on.
+    /// An estimate that counts as known if its confidence is at least `known_from`.
     pub fn new(image_id: &ImageId, pose: Option<Pose>, confidence: f32, known_from: f64) -> Self {
         let known = f64::from(confidence) >= known_from;
         Self { image_id: image_id.clone(), pose, confidence, known }
@@ -222,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn similarity_speaks_for_one_against_the_median_of_the_first_ten() {
+    fn similarity_evidence_is_relative_to_the_median_of_the_first_ten() {
         let some = candidates(&[0.9, 0.5, 0.4, 0.1]);
         let of = |index: &str| Evidence::similarity(&some, &index.parse().unwrap());
         assert_eq!(of("0"), Some(Evidence::Similarity(0.9 - 0.4)));
@@ -235,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn agreement_speaks_for_one_by_the_ratio_to_the_median_of_the_others() {
+    fn agreement_evidence_is_the_log_ratio_to_the_median_of_the_others() {
         let Some(Evidence::Agreement(ratio)) = Evidence::agreement(&[3, 39, 1, 1, 5], 1) else {
             panic!("there are others")
         };
@@ -245,24 +244,24 @@ mod tests {
     }
 
     #[test]
-    fn of_chance_values_at_most_their_share_is_as_sure() {
-        let chance = NullDistribution::from(vec![0.3, 0.1, 0.2, 0.2]);
-        let of = |evidence| chance.confidence(evidence);
+    fn confidence_bounds_the_false_positive_rate() {
+        let null = NullDistribution::from(vec![0.3, 0.1, 0.2, 0.2]);
+        let of = |evidence| null.confidence(evidence);
         assert_eq!([of(0.05), of(0.2), of(0.25), of(9.0)], [0.0, 0.2, 0.6, 0.8]);
-        // Each of 99 values, held against the other 98.
+        // Leave one out: each of 99 values against the other 98.
         let values: Vec<f32> = (0..99).map(|i| ((i * 37) % 99) as f32).collect();
-        let sure = (0..99).filter(|&left_out| {
+        let confident = (0..99).filter(|&left_out| {
             let mut others = values.clone();
             let one = others.remove(left_out);
             NullDistribution::from(others).confidence(one) >= 0.9
         });
-        assert!(sure.count() <= 10);
+        assert!(confident.count() <= 10);
         assert_eq!(NullDistribution::default().confidence(1.0), 0.0);
     }
 
     #[test]
-    fn a_small_map_has_small_places() {
+    fn the_place_radius_shrinks_in_a_small_map() {
         let settings = CalibrationSettings { place_images: 4, ..Default::default() };
-        assert_eq!([8, 25, 40, 4000].map(|n| settings.place_images_of(n)), [0, 2, 4, 4]);
+        assert_eq!([8, 25, 40, 4000].map(|n| settings.place_radius(n)), [0, 2, 4, 4]);
     }
 }

@@ -1,6 +1,6 @@
-//! Dense features: the local feature map of one image, as the backbone sees it.
+//! Dense features: the local feature map of one image.
 
-/// The local features of one image: `height × width` cells of `channels` numbers each.
+/// The local feature map of one image: `height × width` cells of `channels` numbers each.
 ///
 /// Cell `(row, col)` covers the part of the picture around
 /// `((col + 0.5) / width, (row + 0.5) / height)` in fractions of the picture's edges. Each cell is
@@ -12,14 +12,14 @@ pub struct DenseFeatures {
     channels: usize,
     /// Row-major, channels innermost: `height * width * channels` numbers.
     cells: Vec<f32>,
-    /// How far the model trusts each cell, 0 to 1, where the model says so: `height * width`.
+    /// The model's reliability of each cell, 0 to 1, if it outputs one: `height * width` numbers.
     reliability: Option<Vec<f32>>,
 }
 
-/// Why numbers could not become [`DenseFeatures`].
-#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+/// Why a buffer is not valid as [`DenseFeatures`].
+#[derive(Debug, Clone, thiserror::Error, PartialEq, Eq)]
 pub enum DenseFeaturesError {
-    /// The buffer does not hold `height * width * channels` numbers, or holds none.
+    /// The buffer is empty or does not hold `height * width * channels` numbers.
     #[error("dense features of {height}×{width}×{channels} cannot hold {got} numbers")]
     Shape {
         /// Rows of cells.
@@ -31,7 +31,7 @@ pub enum DenseFeaturesError {
         /// Numbers in the buffer.
         got: usize,
     },
-    /// The reliability map does not hold one number for each cell.
+    /// The reliability map does not hold one number per cell.
     #[error("a reliability map of {got} numbers does not fit {cells} cells")]
     Reliability {
         /// Cells of the feature map.
@@ -42,8 +42,8 @@ pub enum DenseFeaturesError {
 }
 
 impl DenseFeatures {
-    /// Takes row-major cells and normalises each one. A cell without a direction, because it is
-    /// zero or not finite, becomes zero and matches nothing.
+    /// Builds a feature map from row-major cells, normalising each one. A cell that is zero or not
+    /// finite has no direction: it is set to zero and matches nothing.
     pub fn new(
         height: usize,
         width: usize,
@@ -87,12 +87,12 @@ impl DenseFeatures {
         self.channels
     }
 
-    /// How many cells there are: `height × width`.
+    /// Number of cells: `height × width`.
     pub fn len(&self) -> usize {
         self.height * self.width
     }
 
-    /// Whether there is no cell; never true of a constructed value.
+    /// Whether there are no cells; always false for a constructed value.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -102,12 +102,12 @@ impl DenseFeatures {
         &self.cells
     }
 
-    /// The reliability of each cell, 0 to 1, where the model gives one.
+    /// The reliability of each cell, 0 to 1, if the model outputs one.
     pub fn reliability(&self) -> Option<&[f32]> {
         self.reliability.as_deref()
     }
 
-    /// Memory held, in bytes.
+    /// Heap memory used, in bytes.
     pub fn bytes(&self) -> usize {
         (self.cells.len() + self.reliability.as_ref().map_or(0, Vec::len)) * size_of::<f32>()
     }

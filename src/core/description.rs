@@ -1,4 +1,4 @@
-//! Descriptions of pairs as the description cache keeps them, and the frames they belong to.
+//! Entries of the description cache, and the frames they belong to.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -7,54 +7,54 @@ use uuid::Uuid;
 
 use crate::{Descriptor, Digest, StandIn, Usage};
 
-/// A frame whose pairs were described.
+/// A frame for which at least one pair has been described.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DescribedFrame {
-    /// Its query.
+    /// The query that posted the frame.
     pub query_id: Uuid,
-    /// Its bytes.
+    /// Digest of the frame's bytes.
     pub digest: Digest,
-    /// Its descriptor.
+    /// Global descriptor of the frame.
     pub descriptor: Descriptor,
 }
 
-/// An earlier frame that resembles another.
+/// An earlier frame that is nearly identical to the current one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SimilarFrame {
-    /// Its bytes.
+    /// Digest of the earlier frame's bytes.
     pub digest: Digest,
-    /// What a job says of it.
+    /// How a job reports it.
     pub stand_in: StandIn,
 }
 
-/// How full a cache of descriptions is.
+/// Fill level of a description cache.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct CacheLevels {
-    /// Descriptions.
+    /// Number of descriptions.
     pub entries: usize,
-    /// Their bytes, keys included.
+    /// Bytes of the descriptions and their keys.
     pub bytes: u64,
 }
 
-/// A description as it was bought.
+/// A description as the model wrote it, with its cost.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CachedDescription {
-    /// What agrees and what differs, in words.
+    /// Similarities and differences of the pair.
     pub text: String,
-    /// What the call cost.
+    /// Cost of the call.
     pub usage: Usage,
-    /// When it was made.
+    /// When the description was written.
     pub created_at: Timestamp,
 }
 
-/// A region of a frame, and the one that it agrees with in a reference image. Positions are in fractions of
-/// the pictures' width and height, from the top left.
+/// A pair of matching regions in a frame and a reference image. Positions are fractions of the picture's
+/// width and height, measured from the top left.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, ToSchema)]
 pub struct PairRegion {
-    /// In the frame.
+    /// Position in the frame.
     pub frame: [f32; 2],
-    /// In the image.
+    /// Position in the reference image.
     pub image: [f32; 2],
-    /// Cosine similarity of the two, −1 to 1.
+    /// Cosine similarity of the two regions, −1 to 1.
     pub similarity: f32,
 }

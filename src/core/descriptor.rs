@@ -1,4 +1,4 @@
-//! Global descriptors: one unit vector for one picture.
+//! Global descriptors: one unit vector per picture.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -14,16 +14,16 @@ use serde::{Deserialize, Serialize};
 #[serde(try_from = "String", into = "String")]
 pub struct Descriptor(Vec<f32>);
 
-/// Why numbers could not become a [`Descriptor`].
-#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+/// Why a vector is not valid as a [`Descriptor`].
+#[derive(Debug, Clone, thiserror::Error, PartialEq, Eq)]
 pub enum DescriptorError {
-    /// All numbers are zero, or there is none, so that no direction is left.
-    #[error("the descriptor is all zeros: the picture gave the model nothing to see")]
+    /// The vector is empty or all zeros, so it has no direction.
+    #[error("the descriptor is all zeros: the model found no features in the picture")]
     Zero,
-    /// A number is infinite or not a number.
-    #[error("the descriptor holds a number that is not finite")]
+    /// An element is infinite or NaN.
+    #[error("the descriptor contains a number that is not finite")]
     NotFinite,
-    /// A text is not base64 of 32-bit floats.
+    /// The string is not base64 of 32-bit floats.
     #[error("the text is not base64 of 32-bit floats")]
     Unreadable,
 }
@@ -43,40 +43,40 @@ impl Descriptor {
         Ok(Self(numbers))
     }
 
-    /// Takes up a descriptor that was written down: to the last bit if it has unit norm.
+    /// Restores a stored descriptor. If it has unit norm, its bits are kept unchanged.
     pub fn stored(numbers: Vec<f32>) -> Result<Self, DescriptorError> {
         let is_unit = (norm(&numbers) - 1.0).abs() < 1e-4;
         if is_unit { Ok(Self(numbers)) } else { Self::normalised(numbers) }
     }
 
-    /// Cosine similarity to another of the same dimension, −1 to 1.
+    /// Cosine similarity to another descriptor of the same dimension, −1 to 1.
     pub fn similarity(&self, other: &Self) -> f32 {
         dot(&self.0, &other.0)
     }
 
-    /// How many numbers it has.
+    /// Number of dimensions.
     pub fn dim(&self) -> usize {
         self.0.len()
     }
 
-    /// The numbers.
+    /// The elements of the vector.
     pub fn as_slice(&self) -> &[f32] {
         &self.0
     }
 }
 
-/// The Euclidean norm, summed in f64, so that that of a stored descriptor is 1 to within f32 rounding.
+/// The Euclidean norm, summed in f64 so that a stored descriptor has norm 1 to within f32 rounding.
 fn norm(numbers: &[f32]) -> f64 {
     numbers.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt()
 }
 
-/// The dot product, in 16 running sums so that the compiler can keep them in vector registers.
+/// The dot product, accumulated in 16 lanes that the compiler can keep in vector registers.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2+fma", "aarch64+neon"))]
 pub fn dot(a: &[f32], b: &[f32]) -> f32 {
     const LANES: usize = 16;
     let mut sums = [0.0_f32; LANES];
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
-    // Indices, because adapters of iterators are not always compiled into their caller.
+    // Indices, because iterator adapters are not always inlined into a multiversioned function.
     for chunk in 0..a.len().min(b.len()) {
         let (x, y) = (&a[chunk], &b[chunk]);
         for lane in 0..LANES {
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn a_descriptor_survives_being_written_down() {
+    fn a_descriptor_round_trips_through_json() {
         let descriptor = Descriptor::normalised(vec![3.0, -4.0, 12.0]).unwrap();
         let read: Descriptor =
             serde_json::from_str(&serde_json::to_string(&descriptor).unwrap()).unwrap();
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_without_a_direction_are_refused() {
+    fn vectors_without_a_direction_are_rejected() {
         assert_eq!(Descriptor::normalised(vec![]), Err(DescriptorError::Zero));
         assert_eq!(Descriptor::normalised(vec![0.0; 4]), Err(DescriptorError::Zero));
         assert_eq!(Descriptor::normalised(vec![f32::NAN]), Err(DescriptorError::NotFinite));
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn the_dot_product_takes_any_length() {
+    fn the_dot_product_handles_any_length() {
         for length in [0, 1, 15, 16, 17, 576] {
             let a: Vec<f32> = (0..length).map(|i| i as f32 % 7.0).collect();
             let expected: f32 = a.iter().map(|x| x * x).sum();

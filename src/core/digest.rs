@@ -1,4 +1,4 @@
-//! The identity of bytes: SHA-256.
+//! SHA-256 digests, which identify pictures, models and records.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,7 +11,7 @@ use sha2::{Digest as _, Sha256};
 pub struct Digest([u8; 32]);
 
 impl Digest {
-    /// The digest of `bytes`.
+    /// Hashes `bytes`. For a whole picture this takes milliseconds: keep it off async threads.
     pub fn of(bytes: &[u8]) -> Self {
         Self(Sha256::digest(bytes).into())
     }
@@ -21,7 +21,7 @@ impl Digest {
         &self.0
     }
 
-    /// The 64 hexadecimal digits, without the `sha256:` in front.
+    /// The 64 hexadecimal digits, without the `sha256:` prefix.
     pub fn hex(&self) -> String {
         hex(&self.0)
     }
@@ -33,7 +33,7 @@ pub(super) fn hex(bytes: &[u8]) -> String {
 }
 
 impl From<[u8; 32]> for Digest {
-    /// The digest that someone else worked out, piece by piece.
+    /// Wraps a digest that was computed incrementally.
     fn from(bytes: [u8; 32]) -> Self {
         Self(bytes)
     }
@@ -51,7 +51,7 @@ impl fmt::Debug for Digest {
     }
 }
 
-/// A text that is no digest.
+/// The string is not a digest.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 #[error("a digest is written as `sha256:` and 64 hexadecimal digits")]
 pub struct DigestError;
@@ -59,7 +59,7 @@ pub struct DigestError;
 impl FromStr for Digest {
     type Err = DigestError;
 
-    /// Reads 64 hexadecimal digits, with or without `sha256:` in front.
+    /// Parses 64 hexadecimal digits with an optional `sha256:` prefix.
     fn from_str(text: &str) -> Result<Self, DigestError> {
         let hex = text.strip_prefix("sha256:").unwrap_or(text);
         if hex.len() != 64 || !hex.bytes().all(|b| b.is_ascii_hexdigit()) {
@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_digest_reads_back_what_it_writes() {
+    fn a_digest_round_trips_through_text() {
         let digest = Digest::of(b"abc");
         // FIPS 180-4, appendix B.1.
         assert_eq!(
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_digest_is_refused() {
+    fn malformed_digests_are_rejected() {
         for text in ["", "sha256:", "abc", &"g".repeat(64), &"é".repeat(32)] {
             assert_eq!(text.parse::<Digest>(), Err(DigestError), "{text}");
         }

@@ -1,4 +1,4 @@
-//! Reference images: pictures of a map, with the pose they were taken from.
+//! Reference images: pictures of a map with the poses they were taken from.
 
 use std::fmt;
 use std::str::FromStr;
@@ -18,8 +18,8 @@ impl ImageId {
     /// The longest id, in bytes of UTF-8.
     pub const MAX_BYTES: usize = 200;
 
-    /// The id of an image that came without one: the head of its digest, so that the same bytes
-    /// sent again are the same image.
+    /// Derives the id of an image that was uploaded without one: the first 16 digits of its digest, so
+    /// that uploading the same bytes again yields the same image.
     pub fn from_digest(digest: &Digest) -> Self {
         Self(digest.hex()[..16].to_owned())
     }
@@ -42,9 +42,9 @@ impl FromStr for ImageId {
             return refuse("must have 1 to 200 bytes");
         }
         if text.chars().any(char::is_control) || text.trim() != text {
-            return refuse("must not hold control characters or begin or end with a space");
+            return refuse("must not contain control characters or begin or end with a space");
         }
-        // A URL path with such a segment never reaches the server: clients resolve it away.
+        // HTTP clients normalise such path segments away, so the image could not be addressed.
         if text == "." || text == ".." {
             return refuse("cannot be addressed in a URL");
         }
@@ -87,7 +87,7 @@ pub enum MediaType {
 }
 
 impl MediaType {
-    /// The name in a `Content-Type`.
+    /// The value of a `Content-Type` header.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Jpeg => "image/jpeg",
@@ -96,7 +96,7 @@ impl MediaType {
         }
     }
 
-    /// What the first bytes say; `None` for anything that is not one of the three.
+    /// Detects the format from the magic bytes; `None` for anything but the three supported formats.
     pub fn sniff(bytes: &[u8]) -> Option<Self> {
         if bytes.starts_with(&[0xFF, 0xD8, 0xFF]) {
             Some(Self::Jpeg)
@@ -110,37 +110,37 @@ impl MediaType {
     }
 }
 
-/// A reference image as it is stored; its bytes are kept under its digest.
+/// The record of a reference image. Its bytes are stored under its digest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Image {
-    /// Its id within the map.
+    /// Id within the map.
     pub id: ImageId,
-    /// The SHA-256 of its bytes: `sha256:` and 64 hexadecimal digits.
+    /// SHA-256 of the bytes: `sha256:` and 64 hexadecimal digits.
     #[schema(value_type = String)]
     pub digest: Digest,
-    /// Where it was taken from, if known.
+    /// Pose of the camera, if known.
     pub pose: Option<Pose>,
-    /// When it was taken, if known.
+    /// When the picture was taken, if known.
     pub captured_at: Option<Timestamp>,
-    /// Words an operator gave it.
+    /// Tags given by the operator.
     #[serde(default)]
     pub tags: Vec<String>,
-    /// Its format.
+    /// Format of the picture.
     pub media_type: MediaType,
-    /// Width in pixels, as shown (after the EXIF orientation).
+    /// Width in pixels, after applying the EXIF orientation.
     pub width: u32,
-    /// Height in pixels, as shown.
+    /// Height in pixels, after applying the EXIF orientation.
     pub height: u32,
-    /// When it was stored.
+    /// When the image was stored.
     pub created_at: Timestamp,
 }
 
-/// An image with its descriptor, as it goes from one store to another.
+/// An image with its descriptor, as exported and imported.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ExportedImage {
-    /// The image.
+    /// The record of the image.
     pub image: Image,
-    /// Base64 of its numbers: 32-bit floats, little-endian. Null if what is stored is damaged.
+    /// The descriptor as base64 of little-endian 32-bit floats. Null if the stored descriptor is damaged.
     #[schema(value_type = Option<String>)]
     pub descriptor: Option<Descriptor>,
 }
@@ -150,7 +150,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ids_from_the_fields_file_names_are_taken() {
+    fn file_names_common_in_the_field_are_valid_ids() {
         for id in ["@0543256.12@4178901.33@.jpg", "street/0001.jpg", "東京-01"] {
             assert!(id.parse::<ImageId>().is_ok(), "{id}");
         }
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn a_format_is_told_by_its_first_bytes() {
+    fn the_format_is_detected_from_the_magic_bytes() {
         assert_eq!(MediaType::sniff(b"\xFF\xD8\xFF\xE0"), Some(MediaType::Jpeg));
         assert_eq!(MediaType::sniff(b"RIFF\0\0\0\0WEBPVP8 "), Some(MediaType::Webp));
         assert_eq!(MediaType::sniff(b"GIF89a"), None);

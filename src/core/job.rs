@@ -1,4 +1,4 @@
-//! Jobs: one refinement of the candidates of one query.
+//! Jobs: each refines the candidates of one query.
 
 use std::fmt;
 use std::ops::{Add, AddAssign};
@@ -15,47 +15,47 @@ use super::confidence::Estimate;
 use super::map::display_as_written;
 use super::{ImageId, InvalidName, MapName, Ranking};
 
-/// Who compares a query with its candidates.
+/// The method that refines candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum RefinerKind {
-    /// Geometric matching of dense features, on this machine.
+    /// Geometric matching of dense features, computed locally.
     #[default]
     Local,
     /// A multimodal LLM.
     Mllm,
 }
 
-/// How far a job has come.
+/// The state of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum JobState {
-    /// Waits for a worker.
+    /// Waiting for a worker.
     Queued,
-    /// A worker holds it.
+    /// A worker is processing it.
     Running,
-    /// Ended with a ranking.
+    /// Finished with a ranking.
     Succeeded,
-    /// Ended with a ranking of which part fell back to the coarse order; `error` says why.
+    /// Finished with a ranking of which a part fell back to the coarse order; `error` says why.
     Degraded,
-    /// Ended without a ranking; `error` says why.
+    /// Finished without a ranking; `error` says why.
     Failed,
-    /// Ended because a caller asked for it.
+    /// Cancelled by a caller.
     Cancelled,
 }
 
-/// Which jobs are refined first: those of higher priority, and among equals the oldest.
+/// Scheduling priority. Jobs of higher priority run first; jobs of equal priority run oldest first.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize, ToSchema,
 )]
 #[serde(rename_all = "lowercase")]
 pub enum Priority {
-    /// When nothing else waits.
+    /// Runs when no other job is waiting.
     Low,
-    /// In its turn.
+    /// The default.
     #[default]
     Normal,
-    /// Before all others.
+    /// Runs before all others.
     High,
 }
 
@@ -71,7 +71,7 @@ display_as_written!(JobState {
 });
 
 impl JobState {
-    /// Whether the job has ended for good.
+    /// Whether the job is finished and will not change any more.
     pub fn is_final(self) -> bool {
         !matches!(self, Self::Queued | Self::Running)
     }
@@ -80,47 +80,47 @@ impl JobState {
 /// The text that compares the query with one candidate.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Description {
-    /// The candidate.
+    /// Id of the candidate's image.
     pub image_id: ImageId,
-    /// What agrees and what differs, in words.
+    /// Similarities and differences of the pair.
     pub text: String,
-    /// Whether the text was known from an earlier job.
+    /// Whether the text came from the description cache.
     pub cached: bool,
-    /// The earlier frame that the text is about, where it stands in for this one because the two
-    /// are nearly the same.
+    /// The earlier, nearly identical frame for which the text was written; null if it was written for
+    /// this frame.
     #[serde(default)]
     #[schema(nullable)]
     pub stands_in: Option<StandIn>,
-    /// Milliseconds that the model took to write it: of `mllm`, from the request that was answered to
-    /// the end of its answer, without waiting for a turn and without earlier tries; of `local`, which
-    /// compares all pairs together, an equal share of that. Null for a text that was known.
+    /// Milliseconds the model took to write the text. For `mllm`: the duration of the successful request,
+    /// excluding queueing and failed attempts. For `local`, which compares all pairs together: an equal
+    /// share of the total. Null for a cached text.
     #[serde(default)]
     pub took_ms: Option<u64>,
-    /// What it cost.
+    /// Cost of the text.
     pub usage: Usage,
 }
 
-/// An earlier frame that is nearly the same.
+/// An earlier, nearly identical frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct StandIn {
-    /// Its query.
+    /// The query that posted the earlier frame.
     pub query_id: Uuid,
     /// Cosine similarity of the two frames' descriptors, −1 to 1.
     pub similarity: f32,
 }
 
-/// What a refinement cost.
+/// Model calls and tokens used by a refinement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 pub struct Usage {
-    /// Calls to a model outside.
+    /// Calls to an external model.
     pub calls: u32,
-    /// Descriptions that were known from an earlier job.
+    /// Descriptions served from the cache.
     pub cached: u32,
-    /// Tokens sent.
+    /// Prompt tokens.
     pub prompt_tokens: u64,
-    /// Tokens received.
+    /// Completion tokens.
     pub completion_tokens: u64,
-    /// Of the calls, those whose tokens are a guess because the model's server did not count them.
+    /// Calls whose tokens are estimated because the model's server did not report them.
     #[serde(default)]
     pub estimated: u32,
 }
@@ -145,80 +145,80 @@ impl AddAssign for Usage {
     }
 }
 
-/// The day that a moment falls on, in UTC: the days of budgets and accounts.
+/// The UTC date of a timestamp. Budgets and usage are counted per UTC day.
 pub fn utc_day(at: Timestamp) -> Date {
     at.to_zoned(TimeZone::UTC).date()
 }
 
-/// What refining in one map cost on one day.
+/// Usage and cost of refinement in one map on one day.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct DayUsage {
-    /// The day, in UTC.
+    /// UTC date.
     pub date: Date,
-    /// The map.
+    /// Name of the map.
     pub map: MapName,
     /// The calls and their tokens.
     pub usage: Usage,
-    /// Money, in the currency of the configured prices, at the prices of the time.
+    /// Cost in the currency of the configured prices, at the prices in effect at the time.
     pub money: f64,
 }
 
-/// One refinement.
+/// A refinement job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Job {
-    /// Its id; ids of later jobs sort after those of earlier ones.
+    /// Id of the job. Ids sort by creation time.
     pub id: Uuid,
-    /// The map of the query.
+    /// Map that was queried.
     pub map: MapName,
-    /// The query.
+    /// Id of the query.
     pub query_id: Uuid,
-    /// Who refines.
+    /// Refinement method.
     pub refiner: RefinerKind,
-    /// Its place among the jobs that wait.
+    /// Scheduling priority.
     #[serde(default)]
     pub priority: Priority,
-    /// How far it has come.
+    /// State of the job.
     pub state: JobState,
-    /// When it was queued.
+    /// When the job was queued.
     pub created_at: Timestamp,
-    /// When a worker first took it.
+    /// When a worker first claimed the job.
     pub started_at: Option<Timestamp>,
-    /// When it ended.
+    /// When the job finished.
     pub finished_at: Option<Timestamp>,
-    /// How often a worker has taken it.
+    /// How often a worker has claimed the job.
     pub attempts: u32,
-    /// One text for each candidate compared so far, in coarse order.
+    /// One description per candidate compared so far, in coarse order.
     pub descriptions: Vec<Description>,
-    /// The refined order, once there is one.
+    /// The refined order; null until the job has one.
     #[schema(nullable)]
     pub ranking: Option<Ranking>,
-    /// Why the ranking is as it is.
+    /// The model's explanation of the ranking.
     pub reasoning: Option<String>,
-    /// Milliseconds that the call took which ordered the candidates, counted as those of a description.
-    /// Null if there was no such call; `local` makes none.
+    /// Milliseconds that the ranking call took, measured like those of a description. Null if there was no
+    /// such call; `local` makes none.
     #[serde(default)]
     pub reasoning_took_ms: Option<u64>,
-    /// Where the frame was probably taken, by the refined order, once there is one.
+    /// Where the frame was probably taken, based on the refined order; null until the job has one.
     #[serde(default)]
     #[schema(nullable)]
     pub estimate: Option<Estimate>,
-    /// What it cost so far, in all attempts since it was queued or last retried.
+    /// Usage of all attempts since the job was queued or last retried.
     pub usage: Usage,
-    /// What went wrong, or what a job that is queued again waits for.
+    /// Why the job failed or was degraded, or why it was queued again.
     pub error: Option<String>,
-    /// The trace of its request and its refinement (W3C Trace Context), where the server sends traces.
+    /// Id of the trace that covers the request and the refinement (W3C Trace Context), if tracing is enabled.
     #[serde(default)]
     #[schema(nullable)]
     pub trace_id: Option<String>,
 }
 
 impl Job {
-    /// The same without what refinement found out.
-    pub fn brief(self) -> Self {
+    /// The job without the results of refinement.
+    pub fn summary(self) -> Self {
         Self { descriptions: Vec::new(), ranking: None, reasoning: None, ..self }
     }
 
-    /// A new job, queued.
+    /// Creates a queued job.
     pub fn queued(map: MapName, query_id: Uuid, refiner: RefinerKind, now: Timestamp) -> Self {
         Self {
             id: Uuid::now_v7(),

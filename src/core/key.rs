@@ -1,4 +1,4 @@
-//! API keys: who may do what, in which maps, how often and until when.
+//! API keys: role, permitted maps, rate limits and expiry.
 
 use std::fmt;
 use std::str::FromStr;
@@ -12,101 +12,101 @@ use super::digest::hex;
 use super::map::display_as_written;
 use super::{Digest, InvalidName, MapName};
 
-/// What the holder of a key may do; each role may do what those before it may.
+/// The role of a key. Each role includes the permissions of the roles before it.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, ToSchema,
 )]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
-    /// Localize frames, look at jobs by their id and at maps.
+    /// May localize frames, and read maps and single jobs.
     Robot,
-    /// Also list, cancel and retry jobs, and list, add and remove images.
+    /// May also list, cancel and retry jobs, and list, add and remove images.
     Operator,
-    /// Everything: maps, keys, backups.
+    /// Full access: maps, keys, backups.
     Admin,
 }
 
 display_as_written!(Role { Robot => "robot", Operator => "operator", Admin => "admin" });
 
-/// How much a key may ask for.
+/// Rate limits of a key.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct KeyLimits {
-    /// Requests in a minute, at least 1; null for no bound.
+    /// Requests per minute, at least 1; null for unlimited.
     #[serde(default)]
     #[schema(nullable, minimum = 1)]
     pub requests_per_minute: Option<u32>,
-    /// Bytes of bodies in a minute, at least 1; null for no bound.
+    /// Bytes of request bodies per minute, at least 1; null for unlimited.
     #[serde(default)]
     #[schema(nullable, minimum = 1)]
     pub bytes_per_minute: Option<u64>,
 }
 
-/// A key, without its secret.
+/// An API key without its secret.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ApiKey {
-    /// Its id: the middle part of the key.
+    /// Id: the middle part of the key.
     pub id: String,
-    /// What people call it.
+    /// Name for people.
     pub name: String,
-    /// What its holder may do.
+    /// Role of the key.
     pub role: Role,
-    /// In which maps; in all, if there is none.
+    /// Maps that the key may access; all maps if empty.
     pub maps: Vec<MapName>,
-    /// How often.
+    /// Rate limits of the key.
     pub limits: KeyLimits,
-    /// When it was made.
+    /// When the key was created.
     pub created_at: Timestamp,
-    /// When it ends; null for never.
+    /// When the key expires; null for never.
     #[schema(nullable)]
     pub expires_at: Option<Timestamp>,
-    /// When it was revoked; null if it was not.
+    /// When the key was revoked; null if it is not revoked.
     #[schema(nullable)]
     pub revoked_at: Option<Timestamp>,
 }
 
 impl ApiKey {
-    /// Whether it is good at that moment.
+    /// Whether the key is neither revoked nor expired at `now`.
     pub fn is_valid(&self, now: Timestamp) -> bool {
         self.revoked_at.is_none() && self.expires_at.is_none_or(|end| now < end)
     }
 
-    /// Whether its holder may use that map.
+    /// Whether the key may access the map.
     pub fn may_use(&self, map: &MapName) -> bool {
         self.maps.is_empty() || self.maps.contains(map)
     }
 }
 
-/// A key as it is stored: the secret is known to its holder alone.
+/// An API key as stored. The store keeps a digest, so the secret cannot be recovered from it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StoredKey {
     /// The key.
     #[serde(flatten)]
     pub key: ApiKey,
-    /// The SHA-256 of its whole text. The secret is 256 random bits, so that no slow hash is needed.
+    /// SHA-256 of the whole token. The secret has 256 random bits, so a slow password hash is not needed.
     pub digest: Digest,
 }
 
 impl StoredKey {
-    /// Whether this is the key; takes as long for a wrong one as for the right one.
-    pub fn is(&self, token: &Token) -> bool {
+    /// Whether `token` is this key. Compares in constant time.
+    pub fn matches(&self, token: &Token) -> bool {
         token.digest().as_bytes().ct_eq(self.digest.as_bytes()).into()
     }
 }
 
-/// The text of a key: `wab_`, the id of 12 characters, `_`, and 64 hexadecimal digits of secret. It shows
-/// itself in no log and no error.
+/// The text of an API key: `wab_`, an id of 12 characters, `_`, and a secret of 64 hexadecimal digits.
+/// `Debug` hides the secret.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Token(String);
 
 impl Token {
-    /// What every key begins with.
+    /// Prefix of every token.
     pub const PREFIX: &str = "wab_";
-    /// Characters of its id.
+    /// Length of the id in characters.
     pub const ID: usize = 12;
     const SECRET: usize = 64;
 
-    /// The token of 38 random bytes.
+    /// Builds a token from 38 random bytes.
     pub fn new(random: &[u8; 38]) -> Self {
         let digits = hex(random);
         let (id, secret) = digits.split_at(Self::ID);
@@ -118,7 +118,7 @@ impl Token {
         &self.0[Self::PREFIX.len()..Self::PREFIX.len() + Self::ID]
     }
 
-    /// The id that a text is, or the id of the key that it is.
+    /// Extracts the id from `text`, which is either a whole token or an id.
     pub fn id_of(text: &str) -> Option<&str> {
         match parts(text) {
             Some((id, _)) => Some(id),
@@ -126,12 +126,12 @@ impl Token {
         }
     }
 
-    /// What is stored of it.
+    /// The digest under which the token is stored.
     pub fn digest(&self) -> Digest {
         Digest::of(self.0.as_bytes())
     }
 
-    /// The whole key, to be shown once.
+    /// The whole token in plain text; shown to the user once.
     pub fn reveal(&self) -> &str {
         &self.0
     }
@@ -143,16 +143,16 @@ impl FromStr for Token {
     fn from_str(text: &str) -> Result<Self, InvalidName> {
         match parts(text) {
             Some(_) => Ok(Self(text.to_owned())),
-            None => Err(InvalidName("this is no key: one begins with \"wab_\"".into())),
+            None => Err(InvalidName("not an API key: keys begin with \"wab_\"".into())),
         }
     }
 }
 
-/// The id and the secret of a key.
+/// Splits a token into its id and its secret.
 fn parts(text: &str) -> Option<(&str, &str)> {
     let (id, secret) = text.strip_prefix(Token::PREFIX)?.split_once('_')?;
-    let fit = (id.len(), secret.len()) == (Token::ID, Token::SECRET);
-    (fit && is_hex(id) && is_hex(secret)).then_some((id, secret))
+    let lengths_match = (id.len(), secret.len()) == (Token::ID, Token::SECRET);
+    (lengths_match && is_hex(id) && is_hex(secret)).then_some((id, secret))
 }
 
 fn is_hex(text: &str) -> bool {
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_reads_back_and_does_not_show_its_secret() {
+    fn a_token_parses_and_hides_its_secret() {
         let token = token(0xa7);
         assert_eq!(token.reveal().parse(), Ok(token.clone()));
         assert_eq!(token.id(), "a7a7a7a7a7a7");
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_ends_when_it_expires_or_is_revoked() {
+    fn a_key_is_invalid_once_expired_or_revoked() {
         let at = |text: &str| text.parse::<Timestamp>().unwrap();
         let mut key = ApiKey {
             id: token(1).id().to_owned(),
@@ -214,11 +214,11 @@ mod tests {
         key.revoked_at = Some(at("2026-01-02T00:00:00Z"));
         assert!(!key.is_valid(at("2026-01-03T00:00:00Z")));
         let stored = StoredKey { key, digest: token(1).digest() };
-        assert!(stored.is(&token(1)) && !stored.is(&token(2)));
+        assert!(stored.matches(&token(1)) && !stored.matches(&token(2)));
     }
 
     #[test]
-    fn a_role_may_do_what_those_before_it_may() {
+    fn roles_are_ordered_by_permission() {
         assert!(Role::Robot < Role::Operator && Role::Operator < Role::Admin);
     }
 }

@@ -1,7 +1,7 @@
-//! The words of the service as plain types: map, image, pose, descriptor, candidate, job.
+//! The vocabulary of the service as plain types: map, image, pose, descriptor, candidate, job.
 //!
-//! A value of these types obeys its rules by construction (a [`Descriptor`] has unit norm, a
-//! [`Ranking`] is a permutation), so nobody downstream checks again. No I/O happens here.
+//! Values are valid by construction (a [`Descriptor`] has unit norm, a [`Ranking`] is a permutation),
+//! so the members above do not check again. This member does no I/O.
 
 mod candidate;
 pub mod confidence;
@@ -31,16 +31,16 @@ pub use job::{
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use map::{CoordinateFrame, DescriptorKind, Map, MapName, Precision, Scene};
-pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError};
+pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, PoseInput};
 pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;
 pub use webhook::{
-    Attempt, Delivery, DeliveryState, Message, StoredWebhook, Then, Webhook, WebhookEvent,
+    Attempt, Delivery, DeliveryState, Disposition, Message, StoredWebhook, Webhook, WebhookEvent,
     WebhookSecret,
 };
 
-/// A text that does not obey the rules of the type it was meant for.
+/// A string that cannot be parsed as the requested type; the message says why.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 #[error("{0}")]
 pub struct InvalidName(pub String);

@@ -1,4 +1,4 @@
-//! Maps: named sets of reference images that share a model, a descriptor and a frame.
+//! Maps: named sets of reference images that share a model, a descriptor kind and a coordinate frame.
 
 use std::fmt;
 use std::str::FromStr;
@@ -59,7 +59,7 @@ impl fmt::Display for MapName {
     }
 }
 
-/// What kind of place a map shows; it chooses the words of the refiner's prompts.
+/// The kind of environment that a map covers. It selects the wording of the refiner's prompts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Scene {
@@ -70,7 +70,7 @@ pub enum Scene {
     Indoor,
 }
 
-/// Which global descriptor a map compares.
+/// The kind of global descriptor that a map uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum DescriptorKind {
@@ -81,7 +81,7 @@ pub enum DescriptorKind {
     Cls,
 }
 
-/// The frame of reference of a map's poses.
+/// The coordinate frame of a map's poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 #[schema(as = Frame)]
@@ -89,25 +89,25 @@ pub enum CoordinateFrame {
     /// Latitude and longitude in degrees.
     #[default]
     Wgs84,
-    /// Metres in a frame of the map's own.
+    /// Metres in a local Cartesian frame.
     Metric,
 }
 
-/// The arithmetic that makes descriptors.
+/// The numeric precision at which a model runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
     /// 32-bit floats.
     #[default]
     Full,
-    /// 16-bit floats with 8 bits of exponent inside the model, 32-bit ones around it.
+    /// bfloat16 inside the model, 32-bit floats at its inputs and outputs.
     Bf16,
 }
 
 macro_rules! display_as_written {
     ($type:ty { $($variant:ident => $text:literal),+ }) => {
         impl $type {
-            /// The word that the API uses.
+            /// The name used in the API.
             pub fn as_str(self) -> &'static str {
                 match self { $(Self::$variant => $text),+ }
             }
@@ -140,44 +140,44 @@ display_as_written!(Precision { Full => "full", Bf16 => "bf16" });
 display_as_written!(DescriptorKind { Gem => "gem", Cls => "cls" });
 display_as_written!(CoordinateFrame { Wgs84 => "wgs84", Metric => "metric" });
 
-/// A map as it is stored.
+/// The record of a map.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Map {
-    /// Tells this map from an earlier, deleted one of the same name.
+    /// Distinguishes this map from a deleted map of the same name.
     pub uid: Uuid,
-    /// Its name.
+    /// Name of the map.
     pub name: MapName,
     /// Indoor or outdoor.
     pub scene: Scene,
-    /// Which descriptor it compares.
+    /// Kind of descriptor that is compared.
     pub descriptor: DescriptorKind,
-    /// The frame of its poses.
+    /// Coordinate frame of the poses.
     pub frame: CoordinateFrame,
-    /// The name of the model that makes its descriptors.
+    /// Name of the model that computes the descriptors.
     pub model: String,
-    /// The digest of that model's weights and of how they are fed and pooled: descriptors of another
-    /// do not mix with them.
+    /// Digest of the model's weights, preprocessing and pooling. Descriptors of models with different
+    /// digests are not comparable.
     #[schema(value_type = String)]
     pub model_digest: Digest,
-    /// The arithmetic that the model runs in.
+    /// Precision at which the model runs.
     #[serde(default)]
     pub precision: Precision,
-    /// Numbers in a descriptor.
+    /// Dimension of the descriptors.
     pub dim: usize,
-    /// How often all its descriptors were replaced by others.
+    /// Number of completed reindexes.
     #[serde(default)]
     pub revision: u32,
-    /// What a person wrote about it.
+    /// Free text for people.
     #[serde(default)]
     pub description: Option<String>,
-    /// When it was created.
+    /// When the map was created.
     pub created_at: Timestamp,
 }
 
 impl Map {
-    /// Whether the descriptors of another map would fit among those of this one: they are of the same
-    /// model, run and pooled alike.
-    pub fn is_like(&self, other: &Self) -> bool {
+    /// Whether descriptors of the two maps are comparable: same model, precision, descriptor kind and
+    /// dimension.
+    pub fn is_compatible_with(&self, other: &Self) -> bool {
         self.model == other.model
             && self.model_digest == other.model_digest
             && self.precision == other.precision
@@ -191,7 +191,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_map_name_is_safe_in_a_path_and_a_label() {
+    fn a_map_name_is_safe_in_a_path_and_a_metric_label() {
         for name in ["a", "tokyo-247", "0.floor_2"] {
             assert!(name.parse::<MapName>().is_ok(), "{name}");
         }

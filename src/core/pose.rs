@@ -1,22 +1,21 @@
-//! Where a camera stood: on the globe or in a map's own metric frame.
+//! Camera poses, geographic or in a map's local metric frame.
 
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use utoipa::ToSchema;
 
 use super::CoordinateFrame;
 
-/// Where a camera stood, in the frame of its map.
+/// The pose of a camera in the coordinate frame of its map.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(untagged)]
 pub enum Pose {
-    /// In a `wgs84` map.
+    /// Pose in a `wgs84` map.
     Geographic(GeographicPose),
-    /// In a `metric` map.
+    /// Pose in a `metric` map.
     Metric(MetricPose),
 }
 
-/// A pose on the globe (WGS84).
+/// A geographic pose (WGS84).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct GeographicPose {
@@ -32,7 +31,7 @@ pub struct GeographicPose {
     pub heading: Option<f64>,
 }
 
-/// A pose in a map's own frame: metres and a unit quaternion.
+/// A pose in a map's local frame: metres and a unit quaternion.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MetricPose {
@@ -43,44 +42,83 @@ pub struct MetricPose {
     /// Metres along the frame's z axis.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub z: Option<f64>,
-    /// Orientation, x part of the unit quaternion; all four parts are given or none.
+    /// Orientation: x component of the unit quaternion. Give all four components or none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub qx: Option<f64>,
-    /// Orientation, y part.
+    /// Orientation: y component.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub qy: Option<f64>,
-    /// Orientation, z part.
+    /// Orientation: z component.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub qz: Option<f64>,
-    /// Orientation, scalar part.
+    /// Orientation: scalar component.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub qw: Option<f64>,
 }
 
-/// Why a pose was refused.
+/// The numbers of a pose as sent by a caller, not yet validated against the coordinate frame of a map.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PoseInput {
+    /// Latitude in degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lat: Option<f64>,
+    /// Longitude in degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lon: Option<f64>,
+    /// Height above the ellipsoid in metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alt: Option<f64>,
+    /// Viewing direction in degrees clockwise from north.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub heading: Option<f64>,
+    /// Metres along the x axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub x: Option<f64>,
+    /// Metres along the y axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub y: Option<f64>,
+    /// Metres along the z axis.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub z: Option<f64>,
+    /// Orientation: x component of the unit quaternion.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qx: Option<f64>,
+    /// Orientation: y component.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qy: Option<f64>,
+    /// Orientation: z component.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qz: Option<f64>,
+    /// Orientation: scalar component.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub qw: Option<f64>,
+}
+
+/// Why a pose is invalid.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum PoseError {
-    /// The fields are not those of the map's frame.
+    /// The fields do not match the map's coordinate frame.
     #[error("the pose does not fit a {frame} map, which takes {expected}: {detail}")]
     Fields {
-        /// The map's frame.
+        /// Coordinate frame of the map.
         frame: &'static str,
-        /// The fields that a pose of this frame has.
+        /// Fields of a pose in this frame.
         expected: &'static str,
-        /// What the reader said.
+        /// Which field is missing or unknown.
         detail: String,
     },
-    /// A number lies outside its range.
+    /// A value is out of range.
     #[error("{field} is {value}; it must be {range}")]
     Range {
-        /// The field.
+        /// Name of the field.
         field: &'static str,
         /// Its value.
         value: f64,
-        /// What it may be.
+        /// The valid range.
         range: &'static str,
     },
-    /// The orientation is given in part, or is not a unit quaternion.
+    /// The orientation is incomplete or not a unit quaternion.
     #[error("{0}")]
     Quaternion(&'static str),
 }
@@ -88,32 +126,75 @@ pub enum PoseError {
 /// Mean radius of the Earth in metres (IUGG).
 pub const EARTH_RADIUS_M: f64 = 6_371_008.8;
 
-/// Farther from the origin than any building, city or orbit of the Earth; keeps typing errors out.
-const FARTHEST_METRES: f64 = 1e8;
+/// Coordinates beyond this distance from the origin are rejected as typing errors.
+const MAX_COORDINATE_M: f64 = 1e8;
 
-impl Pose {
-    /// Reads a pose written in JSON for a map of the given frame.
-    pub fn from_json(frame: CoordinateFrame, value: Value) -> Result<Self, PoseError> {
-        let (name, expected) = match frame {
-            CoordinateFrame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading"),
-            CoordinateFrame::Metric => ("metric", "x, y and, if known, z, qx, qy, qz, qw"),
-        };
-        let fields = |error: serde_json::Error| PoseError::Fields {
-            frame: name,
-            expected,
-            detail: error.to_string(),
-        };
-        match frame {
-            CoordinateFrame::Wgs84 => {
-                serde_json::from_value::<GeographicPose>(value).map_err(fields)?.checked()
-            }
-            CoordinateFrame::Metric => {
-                serde_json::from_value::<MetricPose>(value).map_err(fields)?.checked()
-            }
+impl PoseInput {
+    /// Whether no number is set.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// The coordinate frame that the numbers belong to, judged by which pair of coordinates is set; `None` if
+    /// neither or both pairs are.
+    pub fn frame(&self) -> Option<CoordinateFrame> {
+        match (self.lat.is_some() && self.lon.is_some(), self.x.is_some() && self.y.is_some()) {
+            (true, false) => Some(CoordinateFrame::Wgs84),
+            (false, true) => Some(CoordinateFrame::Metric),
+            _ => None,
         }
     }
 
-    /// The frame it belongs to.
+    /// Validates the numbers for a map with this coordinate frame. Fails if a number is missing, belongs to
+    /// another frame, or is out of range.
+    pub fn check(self, frame: CoordinateFrame) -> Result<Pose, PoseError> {
+        let Self { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw } = self;
+        let geographic = [("lat", lat), ("lon", lon), ("alt", alt), ("heading", heading)];
+        let metric = [("x", x), ("y", y), ("z", z), ("qx", qx), ("qy", qy), ("qz", qz), ("qw", qw)];
+        let (name, expected, foreign): (_, _, &[(&str, Option<f64>)]) = match frame {
+            CoordinateFrame::Wgs84 => ("wgs84", "lat, lon and, if known, alt and heading", &metric),
+            CoordinateFrame::Metric => {
+                ("metric", "x, y and, if known, z, qx, qy, qz, qw", &geographic)
+            }
+        };
+        let misfit = |detail: String| PoseError::Fields { frame: name, expected, detail };
+        if let Some((field, _)) = foreign.iter().find(|(_, value)| value.is_some()) {
+            return Err(misfit(format!("unknown field `{field}`")));
+        }
+        let required = |field: &str, value: Option<f64>| {
+            value.ok_or_else(|| misfit(format!("missing field `{field}`")))
+        };
+        match frame {
+            CoordinateFrame::Wgs84 => GeographicPose {
+                lat: required("lat", lat)?,
+                lon: required("lon", lon)?,
+                alt,
+                heading,
+            }
+            .checked(),
+            CoordinateFrame::Metric => {
+                MetricPose { x: required("x", x)?, y: required("y", y)?, z, qx, qy, qz, qw }
+                    .checked()
+            }
+        }
+    }
+}
+
+impl From<Pose> for PoseInput {
+    fn from(pose: Pose) -> Self {
+        match pose {
+            Pose::Geographic(GeographicPose { lat, lon, alt, heading }) => {
+                Self { lat: Some(lat), lon: Some(lon), alt, heading, ..Self::default() }
+            }
+            Pose::Metric(MetricPose { x, y, z, qx, qy, qz, qw }) => {
+                Self { x: Some(x), y: Some(y), z, qx, qy, qz, qw, ..Self::default() }
+            }
+        }
+    }
+}
+
+impl Pose {
+    /// The coordinate frame of the pose.
     pub fn frame(&self) -> CoordinateFrame {
         match self {
             Self::Geographic(_) => CoordinateFrame::Wgs84,
@@ -121,7 +202,7 @@ impl Pose {
         }
     }
 
-    /// Checks the ranges of a pose that was built in code.
+    /// Validates a pose that was constructed in code.
     pub fn checked(self) -> Result<Self, PoseError> {
         match self {
             Self::Geographic(pose) => pose.checked(),
@@ -129,10 +210,10 @@ impl Pose {
         }
     }
 
-    /// Distance in metres to another pose of the same frame, `None` across frames.
+    /// Distance in metres to another pose; `None` if the two are in different kinds of frames.
     ///
-    /// On the globe this is the great-circle distance of the haversine formula over a sphere of
-    /// the mean Earth radius 6,371,008.8 m (IUGG), good to 0.6 %.
+    /// For geographic poses this is the great-circle distance by the haversine formula on a sphere with
+    /// the mean Earth radius of 6,371,008.8 m (IUGG), accurate to 0.6 %.
     pub fn distance_m(&self, other: &Self) -> Option<f64> {
         match (self, other) {
             (Self::Geographic(a), Self::Geographic(b)) => Some(a.haversine_m(b)),
@@ -149,7 +230,7 @@ impl GeographicPose {
     fn checked(self) -> Result<Pose, PoseError> {
         within("lat", Some(self.lat), -90.0, 90.0, "between -90 and 90 degrees")?;
         within("lon", Some(self.lon), -180.0, 180.0, "between -180 and 180 degrees")?;
-        within("alt", self.alt, -FARTHEST_METRES, FARTHEST_METRES, "within 100,000 km")?;
+        within("alt", self.alt, -MAX_COORDINATE_M, MAX_COORDINATE_M, "within 100,000 km")?;
         within("heading", self.heading, 0.0, 360.0, "between 0 and 360 degrees")?;
         Ok(Pose::Geographic(self))
     }
@@ -166,7 +247,7 @@ impl GeographicPose {
 impl MetricPose {
     fn checked(self) -> Result<Pose, PoseError> {
         for (field, value) in [("x", Some(self.x)), ("y", Some(self.y)), ("z", self.z)] {
-            within(field, value, -FARTHEST_METRES, FARTHEST_METRES, "within 100,000 km")?;
+            within(field, value, -MAX_COORDINATE_M, MAX_COORDINATE_M, "within 100,000 km")?;
         }
         match [self.qx, self.qy, self.qz, self.qw] {
             [None, None, None, None] => {}
@@ -205,54 +286,4 @@ fn within(
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use serde_json::json;
-
-    #[test]
-    fn a_pose_out_of_range_names_the_field_and_the_range() {
-        let error =
-            Pose::from_json(CoordinateFrame::Wgs84, json!({"lat": 91.0, "lon": 0.0})).unwrap_err();
-        assert_eq!(error.to_string(), "lat is 91; it must be between -90 and 90 degrees");
-        assert!(Pose::from_json(CoordinateFrame::Metric, json!({"x": 1e9, "y": 0.0})).is_err());
-    }
-
-    #[test]
-    fn a_pose_of_the_other_frame_says_what_this_map_takes() {
-        let error =
-            Pose::from_json(CoordinateFrame::Wgs84, json!({"x": 1.0, "y": 2.0})).unwrap_err();
-        assert!(error.to_string().contains("takes lat, lon"), "{error}");
-        let error =
-            Pose::from_json(CoordinateFrame::Metric, json!({"lat": 1.0, "lon": 2.0})).unwrap_err();
-        assert!(error.to_string().contains("takes x, y"), "{error}");
-    }
-
-    #[test]
-    fn an_orientation_is_whole_and_of_unit_norm() {
-        let with =
-            |q: [f64; 4]| json!({"x": 0, "y": 0, "qx": q[0], "qy": q[1], "qz": q[2], "qw": q[3]});
-        assert!(Pose::from_json(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.8])).is_ok());
-        assert!(Pose::from_json(CoordinateFrame::Metric, with([0.0, 0.0, 0.6, 0.6])).is_err());
-        assert!(
-            Pose::from_json(CoordinateFrame::Metric, json!({"x": 0, "y": 0, "qw": 1})).is_err()
-        );
-    }
-
-    #[test]
-    fn a_degree_of_latitude_is_111_kilometres() {
-        let at =
-            |lat| Pose::Geographic(GeographicPose { lat, lon: 139.7, alt: None, heading: None });
-        let distance = at(35.0).distance_m(&at(36.0)).unwrap();
-        assert!((distance - 111_195.0).abs() < 10.0, "{distance}");
-    }
-
-    #[test]
-    fn poses_of_different_frames_have_no_distance() {
-        let metric = Pose::from_json(CoordinateFrame::Metric, json!({"x": 3.0, "y": 4.0})).unwrap();
-        let origin = Pose::from_json(CoordinateFrame::Metric, json!({"x": 0.0, "y": 0.0})).unwrap();
-        let globe =
-            Pose::from_json(CoordinateFrame::Wgs84, json!({"lat": 0.0, "lon": 0.0})).unwrap();
-        assert_eq!(metric.distance_m(&origin), Some(5.0));
-        assert_eq!(metric.distance_m(&globe), None);
-    }
-}
+mod tests;

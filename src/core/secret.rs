@@ -1,34 +1,34 @@
-//! A key that must not be seen.
+//! Credentials that must not appear in logs or printed settings.
 
 use std::fmt;
 
 use serde::de::{Error, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// What stands where the key would.
+/// Placeholder printed instead of the secret.
 const HIDDEN: &str = "[hidden]";
 
-/// A key. It is shown neither by `Debug` nor when settings are written out; there is no `Display`.
+/// A credential. `Debug` and `Serialize` print a placeholder, and there is no `Display`.
 #[derive(Clone, Default, PartialEq, Eq)]
 pub struct Secret(String);
 
 impl Secret {
-    /// Takes a key; spaces and line ends around it are not part of it.
+    /// Wraps a credential, trimming surrounding whitespace.
     pub fn new(key: &str) -> Self {
         Self(key.trim().to_owned())
     }
 
-    /// Whether there is no key.
+    /// Whether no credential is set.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// The key itself, for the one place that needs it.
+    /// The credential in plain text, for the code that sends it.
     pub fn expose(&self) -> &str {
         &self.0
     }
 
-    /// `text` without the key: servers like to repeat what they refuse.
+    /// Replaces the credential in `text` by a placeholder; servers tend to echo a rejected key.
     pub fn scrub(&self, text: &str) -> String {
         if self.0.is_empty() { text.to_owned() } else { text.replace(&self.0, HIDDEN) }
     }
@@ -48,14 +48,14 @@ impl Serialize for Secret {
 
 impl<'de> Deserialize<'de> for Secret {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_any(AnyKey)
+        deserializer.deserialize_any(SecretVisitor)
     }
 }
 
-/// An environment variable of digits alone arrives as a number; as a key it is a text all the same.
-struct AnyKey;
+/// Accepts numbers too: an environment variable that consists of digits is deserialized as a number.
+struct SecretVisitor;
 
-impl Visitor<'_> for AnyKey {
+impl Visitor<'_> for SecretVisitor {
     type Value = Secret;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -80,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_key_is_shown_nowhere() {
+    fn a_secret_is_never_printed() {
         let key = Secret::new(" sk-very-secret\n");
         assert_eq!(format!("{key:?}"), "[hidden]");
         assert_eq!(serde_json::to_string(&key).unwrap(), "\"[hidden]\"");
@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_of_digits_is_a_key() {
+    fn a_secret_of_digits_is_accepted() {
         let key: Secret = serde_json::from_str("12345").unwrap();
         assert_eq!(key, Secret::new("12345"));
         let key: Secret = serde_json::from_str("\"sk-1\"").unwrap();

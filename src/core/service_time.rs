@@ -1,37 +1,49 @@
-//! How fast work is done, measured as it ends.
+//! Service time of a queue, measured as requests complete.
 
 use std::time::Duration;
 
-/// A running mean over about the last ten pieces of work.
+/// An exponential moving average of the service time, over about the last ten requests.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ServiceTime {
-    /// Of one piece, in seconds, and between the ends of two.
-    measured: Option<(f64, f64)>,
+    averages: Option<Averages>,
 }
 
-/// The weight of the latest piece.
+#[derive(Debug, Clone, Copy)]
+struct Averages {
+    /// Seconds that one request takes.
+    service_s: f64,
+    /// Seconds between two completions; shorter than the service time where requests run concurrently.
+    interval_s: f64,
+}
+
+/// The weight of the newest sample.
 const WEIGHT: f64 = 0.1;
 
 impl ServiceTime {
-    /// One piece took so long, while `side_by_side` were in progress, itself included.
-    pub fn record(&mut self, took: Duration, side_by_side: usize) {
-        let took = took.as_secs_f64();
-        let between = took / side_by_side.max(1) as f64;
-        let mean = |known: f64, new: f64| known + WEIGHT * (new - known);
-        self.measured = Some(match self.measured {
-            Some((one, interval)) => (mean(one, took), mean(interval, between)),
-            None => (took, between),
+    /// Records a completed request that took `elapsed` while `concurrency` requests, itself included,
+    /// were in progress.
+    pub fn record(&mut self, elapsed: Duration, concurrency: usize) {
+        let service_s = elapsed.as_secs_f64();
+        let interval_s = service_s / concurrency.max(1) as f64;
+        let update = |average: f64, sample: f64| average + WEIGHT * (sample - average);
+        self.averages = Some(match self.averages {
+            Some(known) => Averages {
+                service_s: update(known.service_s, service_s),
+                interval_s: update(known.interval_s, interval_s),
+            },
+            None => Averages { service_s, interval_s },
         });
     }
 
-    /// How long one piece takes; zero before any was measured.
-    pub fn one(&self) -> Duration {
-        Duration::from_secs_f64(self.measured.map_or(0.0, |(one, _)| one))
+    /// Average service time of one request; zero before the first sample.
+    pub fn mean(&self) -> Duration {
+        Duration::from_secs_f64(self.averages.map_or(0.0, |known| known.service_s))
     }
 
-    /// How long it takes until `pieces` have ended; zero before any was measured.
-    pub fn until_done(&self, pieces: usize) -> Duration {
-        Duration::from_secs_f64(self.measured.map_or(0.0, |(_, interval)| interval * pieces as f64))
+    /// Expected time until `requests` have completed; zero before the first sample.
+    pub fn until_done(&self, requests: usize) -> Duration {
+        let seconds = self.averages.map_or(0.0, |known| known.interval_s * requests as f64);
+        Duration::from_secs_f64(seconds)
     }
 }
 
@@ -40,19 +52,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_runs_side_by_side_ends_the_more_often() {
+    fn concurrency_shortens_the_time_until_a_queue_is_done() {
         let mut time = ServiceTime::default();
         assert_eq!(time.until_done(10), Duration::ZERO);
         time.record(Duration::from_secs(2), 4);
-        assert_eq!(time.one(), Duration::from_secs(2));
+        assert_eq!(time.mean(), Duration::from_secs(2));
         assert_eq!(time.until_done(10), Duration::from_secs(5));
     }
 
     #[test]
-    fn one_slow_piece_is_soon_forgotten() {
+    fn one_slow_request_fades_from_the_average() {
         let mut time = ServiceTime::default();
         time.record(Duration::from_secs(100), 1);
         (0..100).for_each(|_| time.record(Duration::from_millis(10), 1));
-        assert!(time.one() < Duration::from_millis(20), "{time:?}");
+        assert!(time.mean() < Duration::from_millis(20), "{time:?}");
     }
 }

@@ -19,12 +19,12 @@ impl From<&DayUsage> for Spent {
 }
 
 impl Spent {
-    /// The sum.
+    /// The sum of the two amounts.
     pub fn plus(self, other: Self) -> Self {
         Self { tokens: self.tokens + other.tokens, money: self.money + other.money }
     }
 
-    /// The difference; nothing where more is taken than there is.
+    /// The difference of the two amounts, saturating at zero.
     pub fn minus(self, other: Self) -> Self {
         Self {
             tokens: self.tokens.saturating_sub(other.tokens),
@@ -32,7 +32,7 @@ impl Spent {
         }
     }
 
-    /// Whether either limit is exceeded; a limit of 0 means no limit.
+    /// Whether the amount exceeds either limit. A limit of 0 means unlimited.
     pub fn exceeds(self, tokens: u64, money: f64) -> bool {
         (tokens > 0 && self.tokens > tokens) || (money > 0.0 && self.money > money)
     }

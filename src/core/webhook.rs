@@ -1,4 +1,4 @@
-//! Webhooks: who is told when a job ends, and what became of telling them.
+//! Webhooks and the state of their deliveries.
 
 use std::fmt;
 use std::str::FromStr;
@@ -14,22 +14,22 @@ use uuid::Uuid;
 use super::map::display_as_written;
 use super::{InvalidName, Job, JobState, MapName};
 
-/// What a webhook is told.
+/// An event that a webhook can subscribe to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, ToSchema)]
 pub enum WebhookEvent {
-    /// A job ended with a ranking.
+    /// A job finished with a ranking.
     #[serde(rename = "job.succeeded")]
     JobSucceeded,
-    /// A job ended with a ranking of which part fell back to the coarse order.
+    /// A job finished with a ranking of which a part fell back to the coarse order.
     #[serde(rename = "job.degraded")]
     JobDegraded,
-    /// A job ended without a ranking.
+    /// A job finished without a ranking.
     #[serde(rename = "job.failed")]
     JobFailed,
-    /// A job ended because a caller asked for it.
+    /// A job was cancelled by a caller.
     #[serde(rename = "job.cancelled")]
     JobCancelled,
-    /// Somebody tries the webhook out.
+    /// A test message requested by the operator.
     #[serde(rename = "ping")]
     Ping,
 }
@@ -43,11 +43,11 @@ display_as_written!(WebhookEvent {
 });
 
 impl WebhookEvent {
-    /// All ends of jobs.
+    /// The events of finished jobs.
     pub const ENDS: [Self; 4] =
         [Self::JobSucceeded, Self::JobDegraded, Self::JobFailed, Self::JobCancelled];
 
-    /// The end of a job that is in this state; none, if it has not ended.
+    /// The event of a job that finished in this state; `None` if the state is not final.
     pub fn of(state: JobState) -> Option<Self> {
         match state {
             JobState::Queued | JobState::Running => None,
@@ -59,67 +59,67 @@ impl WebhookEvent {
     }
 }
 
-/// A webhook, without its secret.
+/// A webhook without its secret.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Webhook {
-    /// Its id; ids of later webhooks sort after those of earlier ones.
+    /// Id of the webhook. Ids sort by creation time.
     pub id: Uuid,
-    /// Where messages are posted.
+    /// URL to which messages are posted.
     pub url: String,
-    /// What it is told.
+    /// Events that the webhook receives.
     pub events: Vec<WebhookEvent>,
-    /// Only of jobs of this map; null for all.
+    /// Restricts the events to jobs of this map; null for all maps.
     #[schema(nullable)]
     pub map: Option<MapName>,
-    /// When it was made. It is told nothing that happened before.
+    /// When the webhook was created. It receives no earlier events.
     pub created_at: Timestamp,
-    /// Since when it is told nothing any more; null if it is.
+    /// When the webhook was disabled; null if it is enabled.
     #[schema(nullable)]
     pub disabled_at: Option<Timestamp>,
-    /// Why that is.
+    /// Why the webhook was disabled.
     #[schema(nullable)]
     pub disabled_reason: Option<String>,
 }
 
 impl Webhook {
-    /// Whether it is to be told of this event of a job.
-    pub fn wants(&self, event: WebhookEvent, job: &Job) -> bool {
+    /// Whether the webhook receives this event of a job.
+    pub fn subscribes_to(&self, event: WebhookEvent, job: &Job) -> bool {
         self.disabled_at.is_none()
             && self.events.contains(&event)
             && self.map.as_ref().is_none_or(|map| *map == job.map)
     }
 }
 
-/// A webhook as it is stored.
+/// A webhook as stored.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StoredWebhook {
     /// The webhook.
     #[serde(flatten)]
     pub webhook: Webhook,
-    /// What its messages are signed with. It is stored as it is, because signing takes all of it.
+    /// Key that signs the messages. Stored in plain text, because signing needs it.
     pub secret: WebhookSecret,
 }
 
-/// What both ends of a webhook know. It is written out where it is stored and where it is shown once; it
-/// shows itself in no log and no error.
+/// The signing secret shared with the receiver of a webhook. It serializes in plain text, for the store and
+/// for the one answer that shows it; `Debug` hides it.
 #[derive(Clone, PartialEq, Eq)]
 pub struct WebhookSecret(Vec<u8>);
 
 impl WebhookSecret {
-    /// What every secret begins with.
+    /// Prefix of every secret.
     pub const PREFIX: &str = "whsec_";
 
-    /// The secret of these random bytes.
+    /// Builds a secret from random bytes.
     pub fn new(random: &[u8; 32]) -> Self {
         Self(random.to_vec())
     }
 
-    /// The bytes that sign.
+    /// The bytes of the signing key.
     pub fn bytes(&self) -> &[u8] {
         &self.0
     }
 
-    /// The secret as its holder gets it: `whsec_` and the bytes in base64.
+    /// The secret in plain text: `whsec_` and the bytes in base64.
     pub fn reveal(&self) -> String {
         format!("{}{}", Self::PREFIX, STANDARD.encode(&self.0))
     }
@@ -130,9 +130,9 @@ impl FromStr for WebhookSecret {
 
     fn from_str(text: &str) -> Result<Self, InvalidName> {
         let bytes = text.strip_prefix(Self::PREFIX).and_then(|text| STANDARD.decode(text).ok());
-        let is_no_secret =
+        let invalid =
             || InvalidName("a webhook's secret is \"whsec_\" and base64 of 24 to 64 bytes".into());
-        bytes.filter(|bytes| (24..=64).contains(&bytes.len())).map(Self).ok_or_else(is_no_secret)
+        bytes.filter(|bytes| (24..=64).contains(&bytes.len())).map(Self).ok_or_else(invalid)
     }
 }
 
@@ -154,82 +154,81 @@ impl<'de> Deserialize<'de> for WebhookSecret {
     }
 }
 
-/// How far a delivery has come.
+/// The state of a delivery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum DeliveryState {
-    /// It is tried, or will be tried again.
+    /// Waiting for its first or next attempt.
     Waiting,
-    /// The other end took it.
+    /// Accepted by the receiver.
     Delivered,
-    /// It was given up. It is kept for a while, and can be delivered again.
+    /// Given up. Kept for a while, and can be redelivered.
     Dead,
 }
 
 display_as_written!(DeliveryState { Waiting => "waiting", Delivered => "delivered", Dead => "dead" });
 
-/// One message for one webhook.
+/// The delivery of one message to one webhook.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Delivery {
-    /// Its id, `webhook-id` of the message, in every attempt; ids of later ones sort after those of earlier
-    /// ones.
+    /// Id of the delivery, sent as `webhook-id` in every attempt. Ids sort by creation time.
     pub id: Uuid,
-    /// The webhook.
+    /// Id of the webhook.
     pub webhook: Uuid,
-    /// What happened.
+    /// Event that is reported.
     pub event: WebhookEvent,
-    /// The job to which it happened, if it is about one.
+    /// Id of the job, if the event is about one.
     #[schema(nullable)]
     pub job: Option<Uuid>,
-    /// How far it has come.
+    /// State of the delivery.
     pub state: DeliveryState,
-    /// When it was queued first.
+    /// When the delivery was first queued.
     pub created_at: Timestamp,
-    /// How often it was tried since it was last queued.
+    /// Attempts since the delivery was last queued.
     pub attempts: u32,
-    /// When that was last.
+    /// Time of the last attempt.
     #[schema(nullable)]
     pub last_attempt_at: Option<Timestamp>,
-    /// The HTTP status that the other end gave then, if it answered.
+    /// HTTP status of the last attempt, if the receiver answered.
     #[schema(nullable)]
     pub last_status: Option<u16>,
-    /// What went wrong then, or why it is dead.
+    /// Error of the last attempt, or why the delivery was given up.
     #[schema(nullable)]
     pub last_error: Option<String>,
-    /// When it is tried next; null unless it waits.
+    /// Time of the next attempt; null unless the delivery is waiting.
     #[schema(nullable)]
     pub next_attempt_at: Option<Timestamp>,
-    /// When it was delivered or given up; null while it waits.
+    /// When the message was delivered or given up; null while it is waiting.
     #[schema(nullable)]
     pub ended_at: Option<Timestamp>,
 }
 
-/// How one attempt went.
+/// The result of one delivery attempt.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Attempt {
-    /// When it ended.
+    /// When the attempt ended.
     pub at: Timestamp,
-    /// The HTTP status, if there was an answer.
+    /// HTTP status, if the receiver answered.
     pub status: Option<u16>,
-    /// What went wrong.
+    /// Why the attempt failed.
     pub error: Option<String>,
-    /// What becomes of the delivery.
-    pub then: Then,
+    /// What happens to the delivery next.
+    pub disposition: Disposition,
 }
 
-/// What becomes of a delivery after an attempt.
+/// What happens to a delivery after an attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Then {
-    /// It is delivered.
+pub enum Disposition {
+    /// The message was delivered.
     Delivered,
-    /// It is tried again at this moment.
-    Again(Timestamp),
-    /// It is given up.
+    /// The next attempt is made at this time.
+    RetryAt(Timestamp),
+    /// The delivery is given up.
     Dead,
 }
 
 impl Delivery {
-    /// A new one, to be tried at once.
+    /// Creates a delivery that is due at once.
     pub fn queued(webhook: Uuid, event: WebhookEvent, job: Option<Uuid>, now: Timestamp) -> Self {
         Self {
             id: Uuid::now_v7(),
@@ -247,19 +246,19 @@ impl Delivery {
         }
     }
 
-    /// Queues it anew, as if it had never been tried.
-    pub fn again(self, now: Timestamp) -> Self {
+    /// Queues the delivery again under the same id, without its earlier attempts.
+    pub fn requeued(self, now: Timestamp) -> Self {
         let Self { id, webhook, event, job, created_at, .. } = self;
         Self { id, created_at, ..Self::queued(webhook, event, job, now) }
     }
 
-    /// The same after an attempt.
-    pub fn after(self, attempt: Attempt) -> Self {
-        let Attempt { at, status, error, then } = attempt;
-        let (state, next_attempt_at, ended_at) = match then {
-            Then::Delivered => (DeliveryState::Delivered, None, Some(at)),
-            Then::Again(next) => (DeliveryState::Waiting, Some(next), None),
-            Then::Dead => (DeliveryState::Dead, None, Some(at)),
+    /// Applies the result of an attempt.
+    pub fn with_attempt(self, attempt: Attempt) -> Self {
+        let Attempt { at, status, error, disposition } = attempt;
+        let (state, next_attempt_at, ended_at) = match disposition {
+            Disposition::Delivered => (DeliveryState::Delivered, None, Some(at)),
+            Disposition::RetryAt(next) => (DeliveryState::Waiting, Some(next), None),
+            Disposition::Dead => (DeliveryState::Dead, None, Some(at)),
         };
         Self {
             state,
@@ -273,8 +272,8 @@ impl Delivery {
         }
     }
 
-    /// The same, given up without another attempt.
-    pub fn given_up(self, at: Timestamp, why: &str) -> Self {
+    /// Gives the delivery up without another attempt.
+    pub fn dead_lettered(self, at: Timestamp, why: &str) -> Self {
         Self {
             state: DeliveryState::Dead,
             last_error: Some(why.to_owned()),
@@ -285,15 +284,15 @@ impl Delivery {
     }
 }
 
-/// What is posted.
+/// The JSON body posted to a webhook.
 #[derive(Debug, Serialize)]
 pub struct Message<'a, T> {
-    /// What happened.
+    /// Event that is reported.
     #[serde(rename = "type")]
     pub event: WebhookEvent,
-    /// When.
+    /// Time of the event.
     pub timestamp: Timestamp,
-    /// To what.
+    /// The subject of the event: a job, or nothing for a ping.
     pub data: &'a T,
 }
 
@@ -302,7 +301,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_secret_is_written_whole_for_its_holder_and_not_at_all_for_a_log() {
+    fn a_secret_serializes_in_full_and_is_hidden_from_debug() {
         let secret = WebhookSecret::new(&[7; 32]);
         let text = secret.reveal();
         assert_eq!(text, format!("whsec_{}", STANDARD.encode([7; 32])));
@@ -316,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn every_end_of_a_job_is_an_event_of_that_name() {
+    fn every_final_job_state_has_an_event_of_the_same_name() {
         for (state, event) in [
             (JobState::Succeeded, WebhookEvent::JobSucceeded),
             (JobState::Degraded, WebhookEvent::JobDegraded),
@@ -332,13 +331,17 @@ mod tests {
     }
 
     #[test]
-    fn a_delivery_that_is_queued_anew_keeps_its_id_and_forgets_its_attempts() {
+    fn a_requeued_delivery_keeps_its_id_and_drops_its_attempts() {
         let now = Timestamp::now();
         let first = Delivery::queued(Uuid::now_v7(), WebhookEvent::Ping, None, now);
-        let attempt =
-            Attempt { at: now, status: Some(500), error: Some("500".into()), then: Then::Dead };
-        let dead = first.clone().after(attempt);
+        let attempt = Attempt {
+            at: now,
+            status: Some(500),
+            error: Some("500".into()),
+            disposition: Disposition::Dead,
+        };
+        let dead = first.clone().with_attempt(attempt);
         assert_eq!((dead.state, dead.attempts), (DeliveryState::Dead, 1));
-        assert_eq!(dead.again(now), first);
+        assert_eq!(dead.requeued(now), first);
     }
 }

@@ -11,6 +11,7 @@
 //! There is no second pipeline: descriptors, search, refiners and the cache of descriptions are those
 //! of [`whereabouts_service`], on a data folder that a server could serve.
 
+mod cache_key;
 mod dataset;
 mod folder;
 mod map;

@@ -9,7 +9,7 @@ use exif::{In, Rational, Tag, Value};
 use serde::Deserialize;
 
 use super::PictureFile;
-use whereabouts_core::{CoordinateFrame, GeographicPose, MetricPose, Pose};
+use whereabouts_core::{CoordinateFrame, GeographicPose, MetricPose, Pose, PoseInput};
 
 /// Source of the poses of a whole folder.
 #[derive(Debug)]
@@ -125,18 +125,15 @@ struct Row {
 
 impl Row {
     fn pose(self) -> anyhow::Result<Pose> {
-        let pose = match (self.lat.zip(self.lon), self.x.zip(self.y)) {
-            (Some((lat, lon)), None) => {
-                let Self { alt, heading, .. } = self;
-                Pose::Geographic(GeographicPose { lat, lon, alt, heading })
-            }
-            (None, Some((x, y))) => {
-                let Self { z, qx, qy, qz, qw, .. } = self;
-                Pose::Metric(MetricPose { x, y, z, qx, qy, qz, qw })
-            }
-            _ => bail!("a row needs either lat and lon, or x and y"),
+        let Self { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw, .. } = self;
+        let position = PoseInput { lat, lon, x, y, ..PoseInput::default() };
+        let frame = position.frame().context("a row needs either lat and lon, or x and y")?;
+        // Columns of the other frame are ignored: tables often have more of them than a pose needs.
+        let pose = match frame {
+            CoordinateFrame::Wgs84 => PoseInput { alt, heading, ..position },
+            CoordinateFrame::Metric => PoseInput { z, qx, qy, qz, qw, ..position },
         };
-        Ok(pose.checked()?)
+        Ok(pose.check(frame)?)
     }
 }
 

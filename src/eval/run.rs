@@ -8,18 +8,20 @@ use anyhow::{Context, bail};
 use async_trait::async_trait;
 use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt};
-use jiff::Timestamp;
 use uuid::Uuid;
 
+use super::cache_key::CacheKey;
 use super::map::ReferenceMap;
 use super::outcome::OutcomeCache;
 use super::{Dataset, EvaluatedQuery, MethodOutcomes, Prediction, QueryOutcome, StageTimes};
-use whereabouts_core::{Calibration, DescriptorKind, Digest, Job, Map, RefinerKind, Scene, Usage};
+use whereabouts_core::{Calibration, DescriptorKind, Digest, Map, RefinerKind, Scene, Usage};
 use whereabouts_index::SearchMode;
-use whereabouts_refine::{DenseKey, Progress, RefineError, Refinement, Refiner};
+use whereabouts_refine::{
+    AttemptPolicy, DenseKey, Progress, QueryFrame, RefineError, RefineInput, Refinement, Refiner,
+};
 use whereabouts_service::{Retrieved, Service};
-use whereabouts_store::{JobRecord, Query, Step};
-use whereabouts_vision::AdmissionRequest;
+use whereabouts_store::Step;
+use whereabouts_vision::{AdmissionRequest, FeatureSet};
 
 /// A way to localize a query: coarse retrieval, with or without refinement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,10 +55,8 @@ pub struct RunSettings {
     pub concurrency: usize,
     /// Folder for the map and the cached outcomes.
     pub work_dir: PathBuf,
-    /// Attempts at one refinement.
-    pub attempts: u32,
-    /// Pause before the second attempt; it doubles with each further one.
-    pub retry_pause: Duration,
+    /// Attempts at one refinement, and the pauses between them.
+    pub attempts: AttemptPolicy,
     /// Everything else that determines what the refiners return; part of the key of cached outcomes.
     pub refiner_settings: String,
 }
@@ -128,15 +128,16 @@ impl Evaluator<'_> {
         references: &ReferenceMap,
     ) -> anyhow::Result<OutcomeCache> {
         let RunSettings { k, search, scene, refiner_settings, work_dir, .. } = &self.settings;
-        let refinement = method.refiner.map(|_| (scene, refiner_settings));
-        let key = format!(
-            "{}\n{}\n{}\n{:?}\n{k}\n{refinement:?}\n{:?}",
-            env!("CARGO_PKG_VERSION"),
-            references.map.name,
-            references.digest,
-            search,
-            self.service.settings.calibration
-        );
+        let key = CacheKey {
+            version: env!("CARGO_PKG_VERSION"),
+            map: &references.map.name,
+            references: references.digest,
+            search: *search,
+            k: *k,
+            refinement: method.refiner.map(|_| (*scene, refiner_settings.as_str())),
+            calibration: self.service.settings.calibration,
+        }
+        .text();
         let folder = work_dir.join("outcomes");
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot create the folder {}", folder.display()))?;
@@ -147,8 +148,8 @@ impl Evaluator<'_> {
     /// Measures the null distribution of the map. A calibration in the store is not reused: it may be of
     /// other references.
     async fn calibrate(&self, map: &Map) -> anyhow::Result<Arc<Calibration>> {
-        let local = self.refiners.iter().find(|refiner| refiner.kind() == RefinerKind::Local);
-        self.service.calibrate(map, local.map(AsRef::as_ref)).await?;
+        let evidence = self.refiners.iter().find_map(|refiner| refiner.negative_evidence());
+        self.service.calibrate(map, evidence).await?;
         Ok(self.service.maps.calibration(map).await?.unwrap_or_default())
     }
 
@@ -169,14 +170,21 @@ impl Evaluator<'_> {
             return Ok(cached.into_iter().flatten().collect());
         }
         let k = self.settings.k.max(MIN_PREDICTIONS);
+        let refines_locally =
+            self.refiners.iter().any(|refiner| refiner.kind() == RefinerKind::Local);
+        let features = match refines_locally {
+            true => FeatureSet::DescriptorAndDense,
+            false => FeatureSet::DescriptorOnly,
+        };
+        let search = (k, self.settings.search);
         let retrieved = self
             .service
-            .retrieve(&map.name, &frame, k, self.settings.search, AdmissionRequest::BACKGROUND)
+            .retrieve(&map.name, &frame, search, features, AdmissionRequest::BACKGROUND)
             .await
             .with_context(file)?;
         let coarse = coarse_outcome(query, digest, &retrieved, calibration);
         let mut outcomes = Vec::with_capacity(caches.len());
-        let record = self.job_record(map, digest, retrieved);
+        let input = self.refine_input(map, digest, retrieved);
         // The refiners fetch the frame from the store; the pin protects it from removal until then.
         let _pin = self.service.blobs.put_blob(digest, frame).await?;
         for (index, (cached, cache)) in cached.into_iter().zip(caches).enumerate() {
@@ -186,7 +194,7 @@ impl Evaluator<'_> {
                 (None, None) => coarse.clone(),
                 (None, Some(refiner)) => {
                     let refiner = self.refiners[refiner].as_ref();
-                    self.refine(refiner, &record, &coarse, calibration).await.with_context(file)?
+                    self.refine(refiner, &input, &coarse, calibration).await.with_context(file)?
                 }
             };
             cache.insert(&outcome)?;
@@ -195,29 +203,24 @@ impl Evaluator<'_> {
         Ok(outcomes)
     }
 
-    /// Builds the job that a server would have queued for the query.
-    fn job_record(&self, map: &Map, digest: Digest, retrieved: Retrieved) -> JobRecord {
+    /// Builds the input of the job that a server would have queued for the query.
+    fn refine_input(&self, map: &Map, digest: Digest, retrieved: Retrieved) -> RefineInput {
         let Retrieved { model, mut candidates, extraction, .. } = retrieved;
         candidates.truncate(self.settings.k);
         let key = DenseKey { model, picture: digest };
-        self.service.dense.insert(key, Arc::new(extraction.dense));
-        let now = Timestamp::now();
-        let query = Query {
+        if let Some(dense) = extraction.dense {
+            self.service.dense.insert(key, Arc::new(dense));
+        }
+        RefineInput {
             id: Uuid::now_v7(),
-            digest,
-            media_type: extraction.media_type,
-            created_at: now,
-            descriptor: Some(extraction.descriptor),
-        };
-        let job = Job::queued(map.name.clone(), query.id, RefinerKind::Local, now);
-        JobRecord {
-            job,
-            map_uid: map.uid,
-            revision: map.revision,
-            query,
+            map: map.clone(),
+            frame: QueryFrame {
+                query_id: Uuid::now_v7(),
+                digest,
+                descriptor: Some(extraction.descriptor),
+            },
             candidates,
-            claims: 0,
-            traceparent: None,
+            spent: Usage::default(),
         }
     }
 
@@ -225,42 +228,33 @@ impl Evaluator<'_> {
     async fn refine(
         &self,
         refiner: &dyn Refiner,
-        record: &JobRecord,
+        input: &RefineInput,
         coarse: &QueryOutcome,
         calibration: &Calibration,
     ) -> anyhow::Result<QueryOutcome> {
-        let mut record = record.clone();
-        record.job.refiner = refiner.kind();
-        if !refiner.wants_descriptor() {
-            record.query.descriptor = None;
-        }
-        let mut attempt = 1;
-        loop {
+        let mut input = input.clone();
+        input.frame.descriptor.take_if(|_| !refiner.wants_descriptor());
+        let attempt = || async {
             let start = Instant::now();
-            match refiner.refine(&record, &NoProgress).await {
-                Ok(refinement) => {
-                    let elapsed = start.elapsed();
-                    let confidence = refinement.ranking.first().map_or(0.0, |first| {
-                        calibration.refined_confidence(
-                            &record.candidates,
-                            &first.image_id,
-                            refinement.evidence,
-                        )
-                    });
-                    return Ok(refined_outcome(coarse, refinement, confidence, elapsed));
-                }
-                Err(RefineError::Deferred { why, after }) => bail!(
-                    "{why}; the outcomes so far are saved: run the same command again in {} s",
-                    after.as_secs()
-                ),
-                Err(RefineError::Transient(_)) if attempt < self.settings.attempts => {
-                    let pause = self.settings.retry_pause * 2_u32.saturating_pow(attempt - 1);
-                    tokio::time::sleep(pause).await;
-                    attempt += 1;
-                }
-                Err(RefineError::Transient(why) | RefineError::Permanent(why)) => {
-                    return Ok(QueryOutcome { degraded: Some(why), ..coarse.clone() });
-                }
+            Ok((refiner.refine(&input, &NoProgress).await?, start.elapsed()))
+        };
+        match self.settings.attempts.run(attempt).await {
+            Ok((refinement, elapsed)) => {
+                let confidence = refinement.ranking.first().map_or(0.0, |first| {
+                    calibration.refined_confidence(
+                        &input.candidates,
+                        &first.image_id,
+                        refinement.evidence,
+                    )
+                });
+                Ok(refined_outcome(coarse, refinement, confidence, elapsed))
+            }
+            Err(RefineError::Deferred { why, after }) => bail!(
+                "{why}; the outcomes so far are saved: run the same command again in {} s",
+                after.as_secs()
+            ),
+            Err(RefineError::Transient(why) | RefineError::Permanent(why)) => {
+                Ok(QueryOutcome { degraded: Some(why), ..coarse.clone() })
             }
         }
     }

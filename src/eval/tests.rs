@@ -41,7 +41,9 @@ fn store(dir: &std::path::Path, exact_up_to: usize) -> EmbeddedStore {
         m: 16,
         ef_construction: 200,
         ef_search: 200,
+        threads: 0,
         max_dead_share: 1.0,
+        check_s: 0,
     };
     let max_age = std::time::Duration::from_secs(3600);
     EmbeddedStore::open(&EmbeddedSettings {

@@ -1,25 +1,25 @@
-//! Exact search: every descriptor is compared.
+//! Selection of the `k` best results.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
-use super::Found;
+use super::ScoredSlot;
 
-/// The `k` best of all that was offered.
-pub(super) struct Best {
+/// Collects the `k` best of all results offered.
+pub(super) struct TopK {
     k: usize,
-    /// The worst of those kept is on top.
+    /// A heap with the worst kept result on top.
     kept: BinaryHeap<WorstFirst>,
 }
 
-struct WorstFirst(Found);
+struct WorstFirst(ScoredSlot);
 
-impl Best {
+impl TopK {
     pub fn new(k: usize) -> Self {
         Self { k, kept: BinaryHeap::with_capacity(k.min(1024) + 1) }
     }
 
-    pub fn offer(&mut self, found: Found) {
+    pub fn offer(&mut self, found: ScoredSlot) {
         if self.kept.len() < self.k {
             self.kept.push(WorstFirst(found));
         } else if let Some(mut worst) = self.kept.peek_mut()
@@ -29,13 +29,18 @@ impl Best {
         }
     }
 
-    pub fn into_sorted(self) -> Vec<Found> {
+    /// Returns the similarity of the worst of the `k` results, once there are as many.
+    pub fn worst(&self) -> Option<f32> {
+        self.kept.peek().filter(|_| self.kept.len() >= self.k).map(|worst| worst.0.similarity)
+    }
+
+    pub fn into_sorted(self) -> Vec<ScoredSlot> {
         self.kept.into_sorted_vec().into_iter().map(|WorstFirst(found)| found).collect()
     }
 }
 
-/// The better one is `Less`: more similar, or as similar and stored earlier.
-fn better(a: &Found, b: &Found) -> Ordering {
+/// Orders results best first: by descending similarity, then by slot.
+fn better(a: &ScoredSlot, b: &ScoredSlot) -> Ordering {
     b.similarity.total_cmp(&a.similarity).then(a.slot.cmp(&b.slot))
 }
 
@@ -64,10 +69,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_best_come_sorted_and_ties_keep_their_order() {
-        let mut best = Best::new(3);
+    fn results_are_sorted_and_ties_are_ordered_by_slot() {
+        let mut best = TopK::new(3);
         for (slot, similarity) in [(4, 0.5), (1, 0.9), (3, 0.5), (2, 0.1), (0, 0.5)] {
-            best.offer(Found { slot, similarity });
+            best.offer(ScoredSlot { slot, similarity });
         }
         let slots: Vec<_> = best.into_sorted().iter().map(|found| found.slot).collect();
         assert_eq!(slots, [1, 0, 3]);

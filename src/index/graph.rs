@@ -1,8 +1,24 @@
-//! Approximate search: an HNSW graph (Malkov and Yashunin, 2018) built by `hnsw_rs`.
+//! The graph that takes new images until the next sealing: HNSW (Malkov and Yashunin, 2018) of `hnsw_rs`, which is
+//! searched while it grows.
+//!
+//! Images with equal descriptors are one point with several slots, as in the sealed graph: the neighbours of each of
+//! many twins would be its twins, and the rest of the map could not be reached from them.
+//!
+//! `hnsw_rs` does not promise that a point is found: among many near duplicates some are not. Points are therefore
+//! searched for after they were inserted, and again each time the graph has doubled; those that are missed are
+//! *stray* and are compared with every query.
+
+use std::collections::{BTreeSet, HashMap};
+use std::hash::{BuildHasher, RandomState};
+use std::ops::Range;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use hnsw_rs::prelude::{Distance, FilterT, Hnsw};
+use parking_lot::RwLock;
+use rayon::ThreadPool;
+use rayon::prelude::*;
 
-use super::{Found, IndexSettings};
+use super::{IndexSettings, ScoredSlot, Vectors};
 use whereabouts_core::dot;
 
 /// One minus the dot product of unit vectors.
@@ -17,16 +33,28 @@ impl Distance<f32> for CosineDistance {
     }
 }
 
-/// A point of a graph.
-pub(super) struct Linked {
-    /// Its slot.
-    pub slot: usize,
-    /// The slots of its neighbours in each of its layers, the lowest layer first.
-    pub layers: Vec<Vec<usize>>,
-}
+/// A distance that is zero but for rounding.
+const SAME: f32 = 1e-6;
 
 pub(super) struct Graph {
     hnsw: Hnsw<'static, f32, CosineDistance>,
+    points: RwLock<Points>,
+    hasher: RandomState,
+    /// Points that a search for their own descriptor misses.
+    stray: RwLock<BTreeSet<usize>>,
+    /// Points at the last check of the whole graph.
+    checked: AtomicUsize,
+    ef: usize,
+}
+
+/// The points of a graph and their slots.
+#[derive(Default)]
+struct Points {
+    /// Point → slots.
+    slots: Vec<Vec<usize>>,
+    /// Hash of a descriptor → point. The hash has 64 bits and a random key, so that two descriptors of one map
+    /// hardly ever share it.
+    by_hash: HashMap<u64, usize>,
 }
 
 impl Graph {
@@ -36,45 +64,89 @@ impl Graph {
         const LAYERS: usize = 16;
         let hnsw =
             Hnsw::new(settings.m, EXPECTED, LAYERS, settings.ef_construction, CosineDistance);
-        Self { hnsw }
+        Self {
+            hnsw,
+            points: RwLock::default(),
+            hasher: RandomState::new(),
+            stray: RwLock::default(),
+            checked: AtomicUsize::new(0),
+            ef: settings.ef_search,
+        }
     }
 
     pub fn insert(&self, slot: usize, vector: &[f32]) {
-        self.hnsw.insert((vector, slot));
+        let bytes: &[u8] = bytemuck::cast_slice(vector);
+        let hash = self.hasher.hash_one(bytes);
+        let point = {
+            let mut points = self.points.write();
+            if let Some(&twin) = points.by_hash.get(&hash) {
+                points.slots[twin].push(slot);
+                return;
+            }
+            let point = points.slots.len();
+            points.slots.push(vec![slot]);
+            points.by_hash.insert(hash, point);
+            point
+        };
+        self.hnsw.insert((vector, point));
     }
 
-    /// Its points, each with its neighbours.
-    pub fn linked(&self) -> Vec<Linked> {
-        let points = self.hnsw.get_point_indexation();
-        let layers = 0..=usize::from(points.get_max_level_observed());
-        layers
-            .flat_map(|layer| points.get_layer_iterator(layer))
-            .map(|point| Linked {
-                slot: point.get_origin_id(),
-                layers: point
-                    .get_neighborhood_id()
-                    .iter()
-                    // A point has room for all layers, but is part of those up to its own.
-                    .take(usize::from(point.get_point_id().0) + 1)
-                    .map(|layer| layer.iter().map(|neighbour| neighbour.d_id).collect())
-                    .collect(),
-            })
-            .collect()
+    /// Searches for the points of these slots, which were just inserted, or for all if the graph has doubled since
+    /// all were checked; notes those that are missed.
+    pub fn check(&self, vectors: &dyn Vectors, inserted: Range<usize>, threads: &ThreadPool) {
+        let points = self.points.read();
+        let all = points.slots.len() >= 2 * self.checked.load(Ordering::Relaxed).max(1);
+        if all {
+            self.checked.store(points.slots.len(), Ordering::Relaxed);
+        }
+        let is_due = |point: &usize| all || inserted.contains(&points.slots[*point][0]);
+        let is_missed = |point: &usize| {
+            let mut missed = false;
+            // A slot whose row is gone cannot be searched for; a twin of it can.
+            for &slot in points.slots[*point].iter() {
+                let mut stored = false;
+                vectors.scan(slot..slot + 1, &mut |_, vector| {
+                    let found = self.hnsw.search(vector, 1, self.ef);
+                    missed = found.first().is_none_or(|first| first.distance > SAME);
+                    stored = true;
+                });
+                if stored {
+                    break;
+                }
+            }
+            missed
+        };
+        let due: Vec<usize> = (0..points.slots.len()).filter(is_due).collect();
+        let missed: Vec<usize> =
+            threads.install(|| due.into_par_iter().filter(is_missed).collect());
+        self.stray.write().extend(missed);
     }
 
-    /// The `k` nearest among the slots that `keep` lets through.
+    /// Slots of stray points that `keep` accepts, at most `k` of each point, to be compared one by one.
+    pub fn stray_slots(&self, k: usize, keep: &dyn Fn(usize) -> bool) -> Vec<usize> {
+        let points = self.points.read();
+        let stray = self.stray.read();
+        let of = |point: &usize| points.slots[*point].iter().copied().filter(|&s| keep(s)).take(k);
+        stray.iter().flat_map(of).collect()
+    }
+
+    /// The nearest of the slots that `keep` accepts: at least `k`, if there are as many, and at most `k` of each
+    /// point.
     pub fn search(
         &self,
         query: &[f32],
         k: usize,
         ef: usize,
         keep: &dyn Fn(usize) -> bool,
-    ) -> Vec<Found> {
-        let filter = |slot: &usize| keep(*slot);
-        self.hnsw
-            .search_filter(query, k, ef, Some(&filter as &dyn FilterT))
-            .into_iter()
-            .map(|neighbour| Found { slot: neighbour.d_id, similarity: 1.0 - neighbour.distance })
-            .collect()
+    ) -> Vec<ScoredSlot> {
+        let points = self.points.read();
+        let filter = |point: &usize| points.slots[*point].iter().any(|&slot| keep(slot));
+        let near = self.hnsw.search_filter(query, k, ef, Some(&filter as &dyn FilterT));
+        let found = near.into_iter().flat_map(|neighbour| {
+            let kept = points.slots[neighbour.d_id].iter().copied().filter(|&slot| keep(slot));
+            let similarity = 1.0 - neighbour.distance;
+            kept.take(k).map(move |slot| ScoredSlot { slot, similarity })
+        });
+        found.collect()
     }
 }

@@ -1,68 +1,64 @@
-//! The index of one map: which stored descriptors are most similar to a query's.
+//! The nearest-neighbour index of one map: finds the stored descriptors most similar to that of a query.
 //!
-//! The index is derived. It reads descriptors from wherever they are stored ([`Vectors`]) by
-//! *slot*, the position in which they were stored, and can be thrown away and made again.
+//! The index is derived data. It reads descriptors by *slot*, their position in the store ([`Vectors`]), and can be
+//! rebuilt at any time.
 //!
-//! Small maps are searched exactly. For larger ones an HNSW graph covers the slots below
-//! [`MapIndex::graphed`], and the rest, which arrived since, is searched exactly: adding an image
-//! never waits for the graph, and a map answers while its graph is still being built. A graph that
-//! has caught up is sealed ([`SealedGraph`]), which makes it smaller and its search faster, and lets
-//! it be written to a file.
+//! Small maps are searched exactly. For larger ones HNSW graphs cover the slots below [`MapIndex::graphed`]; slots that
+//! arrived since are searched exactly, so that adding an image never waits for a graph and a map answers while its
+//! graph is being built.
+//!
+//! There are two graphs: a compact one over the map as it was when it was last sealed ([`SealedGraph`]), which is kept
+//! in a file, and one of `hnsw_rs` that grows with every new image. Once the growing one covers as many slots as the
+//! sealed one, a new sealed graph is built over all of them ([`Builder`]).
 
+mod builder;
+mod codes;
 mod exact;
 mod graph;
+mod layer;
+mod repair;
 mod sealed;
+mod settings;
 
+use std::collections::HashSet;
 use std::ops::Range;
 use std::sync::Arc;
 
 use parking_lot::{Mutex, MutexGuard, RwLock, RwLockReadGuard, RwLockWriteGuard};
+
 use rayon::ThreadPool;
 use rayon::prelude::*;
 
-use self::exact::Best;
+use self::builder::Builder;
+use self::exact::TopK;
 use self::graph::Graph;
 pub use self::sealed::{DamagedGraph, SealedGraph};
+pub use self::settings::IndexSettings;
 use whereabouts_core::dot;
 
 /// Stored descriptors, by slot.
 pub trait Vectors: Send + Sync {
     /// Numbers in each descriptor.
     fn dim(&self) -> usize;
-    /// Calls `visit` with each slot of the range that is stored, in order.
+    /// Calls `visit` with each stored slot of the range, in order.
     fn scan(&self, slots: Range<usize>, visit: &mut dyn FnMut(usize, &[f32]));
-}
-
-/// How a map is indexed.
-#[derive(Debug, Clone, Copy)]
-pub struct IndexSettings {
-    /// Maps with at most this many images are searched exactly, without a graph.
-    pub exact_up_to: usize,
-    /// Neighbours of a point in the graph (M).
-    pub m: usize,
-    /// Points looked at when inserting (efConstruction).
-    pub ef_construction: usize,
-    /// Points looked at when searching (ef); raised to k where that is larger.
-    pub ef_search: usize,
-    /// A sealed graph is built again once this share of its points, 0 to 1, has been removed.
-    pub max_dead_share: f32,
 }
 
 /// A stored descriptor and its similarity to the query.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Found {
-    /// Where the descriptor is stored.
+pub struct ScoredSlot {
+    /// The slot of the descriptor.
     pub slot: usize,
     /// Cosine similarity, −1 to 1.
     pub similarity: f32,
 }
 
-/// How to search.
+/// Approximate or exact search.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SearchMode {
-    /// The graph where there is one.
+    /// Through the graphs, if there are any.
     Fast,
-    /// Every descriptor: the reference.
+    /// Every descriptor is compared.
     Exact,
 }
 
@@ -75,15 +71,15 @@ pub struct MapIndex {
     /// Whether the image in each slot is still part of the map.
     live: RwLock<Live>,
     graphs: RwLock<Graphs>,
-    /// A graph over everything, on its way to replace those there are. Only the indexer touches it.
-    merging: Mutex<Option<Merging>>,
+    /// The graph that will replace the others. Only the indexer uses it.
+    building: Mutex<Option<Builder>>,
 }
 
 #[derive(Default)]
 struct Live {
     slots: Vec<bool>,
     count: usize,
-    /// Where the sealed graph ends, and how many of the slots below are live.
+    /// The end of the sealed graph, and the number of live slots below it.
     sealed_end: usize,
     sealed_count: usize,
 }
@@ -113,20 +109,12 @@ impl Live {
 struct Graphs {
     sealed: Option<Arc<SealedGraph>>,
     growing: Option<Arc<Graph>>,
-    /// Slots below this one are in one of the two, unless they were removed before they got there.
+    /// Slots below this one are in one of the two graphs, unless they were removed before they were inserted.
     graphed: usize,
 }
 
-struct Merging {
-    graph: Graph,
-    /// Slots below this one are in it.
-    done: usize,
-    /// Slots below this one will be.
-    end: usize,
-}
-
 impl Graphs {
-    /// Where the growing graph begins.
+    /// The first slot of the growing graph.
     fn sealed_end(&self) -> usize {
         self.sealed.as_ref().map_or(0, |sealed| sealed.end())
     }
@@ -139,41 +127,41 @@ impl MapIndex {
             settings,
             live: RwLock::default(),
             graphs: RwLock::default(),
-            merging: Mutex::default(),
+            building: Mutex::default(),
         }
     }
 
-    /// Searches with a graph that was sealed by an earlier process.
+    /// Uses a graph that an earlier process sealed.
     pub fn restore(&self, sealed: SealedGraph) {
         self.replace_graphs(Arc::new(sealed));
     }
 
-    /// Makes the image in `slot` part of every later answer.
+    /// Adds the image in `slot` to all later results.
     pub fn add(&self, slot: usize) {
         self.live_mut().set(slot, true);
     }
 
-    /// Keeps the image in `slot` out of every later answer.
+    /// Removes the image in `slot` from all later results.
     pub fn remove(&self, slot: usize) {
         self.live_mut().set(slot, false);
     }
 
-    /// How many images are part of the map.
+    /// The number of images in the map.
     pub fn len(&self) -> usize {
         self.live().count
     }
 
-    /// Whether no image is part of the map.
+    /// Whether the map has no images.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Slots below this one are in a graph, unless they were removed before they got there.
+    /// Slots below this one are in a graph, unless they were removed before they were inserted.
     pub fn graphed(&self) -> usize {
         self.graphs().graphed
     }
 
-    /// Bytes of the sealed graph, in memory as on disk. The growing one is not counted.
+    /// Bytes of the sealed graph, in memory and on disk. The growing graph is not counted.
     pub fn sealed_bytes(&self) -> usize {
         self.graphs().sealed.as_ref().map_or(0, |sealed| sealed.bytes())
     }
@@ -185,7 +173,7 @@ impl MapIndex {
         query: &[f32],
         k: usize,
         mode: SearchMode,
-    ) -> Vec<Found> {
+    ) -> Vec<ScoredSlot> {
         let live = self.live();
         let is_live = |slot: usize| live.slots.get(slot).copied().unwrap_or(false);
         let graphs = match mode {
@@ -193,9 +181,9 @@ impl MapIndex {
             SearchMode::Exact => Graphs::default(),
         };
         let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
-        let mut best = Best::new(k);
-        let mut found_in = |slots: Range<usize>, found: Vec<Found>| {
-            // Among many removed images a graph can lose its way to the rest.
+        let mut best = TopK::new(k);
+        let mut found_in = |slots: Range<usize>, found: Vec<ScoredSlot>| {
+            // If many images were removed, a graph search may end before it has found enough live ones.
             let end = slots.end.min(live.slots.len());
             let all = live.slots[slots.start.min(end)..end].iter().filter(|live| **live).take(k);
             if found.len() >= all.count() {
@@ -209,82 +197,83 @@ impl MapIndex {
             found_in(0..sealed_end, sealed.search(vectors, query, (k, ef), is_live));
         }
         if let Some(growing) = &graphs.growing {
-            // It may hold more than `graphed` says by now.
+            // It may already hold slots beyond `graphed`.
             let kept = |slot: usize| slot < graphed && is_live(slot);
-            found_in(sealed_end..graphed, growing.search(query, k, ef, &kept));
+            let mut found = growing.search(query, k, ef, &kept);
+            let known: HashSet<usize> = found.iter().map(|found| found.slot).collect();
+            let stray = growing.stray_slots(k, &kept);
+            for slot in stray.into_iter().filter(|slot| !known.contains(slot)) {
+                vectors.scan(slot..slot + 1, &mut |slot, vector| {
+                    found.push(ScoredSlot { slot, similarity: dot(query, vector) });
+                });
+            }
+            found_in(sealed_end..graphed, found);
         }
         exactly(vectors, query, graphed..live.slots.len(), &is_live, &mut best);
         best.into_sorted()
     }
 
-    /// Whether slots wait to be put into a graph.
+    /// Whether slots wait to be inserted into a graph.
     pub fn is_behind(&self) -> bool {
         let graphed = self.graphed();
         let live = self.live();
         live.count > self.settings.exact_up_to && graphed < live.slots.len()
     }
 
-    /// Whether [`MapIndex::catch_up`] has anything to do.
+    /// Whether [`MapIndex::catch_up`] has work to do.
     pub fn has_work(&self) -> bool {
-        self.is_behind() || self.merging().is_some() || self.wants_sealing()
+        self.is_behind() || self.building().is_some() || self.wants_sealing()
     }
 
-    /// Whether the growing graph has become as large as the sealed one, or too many points of the
-    /// sealed one are dead: a search walks over them in vain.
+    /// Whether as many slots lie beyond the sealed graph as in it, or too many of its slots are dead, which slow down
+    /// every search.
     fn wants_sealing(&self) -> bool {
-        let graphs = self.graphs();
-        let (sealed_end, graphed) = (graphs.sealed_end(), graphs.graphed);
-        let has_grown = graphs.growing.is_some() && graphed - sealed_end >= sealed_end.max(1);
-        let points = graphs.sealed.as_ref().map_or(0, |sealed| sealed.len());
-        let dead = points.saturating_sub(self.live().sealed_count);
+        let sealed = self.graphs().sealed.clone();
+        let (end, points) = sealed.map_or((0, 0), |sealed| (sealed.end(), sealed.len()));
+        let live = self.live();
+        let has_grown = live.count > self.settings.exact_up_to
+            && live.slots.len().saturating_sub(end) >= end.max(1);
+        let dead = points.saturating_sub(live.sealed_count);
         has_grown || dead as f32 > self.settings.max_dead_share * points as f32
     }
 
-    /// Does a piece of the work that waits, over at most `most` slots; returns the graph that was
-    /// sealed by it, if one was. Call from one thread at a time; searches go on meanwhile.
+    /// Processes up to `most` waiting slots; returns the sealed graph, if this completed one. Only one thread may call
+    /// it at a time; searches continue meanwhile.
     ///
-    /// New slots go into the growing graph. When none waits and that graph has become as large as
-    /// the sealed one, the two are made one, which is then sealed: each slot is put into a graph
-    /// twice on average, whatever the size of the map. `threads` share the work on the graph.
+    /// New slots go into the growing graph. Once it covers as many slots as the sealed graph, a graph over all slots
+    /// is built, which replaces both: on average each slot is inserted into a sealed graph twice, whatever the size of
+    /// the map. `threads` share the work.
     pub fn catch_up(
         &self,
         vectors: &dyn Vectors,
         most: usize,
         threads: &ThreadPool,
     ) -> Option<Arc<SealedGraph>> {
-        let mut merging = self.merging();
-        if let Some(merge) = merging.as_mut() {
-            let end = merge.end.min(merge.done + most);
-            self.insert(&merge.graph, vectors, merge.done..end, threads);
-            merge.done = end;
-            if merge.done < merge.end {
+        let mut building = self.building();
+        if let Some(builder) = building.as_mut() {
+            if !builder.link(most, threads) {
                 return None;
             }
-            let Merging { graph, end, .. } = merging.take()?;
-            return Some(self.seal(&graph, end, vectors));
+            let sealed = Arc::new(building.take()?.finish(threads));
+            self.replace_graphs(Arc::clone(&sealed));
+            return Some(sealed);
+        }
+        if self.wants_sealing() {
+            let live = self.live().slots.clone();
+            *building = Some(Builder::new(&live, vectors, self.settings));
+            return None;
         }
         if self.is_behind() {
             let graphs = self.graphs().clone();
             let growing = graphs.growing.unwrap_or_else(|| Arc::new(Graph::new(&self.settings)));
             let end = self.live().slots.len().min(graphs.graphed + most);
             self.insert(&growing, vectors, graphs.graphed..end, threads);
+            growing.check(vectors, graphs.graphed..end, threads);
             let mut graphs = self.graphs_mut();
             graphs.growing = Some(growing);
             graphs.graphed = end;
-            return None;
         }
-        if !self.wants_sealing() {
-            return None;
-        }
-        let Graphs { sealed, growing, graphed } = self.graphs().clone();
-        match (sealed, growing) {
-            (None, Some(growing)) => Some(self.seal(&growing, graphed, vectors)),
-            _ => {
-                let graph = Graph::new(&self.settings);
-                *merging = Some(Merging { graph, done: 0, end: graphed });
-                None
-            }
-        }
+        None
     }
 
     fn insert(
@@ -307,13 +296,7 @@ impl MapIndex {
         threads.install(|| rows.par_iter().for_each(|(slot, vector)| graph.insert(*slot, vector)));
     }
 
-    /// Replaces the graphs there are by a finished one.
-    fn seal(&self, graph: &Graph, end: usize, vectors: &dyn Vectors) -> Arc<SealedGraph> {
-        let sealed = Arc::new(SealedGraph::new(&graph.linked(), end, vectors, &self.settings));
-        self.replace_graphs(Arc::clone(&sealed));
-        sealed
-    }
-
+    /// Replaces both graphs by a finished one.
     fn replace_graphs(&self, sealed: Arc<SealedGraph>) {
         let graphed = sealed.end();
         *self.graphs_mut() = Graphs { sealed: Some(sealed), growing: None, graphed };
@@ -336,25 +319,27 @@ impl MapIndex {
         self.graphs.write()
     }
 
-    fn merging(&self) -> MutexGuard<'_, Option<Merging>> {
-        self.merging.lock()
+    fn building(&self) -> MutexGuard<'_, Option<Builder>> {
+        self.building.lock()
     }
 }
 
-/// Offers every live slot of a range.
+/// Offers every live slot of the range to `best`.
 fn exactly(
     vectors: &dyn Vectors,
     query: &[f32],
     slots: Range<usize>,
     is_live: &dyn Fn(usize) -> bool,
-    best: &mut Best,
+    best: &mut TopK,
 ) {
     vectors.scan(slots, &mut |slot, vector| {
         if is_live(slot) {
-            best.offer(Found { slot, similarity: dot(query, vector) });
+            best.offer(ScoredSlot { slot, similarity: dot(query, vector) });
         }
     });
 }
 
+#[cfg(test)]
+mod property_tests;
 #[cfg(test)]
 mod tests;

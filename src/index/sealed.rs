@@ -1,67 +1,67 @@
-//! A graph that is finished: `hnsw_rs` builds it, and this searches it.
+//! A finished graph: no point is added to it any more.
 //!
-//! While a graph grows, each of its points holds counted references to its neighbours, and a search
-//! keeps a hash map of the points it has seen. Once it is finished that freedom is not needed:
-//! neighbours become rows of a flat array, the points seen a bitmap, and descriptors 8-bit codes
-//! beside one another, a quarter of the bytes that a comparison has to fetch. The best are scored
-//! again with the stored descriptors, so that what is returned is exact.
+//! Neighbours are rows of flat arrays, the visited set of a search is a bitmap, and descriptors are compared by 8-bit
+//! codes. The best candidates are scored again with the stored descriptors, so that returned similarities are exact.
 //!
-//! The algorithm is that of Malkov and Yashunin (2018): descend greedily through the upper layers,
-//! then search the lowest one with a queue of the `ef` best.
+//! Images with equal descriptors are one point with several slots.
 
-use std::cmp::Reverse;
-use std::collections::BinaryHeap;
-
-use multiversion::multiversion;
-
-use super::exact::Best;
-use super::graph::Linked;
-use super::{Found, IndexSettings, Vectors};
+use super::codes::{Coded, Codes, Ranked};
+use super::exact::TopK;
+use super::layer::Layer;
+use super::repair::reach;
+use super::{IndexSettings, ScoredSlot, Vectors};
 use whereabouts_core::dot;
 
-/// Fills rows of neighbours that are shorter than the longest.
-const NONE: u32 = u32::MAX;
-
-/// What a file begins with; the last byte is its version.
-const MAGIC: [u8; 8] = *b"WBGRAPH1";
+/// The first bytes of a file; the last of them is its version.
+const MAGIC: [u8; 8] = *b"WBGRAPH3";
 /// Magic and the checksum of the rest.
 const HEADER_BYTES: usize = 8 + 4;
+
+/// Beam width of the descent through the upper layers.
+pub(super) const DESCENT: usize = 8;
+
+/// How often a search is repeated with twice the beam width, if its candidates are too alike for their codes.
+const WIDENINGS: usize = 3;
 
 /// A finished graph over the slots below [`SealedGraph::end`].
 #[derive(Debug, PartialEq)]
 pub struct SealedGraph {
-    /// How it was built: M and efConstruction.
+    /// The M and efConstruction that it was built with.
     built: (usize, usize),
-    /// Slots from here on are not in it.
+    /// The first slot beyond the graph.
     end: usize,
-    dim: usize,
-    /// Point → slot.
-    slots: Vec<u32>,
-    /// The neighbours of each point in the lowest layer, in rows of `degree`.
-    lowest: Vec<u32>,
-    degree: usize,
-    /// The layers above it, the highest first.
-    upper: Vec<Layer>,
-    /// Point → `dim` codes.
-    codes: Vec<i8>,
-    /// Point → what one step of its codes is worth.
-    scales: Vec<f32>,
+    slots: Slots,
+    /// The lowest first; there is always one.
+    layers: Vec<Layer<u32>>,
+    codes: Codes,
 }
 
-/// A layer of few points.
-#[derive(Debug, Default, PartialEq)]
-struct Layer {
-    /// Its points, in order.
-    points: Vec<u32>,
-    /// Where the neighbours of each begin in `neighbours`, and the end.
+/// The slots of each point, ascending.
+#[derive(Debug, PartialEq)]
+pub(super) struct Slots {
+    /// Point → where its slots start; one more at the end.
     starts: Vec<u32>,
-    neighbours: Vec<u32>,
+    slots: Vec<u32>,
 }
 
-impl Layer {
+impl Slots {
+    pub fn new<'a>(of_points: impl Iterator<Item = &'a [u32]>) -> Self {
+        let (mut starts, mut slots) = (vec![0], Vec::new());
+        for of_point in of_points {
+            slots.extend_from_slice(of_point);
+            starts.push(slots.len() as u32);
+        }
+        Self { starts, slots }
+    }
+
+    /// The number of points.
+    pub fn points(&self) -> usize {
+        self.starts.len() - 1
+    }
+
     fn of(&self, point: u32) -> &[u32] {
-        let Ok(place) = self.points.binary_search(&point) else { return &[] };
-        &self.neighbours[self.starts[place] as usize..self.starts[place + 1] as usize]
+        let point = point as usize;
+        &self.slots[self.starts[point] as usize..self.starts[point + 1] as usize]
     }
 }
 
@@ -70,257 +70,145 @@ impl Layer {
 #[error("the graph's file is damaged or of another version")]
 pub struct DamagedGraph;
 
-/// A descriptor in 8-bit codes.
-struct Coded<'a> {
-    codes: &'a [i8],
-    scale: f32,
-}
-
-fn code(vector: &[f32], into: &mut Vec<i8>) -> f32 {
-    let largest = vector.iter().fold(f32::MIN_POSITIVE, |most, x| most.max(x.abs()));
-    let scale = largest / 127.0;
-    // Rounded away from zero at halves; the cast keeps within −127..=127.
-    into.extend(vector.iter().map(|x| (x / scale).round() as i8));
-    scale
-}
-
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn coded_dot(a: &[i8], b: &[i8]) -> i32 {
-    let length = a.len().min(b.len());
-    let (a, b) = (&a[..length], &b[..length]);
-    let mut sum = 0;
-    // Indices, because adapters of iterators are not always compiled into their caller.
-    for index in 0..length {
-        sum += i32::from(a[index]) * i32::from(b[index]);
-    }
-    sum
-}
-
-/// Similarity and point in one number that sorts by similarity.
-fn ranked(similarity: f32, point: u32) -> u64 {
-    let bits = similarity.to_bits();
-    let ordered = if bits >> 31 == 0 { bits | 1 << 31 } else { !bits };
-    u64::from(ordered) << 32 | u64::from(point)
-}
-
-fn point_of(ranked: u64) -> u32 {
-    ranked as u32
-}
-
 impl SealedGraph {
-    /// Takes a grown graph apart. `linked` are its points with their neighbours, `vectors` their
-    /// descriptors; it covers the slots below `end`.
     pub(super) fn new(
-        linked: &[Linked],
+        built: (usize, usize),
         end: usize,
-        vectors: &dyn Vectors,
-        settings: &IndexSettings,
+        slots: Slots,
+        layers: Vec<Layer<u32>>,
+        codes: Codes,
     ) -> Self {
-        let mut point_of_slot = vec![NONE; end];
-        for (point, linked) in linked.iter().enumerate() {
-            point_of_slot[linked.slot] = point as u32;
-        }
-        let points = |slots: &[usize]| -> Vec<u32> {
-            let known = slots.iter().filter_map(|slot| point_of_slot.get(*slot).copied());
-            known.filter(|point| *point != NONE).collect()
-        };
-        let degree = linked.iter().filter_map(|linked| linked.layers.first()).map(Vec::len).max();
-        let degree = degree.unwrap_or(0).max(1);
-        let mut lowest = vec![NONE; linked.len() * degree];
-        for (row, linked) in lowest.chunks_exact_mut(degree).zip(linked) {
-            let neighbours = linked.layers.first().map_or(Vec::new(), |slots| points(slots));
-            row.iter_mut().zip(neighbours).for_each(|(place, neighbour)| *place = neighbour);
-        }
-        let highest = linked.iter().map(|linked| linked.layers.len()).max().unwrap_or(0);
-        let layer = |level: usize| {
-            let mut layer = Layer::default();
-            for (point, linked) in linked.iter().enumerate() {
-                if let Some(slots) = linked.layers.get(level) {
-                    layer.points.push(point as u32);
-                    layer.starts.push(layer.neighbours.len() as u32);
-                    layer.neighbours.extend(points(slots));
-                }
-            }
-            layer.starts.push(layer.neighbours.len() as u32);
-            layer
-        };
-        let upper = (1..highest).rev().map(layer).collect();
-        let dim = vectors.dim();
-        let mut codes = Vec::with_capacity(linked.len() * dim);
-        let mut scales = Vec::with_capacity(linked.len());
-        for (point, linked) in linked.iter().enumerate() {
-            vectors.scan(linked.slot..linked.slot + 1, &mut |_, vector| {
-                scales.push(code(vector, &mut codes));
-            });
-            if scales.len() == point {
-                // Its row has gone. It is not part of the map then, but a way to its neighbours.
-                scales.push(0.0);
-                codes.resize(codes.len() + dim, 0);
-            }
-        }
-        let slots = linked.iter().map(|linked| linked.slot as u32).collect();
-        let built = (settings.m, settings.ef_construction);
-        Self { built, end, dim, slots, lowest, degree, upper, codes, scales }
+        Self { built, end, slots, layers, codes }
     }
 
-    /// Slots from here on are not in the graph.
+    /// The first slot beyond the graph.
     pub fn end(&self) -> usize {
         self.end
     }
 
-    /// Whether it was built as these settings say.
-    pub fn fits(&self, settings: &IndexSettings) -> bool {
+    /// Whether it was built with these settings.
+    pub fn is_built_with(&self, settings: &IndexSettings) -> bool {
         self.built == (settings.m, settings.ef_construction)
     }
 
     /// Numbers in each descriptor.
     pub fn dim(&self) -> usize {
-        self.dim
+        self.codes.dim
     }
 
     /// Bytes of its arrays.
     pub fn bytes(&self) -> usize {
-        let of_layer = |layer: &Layer| {
-            size_of_val(&layer.points[..])
-                + size_of_val(&layer.starts[..])
-                + size_of_val(&layer.neighbours[..])
-        };
-        size_of_val(&self.slots[..])
-            + size_of_val(&self.lowest[..])
-            + self.upper.iter().map(of_layer).sum::<usize>()
-            + size_of_val(&self.codes[..])
-            + size_of_val(&self.scales[..])
+        size_of_val(&self.slots.starts[..])
+            + size_of_val(&self.slots.slots[..])
+            + self.layers.iter().map(|layer| size_of_val(&layer.cells[..])).sum::<usize>()
+            + size_of_val(&self.codes.codes[..])
+            + size_of_val(&self.codes.scales[..])
     }
 
-    /// Points in the graph.
+    /// Slots in the graph.
     pub fn len(&self) -> usize {
-        self.slots.len()
+        self.slots.slots.len()
     }
 
-    /// Whether there is no point in the graph.
+    /// Whether there is no slot in the graph.
     pub fn is_empty(&self) -> bool {
-        self.slots.is_empty()
+        self.slots.slots.is_empty()
     }
 
-    /// The `k` nearest that `keep` lets through, scored with the stored descriptors.
+    /// Slots that no search can reach from the entry point. A graph that was built without an error has none.
+    pub fn unreachable(&self) -> usize {
+        let mut reached = vec![false; self.slots.points()];
+        if !reached.is_empty() {
+            reach(&self.layers[0], 0, &mut reached);
+        }
+        let lost = (0..reached.len()).filter(|&point| !reached[point]);
+        lost.map(|point| self.slots.of(point as u32).len()).sum()
+    }
+
+    /// The `k` nearest slots that `keep` accepts, scored with the stored descriptors.
     pub(super) fn search(
         &self,
         vectors: &dyn Vectors,
         query: &[f32],
         (k, ef): (usize, usize),
         keep: impl Fn(usize) -> bool,
-    ) -> Vec<Found> {
-        if self.is_empty() || query.len() != self.dim {
+    ) -> Vec<ScoredSlot> {
+        if self.is_empty() || query.len() != self.dim() {
             return Vec::new();
         }
-        let mut codes = Vec::with_capacity(self.dim);
-        let scale = code(query, &mut codes);
-        let near = self.beam(&Coded { codes: &codes, scale }, ef, keep);
-        // Codes are right to about a hundredth: a few more than k hold the k best.
-        let mut best = Best::new(k);
-        for ranked in near.into_iter().rev().take(2 * k + 16) {
-            let slot = self.slots[point_of(ranked) as usize] as usize;
-            vectors.scan(slot..slot + 1, &mut |slot, vector| {
-                best.offer(Found { slot, similarity: dot(query, vector) });
-            });
+        let mut coded = Codes::new(self.dim(), 1);
+        coded.push(query);
+        let query_code = coded.of(0);
+        let mut ef = ef;
+        for _ in 0..WIDENINGS {
+            let near = self.near(query_code, ef, &keep);
+            let (best, is_complete) = self.rescored(vectors, query, query_code, &near, k, &keep);
+            if is_complete || near.len() < ef {
+                return best;
+            }
+            ef *= 2;
         }
-        best.into_sorted()
+        let near = self.near(query_code, ef, &keep);
+        self.rescored(vectors, query, query_code, &near, k, &keep).0
     }
 
-    fn similarity(&self, query: &Coded<'_>, point: u32) -> f32 {
-        let point = point as usize;
-        let codes = &self.codes[point * self.dim..(point + 1) * self.dim];
-        coded_dot(query.codes, codes) as f32 * (query.scale * self.scales[point])
-    }
-
-    /// Where the search of the lowest layer begins: the best that the upper layers lead to.
-    fn descend(&self, query: &Coded<'_>) -> u64 {
-        let entry = self.upper.first().and_then(|layer| layer.points.first()).copied();
-        let entry = entry.unwrap_or(0);
-        let mut best = ranked(self.similarity(query, entry), entry);
-        for layer in &self.upper {
-            loop {
-                let nearer = layer
-                    .of(point_of(best))
-                    .iter()
-                    .map(|&point| ranked(self.similarity(query, point), point))
-                    .max()
-                    .filter(|nearer| *nearer > best);
-                match nearer {
-                    Some(nearer) => best = nearer,
-                    None => break,
-                }
+    /// Scores candidates with the stored descriptors. Among images that hardly differ the coded similarity says
+    /// little, so scoring goes on until no further candidate can be one of the `k` best; the second value tells
+    /// whether it got there.
+    fn rescored(
+        &self,
+        vectors: &dyn Vectors,
+        query: &[f32],
+        query_code: Coded<'_>,
+        near: &[Ranked],
+        k: usize,
+        keep: impl Fn(usize) -> bool,
+    ) -> (Vec<ScoredSlot>, bool) {
+        // Bounds the work on a point with many slots; their similarities differ by less than the code tells.
+        let per_point = 2 * k + 16;
+        let mut best = TopK::new(k);
+        for ranked in near {
+            let margin = query_code.error(self.codes.of(ranked.point()));
+            if best.worst().is_some_and(|worst| ranked.similarity() + margin < worst) {
+                return (best.into_sorted(), true);
+            }
+            let kept = self.slots.of(ranked.point()).iter().map(|&slot| slot as usize);
+            for slot in kept.filter(|&slot| keep(slot)).take(per_point) {
+                vectors.scan(slot..slot + 1, &mut |slot, vector| {
+                    best.offer(ScoredSlot { slot, similarity: dot(query, vector) });
+                });
             }
         }
-        best
+        (best.into_sorted(), false)
     }
 
-    /// The `ef` nearest of the lowest layer that `keep` lets through, the farthest first.
-    fn beam(&self, query: &Coded<'_>, ef: usize, keep: impl Fn(usize) -> bool) -> Vec<u64> {
-        let mut seen = vec![0_u64; self.len().div_ceil(64)];
-        let mut see = |point: u32| {
-            let (word, bit) = (&mut seen[point as usize / 64], 1 << (point % 64));
-            let new = *word & bit == 0;
-            *word |= bit;
-            new
-        };
-        let kept = |point: u32| keep(self.slots[point as usize] as usize);
-        let entry = self.descend(query);
-        see(point_of(entry));
-        let mut open = BinaryHeap::from([entry]);
-        let mut best: BinaryHeap<Reverse<u64>> = BinaryHeap::with_capacity(ef + 1);
-        if kept(point_of(entry)) {
-            best.push(Reverse(entry));
-        }
-        let mut fresh = Vec::with_capacity(self.degree);
-        while let Some(nearest) = open.pop() {
-            let worst = best.peek().filter(|_| best.len() >= ef).map_or(0, |worst| worst.0);
-            if nearest < worst {
-                break;
-            }
-            let row = point_of(nearest) as usize * self.degree;
-            fresh.clear();
-            // Found first and compared afterwards, so that the fetches of codes overlap.
-            let neighbours = &self.lowest[row..row + self.degree];
-            fresh.extend(neighbours.iter().copied().take_while(|p| *p != NONE).filter(|p| see(*p)));
-            for &point in &fresh {
-                let candidate = ranked(self.similarity(query, point), point);
-                let worst = best.peek().filter(|_| best.len() >= ef).map_or(0, |worst| worst.0);
-                if candidate > worst {
-                    open.push(candidate);
-                    if kept(point) {
-                        best.push(Reverse(candidate));
-                        if best.len() > ef {
-                            best.pop();
-                        }
-                    }
-                }
-            }
-        }
-        best.into_sorted_vec().into_iter().rev().map(|Reverse(ranked)| ranked).collect()
+    /// The `ef` nearest points with a slot that `keep` accepts, the nearest first.
+    fn near(&self, query: Coded<'_>, ef: usize, keep: impl Fn(usize) -> bool) -> Vec<Ranked> {
+        let entries = descend(&self.layers, &self.codes, query);
+        let kept = |point: u32| self.slots.of(point).iter().any(|&slot| keep(slot as usize));
+        self.layers[0].beam(&self.codes, query, &entries, ef, kept)
     }
 
-    /// The graph as a file holds it: a header with a checksum, then the arrays, little-endian.
+    /// The graph as a file: a header with a checksum, then the arrays, little-endian.
     pub fn to_bytes(&self) -> Vec<u8> {
-        let mut rest = Vec::with_capacity(self.codes.len() + 4 * (self.lowest.len() + 4));
-        let (m, ef_construction) = self.built;
-        let counts = [m, ef_construction, self.end, self.dim, self.len(), self.degree];
-        let counts = counts.into_iter().chain([self.upper.len(), self.codes.len()]);
-        counts.for_each(|count| rest.extend((count as u32).to_le_bytes()));
-        put(&mut rest, &self.slots);
-        put(&mut rest, &self.lowest);
-        for layer in &self.upper {
-            for part in [&layer.points, &layer.starts, &layer.neighbours] {
-                rest.extend((part.len() as u32).to_le_bytes());
-                put(&mut rest, part);
-            }
-        }
-        rest.extend(self.scales.iter().flat_map(|scale| scale.to_le_bytes()));
-        rest.extend_from_slice(bytemuck::cast_slice(&self.codes));
-        let mut bytes = Vec::with_capacity(HEADER_BYTES + rest.len());
+        let mut bytes = Vec::with_capacity(HEADER_BYTES + self.bytes() + 64);
         bytes.extend(MAGIC);
-        bytes.extend(crc32fast::hash(&rest).to_le_bytes());
-        bytes.append(&mut rest);
+        bytes.extend([0; 4]);
+        let (m, ef_construction) = self.built;
+        let (len, points) = (self.len(), self.slots.points());
+        let counts = [m, ef_construction, self.end, self.dim(), len, points, self.layers.len()];
+        counts.into_iter().for_each(|count| put(&mut bytes, count as u32));
+        self.slots.starts.iter().for_each(|start| put(&mut bytes, *start));
+        self.slots.slots.iter().for_each(|slot| put(&mut bytes, *slot));
+        for layer in &self.layers {
+            put(&mut bytes, layer.degree as u32);
+            put(&mut bytes, layer.points() as u32);
+            layer.cells.iter().for_each(|cell| put(&mut bytes, *cell));
+        }
+        self.codes.scales.iter().for_each(|scale| put(&mut bytes, scale.to_bits()));
+        bytes.extend_from_slice(bytemuck::cast_slice(&self.codes.codes));
+        let checksum = crc32fast::hash(&bytes[HEADER_BYTES..]);
+        bytes[MAGIC.len()..HEADER_BYTES].copy_from_slice(&checksum.to_le_bytes());
         bytes
     }
 
@@ -331,28 +219,45 @@ impl SealedGraph {
         if crc32fast::hash(rest) != u32::from_le_bytes(*checksum) {
             return Err(DamagedGraph);
         }
-        // What follows is what was written: the checksum says so.
         let mut reader = Reader(rest);
-        let [m, ef_construction, end, dim, len, degree, layers, codes] = reader.counts()?;
-        let slots = reader.numbers(len)?;
-        let lowest = reader.numbers(len * degree)?;
-        let mut upper = Vec::with_capacity(layers.min(64));
-        for _ in 0..layers {
-            let mut part = || {
-                let [count] = reader.counts()?;
-                reader.numbers(count)
-            };
-            upper.push(Layer { points: part()?, starts: part()?, neighbours: part()? });
-        }
-        let scales = reader.numbers(len)?.into_iter().map(f32::from_bits).collect();
-        let codes = bytemuck::cast_slice(reader.take(codes)?).to_vec();
-        let built = (m, ef_construction);
-        Ok(Self { built, end, dim, slots, lowest, degree, upper, codes, scales })
+        let [m, ef_construction, end, dim, len, points, layers] = reader.counts()?;
+        let slots = Slots { starts: reader.numbers(points + 1)?, slots: reader.numbers(len)? };
+        let layers = (0..layers)
+            .map(|_| {
+                let [degree, points] = reader.counts()?;
+                Ok(Layer { degree, cells: reader.numbers(points.saturating_mul(degree))? })
+            })
+            .collect::<Result<Vec<_>, _>>()?;
+        let scales = reader.numbers(points)?.into_iter().map(f32::from_bits).collect();
+        let codes = bytemuck::cast_slice(reader.take(points.saturating_mul(dim))?).to_vec();
+        let codes = Codes { dim, codes, scales };
+        let graph = Self { built: (m, ef_construction), end, slots, layers, codes };
+        graph.is_sound().then_some(graph).ok_or(DamagedGraph)
+    }
+
+    /// Whether every number that is used as an index is within its bounds.
+    fn is_sound(&self) -> bool {
+        let Slots { starts, slots } = &self.slots;
+        let points = self.slots.points();
+        starts.is_sorted()
+            && starts.last().is_some_and(|&last| last as usize == slots.len())
+            && slots.iter().all(|&slot| (slot as usize) < self.end)
+            && self.layers.first().is_some_and(|lowest| lowest.points() == points)
+            && self.layers.iter().all(|layer| layer.is_within(points))
     }
 }
 
-fn put(bytes: &mut Vec<u8>, numbers: &[u32]) {
-    bytes.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
+/// The entry points of the lowest layer for a query: the best of the layer above.
+pub(super) fn descend(layers: &[Layer<u32>], codes: &Codes, query: Coded<'_>) -> Vec<Ranked> {
+    let mut near = vec![codes.ranked(query, 0)];
+    for layer in layers[1..].iter().rev() {
+        near = layer.beam(codes, query, &near, DESCENT, |_| true);
+    }
+    near
+}
+
+fn put(bytes: &mut Vec<u8>, number: u32) {
+    bytes.extend(number.to_le_bytes());
 }
 
 struct Reader<'a>(&'a [u8]);
@@ -365,7 +270,7 @@ impl<'a> Reader<'a> {
     }
 
     fn numbers(&mut self, count: usize) -> Result<Vec<u32>, DamagedGraph> {
-        let (numbers, _) = self.take(count * 4)?.as_chunks::<4>();
+        let (numbers, _) = self.take(count.saturating_mul(4))?.as_chunks::<4>();
         Ok(numbers.iter().copied().map(u32::from_le_bytes).collect())
     }
 
@@ -377,35 +282,5 @@ impl<'a> Reader<'a> {
             .collect::<Vec<_>>()
             .try_into()
             .map_err(|_| DamagedGraph)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_sorts_later_is_more_similar() {
-        let similarities = [-1.0, -0.5, -0.0, 0.0, 1e-9, 0.5, 1.0];
-        let ranks: Vec<u64> = similarities.iter().map(|&s| ranked(s, 7)).collect();
-        assert!(ranks.is_sorted());
-        assert_eq!(point_of(ranked(-0.3, 12)), 12);
-    }
-
-    #[test]
-    fn codes_keep_a_similarity_to_about_a_hundredth() {
-        let wave = |phase: f32| -> Vec<f32> {
-            let wave: Vec<f32> = (0..384).map(|i| (i as f32 * 0.7 + phase).sin()).collect();
-            let norm = wave.iter().map(|x| x * x).sum::<f32>().sqrt();
-            wave.iter().map(|x| x / norm).collect()
-        };
-        let a = wave(0.0);
-        for phase in [0.0, 0.3, 1.5, 3.0] {
-            let b = wave(phase);
-            let (mut ca, mut cb) = (Vec::new(), Vec::new());
-            let (sa, sb) = (code(&a, &mut ca), code(&b, &mut cb));
-            let coded = coded_dot(&ca, &cb) as f32 * sa * sb;
-            assert!((coded - dot(&a, &b)).abs() < 0.01);
-        }
     }
 }

@@ -1,4 +1,6 @@
-//! Indexes of vectors in memory.
+//! Search, sealing and removal on vectors in memory.
+
+use proptest::prelude::*;
 
 use super::*;
 
@@ -16,28 +18,37 @@ impl Vectors for Rows {
     }
 }
 
-const SETTINGS: IndexSettings = IndexSettings {
+pub(super) const SETTINGS: IndexSettings = IndexSettings {
     exact_up_to: 100,
     m: 16,
     ef_construction: 100,
     ef_search: 64,
+    threads: 1,
     max_dead_share: 0.3,
+    check_s: 0,
 };
 
 fn threads() -> ThreadPool {
     rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap()
 }
 
-/// Unit vectors around a few dozen centres, as the descriptors of one building are.
+/// Unit vectors clustered around a few dozen centres, like the descriptors of one building.
 fn clustered(count: usize, dim: usize) -> Rows {
+    around(32, 0.6, count, dim)
+}
+
+/// Unit vectors around common centres.
+fn around(centres: usize, width: f32, count: usize, dim: usize) -> Rows {
     let mut state = 1_u64;
     let mut random = move || {
         state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
         (state >> 40) as f32 / (1_u64 << 24) as f32 - 0.5
     };
-    let centres: Vec<Vec<f32>> = (0..32).map(|_| (0..dim).map(|_| random()).collect()).collect();
+    let centres: Vec<Vec<f32>> =
+        (0..centres).map(|_| (0..dim).map(|_| random()).collect()).collect();
     let rows = (0..count).map(|i| {
-        let row: Vec<f32> = centres[i % 32].iter().map(|x| x + 0.6 * random()).collect();
+        let row: Vec<f32> =
+            centres[i % centres.len()].iter().map(|x| x + width * random()).collect();
         let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
         row.iter().map(|x| x / norm).collect()
     });
@@ -73,7 +84,7 @@ fn the_graph_finds_what_exact_search_finds() {
 }
 
 #[test]
-fn a_sealed_graph_survives_a_file_and_notices_damage() {
+fn a_sealed_graph_round_trips_and_detects_damage() {
     let rows = clustered(400, 20);
     let index = filled(&rows);
     let mut sealed = None;
@@ -81,12 +92,12 @@ fn a_sealed_graph_survives_a_file_and_notices_damage() {
         sealed = index.catch_up(&rows, 100, &threads()).or(sealed);
     }
     let mut bytes = sealed.unwrap().to_bytes();
-    let again = filled(&rows);
-    again.restore(SealedGraph::from_bytes(&bytes).unwrap());
-    assert_eq!((again.graphed(), again.has_work()), (400, false));
+    let restored = filled(&rows);
+    restored.restore(SealedGraph::from_bytes(&bytes).unwrap());
+    assert_eq!((restored.graphed(), restored.has_work()), (400, false));
     for query in rows.0.iter().step_by(37) {
         let search = |index: &MapIndex| index.search(&rows, query, 5, SearchMode::Fast);
-        assert_eq!(search(&again), search(&index));
+        assert_eq!(search(&restored), search(&index));
     }
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
@@ -97,13 +108,13 @@ fn a_sealed_graph_survives_a_file_and_notices_damage() {
 }
 
 #[test]
-fn graphs_are_made_one_as_a_map_grows_and_every_image_is_found_meanwhile() {
+fn graphs_are_merged_as_a_map_grows_and_every_image_is_found_meanwhile() {
     let rows = clustered(1000, 24);
     let index = MapIndex::new(SETTINGS);
     let mut seals = Vec::new();
     for slot in 0..1000 {
         index.add(slot);
-        // Images come in bursts; between them there is time to seal what has grown.
+        // Images arrive in bursts, between which the indexer catches up.
         while slot % 100 == 70 && index.has_work() {
             seals.extend(index.catch_up(&rows, 16, &threads()).map(|sealed| sealed.end()));
         }
@@ -124,13 +135,36 @@ fn graphs_are_made_one_as_a_map_grows_and_every_image_is_found_meanwhile() {
 }
 
 #[test]
-fn an_image_is_found_before_the_graph_has_it() {
+fn an_image_is_found_before_it_is_in_the_graph() {
     let rows = clustered(300, 16);
-    let index = filled(&rows);
-    index.catch_up(&rows, 250, &threads());
-    assert_eq!(index.graphed(), 250);
-    let found = index.search(&rows, &rows.0[299], 1, SearchMode::Fast);
-    assert_eq!(found[0].slot, 299);
+    let index = MapIndex::new(SETTINGS);
+    let found = |slot: usize| index.search(&rows, &rows.0[slot], 1, SearchMode::Fast)[0].slot;
+    (0..200).for_each(|slot| index.add(slot));
+    index.catch_up(&rows, 100, &threads());
+    index.catch_up(&rows, 100, &threads());
+    assert_eq!((index.graphed(), found(7), found(199)), (0, 7, 199));
+    index.catch_up(&rows, 100, &threads());
+    assert_eq!(index.graphed(), 200);
+    (200..300).for_each(|slot| index.add(slot));
+    index.catch_up(&rows, 50, &threads());
+    assert_eq!((index.graphed(), found(7), found(220), found(299)), (250, 7, 220, 299));
+}
+
+/// What robots leave that stand still: pictures that hardly differ, of very many places.
+#[test]
+fn no_place_is_lost_among_many_of_which_there_are_many_images() {
+    let rows = around(400, 0.2, 20_000, 32);
+    let settings = IndexSettings { m: 8, ef_construction: 40, ef_search: 32, ..SETTINGS };
+    let index = MapIndex::new(settings);
+    (0..20_000).for_each(|slot| index.add(slot));
+    while index.has_work() {
+        index.catch_up(&rows, 1000, &threads());
+    }
+    let lost = (0..20_000).step_by(10).filter(|&slot| {
+        let found = index.search(&rows, &rows.0[slot], 10, SearchMode::Fast);
+        found.iter().all(|found| found.slot % 400 != slot % 400)
+    });
+    assert_eq!(lost.count(), 0);
 }
 
 #[test]
@@ -153,22 +187,22 @@ fn a_removed_image_is_never_found() {
 }
 
 #[test]
-fn a_graph_with_too_many_dead_points_is_built_again_without_them() {
+fn a_graph_with_too_many_removed_points_is_rebuilt_without_them() {
     let rows = clustered(400, 16);
     let index = filled(&rows);
     let threads = threads();
-    let settle = || {
+    let catch_up = || {
         let mut sealed = None;
         while index.has_work() {
             sealed = index.catch_up(&rows, 64, &threads).or(sealed);
         }
         sealed.map(|sealed| sealed.len())
     };
-    assert_eq!(settle(), Some(400));
+    assert_eq!(catch_up(), Some(400));
     (0..100).for_each(|slot| index.remove(slot));
-    assert_eq!(settle(), None);
+    assert_eq!(catch_up(), None);
     (100..125).for_each(|slot| index.remove(slot));
-    assert_eq!(settle(), Some(275));
+    assert_eq!(catch_up(), Some(275));
     let found = index.search(&rows, &rows.0[200], 1, SearchMode::Fast);
     assert_eq!(found[0].slot, 200);
 }
@@ -183,7 +217,158 @@ fn a_small_map_never_builds_a_graph() {
 }
 
 #[test]
-fn an_empty_map_finds_nothing() {
+fn an_empty_map_returns_nothing() {
     let index = MapIndex::new(SETTINGS);
     assert!(index.search(&clustered(1, 8), &[0.0; 8], 10, SearchMode::Fast).is_empty());
+}
+
+/// Builds whatever waits to be built.
+fn caught_up(index: &MapIndex, rows: &Rows) {
+    while index.has_work() {
+        index.catch_up(rows, 1000, &threads());
+    }
+}
+
+/// The number of live slots whose own descriptor finds neither them nor a twin first.
+fn lost(index: &MapIndex, rows: &Rows) -> usize {
+    let misses = |slot: &usize| {
+        let found = index.search(rows, &rows.0[*slot], 10, SearchMode::Fast);
+        found.first().is_none_or(|first| rows.0[first.slot] != rows.0[*slot])
+    };
+    let live = index.live().slots.clone();
+    (0..rows.0.len()).filter(|slot| live[*slot]).filter(misses).count()
+}
+
+/// An index of all rows: the first `sealed` of them in the sealed graph, the rest in the growing one.
+fn grown(rows: &Rows, sealed: usize, settings: IndexSettings) -> MapIndex {
+    let index = MapIndex::new(settings);
+    (0..sealed).for_each(|slot| index.add(slot));
+    caught_up(&index, rows);
+    (sealed..rows.0.len()).for_each(|slot| index.add(slot));
+    caught_up(&index, rows);
+    index
+}
+
+const DEFAULTS: IndexSettings = IndexSettings {
+    exact_up_to: 0,
+    m: 16,
+    ef_construction: 200,
+    ef_search: 96,
+    max_dead_share: 0.3,
+    threads: 0,
+    check_s: 0,
+};
+
+#[test]
+fn identical_images_crowd_no_other_image_out() {
+    for (twins, others) in [(600, 900), (10_000, 2000)] {
+        let mut rows = around(900, 0.6, twins + others, 32);
+        let picture = rows.0[0].clone();
+        rows.0[..twins].fill(picture);
+        for sealed in [rows.0.len(), twins + others * 2 / 3] {
+            let index = grown(&rows, sealed, DEFAULTS);
+            assert_eq!(lost(&index, &rows), 0, "{twins} twins, {sealed} of {others} others sealed");
+            assert_eq!(index.graphs().sealed.as_ref().unwrap().unreachable(), 0);
+        }
+    }
+}
+
+#[test]
+fn identical_images_that_arrive_in_the_growing_graph_crowd_no_other_image_out() {
+    let mut rows = around(1000, 0.6, 3000, 32);
+    let picture = rows.0[0].clone();
+    rows.0[1600..2200].fill(picture);
+    let index = grown(&rows, 1600, DEFAULTS);
+    assert!(index.graphs().growing.is_some(), "the rest is in the growing graph");
+    assert_eq!(lost(&index, &rows), 0);
+}
+
+#[test]
+fn a_robot_that_stands_still_hides_no_other_place() {
+    // 100 frames that hardly differ at each of 100 places, in the order in which they are taken.
+    let spread = around(100, 0.1, 10_000, 32);
+    let rows = Rows((0..10_000).map(|i| spread.0[i / 100 + i % 100 * 100].clone()).collect());
+    let index = grown(&rows, rows.0.len(), DEFAULTS);
+    assert_eq!(lost(&index, &rows), 0);
+    let places = (0..rows.0.len()).step_by(7).filter(|&slot| {
+        let found = index.search(&rows, &rows.0[slot], 10, SearchMode::Fast);
+        found.iter().any(|found| found.slot / 100 != slot / 100)
+    });
+    assert_eq!(places.count(), 0, "ten frames of the same place are nearer than any of another");
+}
+
+#[test]
+fn a_removed_twin_leaves_the_others() {
+    let mut rows = around(100, 0.6, 300, 16);
+    let picture = rows.0[0].clone();
+    rows.0[..50].fill(picture.clone());
+    let index = grown(&rows, 300, DEFAULTS);
+    (0..49).for_each(|slot| index.remove(slot));
+    assert_eq!(index.search(&rows, &picture, 1, SearchMode::Fast)[0].slot, 49);
+    index.remove(49);
+    assert_ne!(index.search(&rows, &picture, 1, SearchMode::Fast)[0].slot, 49);
+}
+
+#[test]
+fn a_graph_file_with_an_index_out_of_bounds_is_refused() {
+    let rows = around(10, 0.6, 100, 8);
+    let index = grown(&rows, 100, DEFAULTS);
+    let sealed = index.graphs().sealed.clone().unwrap();
+    let bytes = sealed.to_bytes();
+    assert_eq!(SealedGraph::from_bytes(&bytes).as_ref(), Ok(&*sealed));
+    for at in (12..bytes.len() - 4).step_by(4) {
+        let mut forged = bytes.clone();
+        forged[at..at + 4].copy_from_slice(&0x7fff_fff0_u32.to_le_bytes());
+        let checksum = crc32fast::hash(&forged[12..]).to_le_bytes();
+        forged[8..12].copy_from_slice(&checksum);
+        if let Ok(read) = SealedGraph::from_bytes(&forged) {
+            // It differs in numbers that are no indices; a search still works.
+            let _ = read.search(&rows, &rows.0[0], (5, 32), |_| true);
+            let _ = read.unreachable();
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
+
+    /// Any small map with twins and near twins, in any order, partly sealed and partly removed: each image that is
+    /// left finds itself or a twin first, and every point of the sealed graph can be reached.
+    #[test]
+    fn every_image_finds_itself_first(
+        seed in any::<u64>(),
+        sizes in prop::collection::vec(1_usize..120, 1..12),
+        jitter in prop::sample::select(vec![0.0_f32, 0.05, 0.3]),
+        sealed_share in 0.0_f64..1.0,
+        removed in 0_usize..5,
+    ) {
+        let count = sizes.iter().sum::<usize>();
+        let centres = around(sizes.len(), 0.0, sizes.len(), 16);
+        let noise = around(count, 0.0, count, 16);
+        let cluster = sizes.iter().enumerate().flat_map(|(of, size)| vec![of; *size]);
+        let mut rows: Vec<Vec<f32>> = cluster
+            .zip(&noise.0)
+            .map(|(of, noise)| {
+                let row: Vec<f32> =
+                    centres.0[of].iter().zip(noise).map(|(x, y)| x + jitter * y).collect();
+                let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
+                row.into_iter().map(|x| x / norm).collect()
+            })
+            .collect();
+        let mut state = seed | 1;
+        for last in (1..rows.len()).rev() {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            rows.swap(last, (state >> 33) as usize % (last + 1));
+        }
+        let rows = Rows(rows);
+        let settings = IndexSettings { m: 8, ef_construction: 64, ef_search: 64, ..DEFAULTS };
+        let index = grown(&rows, (count as f64 * sealed_share) as usize, settings);
+        if removed > 0 {
+            (0..count).step_by(removed + 1).for_each(|slot| index.remove(slot));
+            caught_up(&index, &rows);
+        }
+        prop_assert_eq!(lost(&index, &rows), 0);
+        let sealed = index.graphs().sealed.clone();
+        prop_assert_eq!(sealed.map_or(0, |sealed| sealed.unreachable()), 0);
+    }
 }

@@ -1,4 +1,4 @@
-//! The models that can be pulled by name.
+//! The catalogue of models that can be pulled by name.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use whereabouts_vision::{Manifest, ManifestError};
 
 const BUILT_IN: &str = include_str!("../../deploy/models/catalogue.toml");
 
-/// What can be pulled.
+/// The models that can be pulled.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Catalogue {
@@ -16,60 +16,60 @@ pub struct Catalogue {
     entries: Vec<Entry>,
 }
 
-/// One model on the hub.
+/// One model on a hub.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Entry {
-    /// The repository on the hub, as `owner/name`.
+    /// Repository on the hub, as `owner/name`.
     pub repository: String,
-    /// A commit, branch or tag of the repository.
+    /// Commit, branch or tag of the repository.
     pub revision: String,
-    /// The ONNX file in the repository.
+    /// Path of the ONNX file in the repository.
     pub path: String,
-    /// Its size, if known.
+    /// Size of the ONNX file in bytes, if known.
     pub bytes: Option<u64>,
-    /// What is to be said about the licence beyond its name.
+    /// Notes on the licence beyond its name.
     pub licence_note: Option<String>,
-    /// What is installed beside the file; its `sha256` is the pin, if there is one.
+    /// The manifest installed with the file. Its `sha256` pins the file, if set.
     pub manifest: Manifest,
 }
 
-/// Why a catalogue cannot be used.
+/// Why a catalogue is invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum CatalogueError {
     /// The file cannot be read.
     #[error("cannot read the catalogue {path}: {source}")]
     Read {
-        /// The catalogue.
+        /// Path of the catalogue.
         path: PathBuf,
-        /// What the system said.
+        /// Cause.
         source: std::io::Error,
     },
     /// The file is not a catalogue.
-    #[error("{path} is not a catalogue of models: {detail}")]
+    #[error("{path} is not a model catalogue: {detail}")]
     Malformed {
-        /// The catalogue.
+        /// Path of the catalogue.
         path: PathBuf,
-        /// What the reader said.
+        /// Message of the parser.
         detail: String,
     },
-    /// The manifest of an entry is wrong.
+    /// The manifest of an entry is invalid.
     #[error("in the catalogue, {0}")]
     Manifest(#[from] ManifestError),
 }
 
 impl Catalogue {
-    /// The catalogue of this release.
+    /// The catalogue bundled with this release.
     pub fn built_in() -> Result<Self, CatalogueError> {
         Self::parse(BUILT_IN, Path::new("deploy/models/catalogue.toml"))
     }
 
-    /// The catalogue in a file, or that of this release.
+    /// Reads the catalogue in `file`, or returns the bundled one.
     pub fn of(file: Option<&Path>) -> Result<Self, CatalogueError> {
         file.map_or_else(Self::built_in, Self::read)
     }
 
-    /// Reads another catalogue.
+    /// Reads a catalogue file.
     pub fn read(path: &Path) -> Result<Self, CatalogueError> {
         let text = std::fs::read_to_string(path)
             .map_err(|source| CatalogueError::Read { path: path.to_owned(), source })?;
@@ -92,21 +92,21 @@ impl Catalogue {
         &self.entries
     }
 
-    /// The model called `name`.
+    /// Finds the entry of the model called `name`.
     pub fn find(&self, name: &str) -> Option<&Entry> {
         self.entries.iter().find(|entry| entry.name() == name)
     }
 }
 
 impl Entry {
-    /// The model's name.
+    /// Name of the model.
     pub fn name(&self) -> &str {
         &self.manifest.name
     }
 
-    /// Where one of its files is on `hub`. The ONNX file may have another name there; what is beside
-    /// it is named in it and has the same.
-    pub fn address(&self, hub: &str, file: &Path) -> String {
+    /// The URL of one of the model's files on `hub`. The ONNX file may have another name there; files of
+    /// external weights keep theirs, because the ONNX file references them by name.
+    pub fn url(&self, hub: &str, file: &Path) -> String {
         let Self { repository, revision, path, manifest, .. } = self;
         let path = match path.rsplit_once('/') {
             _ if file == manifest.file => path.clone(),
@@ -124,7 +124,7 @@ mod tests {
     use whereabouts_vision::PREFERRED_MODELS;
 
     #[test]
-    fn every_entry_is_consistent_and_says_its_licence() {
+    fn every_entry_is_consistent_and_states_its_licence() {
         let catalogue = Catalogue::built_in().unwrap();
         for entry in catalogue.entries() {
             let manifest = &entry.manifest;
@@ -148,21 +148,21 @@ mod tests {
     }
 
     #[test]
-    fn an_address_is_on_the_hub_that_is_set() {
+    fn urls_are_on_the_configured_hub() {
         let catalogue = Catalogue::built_in().unwrap();
         let large = catalogue.find("dinov2-large").unwrap();
         assert_eq!(
-            large.address("https://mirror.example/hub/", &large.manifest.file),
+            large.url("https://mirror.example/hub/", &large.manifest.file),
             "https://mirror.example/hub/onnx-community/dinov2-large/resolve/main/onnx/model.onnx"
         );
         assert_eq!(
-            large.address("https://mirror.example/hub", Path::new("model.onnx_data")),
+            large.url("https://mirror.example/hub", Path::new("model.onnx_data")),
             "https://mirror.example/hub/onnx-community/dinov2-large/resolve/main/onnx/model.onnx_data"
         );
     }
 
     #[test]
-    fn an_installed_manifest_reads_back_the_same() {
+    fn manifests_round_trip_through_toml() {
         for entry in Catalogue::built_in().unwrap().entries() {
             let text = toml::to_string(&entry.manifest).unwrap();
             let read = Manifest::parse(&text, Path::new("manifest.toml")).unwrap();

@@ -1,4 +1,4 @@
-//! Downloading one large file over a bad line: continue, try again, give up with a sentence.
+//! Resumable download of one large file over an unreliable connection, with retries.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -10,133 +10,133 @@ use reqwest::{Client, Response, StatusCode};
 use super::partial::{Origin, Partial, remove_if_there};
 use whereabouts_core::Digest;
 
-/// Bounds on a download.
+/// Limits and retry policy of a download.
 #[derive(Debug, Clone, Copy)]
 pub struct DownloadSettings {
-    /// The largest file, in bytes.
+    /// Maximum size of a file in bytes.
     pub max_bytes: u64,
-    /// The longest time without a byte.
+    /// Maximum time without receiving a byte.
     pub stall: Duration,
-    /// How often the server is asked while nothing comes of it.
+    /// Maximum consecutive attempts without progress.
     pub attempts: u32,
-    /// The pause before the second attempt; it doubles each time.
+    /// Pause before the second attempt; doubles with each further attempt.
     pub backoff: Duration,
 }
 
-/// One file to get.
+/// A file to download.
 #[derive(Debug, Clone, Copy)]
 pub struct Download<'a> {
-    /// Where it is.
+    /// URL of the file.
     pub url: &'a str,
-    /// Where it goes. What an earlier run left there is continued.
+    /// Target path. A partial file of an earlier run is resumed.
     pub to: &'a Path,
-    /// The digest it must have, if known.
+    /// Expected digest, if pinned.
     pub pinned: Option<Digest>,
-    /// Bounds.
+    /// Limits and retry policy.
     pub settings: DownloadSettings,
 }
 
-/// How a download goes on.
+/// Progress of a download.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Progress {
-    /// Bytes will come, the first of them at this position.
+    /// The server has started sending.
     Started {
-        /// How many bytes are there already.
+        /// Offset of the first byte: the bytes already on disk.
         at: u64,
-        /// How many there will be, if the server says so.
+        /// Total size of the file, if the server reports it.
         total: Option<u64>,
     },
-    /// So many bytes are there.
+    /// This many bytes are on disk.
     Received(u64),
     /// An attempt failed; another follows.
     Retrying {
-        /// After this pause.
+        /// Pause before the next attempt.
         pause: Duration,
-        /// What failed.
+        /// Why the attempt failed.
         why: String,
     },
 }
 
-/// Why a file was not downloaded.
+/// Why a download failed.
 #[derive(Debug, thiserror::Error)]
 pub enum DownloadError {
     /// The HTTP client cannot be built.
     #[error("cannot start an HTTP client: {0}")]
     Client(reqwest::Error),
-    /// The server refuses.
+    /// The server rejected the request.
     #[error(
         "{url} answered {status}; if the hub has moved, set model.hub to a mirror, or download \
          the file by hand and install it with `whereabouts model add FILE --manifest TOML`"
     )]
     Refused {
-        /// The address.
+        /// URL of the file.
         url: String,
-        /// The answer.
+        /// Status of the response.
         status: StatusCode,
     },
-    /// Nothing came of so many attempts.
+    /// All attempts failed.
     #[error(
         "gave up on {url} after {attempts} attempts: {why}; {kept} bytes are kept, so run the same \
          command again to continue, or set model.hub to a mirror"
     )]
     GaveUp {
-        /// The address.
+        /// URL of the file.
         url: String,
-        /// How many there were.
+        /// Number of attempts.
         attempts: u32,
-        /// How the last one ended.
+        /// Why the last attempt failed.
         why: String,
-        /// Bytes on disk.
+        /// Bytes kept on disk.
         kept: u64,
     },
-    /// The file is larger than allowed.
-    #[error("{url} has more than {max} bytes; raise model.max_download_bytes if that is right")]
+    /// The file exceeds the maximum size.
+    #[error("{url} has more than {max} bytes; raise model.max_download_bytes if that is expected")]
     TooLarge {
-        /// The address.
+        /// URL of the file.
         url: String,
-        /// The bound.
+        /// The limit.
         max: u64,
     },
-    /// The bytes are not those that are pinned.
+    /// The digest of the file does not match the pinned one.
     #[error(
         "{url} gave a file of {got}, but {pinned} is pinned; it was removed. Run the same command \
          again; if that happens again, the hub or a proxy changed the file: set model.hub to a \
          mirror you trust"
     )]
     Mismatch {
-        /// The address.
+        /// URL of the file.
         url: String,
-        /// What came.
+        /// Digest of the downloaded file.
         got: Digest,
-        /// What should have come.
+        /// Pinned digest.
         pinned: Digest,
     },
-    /// The disk.
+    /// The file cannot be written.
     #[error("cannot write {path}: {source}; make room or choose another folder with --assets")]
     Disk {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Cause.
         source: io::Error,
     },
 }
 
 /// How an attempt failed.
 enum Failure {
-    /// Another one may succeed, but not before `after`.
-    Passing { why: String, after: Duration },
-    /// None will.
-    Lasting(DownloadError),
+    /// Another attempt may succeed, but not earlier than in `retry_after`.
+    Transient { why: String, retry_after: Duration },
+    /// No further attempt can succeed.
+    Permanent(DownloadError),
 }
 
-/// So many new bytes make an attempt a success, however it ended.
-const WORTHWHILE_BYTES: u64 = 1 << 20;
+/// An attempt that received at least this many bytes counts as progress, even if it failed.
+const PROGRESS_BYTES: u64 = 1 << 20;
 
-/// A `Retry-After` is followed up to this.
-const LONGEST_PAUSE: Duration = Duration::from_secs(60);
+/// Maximum pause between attempts, even if `Retry-After` asks for more.
+const MAX_PAUSE: Duration = Duration::from_secs(60);
 
 impl Download<'_> {
-    /// Gets the file, continuing it as often as necessary. Returns its digest once it is durable.
+    /// Downloads the file, resuming as often as necessary. Returns its digest once the file is durable.
     pub async fn run(
         &self,
         mut on_progress: impl FnMut(Progress),
@@ -149,14 +149,14 @@ impl Download<'_> {
             let before = partial.length();
             match self.attempt(&client, &mut partial, &mut on_progress).await {
                 Ok(()) => break,
-                Err(Failure::Lasting(error)) => {
+                Err(Failure::Permanent(error)) => {
                     if matches!(error, DownloadError::TooLarge { .. }) {
                         partial.discard().map_err(|error| self.disk(error))?;
                     }
                     return Err(error);
                 }
-                Err(Failure::Passing { why, after }) => {
-                    failures = match partial.length() >= before.saturating_add(WORTHWHILE_BYTES) {
+                Err(Failure::Transient { why, retry_after }) => {
+                    failures = match partial.length() >= before.saturating_add(PROGRESS_BYTES) {
                         true => 1,
                         false => failures + 1,
                     };
@@ -164,7 +164,7 @@ impl Download<'_> {
                         return Err(self.gave_up(failures, why, partial.length()));
                     }
                     let pause = self.settings.backoff * 2u32.saturating_pow(failures - 1).min(64);
-                    let pause = pause.max(after).min(LONGEST_PAUSE);
+                    let pause = pause.max(retry_after).min(MAX_PAUSE);
                     on_progress(Progress::Retrying { pause, why });
                     tokio::time::sleep(pause).await;
                 }
@@ -190,8 +190,8 @@ impl Download<'_> {
             .map_err(DownloadError::Client)
     }
 
-    /// Asks once and appends what comes. A disk is fast beside a line, so writing does not leave
-    /// the thread.
+    /// Sends one request and appends the body to the partial file. Writes block the task, because the disk is
+    /// much faster than the network.
     async fn attempt(
         &self,
         client: &Client,
@@ -205,8 +205,8 @@ impl Download<'_> {
                 request = request.header(IF_RANGE, etag);
             }
         }
-        let mut response = request.send().await.map_err(|error| broke_off(&error))?;
-        if self.accept(&response, partial)? == Accepted::Whole {
+        let mut response = request.send().await.map_err(|error| interrupted(&error))?;
+        if self.accept(&response, partial)? == Accepted::Complete {
             return Ok(());
         }
         let total = partial.origin().total;
@@ -214,25 +214,25 @@ impl Download<'_> {
             return Err(self.too_large());
         }
         on_progress(Progress::Started { at: partial.length(), total });
-        while let Some(bytes) = response.chunk().await.map_err(|error| broke_off(&error))? {
+        while let Some(bytes) = response.chunk().await.map_err(|error| interrupted(&error))? {
             if partial.length() + bytes.len() as u64 > self.settings.max_bytes {
                 return Err(self.too_large());
             }
-            partial.append(&bytes).map_err(|error| Failure::Lasting(self.disk(error)))?;
+            partial.append(&bytes).map_err(|error| Failure::Permanent(self.disk(error)))?;
             on_progress(Progress::Received(partial.length()));
         }
         match total {
-            Some(total) if partial.length() != total => Err(passing(format!(
-                "the server ended after {} of {total} bytes",
+            Some(total) if partial.length() != total => Err(transient(format!(
+                "the server closed the connection after {} of {total} bytes",
                 partial.length()
             ))),
             _ => Ok(()),
         }
     }
 
-    /// Makes the partial file ready for the body of this answer.
+    /// Prepares the partial file for the body of a response.
     fn accept(&self, response: &Response, partial: &mut Partial) -> Result<Accepted, Failure> {
-        let disk = |error| Failure::Lasting(self.disk(error));
+        let disk = |error| Failure::Permanent(self.disk(error));
         let headers = response.headers();
         let whole = |total| Origin { url: self.url.to_owned(), etag: strong_etag(headers), total };
         match response.status() {
@@ -242,20 +242,20 @@ impl Download<'_> {
             }
             StatusCode::PARTIAL_CONTENT if continues(headers, partial) => Ok(Accepted::Body),
             StatusCode::RANGE_NOT_SATISFIABLE if total_of(headers) == Some(partial.length()) => {
-                Ok(Accepted::Whole)
+                Ok(Accepted::Complete)
             }
             StatusCode::PARTIAL_CONTENT | StatusCode::RANGE_NOT_SATISFIABLE
                 if partial.length() > 0 =>
             {
                 partial.restart(whole(None)).map_err(disk)?;
-                Err(passing("the file on the server is another one than before".to_owned()))
+                Err(transient("the file on the server has changed".to_owned()))
             }
-            status if is_passing(status) => Err(Failure::Passing {
+            status if is_transient(status) => Err(Failure::Transient {
                 why: format!("the server answered {status}"),
-                after: retry_after(headers),
+                retry_after: retry_after(headers),
             }),
             status => {
-                Err(Failure::Lasting(DownloadError::Refused { url: self.url.to_owned(), status }))
+                Err(Failure::Permanent(DownloadError::Refused { url: self.url.to_owned(), status }))
             }
         }
     }
@@ -266,7 +266,7 @@ impl Download<'_> {
 
     fn too_large(&self) -> Failure {
         let max = self.settings.max_bytes;
-        Failure::Lasting(DownloadError::TooLarge { url: self.url.to_owned(), max })
+        Failure::Permanent(DownloadError::TooLarge { url: self.url.to_owned(), max })
     }
 
     fn disk(&self, source: io::Error) -> DownloadError {
@@ -276,31 +276,31 @@ impl Download<'_> {
 
 #[derive(PartialEq, Eq)]
 enum Accepted {
-    /// Its body is to be appended.
+    /// The body is to be appended.
     Body,
-    /// Everything is there already.
-    Whole,
+    /// The partial file is already complete.
+    Complete,
 }
 
-fn passing(why: String) -> Failure {
-    Failure::Passing { why, after: Duration::ZERO }
+fn transient(why: String) -> Failure {
+    Failure::Transient { why, retry_after: Duration::ZERO }
 }
 
-fn broke_off(error: &reqwest::Error) -> Failure {
+fn interrupted(error: &reqwest::Error) -> Failure {
     let mut why = error.to_string();
     let mut source = std::error::Error::source(error);
     while let Some(cause) = source {
         why = format!("{why}: {cause}");
         source = cause.source();
     }
-    passing(why)
+    transient(why)
 }
 
-fn is_passing(status: StatusCode) -> bool {
+fn is_transient(status: StatusCode) -> bool {
     matches!(status.as_u16(), 408 | 425 | 429 | 500..)
 }
 
-/// Whether the body starts where the partial file ends, and both are of the same whole.
+/// Whether the body continues the partial file: it starts where that ends, and both are of the same version.
 fn continues(headers: &HeaderMap, partial: &Partial) -> bool {
     let range =
         text(headers, CONTENT_RANGE.as_str()).and_then(|range| range.strip_prefix("bytes "));
@@ -313,13 +313,12 @@ fn continues(headers: &HeaderMap, partial: &Partial) -> bool {
     start == Some(partial.length()) && same_length && same_tag
 }
 
-/// The length of the whole in `Content-Range: bytes 2-9/10` or `bytes */10`.
+/// The total length in `Content-Range: bytes 2-9/10` or `bytes */10`.
 fn total_of(headers: &HeaderMap) -> Option<u64> {
     text(headers, CONTENT_RANGE.as_str())?.rsplit('/').next()?.parse().ok()
 }
 
-/// An entity tag that names bytes; a weak one (`W/"…"`) does not, and RFC 9110 bars it from
-/// `If-Range`.
+/// A strong entity tag. Weak tags (`W/"…"`) do not identify bytes, and RFC 9110 does not allow them in `If-Range`.
 fn strong_etag(headers: &HeaderMap) -> Option<String> {
     text(headers, ETAG.as_str()).filter(|etag| etag.starts_with('"')).map(str::to_owned)
 }

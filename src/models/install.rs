@@ -1,4 +1,4 @@
-//! The folder `ASSETS/models`: putting models there, and checking those that are there.
+//! The folder `ASSETS/models`: installing and verifying models.
 
 use std::fs::{self, File, TryLockError};
 use std::io;
@@ -11,112 +11,112 @@ use super::partial::remove_if_there;
 use whereabouts_core::Digest;
 use whereabouts_vision::{AUTO, CHOSEN, MANIFEST, Manifest, ManifestError, file_digest};
 
-/// `ASSETS/models` of an assets folder that can be written.
+/// The `models` folder of a writable assets folder.
 #[derive(Debug, Clone)]
 pub struct ModelsFolder {
     models: PathBuf,
 }
 
-/// What came of a pull.
+/// The result of a pull.
 #[derive(Debug)]
 pub enum Pulled {
-    /// The model was there and is whole.
+    /// The model is already installed and intact.
     Present(PathBuf),
-    /// It was downloaded.
+    /// The model was downloaded and installed.
     Installed {
-        /// Its folder.
+        /// Folder of the model.
         folder: PathBuf,
-        /// The digests of its files, the ONNX file first.
+        /// Digests of the model's files, the ONNX file first.
         digests: Vec<Digest>,
-        /// Whether the catalogue pins them; if not, they are recorded in the manifest.
+        /// Whether the catalogue pins the digests. If not, they are recorded in the installed manifest.
         pinned: bool,
-        /// What was wrong with the model that was there before, if one was.
+        /// Why the previously installed model was replaced, if there was one.
         replaced: Option<String>,
     },
 }
 
-/// What came of adding a file.
+/// The result of adding a model file.
 #[derive(Debug)]
 pub enum Added {
-    /// The same file is installed under this name.
+    /// The same file is already installed under this name.
     Present(PathBuf),
-    /// It was copied.
+    /// The file was copied and installed.
     Installed {
-        /// The model's folder.
+        /// Folder of the model.
         folder: PathBuf,
-        /// The model's name.
+        /// Name of the model.
         name: String,
-        /// The digests of its files, the ONNX file first.
+        /// Digests of the model's files, the ONNX file first.
         digests: Vec<Digest>,
     },
 }
 
-/// What was found when an installed model was hashed again.
+/// An installed model whose files match its manifest.
 #[derive(Debug)]
-pub struct Verdict {
-    /// What its manifest says.
+pub struct VerifiedFiles {
+    /// The installed manifest.
     pub manifest: Manifest,
-    /// The digests of its files, the ONNX file first.
+    /// Digests of the model's files, the ONNX file first.
     pub digests: Vec<Digest>,
-    /// The size of its files together.
+    /// Total size of the files in bytes.
     pub bytes: u64,
 }
 
-/// Why a model was not installed, or is not as it should be.
+/// Why a model cannot be installed or verified.
 #[derive(Debug, thiserror::Error)]
 pub enum InstallError {
-    /// A name that cannot be a folder's.
+    /// The name is not usable as a folder name.
     #[error(
-        "{0:?} cannot be a model's name: use up to 64 letters, digits, '-', '_' and '.', not \
+        "{0:?} is not a valid model name: use up to 64 letters, digits, '-', '_' and '.', not \
          beginning with '.', and neither \"auto\" nor \"chosen\""
     )]
     Name(String),
-    /// Another process installs this model.
+    /// Another process is installing this model.
     #[error("another process is installing {name} ({lock} is locked); wait until it has ended")]
     Locked {
-        /// The model.
+        /// Name of the model.
         name: String,
-        /// The lock.
+        /// Path of the lock file.
         lock: PathBuf,
     },
-    /// Another model has the name.
+    /// The name is in use by another model.
     #[error(
         "another model is installed in {0}; give this one another name with --name, or remove \
          that folder"
     )]
     Taken(PathBuf),
-    /// The file is not the one that the manifest pins.
-    #[error("{file} is {got}, but its manifest pins {pinned}; {remedy}")]
+    /// A file does not match the digest pinned in the manifest.
+    #[error("{file} has the digest {got}, but its manifest pins {pinned}; {remedy}")]
     Damaged {
-        /// The model file.
+        /// Path of the file.
         file: PathBuf,
-        /// What it is.
+        /// Digest of the file.
         got: Digest,
-        /// What it should be.
+        /// Pinned digest.
         pinned: Digest,
-        /// What to do.
+        /// What the user can do.
         remedy: String,
     },
-    /// The manifest is wrong.
+    /// The manifest is invalid.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
     /// The download failed.
     #[error(transparent)]
     Download(#[from] DownloadError),
-    /// The disk.
+    /// A file operation failed.
     #[error("cannot {doing} {path}: {source}")]
     Disk {
-        /// What was tried.
+        /// The operation.
         doing: &'static str,
-        /// With what.
+        /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// Cause.
         source: io::Error,
     },
 }
 
 impl ModelsFolder {
-    /// Makes `models` in an assets folder if it is not there, and checks that it can be written.
+    /// Opens or creates `models` in an assets folder, and checks that it is writable.
     pub fn open(assets: &Path) -> Result<Self, InstallError> {
         let models = assets.join("models");
         let partial = models.join(".partial");
@@ -126,7 +126,7 @@ impl ModelsFolder {
         Ok(Self { models })
     }
 
-    /// Downloads a model of the catalogue from `hub`, unless it is there and whole.
+    /// Downloads a model of the catalogue from `hub`, unless it is installed and intact.
     pub async fn pull(
         &self,
         entry: &Entry,
@@ -147,7 +147,7 @@ impl ModelsFolder {
         let mut manifest = entry.manifest.clone();
         let mut digests = Vec::new();
         for (file, pinned) in entry.manifest.files() {
-            let url = entry.address(hub, file);
+            let url = entry.url(hub, file);
             let to = self.partial(name, &file.display());
             let download = Download { url: &url, to: &to, pinned, settings };
             digests.push(download.run(&mut on_progress).await?);
@@ -158,8 +158,8 @@ impl ModelsFolder {
         Ok(Pulled::Installed { folder, digests, pinned, replaced })
     }
 
-    /// Copies an ONNX file, the file of weights beside it where the manifest names one, and the manifest
-    /// under `name`, or the name in the manifest. The digests are recorded in the installed manifest.
+    /// Installs an ONNX file, its external weights if the manifest has any, and the manifest under `name`, or
+    /// under the name in the manifest. The digests are recorded in the installed manifest.
     pub fn add(
         &self,
         file: &Path,
@@ -177,13 +177,13 @@ impl ModelsFolder {
         let given: Vec<PathBuf> = iter::once(file.to_owned()).chain(data).collect();
         let mut digests = Vec::new();
         for (file, (_, pinned)) in given.iter().zip(manifest.files()) {
-            let remedy = || format!("give the file that {} is for", source.display());
+            let remedy = || format!("pass the file that {} describes", source.display());
             digests.push(checked(file, pinned, remedy)?.0);
         }
         let target = self.models.join(&name);
         if target.exists() {
             return match verify(&target) {
-                Ok(verdict) if verdict.digests == digests => Ok(Added::Present(target)),
+                Ok(verified) if verified.digests == digests => Ok(Added::Present(target)),
                 _ => Err(InstallError::Taken(target)),
             };
         }
@@ -191,7 +191,7 @@ impl ModelsFolder {
         for (file, (installed, _)) in given.iter().zip(manifest.files()) {
             let copy = self.partial(&name, &installed.display());
             fs::copy(file, &copy).map_err(disk("copy the model to", &copy))?;
-            // What was copied is what was hashed, or the file changed in between.
+            // Hash the copy, because the source may have changed since it was checked.
             digests.push(digest_of(&copy)?.0);
             File::open(&copy).and_then(|file| file.sync_all()).map_err(disk("sync", &copy))?;
         }
@@ -200,30 +200,33 @@ impl ModelsFolder {
         Ok(Added::Installed { folder, name, digests })
     }
 
-    /// Chooses the model that `auto` stands for; `None` leaves it to the order of preference.
+    /// Chooses the model that `auto` resolves to; `None` removes the choice.
     pub fn choose(&self, name: Option<&str>) -> Result<(), InstallError> {
         let chosen = self.models.join(CHOSEN);
         match name {
             None => remove_if_there(&chosen).map_err(disk("remove", &chosen)),
             Some(name) => {
-                let beside = self.partial("", &CHOSEN);
-                write_durably(&beside, &format!("{name}\n"))?;
-                fs::rename(&beside, &chosen).map_err(disk("write", &chosen))?;
+                let temporary = self.partial("", &CHOSEN);
+                write_durably(&temporary, &format!("{name}\n"))?;
+                fs::rename(&temporary, &chosen).map_err(disk("write", &chosen))?;
                 sync_folder(&self.models)
             }
         }
     }
 
-    /// What is wrong with an installed model, if anything: a pull replaces it then.
+    /// Why an installed model is to be replaced by a pull; `None` if it is intact.
     fn fault(&self, target: &Path, entry: &Entry) -> Option<String> {
-        let verdict = match verify(target) {
-            Ok(verdict) => verdict,
+        let verified = match verify(target) {
+            Ok(verified) => verified,
             Err(error) => return Some(error.to_string()),
         };
-        let mut pins = entry.manifest.files().zip(&verdict.digests);
-        pins.find_map(|((file, pinned), was)| {
-            let pinned = pinned.filter(|pinned| pinned != was)?;
-            Some(format!("{} was {was}, but the catalogue pins {pinned}", file.display()))
+        let mut pins = entry.manifest.files().zip(&verified.digests);
+        pins.find_map(|((file, pinned), got)| {
+            let pinned = pinned.filter(|pinned| pinned != got)?;
+            Some(format!(
+                "{} had the digest {got}, but the catalogue pins {pinned}",
+                file.display()
+            ))
         })
     }
 
@@ -248,8 +251,7 @@ impl ModelsFolder {
         self.models.join(".partial").join(format!("{name}-{what}"))
     }
 
-    /// Puts a model's finished partial files, which are durable, and its manifest in place as one
-    /// folder.
+    /// Moves a model's finished files, which are already durable, and its manifest into place as one folder.
     fn place(
         &self,
         manifest: &Manifest,
@@ -281,8 +283,8 @@ impl ModelsFolder {
     }
 }
 
-/// Hashes the files of an installed model and compares them with the manifest.
-pub fn verify(folder: &Path) -> Result<Verdict, InstallError> {
+/// Hashes the files of an installed model and checks them against its manifest.
+pub fn verify(folder: &Path) -> Result<VerifiedFiles, InstallError> {
     let manifest = Manifest::read(&folder.join(MANIFEST))?;
     let (mut digests, mut bytes) = (Vec::new(), 0);
     for (file, pinned) in manifest.files() {
@@ -290,10 +292,10 @@ pub fn verify(folder: &Path) -> Result<Verdict, InstallError> {
         digests.push(digest);
         bytes += size;
     }
-    Ok(Verdict { manifest, digests, bytes })
+    Ok(VerifiedFiles { manifest, digests, bytes })
 }
 
-/// The digest and the size of a file, which is the one that is pinned, if one is.
+/// Hashes a file and checks it against the pinned digest, if there is one. Returns the digest and the size.
 fn checked(
     file: &Path,
     pinned: Option<Digest>,
@@ -310,9 +312,9 @@ fn checked(
 }
 
 fn is_name(name: &str) -> bool {
-    let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
+    let is_allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
     (1..=64).contains(&name.len())
-        && name.bytes().all(plain)
+        && name.bytes().all(is_allowed)
         && !name.starts_with('.')
         && ![AUTO, CHOSEN].contains(&name)
 }
@@ -342,84 +344,4 @@ fn disk(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> InstallEr
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use whereabouts_vision::Assets;
-
-    fn fixture(file: &str) -> PathBuf {
-        Path::new(env!("CARGO_MANIFEST_DIR"))
-            .join("../../tests/fixtures/models/tiny-tokens")
-            .join(file)
-    }
-
-    #[test]
-    fn a_file_that_is_added_is_pinned_and_found() {
-        let assets = tempfile::tempdir().unwrap();
-        let folder = ModelsFolder::open(assets.path()).unwrap();
-        let add = |name| folder.add(&fixture("model.onnx"), &fixture(MANIFEST), name);
-        let Added::Installed { folder: placed, digests, .. } = add(Some("mine")).unwrap() else {
-            panic!("it was not there before");
-        };
-        let verdict = verify(&placed).unwrap();
-        assert_eq!(verdict.digests, digests);
-        assert_eq!(verdict.manifest.sha256, digests.first().copied());
-        assert_eq!(verdict.manifest.name, "mine");
-        assert_eq!(Assets::locate(Some(assets.path())).model("mine").unwrap(), placed);
-        assert!(matches!(add(Some("mine")).unwrap(), Added::Present(_)));
-        assert!(matches!(add(Some("../mine")), Err(InstallError::Name(_))));
-        assert!(matches!(add(Some("auto")), Err(InstallError::Name(_))));
-    }
-
-    #[test]
-    fn a_name_that_is_taken_and_a_wrong_file_are_refused() {
-        let assets = tempfile::tempdir().unwrap();
-        let folder = ModelsFolder::open(assets.path()).unwrap();
-        folder.add(&fixture("model.onnx"), &fixture(MANIFEST), None).unwrap();
-        let other = assets.path().join("other.onnx");
-        fs::write(&other, "other").unwrap();
-        let wrong = folder.add(&other, &fixture(MANIFEST), None).unwrap_err().to_string();
-        assert!(wrong.contains("pins"), "{wrong}");
-        let manifest = assets.path().join("other.toml");
-        let text = fs::read_to_string(fixture(MANIFEST)).unwrap();
-        let unpinned: Vec<_> = text.lines().filter(|line| !line.starts_with("sha256")).collect();
-        fs::write(&manifest, unpinned.join("\n")).unwrap();
-        assert!(matches!(folder.add(&other, &manifest, None), Err(InstallError::Taken(_))));
-    }
-
-    #[test]
-    fn weights_in_a_file_of_their_own_are_added_and_checked() {
-        let (assets, given) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        let folder = ModelsFolder::open(assets.path()).unwrap();
-        let (file, manifest) = (given.path().join("model.onnx"), given.path().join("given.toml"));
-        fs::copy(fixture("model.onnx"), &file).unwrap();
-        let text = fs::read_to_string(fixture(MANIFEST)).unwrap();
-        let data = "[data]\nfile = \"model.onnx.data\"\n[input]";
-        fs::write(&manifest, text.replace("[input]", data)).unwrap();
-        let missing = folder.add(&file, &manifest, None).unwrap_err().to_string();
-        assert!(missing.contains("model.onnx.data"), "{missing}");
-
-        fs::write(given.path().join("model.onnx.data"), "weights").unwrap();
-        let Added::Installed { folder: placed, digests, .. } =
-            folder.add(&file, &manifest, None).unwrap()
-        else {
-            panic!("it was not there before");
-        };
-        assert_eq!(digests[1], Digest::of(b"weights"));
-        assert_eq!(verify(&placed).unwrap().digests, digests);
-        fs::write(placed.join("model.onnx.data"), "weight5").unwrap();
-        assert!(matches!(verify(&placed), Err(InstallError::Damaged { .. })));
-        fs::write(given.path().join("model.onnx.data"), "others").unwrap();
-        assert!(matches!(folder.add(&file, &manifest, None), Err(InstallError::Taken(_))));
-    }
-
-    #[test]
-    fn two_cannot_install_one_model_at_once() {
-        let assets = tempfile::tempdir().unwrap();
-        let folder = ModelsFolder::open(assets.path()).unwrap();
-        let held = folder.lock("m").unwrap();
-        assert!(matches!(folder.lock("m"), Err(InstallError::Locked { .. })));
-        assert!(folder.lock("n").is_ok());
-        drop(held);
-        assert!(folder.lock("m").is_ok());
-    }
-}
+mod tests;

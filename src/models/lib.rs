@@ -1,8 +1,8 @@
-//! Installing models: what can be had, how it is downloaded, where it is put.
+//! Installation of models: the catalogue, downloads, and the models folder.
 //!
-//! A model is installed when `ASSETS/models/NAME` holds its manifest and its ONNX file; that folder
-//! appears whole or not at all. What is in the making lies in `ASSETS/models/.partial`. Which
-//! installed model a server starts with is decided by [`whereabouts_vision::Assets::resolve`].
+//! A model is installed if `ASSETS/models/NAME` holds its manifest and its ONNX file. That folder is created
+//! atomically; unfinished files are kept in `ASSETS/models/.partial`. Which installed model is the default is decided
+//! by [`whereabouts_vision::Assets::resolve`].
 
 mod catalogue;
 mod download;
@@ -11,4 +11,4 @@ mod partial;
 
 pub use catalogue::{Catalogue, CatalogueError, Entry};
 pub use download::{Download, DownloadError, DownloadSettings, Progress};
-pub use install::{Added, InstallError, ModelsFolder, Pulled, Verdict, verify};
+pub use install::{Added, InstallError, ModelsFolder, Pulled, VerifiedFiles, verify};

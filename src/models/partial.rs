@@ -1,4 +1,4 @@
-//! A file that is being downloaded, and what must be known to continue it after a crash.
+//! A partially downloaded file, and the metadata needed to resume it after a crash.
 
 use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions};
@@ -10,7 +10,7 @@ use sha2::{Digest as _, Sha256};
 
 use whereabouts_core::Digest;
 
-/// The bytes so far, on disk, with their running digest.
+/// A partial file on disk, with the running digest of its bytes.
 #[derive(Debug)]
 pub(super) struct Partial {
     path: PathBuf,
@@ -20,22 +20,22 @@ pub(super) struct Partial {
     origin: Origin,
 }
 
-/// Which bytes these are, kept beside them in a file of its own.
+/// Where the bytes came from. Stored in a sidecar file.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Origin {
-    /// Where they come from.
+    /// URL of the file.
     pub url: String,
-    /// A strong entity tag of the whole, if the server gave one.
+    /// Strong entity tag, if the server sent one.
     pub etag: Option<String>,
-    /// The length of the whole, if the server said it.
+    /// Total length of the file, if the server reported it.
     pub total: Option<u64>,
 }
 
 impl Partial {
-    /// Opens the file and reads what is there; begins anew unless that came from `url` and a
-    /// mix-up of two versions would be noticed, by the entity tag or because `pinned`.
+    /// Opens a partial file and hashes the bytes in it. Truncates the file unless the bytes came from `url` and
+    /// mixing two versions of the file would be detected, by an entity tag or by a pinned digest.
     pub fn open(path: &Path, url: &str, pinned: bool) -> io::Result<Self> {
-        let origin = fs::read_to_string(beside(path))
+        let origin = fs::read_to_string(sidecar(path))
             .ok()
             .and_then(|text| toml::from_str::<Origin>(&text).ok())
             .filter(|origin| origin.url == url && (pinned || origin.etag.is_some()));
@@ -61,12 +61,12 @@ impl Partial {
         Ok(Self { path: path.to_owned(), file, hasher, length, origin })
     }
 
-    /// Throws the bytes away and begins with those of `origin`.
+    /// Discards the bytes and starts over with those of `origin`.
     pub fn restart(&mut self, origin: Origin) -> io::Result<()> {
-        // The bytes go first: a crash in between must not leave them under another origin.
+        // Truncate before writing the origin, so that a crash cannot pair old bytes with a new origin.
         *self = Self::emptied(std::mem::take(&mut self.path), origin)?;
         let text = toml::to_string(&self.origin).map_err(io::Error::other)?;
-        fs::write(beside(&self.path), text)
+        fs::write(sidecar(&self.path), text)
     }
 
     fn emptied(path: PathBuf, origin: Origin) -> io::Result<Self> {
@@ -82,31 +82,31 @@ impl Partial {
         Ok(())
     }
 
-    /// How many bytes there are.
+    /// Number of bytes on disk.
     pub fn length(&self) -> u64 {
         self.length
     }
 
-    /// Which bytes these are.
+    /// Where the bytes came from.
     pub fn origin(&self) -> &Origin {
         &self.origin
     }
 
-    /// Removes the file.
+    /// Removes the file and its sidecar.
     pub fn discard(self) -> io::Result<()> {
-        remove_if_there(&beside(&self.path))?;
+        remove_if_there(&sidecar(&self.path))?;
         remove_if_there(&self.path)
     }
 
-    /// Makes the file durable and gives its digest. Only the file stays.
+    /// Makes the file durable, removes the sidecar, and returns the digest.
     pub fn finish(self) -> io::Result<Digest> {
         self.file.sync_all()?;
-        remove_if_there(&beside(&self.path))?;
+        remove_if_there(&sidecar(&self.path))?;
         Ok(Digest::from(<[u8; 32]>::from(self.hasher.finalize())))
     }
 }
 
-fn beside(path: &Path) -> PathBuf {
+fn sidecar(path: &Path) -> PathBuf {
     let mut name = OsString::from(path);
     name.push(".origin");
     name.into()
@@ -127,17 +127,17 @@ mod tests {
         Origin { url: "http://hub/a".into(), etag: etag.map(str::to_owned), total: Some(6) }
     }
 
-    fn left_behind(path: &Path, etag: Option<&str>) {
+    fn leave_partial(path: &Path, etag: Option<&str>) {
         let mut partial = Partial::open(path, "http://hub/a", false).unwrap();
         partial.restart(origin(etag)).unwrap();
         partial.append(b"abc").unwrap();
     }
 
     #[test]
-    fn what_was_left_behind_is_continued() {
+    fn a_partial_file_is_resumed() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("file");
-        left_behind(&path, Some("\"1\""));
+        leave_partial(&path, Some("\"1\""));
         let mut partial = Partial::open(&path, "http://hub/a", false).unwrap();
         assert_eq!((partial.length(), partial.origin()), (3, &origin(Some("\"1\""))));
         partial.append(b"def").unwrap();
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn what_could_be_mixed_up_is_begun_anew() {
+    fn a_partial_file_is_discarded_if_versions_could_be_mixed() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("file");
         for (etag, url, pinned, kept) in [
@@ -155,7 +155,7 @@ mod tests {
             (None, "http://hub/a", true, 3),
             (Some("\"1\""), "http://mirror/a", true, 0),
         ] {
-            left_behind(&path, etag);
+            leave_partial(&path, etag);
             assert_eq!(Partial::open(&path, url, pinned).unwrap().length(), kept, "{etag:?} {url}");
         }
     }

@@ -1,6 +1,9 @@
-//! Dense features of pictures that were looked at lately.
+//! An LRU cache of dense features, bounded in bytes.
 //!
-//! They are derived: whoever misses one here extracts it again from the image's bytes.
+//! The features are derived data: after a miss they are extracted again from the picture.
+//!
+//! Not `quick_cache`: a frame's features are inserted once and read once, when its job runs, and the
+//! eviction policy of that cache (S3-FIFO) drops just such entries first.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -8,16 +11,16 @@ use std::sync::Arc;
 use parking_lot::Mutex;
 use whereabouts_core::{DenseFeatures, Digest};
 
-/// Whose features they are.
+/// The picture that the features are of, and the model that extracted them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct DenseKey {
-    /// The identity of the model that made them.
+    /// The identity of the model.
     pub model: Digest,
     /// The digest of the picture.
     pub picture: Digest,
 }
 
-/// A cache by model and picture, bounded in bytes; the least recently used goes first.
+/// Caches dense features by model and picture; the least recently used are evicted first.
 #[derive(Debug)]
 pub struct DenseCache {
     max_bytes: usize,
@@ -28,32 +31,34 @@ pub struct DenseCache {
 struct State {
     entries: HashMap<DenseKey, Entry>,
     bytes: usize,
+    /// Counts accesses, to order them.
     clock: u64,
 }
 
 #[derive(Debug)]
 struct Entry {
     features: Arc<DenseFeatures>,
-    used: u64,
+    last_used: u64,
 }
 
 impl DenseCache {
-    /// A cache that holds at most `max_bytes` of features.
+    /// Creates a cache that holds at most `max_bytes` of features.
     pub fn new(max_bytes: usize) -> Self {
         Self { max_bytes, state: Mutex::default() }
     }
 
-    /// The features of a picture, if they are still here.
+    /// Returns the features of a picture, if they are cached.
     pub fn get(&self, key: &DenseKey) -> Option<Arc<DenseFeatures>> {
         let mut state = self.state.lock();
         state.clock += 1;
         let now = state.clock;
         let entry = state.entries.get_mut(key)?;
-        entry.used = now;
+        entry.last_used = now;
         Some(Arc::clone(&entry.features))
     }
 
-    /// Keeps the features of a picture, at the expense of those used longest ago.
+    /// Caches the features of a picture and evicts the least recently used ones if there is no room.
+    /// Features larger than the whole cache are not cached.
     pub fn insert(&self, key: DenseKey, features: Arc<DenseFeatures>) {
         let bytes = features.bytes();
         if bytes > self.max_bytes {
@@ -61,26 +66,28 @@ impl DenseCache {
         }
         let mut state = self.state.lock();
         state.clock += 1;
-        let used = state.clock;
-        if let Some(old) = state.entries.insert(key, Entry { features, used }) {
+        let last_used = state.clock;
+        if let Some(old) = state.entries.insert(key, Entry { features, last_used }) {
             state.bytes -= old.features.bytes();
         }
         state.bytes += bytes;
         while state.bytes > self.max_bytes {
-            state.drop_oldest();
+            state.evict();
         }
     }
 
-    /// Bytes held.
+    /// Returns the size of all cached features in bytes.
     pub fn bytes(&self) -> usize {
         self.state.lock().bytes
     }
 }
 
 impl State {
-    /// A walk over all entries: there are hundreds, each worth a matrix of 100 kB and more.
-    fn drop_oldest(&mut self) {
-        let oldest = self.entries.iter().min_by_key(|(_, entry)| entry.used).map(|(key, _)| *key);
+    /// Evicts the least recently used entry. Scans all entries, of which there are hundreds, because each
+    /// is a matrix of 100 kB or more.
+    fn evict(&mut self) {
+        let oldest =
+            self.entries.iter().min_by_key(|(_, entry)| entry.last_used).map(|(key, _)| *key);
         if let Some(entry) = oldest.and_then(|key| self.entries.remove(&key)) {
             self.bytes -= entry.features.bytes();
         }
@@ -100,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn the_least_recently_used_goes_first() {
+    fn the_least_recently_used_features_are_evicted_first() {
         let cache = DenseCache::new(3 * 40);
         let keys = [b"a", b"b", b"c", b"d"].map(|name| key(name));
         for key in &keys[..3] {
@@ -108,15 +115,15 @@ mod tests {
         }
         assert!(cache.get(&keys[0]).is_some());
         cache.insert(keys[3], features(10));
-        let kept: Vec<bool> = keys.iter().map(|key| cache.get(key).is_some()).collect();
-        assert_eq!(kept, [true, false, true, true]);
+        let cached: Vec<bool> = keys.iter().map(|key| cache.get(key).is_some()).collect();
+        assert_eq!(cached, [true, false, true, true]);
         assert_eq!(cache.bytes(), 120);
-        let of_another_model = DenseKey { model: Digest::of(b"another"), ..keys[0] };
-        assert!(cache.get(&of_another_model).is_none());
+        let other_model = DenseKey { model: Digest::of(b"another"), ..keys[0] };
+        assert!(cache.get(&other_model).is_none());
     }
 
     #[test]
-    fn the_bound_holds_whatever_comes() {
+    fn the_bound_holds_for_any_sequence_of_sizes() {
         let cache = DenseCache::new(100);
         cache.insert(key(b"huge"), features(26));
         assert_eq!(cache.bytes(), 0);

@@ -1,4 +1,4 @@
-//! Metric families of refinement: jobs that ended, what they cost, and lookups in the description cache.
+//! Metric families of refinement: ended jobs, their cost, and lookups in the description cache.
 
 use std::sync::Arc;
 
@@ -23,12 +23,12 @@ pub struct RefineMetrics {
     description_lookups: Family<LookupLabels, Counter>,
 }
 
-/// What came of looking for a pair's description.
+/// The outcome of looking up a pair's description.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum CacheLookup {
-    /// It was there.
+    /// It was cached.
     Hit,
-    /// That of a similar frame was there.
+    /// The description of a similar frame was cached.
     Similar,
     /// It had to be bought.
     Miss,
@@ -57,7 +57,7 @@ struct LookupLabels {
 }
 
 impl RefineMetrics {
-    /// Registers the families; all counts are zero.
+    /// Registers the metric families, with all counts at zero.
     pub fn register(registry: &mut Registry, hourly: Arc<HourlyStats>) -> Self {
         Self {
             hourly,
@@ -71,25 +71,25 @@ impl RefineMetrics {
             model_calls: register(
                 registry,
                 "model_calls",
-                "Calls to a model outside, by jobs that ended",
+                "Calls to an external model, by ended jobs",
                 Family::default(),
             ),
             cached_descriptions: register(
                 registry,
                 "cached_descriptions",
-                "Descriptions that were known from an earlier job",
+                "Descriptions that an earlier job had paid for, by ended jobs",
                 Family::default(),
             ),
             tokens: register(
                 registry,
                 "tokens",
-                "Tokens sent to a model outside (prompt) and received (completion)",
+                "Tokens sent to an external model (prompt) and received from it (completion)",
                 Family::default(),
             ),
             description_lookups: register(
                 registry,
                 "description_lookups",
-                "Pairs whose description was looked for: known (hit), known of a nearly equal frame \
+                "Lookups of a pair's description: cached (hit), cached for a nearly equal frame \
                  (similar), or bought (miss)",
                 Family::default(),
             ),
@@ -101,9 +101,9 @@ impl RefineMetrics {
         self.hourly.job_ended(Timestamp::now(), job.state == JobState::Failed);
         let refiner = job.refiner.as_str();
         self.jobs.get_or_create(&JobLabels { refiner, state: job.state.as_str() }).inc();
-        let (of, usage) = (RefinerLabels { refiner }, job.usage);
-        self.model_calls.get_or_create(&of).inc_by(usage.calls.into());
-        self.cached_descriptions.get_or_create(&of).inc_by(usage.cached.into());
+        let (labels, usage) = (RefinerLabels { refiner }, job.usage);
+        self.model_calls.get_or_create(&labels).inc_by(usage.calls.into());
+        self.cached_descriptions.get_or_create(&labels).inc_by(usage.cached.into());
         for (direction, tokens) in
             [("prompt", usage.prompt_tokens), ("completion", usage.completion_tokens)]
         {
@@ -115,7 +115,7 @@ impl RefineMetrics {
         }
     }
 
-    /// Counts a search for a pair's description.
+    /// Counts a lookup of a pair's description.
     pub fn description_lookup(&self, found: CacheLookup) {
         let result = match found {
             CacheLookup::Hit => "hit",

@@ -1,4 +1,4 @@
-//! The worker: takes a job, has it refined, writes down how it ended.
+//! The worker: claims a job, has it refined, and records the outcome.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -8,50 +8,53 @@ use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast::error::RecvError;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
-
-use super::patience::until;
-use super::{JobServiceTime, Progress, RefineError, RefineMetrics, Refinement, Refiner};
 use whereabouts_core::{Estimate, Job, JobState};
 use whereabouts_store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
 use whereabouts_telemetry::traces;
 
-/// Bounds on a worker's patience.
+use super::store_retry::retry_for;
+use super::{
+    AttemptPolicy, JobServiceTime, NextAttempt, Progress, RefineError, RefineInput, RefineMetrics,
+    Refinement, Refiner,
+};
+
+/// The settings of a worker.
 #[derive(Debug, Clone, Copy)]
 pub struct WorkerSettings {
-    /// How long a job is held without a sign of life.
+    /// How long a claim lasts. It must outlast `timeout`.
     pub lease: Duration,
     /// The longest a job may take.
     pub timeout: Duration,
-    /// How often a job is tried.
-    pub attempts: u32,
-    /// The pause before the second try; it doubles each time.
-    pub retry_pause: Duration,
+    /// How often a job is attempted.
+    pub attempts: AttemptPolicy,
     /// The least confidence of a known place.
     pub known_confidence: f64,
-    /// How many workers there are.
-    pub side_by_side: usize,
+    /// How many workers the process has.
+    pub workers: usize,
 }
 
 /// Refines one job after another.
 pub struct Worker {
     /// The queue.
     pub jobs: Arc<dyn JobStore>,
-    /// What the maps are like.
+    /// The maps and their calibration.
     pub maps: Arc<dyn MapStore>,
-    /// Who refines.
+    /// The refiner.
     pub refiner: Arc<dyn Refiner>,
-    /// What is counted.
+    /// Counts jobs.
     pub metrics: Arc<RefineMetrics>,
-    /// Learns how long jobs take.
-    pub pace: JobServiceTime,
-    /// Its patience.
+    /// Averages the time that jobs take.
+    pub service_time: JobServiceTime,
+    /// The settings.
     pub settings: WorkerSettings,
 }
 
-/// Why a refinement was given up.
-enum Stopped {
+/// The outcome of one attempt.
+enum AttemptOutcome {
+    Refined(Box<Refinement>),
     Failed(RefineError),
-    NoLongerOurs,
+    /// The job was cancelled, or another worker has claimed it.
+    ClaimLost,
     ShuttingDown,
 }
 
@@ -65,96 +68,106 @@ impl Worker {
                 Ok(false) => {}
                 Err(error) => tracing::error!(%error, "the job queue cannot be worked on"),
             }
-            // A notice wakes the worker at once; the pause finds jobs whose time has come.
-            let pause = tokio::time::sleep(self.settings.lease.min(Duration::from_secs(1)));
+            // A change wakes the worker at once; polling finds jobs whose pause or lease has ended.
+            let poll = tokio::time::sleep(self.settings.lease.min(Duration::from_secs(1)));
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = pause => {}
+                () = poll => {}
                 _ = changes.recv() => {}
             }
         }
     }
 
-    /// Takes one job and sees it through; `false` if none waits.
+    /// Claims one job and makes one attempt at it; `false` if no job is waiting.
     pub async fn step(&self, shutdown: &CancellationToken) -> Result<bool, StoreError> {
-        let until = after(self.settings.lease);
+        let until = from_now(self.settings.lease);
         let Some(record) = self.jobs.claim(Timestamp::now(), until).await? else {
             return Ok(false);
         };
         let (job, claim, began) = (record.job.clone(), record.claim(), Instant::now());
         let traceparent = record.traceparent.as_deref();
         let span = traces::job(job.id, job.refiner.as_str(), job.attempts, traceparent);
-        match self.refine(&record, shutdown).instrument(span).await {
-            Ok(refinement) => {
-                self.record(began.elapsed());
+        match self.attempt(&record, shutdown).instrument(span).await {
+            AttemptOutcome::Refined(refinement) => {
+                self.record_time(began.elapsed());
                 let estimate = self.estimate(&record, &refinement).await;
-                self.end(claim, succeeded(job, refinement, estimate)).await?;
+                self.finish(claim, succeeded(job, *refinement, estimate)).await?;
             }
-            Err(Stopped::NoLongerOurs) => {}
-            Err(Stopped::ShuttingDown) => {
+            AttemptOutcome::Failed(error) => self.after_failure(claim, job, error).await?,
+            AttemptOutcome::ClaimLost => {}
+            AttemptOutcome::ShuttingDown => {
                 let why = "the server was stopped".to_owned();
                 let release = Release { why, not_before: None, counts: false };
                 self.release(claim, release).await?;
             }
-            Err(Stopped::Failed(RefineError::Deferred { why, after: pause })) => {
-                tracing::info!(job = %job.id, why, seconds = pause.as_secs(), "a job waits");
-                let release = Release { why, not_before: Some(after(pause)), counts: false };
-                self.release(claim, release).await?;
-            }
-            Err(Stopped::Failed(RefineError::Transient(why)))
-                if job.attempts < self.settings.attempts =>
-            {
-                tracing::warn!(job = %job.id, attempt = job.attempts, why, "a job is tried again");
-                let doubled = 2_u32.saturating_pow(job.attempts.saturating_sub(1));
-                let pause = self.settings.retry_pause.saturating_mul(doubled);
-                let release = Release { why, not_before: Some(after(pause)), counts: true };
-                self.release(claim, release).await?;
-            }
-            Err(Stopped::Failed(error)) => self.fail(claim, job, &error).await?,
         }
         Ok(true)
     }
 
-    /// Ends a job with what it has so far.
+    /// Puts a job back into the queue if it is to be attempted again, and ends it otherwise.
+    async fn after_failure(
+        &self,
+        claim: Claim,
+        job: Job,
+        error: RefineError,
+    ) -> Result<(), StoreError> {
+        match self.settings.attempts.next(job.attempts, &error) {
+            NextAttempt::Never => self.fail(claim, job, &error).await,
+            NextAttempt::After { pause, counts } => {
+                let (why, seconds) = (error.to_string(), pause.as_secs());
+                if counts {
+                    tracing::warn!(job = %job.id, attempt = job.attempts, why, seconds, "a job is retried later");
+                } else {
+                    tracing::info!(job = %job.id, why, seconds, "a job is deferred");
+                }
+                let release = Release { why, not_before: Some(from_now(pause)), counts };
+                self.release(claim, release).await
+            }
+        }
+    }
+
+    /// Ends a job with the descriptions and costs that are recorded so far.
     async fn fail(&self, claim: Claim, job: Job, error: &RefineError) -> Result<(), StoreError> {
         let job = match self.jobs.job(job.id).await? {
             Some(record) => record.job,
             None => job,
         };
-        self.end(claim, failed(job, error)).await
+        self.finish(claim, failed(job, error)).await
     }
 
-    async fn refine(
-        &self,
-        record: &JobRecord,
-        shutdown: &CancellationToken,
-    ) -> Result<Refinement, Stopped> {
+    async fn attempt(&self, record: &JobRecord, shutdown: &CancellationToken) -> AttemptOutcome {
         let timeout = self.settings.timeout;
-        let progress = JobProgress { jobs: self.jobs.as_ref(), claim: record.claim() };
         tokio::select! {
-            () = shutdown.cancelled() => Err(Stopped::ShuttingDown),
-            () = self.taken_away(record.claim()) => Err(Stopped::NoLongerOurs),
-            outcome = tokio::time::timeout(timeout, self.refiner.refine(record, &progress)) => match outcome {
-                Ok(refined) => refined.map_err(Stopped::Failed),
-                Err(_) => Err(Stopped::Failed(RefineError::Transient(format!(
+            () = shutdown.cancelled() => AttemptOutcome::ShuttingDown,
+            () = self.claim_lost(record.claim()) => AttemptOutcome::ClaimLost,
+            refined = tokio::time::timeout(timeout, self.refine(record)) => match refined {
+                Ok(Ok(refinement)) => AttemptOutcome::Refined(Box::new(refinement)),
+                Ok(Err(error)) => AttemptOutcome::Failed(error),
+                Err(_) => AttemptOutcome::Failed(RefineError::Transient(format!(
                     "it took longer than {} s (jobs.timeout_s)",
                     timeout.as_secs()
-                )))),
+                ))),
             },
         }
     }
 
-    /// Returns when the job has been cancelled, even if it is queued again by the time of a look, or
-    /// when another worker has it.
-    async fn taken_away(&self, claim: Claim) {
+    async fn refine(&self, record: &JobRecord) -> Result<Refinement, RefineError> {
+        let input = RefineInput::of_job(record, self.maps.as_ref()).await?;
+        let progress = JobProgress { jobs: self.jobs.as_ref(), claim: record.claim() };
+        self.refiner.refine(&input, &progress).await
+    }
+
+    /// Returns when the job has been cancelled, even if it was queued again since, or when another worker
+    /// has claimed it.
+    async fn claim_lost(&self, claim: Claim) {
         let mut changes = self.jobs.changes();
         loop {
-            let look = match changes.recv().await {
+            let changed = match changes.recv().await {
                 Ok(changed) => changed == claim.job,
                 Err(RecvError::Lagged(_)) => true,
                 Err(RecvError::Closed) => return std::future::pending().await,
             };
-            if look
+            if changed
                 && let Ok(Some(record)) = self.jobs.job(claim.job).await
                 && !record.is_held_by(claim)
             {
@@ -163,7 +176,7 @@ impl Worker {
         }
     }
 
-    /// The first of the refined order, and how sure it is.
+    /// Returns the first of the refined ranking with its confidence.
     async fn estimate(&self, record: &JobRecord, refinement: &Refinement) -> Option<Estimate> {
         let first = refinement.ranking.first()?;
         let calibration = match self.maps.map(&record.job.map).await {
@@ -180,31 +193,30 @@ impl Worker {
         Some(Estimate::new(&first.image_id, first.pose, confidence, known_from))
     }
 
-    fn record(&self, took: Duration) {
-        let mut pace = self.pace.lock();
-        pace.record(took, self.settings.side_by_side);
+    fn record_time(&self, took: Duration) {
+        self.service_time.lock().record(took, self.settings.workers);
     }
 
-    async fn end(&self, claim: Claim, job: Job) -> Result<(), StoreError> {
+    async fn finish(&self, claim: Claim, job: Job) -> Result<(), StoreError> {
         self.metrics.job_ended(&job);
-        self.insist(|| self.jobs.finish(claim, job.clone())).await
+        self.retry_while_claimed(|| self.jobs.finish(claim, job.clone())).await
     }
 
     async fn release(&self, claim: Claim, release: Release) -> Result<(), StoreError> {
-        self.insist(|| self.jobs.release(claim, release.clone())).await
+        self.retry_while_claimed(|| self.jobs.release(claim, release.clone())).await
     }
 
-    /// Tells a store that is away for a while how a job has ended, as long as the job is this worker's:
-    /// what was worked out is not to be lost.
-    async fn insist<F>(&self, tell: impl Fn() -> F) -> Result<(), StoreError>
+    /// Retries a write while the store is unavailable, for as long as the claim lasts: the outcome of the
+    /// attempt should not be lost.
+    async fn retry_while_claimed<F>(&self, write: impl Fn() -> F) -> Result<(), StoreError>
     where
         F: Future<Output = Result<(), StoreError>>,
     {
-        until(self.settings.lease, tell).await
+        retry_for(self.settings.lease, write).await
     }
 }
 
-/// Writes the steps of a refinement into its job.
+/// Records the steps of a refinement in its job.
 struct JobProgress<'a> {
     jobs: &'a dyn JobStore,
     claim: Claim,
@@ -214,14 +226,13 @@ struct JobProgress<'a> {
 impl Progress for JobProgress<'_> {
     async fn step(&self, step: Step) {
         if let Err(error) = self.jobs.progress(self.claim, step).await {
-            // The refinement says it all again at its end.
-            tracing::error!(job = %self.claim.job, %error, "a step of a job could not be written down");
+            // The outcome of the refinement contains the step again.
+            tracing::error!(job = %self.claim.job, %error, "a step of a job could not be recorded");
         }
     }
 }
 
-/// So long from now.
-fn after(pause: Duration) -> Timestamp {
+fn from_now(pause: Duration) -> Timestamp {
     let pause = SignedDuration::try_from(pause).unwrap_or(SignedDuration::MAX);
     Timestamp::now().saturating_add(pause).unwrap_or(Timestamp::MAX)
 }

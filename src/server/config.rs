@@ -6,6 +6,7 @@ mod answers;
 mod database;
 mod model;
 mod overrides;
+mod refiner;
 mod server;
 
 use std::path::{Path, PathBuf};
@@ -14,15 +15,18 @@ use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
-pub use self::answers::{Confidence, Idempotency, Jobs, Localize, Refine, Refiner};
+pub use self::answers::{Confidence, Idempotency, Jobs, Localize, Refine};
 pub use self::database::{Database, ObjectStore};
-pub use self::model::{Image, Model, PrecisionWish, ProviderWish, cores_unless};
+pub use self::model::Model;
 pub use self::overrides::Overrides;
+pub use self::refiner::RefinerChoice;
 pub use self::server::Server;
 use crate::http::Tiles;
+use whereabouts_index::IndexSettings;
 use whereabouts_refine::mllm::MllmSettings;
 use whereabouts_service::{BulkSettings, TrackSettings, WebhookSettings};
 use whereabouts_telemetry::{LogSettings, TraceSettings};
+use whereabouts_vision::ImageSettings;
 
 /// The default settings, every key with a comment.
 pub const DEFAULTS: &str = include_str!("../../deploy/whereabouts.toml");
@@ -42,9 +46,9 @@ pub struct Config {
     /// The model.
     pub model: Model,
     /// Decoding.
-    pub image: Image,
+    pub image: ImageSettings,
     /// Search.
-    pub index: Index,
+    pub index: IndexSettings,
     /// Who may ask.
     pub auth: Auth,
     /// Answers.
@@ -91,26 +95,6 @@ pub struct Data {
     pub description_cache_days: u64,
     /// For how many days it is known what was spent.
     pub usage_days: u32,
-}
-
-/// `[index]`
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Index {
-    /// The largest map that is searched exactly, in images.
-    pub exact_up_to: usize,
-    /// HNSW: neighbours of a point.
-    pub m: usize,
-    /// HNSW: points looked at when inserting.
-    pub ef_construction: usize,
-    /// HNSW: points looked at when searching.
-    pub ef_search: usize,
-    /// Threads that build graphs; 0 for half of the cores.
-    pub threads: usize,
-    /// The share of dead points from which a graph is built again.
-    pub max_dead_share: f32,
-    /// The pause between two searches that are held against exact search; 0 for none.
-    pub check_s: u64,
 }
 
 /// `[auth]`
@@ -253,12 +237,6 @@ impl Config {
             ("model.max_batch", self.model.max_batch),
             ("model.download_attempts", self.model.download_attempts as usize),
             ("model.download_stall_s", self.model.download_stall_s as usize),
-            ("image.queue", self.image.queue),
-            ("image.max_wait_ms", self.image.max_wait_ms as usize),
-            ("image.max_retry_after_s", self.image.max_retry_after_s as usize),
-            ("index.m", self.index.m),
-            ("index.ef_construction", self.index.ef_construction),
-            ("index.ef_search", self.index.ef_search),
             ("localize.k", self.localize.k),
             ("bulk.in_flight", self.bulk.in_flight),
             ("bulk.max_images", self.bulk.max_images),
@@ -290,11 +268,11 @@ impl Config {
         if !self.model.hub.starts_with("https://") && !self.model.hub.starts_with("http://") {
             return Some("model.hub must begin with https:// or http://".into());
         }
-        if self.index.m > 256 {
-            return Some("index.m must not exceed 256".into());
+        if let Some(why) = self.image.validate().or_else(|| self.index.validate()) {
+            return Some(why);
         }
-        if self.refine.refiner == Refiner::Mllm
-            && let Some(why) = self.mllm.validate(self.jobs.timeout_s)
+        if let Some(refiner) = self.refine.refiner.entry()
+            && let Some(why) = (refiner.validate)(&self.refiner_settings())
         {
             return Some(why);
         }

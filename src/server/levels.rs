@@ -1,4 +1,4 @@
-//! Levels: what is measured when somebody asks.
+//! Gauges that are read when the metrics are scraped.
 
 use std::sync::atomic::AtomicU64;
 use std::time::Duration;
@@ -8,31 +8,31 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use whereabouts_telemetry::metrics::Registry;
 
-use whereabouts_refine::mllm::MllmLevels;
+use whereabouts_refine::PaidCallLevels;
 use whereabouts_telemetry::metrics::register;
 use whereabouts_vision::AdmissionLevels;
 
-/// What is measured when it is asked for.
+/// Values of the gauges at one scrape.
 #[derive(Debug, Clone)]
 pub struct Levels {
-    /// Images of each map.
+    /// Number of images of each map.
     pub maps: Vec<(String, usize)>,
-    /// Bytes of each map's descriptors and their index.
+    /// Size of each map's descriptors and index, in bytes.
     pub index_bytes: Vec<(String, u64)>,
-    /// Jobs that wait or run.
+    /// Jobs queued or running.
     pub queued: usize,
-    /// How long ago the oldest of them was submitted; zero, if there is none.
+    /// Age of the oldest of them; zero if there is none.
     pub oldest_job: Duration,
-    /// Deliveries to webhooks that wait.
+    /// Webhook deliveries that are queued.
     pub waiting_deliveries: usize,
-    /// Bytes of the database's files.
+    /// Size of the database files, in bytes.
     pub db_bytes: u64,
-    /// Bytes of cached dense features.
+    /// Size of the cached dense features, in bytes.
     pub dense_cache_bytes: usize,
-    /// Pictures in work and waiting.
+    /// Pictures in progress and waiting.
     pub admission: AdmissionLevels,
-    /// How the refiner stands, if it asks models outside.
-    pub mllm: Option<MllmLevels>,
+    /// State of the MLLM client, if the refiner uses one.
+    pub mllm: Option<PaidCallLevels>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
@@ -45,7 +45,7 @@ struct ClassLabels {
     class: &'static str,
 }
 
-/// How the levels stood when they were last asked for.
+/// The gauges, as set at the last scrape.
 #[derive(Debug)]
 pub(super) struct Gauges {
     queued_jobs: Gauge,
@@ -71,37 +71,37 @@ impl Gauges {
             queued_jobs: register(
                 registry,
                 "jobs_queued",
-                "Jobs that wait or run",
+                "Jobs queued or running",
                 Gauge::default(),
             ),
             oldest_job_seconds: register(
                 registry,
                 "oldest_job_seconds",
-                "Time since the oldest job that waits or runs was submitted; 0 if there is none",
+                "Age of the oldest job queued or running; 0 if there is none",
                 Gauge::default(),
             ),
             db_bytes: register(
                 registry,
                 "db_bytes",
-                "Bytes of the database's files",
+                "Size of the database files",
                 Gauge::default(),
             ),
             description_cache_entries: register(
                 registry,
                 "description_cache_entries",
-                "Descriptions that are kept",
+                "Cached descriptions",
                 Gauge::default(),
             ),
             description_cache_bytes: register(
                 registry,
                 "description_cache_bytes",
-                "Bytes of the descriptions that are kept",
+                "Size of the cached descriptions",
                 Gauge::default(),
             ),
             mllm_suspended: register(
                 registry,
                 "mllm_suspended",
-                "Whether calls to the MLLM are suspended because the last ones failed",
+                "Whether calls to the MLLM are suspended after repeated failures",
                 Gauge::default(),
             ),
             mllm_tokens_today: register(
@@ -120,7 +120,7 @@ impl Gauges {
             index_bytes: register(
                 registry,
                 "index_bytes",
-                "Bytes of a map's descriptors and of their index",
+                "Size of the descriptors and index of a map",
                 Family::default(),
             ),
             dense_cache_bytes: register(
@@ -132,25 +132,25 @@ impl Gauges {
             permits: register(
                 registry,
                 "permits",
-                "Pictures that may be decoded and inferred at a time",
+                "Pictures that may be decoded and inferred concurrently",
                 Gauge::default(),
             ),
             permits_in_use: register(
                 registry,
                 "permits_in_use",
-                "Pictures that are decoded and inferred",
+                "Pictures being decoded and inferred",
                 Gauge::default(),
             ),
             waiting: register(
                 registry,
                 "pictures_waiting",
-                "Pictures that wait for a permit, by what it is for",
+                "Pictures waiting for a permit, by class of work",
                 Family::default(),
             ),
             waiting_deliveries: register(
                 registry,
                 "webhook_deliveries_waiting",
-                "Deliveries to webhooks that wait",
+                "Webhook deliveries queued",
                 Gauge::default(),
             ),
         }
@@ -186,7 +186,7 @@ impl Gauges {
     }
 }
 
-/// Sets a level of each map; one that is gone has none any more.
+/// Sets the gauge of each map, and removes those of deleted maps.
 fn set_of_maps<'a>(
     family: &Family<MapLabels, Gauge>,
     levels: impl Iterator<Item = (&'a String, i64)>,

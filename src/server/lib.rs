@@ -1,19 +1,27 @@
-//! The server: what stands behind the listener, and the wiring of everything.
+//! The server: everything behind the listener, and the wiring of all parts.
 //!
 //! | module | what it is for |
 //! |---|---|
-//! | [`http`] | axum: extract, call the service, convert |
-//! | [`grpc`] | tonic: the same for the contract in `proto/` |
-//! | [`console`] | the operator's page |
+//! | `gate` | what every request passes, whatever its protocol: connections, bounds, keys, errors |
+//! | [`http`] | the routes of HTTP |
+//! | `grpc` | the calls of the contract in `proto/` |
+//! | `console` | the operator's page |
+//! | `router` | puts the routes of all protocols behind the gate |
 //! | [`config`] | settings: defaults, file, environment, flags |
 //! | [`startup`] | builds the parts, serves, drains |
+//!
+//! `http`, `grpc` and `console` depend on `gate`, and not on one another.
 
 pub mod config;
-pub mod console;
-pub mod grpc;
+#[cfg(feature = "console")]
+mod console;
+mod gate;
+#[cfg(feature = "grpc")]
+mod grpc;
 pub mod http;
 mod levels;
 mod metrics;
+mod router;
 pub mod startup;
 
 pub use levels::Levels;

@@ -1,4 +1,4 @@
-//! Metrics of requests and connections, and the registry that all members put their families into.
+//! Metrics of requests and connections, and the registry of all metric families.
 
 use std::fmt;
 use std::sync::Arc;
@@ -16,9 +16,6 @@ use whereabouts_telemetry::HourlyStats;
 use whereabouts_telemetry::metrics::{self, Registry, latency, register};
 
 use super::levels::{Gauges, Levels};
-
-/// The routes that localize a frame.
-const FRAME_ROUTES: [&str; 2] = ["/localize", "/whereabouts.v1.LocalizationService/Localize"];
 
 /// All metrics of a process: those of the server itself, and those that other members registered.
 #[derive(Debug)]
@@ -66,15 +63,10 @@ impl Metrics {
             request_seconds: register(
                 registry,
                 "http_request_seconds",
-                "Time from the request's head to the answer's",
+                "Time from the head of the request to the head of the response",
                 Family::new_with_constructor(latency),
             ),
-            connections: register(
-                registry,
-                "connections",
-                "Connections that are open",
-                Gauge::default(),
-            ),
+            connections: register(registry, "connections", "Open connections", Gauge::default()),
             service: Arc::new(ServiceMetrics::register(registry, rejections)),
             refine: Arc::new(RefineMetrics::register(registry, Arc::clone(&last_hour))),
             last_hour,
@@ -83,9 +75,9 @@ impl Metrics {
         }
     }
 
-    /// Counts an answered request.
-    pub fn request(&self, method: &str, route: &str, status: u16, took: Duration) {
-        let is_frame = status == 200 && FRAME_ROUTES.contains(&route);
+    /// Counts an answered request; `localizes` says whether its answer is a localized frame.
+    pub fn request(&self, method: &str, route: &str, status: u16, took: Duration, localizes: bool) {
+        let is_frame = status == 200 && localizes;
         self.last_hour.answered(Timestamp::now(), status, is_frame.then_some(took));
         let route = route.to_owned();
         self.request_seconds
@@ -114,7 +106,7 @@ impl Metrics {
         self.connections.dec();
     }
 
-    /// Sets what is measured when it is asked for.
+    /// Sets the gauges that are read at a scrape.
     pub fn set_levels(&self, levels: &Levels) {
         self.levels.set(levels);
     }

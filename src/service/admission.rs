@@ -11,7 +11,7 @@ impl Service {
 
     /// Waits for the permit to decode and infer one picture.
     pub(super) async fn admit(&self, demand: AdmissionRequest) -> Result<Permit, ServiceError> {
-        self.admission.enter(demand).await.map_err(|refused| self.counted(refused))
+        self.admission.acquire(demand).await.map_err(|refused| self.counted(refused))
     }
 
     fn counted(&self, refused: Rejected) -> ServiceError {

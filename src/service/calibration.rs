@@ -9,8 +9,8 @@ use uuid::Uuid;
 use super::{Service, ServiceError};
 use whereabouts_core::confidence::{COMPARED, NullDistribution};
 use whereabouts_core::{Calibration, Evidence, Map};
-use whereabouts_refine::{RefineError, Refiner};
-use whereabouts_store::{HardNegatives, IndexState};
+use whereabouts_refine::{AttemptPolicy, NegativeEvidence, Refiner};
+use whereabouts_store::IndexState;
 
 /// How often it is looked for maps that have changed.
 const LOOK: Duration = Duration::from_millis(500);
@@ -21,9 +21,12 @@ const PAUSE_PER_LOOK: u32 = 10;
 /// But no longer than this: measuring takes long too.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
 
-/// The pause when those who refine jobs have no time, and how often that may happen for one image.
-const PAUSE: Duration = Duration::from_millis(200);
-const PAUSES: usize = 300;
+/// How long to wait for one image while the threads that refine are busy: jobs have priority.
+const ATTEMPTS: AttemptPolicy = AttemptPolicy {
+    attempts: 301,
+    pause: Duration::from_millis(200),
+    longest_pause: Duration::from_millis(200),
+};
 
 /// A map is measured again when its number of images has changed by one in so many.
 const CHANGED: usize = 5;
@@ -62,7 +65,8 @@ impl Service {
             let IndexState { images, .. } = self.maps.index_state(&map).await?;
             let settled = seen.insert(map.uid, images) == Some(images);
             if settled && self.is_due(&map, images).await? {
-                self.calibrate(&map, self.refiner.as_deref()).await?;
+                let refiner = self.refiner.as_deref();
+                self.calibrate(&map, refiner.and_then(Refiner::negative_evidence)).await?;
             }
         }
         Ok(())
@@ -75,16 +79,17 @@ impl Service {
             || known.images.abs_diff(images) * CHANGED > known.images)
     }
 
-    /// Measures a map: first by similarity, which takes a moment, then by what `refiner` says. What is
-    /// measured counts at once.
+    /// Measures a map: first by similarity, which takes a moment, then by the evidence of a refiner, if it
+    /// measures any. What is measured counts at once.
     pub async fn calibrate(
         &self,
         map: &Map,
-        refiner: Option<&dyn Refiner>,
+        refiner: Option<&dyn NegativeEvidence>,
     ) -> Result<(), ServiceError> {
         let settings = self.settings.calibration;
         let IndexState { images, .. } = self.maps.index_state(map).await?;
-        let asked = self.maps.look_alikes(map, settings, COMPARED.max(settings.candidates)).await?;
+        let asked =
+            self.maps.hard_negatives(map, settings, COMPARED.max(settings.candidates)).await?;
         let similarity = NullDistribution::from(values(asked.iter().filter_map(|asked| {
             Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
         })));
@@ -95,7 +100,9 @@ impl Service {
             let mut found = Vec::new();
             for mut asked in asked.into_iter().step_by(step) {
                 asked.others.truncate(settings.candidates);
-                found.extend(chance(refiner, map, &asked).await);
+                // A map that cannot be measured completely is measured as far as possible.
+                let measure = || refiner.best_negative(map, &asked);
+                found.extend(ATTEMPTS.run(measure).await.ok().flatten());
             }
             measured.agreement = NullDistribution::from(values(found.into_iter()));
         }
@@ -114,18 +121,4 @@ fn values(evidence: impl Iterator<Item = Evidence>) -> Vec<f32> {
             Evidence::Similarity(value) | Evidence::Agreement(value) => value,
         })
         .collect()
-}
-
-/// What speaks for the first of these, which are all wrong. Jobs go first.
-async fn chance(refiner: &dyn Refiner, map: &Map, asked: &HardNegatives) -> Option<Evidence> {
-    for _ in 0..PAUSES {
-        match refiner.chance(map, asked).await {
-            Ok(evidence) => return evidence,
-            Err(RefineError::Transient(_) | RefineError::Deferred { .. }) => {
-                tokio::time::sleep(PAUSE).await;
-            }
-            Err(RefineError::Permanent(_)) => return None,
-        }
-    }
-    None
 }

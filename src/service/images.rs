@@ -8,10 +8,11 @@ use tokio_util::sync::CancellationToken;
 
 use super::{SUPERSEDED, Service, ServiceError};
 use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
-use whereabouts_core::{DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose};
+use whereabouts_core::{DescriptorKind, Image, ImageId, Map, MapName, MediaType, Pose};
 use whereabouts_store::{Added, StoreError};
 use whereabouts_vision::{
-    AdmissionRequest, ExtractError, Extraction, Extractor, PoolError, WorkClass, decode, preprocess,
+    AdmissionRequest, ExtractError, Extraction, Extractor, FeatureSet, PoolError, WorkClass,
+    decode, preprocess,
 };
 
 /// An image to add.
@@ -31,14 +32,15 @@ impl Service {
         if new.bytes.is_empty() {
             return Err(empty_body());
         }
-        let digest = Digest::of(&new.bytes);
         let (mut pin, mut left) = (None, SUPERSEDED);
         loop {
             let (map, extractor) = self.usable_map(map).await?;
             let meta = CheckedMeta::new(new.meta.clone(), &map)?;
             let bytes = new.bytes.clone();
-            let extraction = self.extract(&extractor, bytes, map.descriptor, new.demand).await?;
+            let (kind, features) = (map.descriptor, FeatureSet::DescriptorOnly);
+            let extraction = self.extract(&extractor, bytes, kind, features, new.demand).await?;
             self.metrics.observe_extraction(&extraction);
+            let digest = extraction.digest;
             let image = Image {
                 id: meta.id.unwrap_or_else(|| ImageId::from_digest(&digest)),
                 digest,
@@ -143,6 +145,7 @@ impl Service {
         extractor: &Arc<Extractor>,
         bytes: Bytes,
         kind: DescriptorKind,
+        features: FeatureSet,
         demand: AdmissionRequest,
     ) -> Result<Extraction, ServiceError> {
         let permit = Arc::new(self.admit(demand).await?);
@@ -152,16 +155,10 @@ impl Service {
         let begin = move || {
             // Whoever leaves now gives the permit back when the thread is free.
             let _decoding = decoding;
-            beginning.begin(&bytes, || !gone.is_cancelled())
+            beginning.begin(&bytes, kind, features, || !gone.is_cancelled())
         };
-        let extracting = self.on_pool(begin).await?;
-        let inferred = extracting.inferred().await?;
-        // Not by the pool, where it would wait although nearly all is done.
-        let extractor = Arc::clone(extractor);
-        let finishing = tokio::task::spawn_blocking(move || extractor.finish(inferred, kind)).await;
-        let extraction = finishing
-            .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))??;
-        permit.served();
+        let extraction = self.on_pool(begin).await?.result().await?;
+        permit.complete();
         Ok(extraction)
     }
 
@@ -173,7 +170,7 @@ impl Service {
         match self.pool.run(work).await {
             Ok(result) => Ok(result?),
             Err(PoolError::Overloaded(overloaded)) => Err(overloaded.into()),
-            Err(error @ PoolError::BrokeOff) => {
+            Err(error @ PoolError::Aborted) => {
                 Err(ServiceError::new(ErrorKind::Internal, error.to_string()))
             }
         }
@@ -193,7 +190,7 @@ impl CheckedMeta {
         check_tags(&meta.tags)?;
         Ok(Self {
             id: meta.id.map(|id| id.parse()).transpose()?,
-            pose: meta.pose.map(|pose| Pose::from_json(map.frame, pose)).transpose()?,
+            pose: meta.pose.map(|pose| pose.check(map.frame)).transpose()?,
             captured_at: meta.captured_at,
             tags: meta.tags,
         })

@@ -11,9 +11,9 @@ use uuid::Uuid;
 use super::images::page_size;
 use super::{Service, ServiceError};
 use whereabouts_api::{ErrorKind, JobPage, PairRegions};
-use whereabouts_core::{ImageId, Job, MediaType};
-use whereabouts_refine::RefineError;
-use whereabouts_store::{JobFilter, JobList};
+use whereabouts_core::{ImageId, Job, MediaType, PairRegion};
+use whereabouts_refine::{RefineError, RefineInput, RegionMatcher};
+use whereabouts_store::{JobFilter, JobList, JobRecord};
 
 /// The longest text that jobs are searched for, in characters.
 const LONGEST_SEARCH: usize = 200;
@@ -67,7 +67,7 @@ impl Service {
 
     /// How long ago the oldest of them was submitted; zero, if there is none.
     pub async fn age_of_oldest_job(&self) -> Result<Duration, ServiceError> {
-        let submitted = self.jobs.oldest_open().await?;
+        let submitted = self.jobs.oldest_unfinished().await?;
         let age = submitted.map(|submitted| Timestamp::now().duration_since(submitted));
         // The clock of whoever submitted it may be ahead.
         Ok(age.and_then(|age| age.try_into().ok()).unwrap_or_default())
@@ -92,9 +92,9 @@ impl Service {
         let record = self.jobs.job(id).await?.ok_or_else(|| no_job(id))?;
         let refiner = self.refiner.as_ref().filter(|refiner| refiner.kind() == record.job.refiner);
         let _turn = self.matching.acquire().await;
-        let regions = match refiner {
-            Some(refiner) => {
-                refiner.regions(&record, image).await.map_err(|error| match error {
+        let regions = match refiner.and_then(|refiner| refiner.region_matcher()) {
+            Some(matcher) => {
+                self.regions(&record, matcher, image).await.map_err(|error| match error {
                     RefineError::Permanent(why) => ServiceError::not_found(why),
                     RefineError::Transient(why) | RefineError::Deferred { why, .. } => {
                         ServiceError::new(ErrorKind::Unavailable, why)
@@ -110,6 +110,16 @@ impl Service {
             ))
         })?;
         Ok(PairRegions { regions })
+    }
+
+    async fn regions(
+        &self,
+        record: &JobRecord,
+        matcher: &dyn RegionMatcher,
+        image: &ImageId,
+    ) -> Result<Option<Vec<PairRegion>>, RefineError> {
+        let input = RefineInput::of_job(record, self.maps.as_ref()).await?;
+        matcher.regions(&input, image).await
     }
 
     /// Waits until the job has ended, but no longer than `longest`; the job as it then is.

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::{Principal, ServiceError};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::ApiKey;
-use whereabouts_store::{Buckets, TokenGrant, TokenRequest};
+use whereabouts_store::{TokenBuckets, TokenGrant, TokenRequest};
 
 /// A bucket of a key fills up in this time.
 const WINDOW: Duration = Duration::from_secs(60);
@@ -35,11 +35,11 @@ pub struct Allowances {
 
 /// What each key has asked for lately, by its id.
 #[derive(Debug, Default)]
-pub struct Limits(Buckets);
+pub struct Limits(TokenBuckets);
 
 impl Limits {
     /// Limits that these buckets keep.
-    pub fn new(buckets: Buckets) -> Self {
+    pub fn new(buckets: TokenBuckets) -> Self {
         Self(buckets)
     }
 
@@ -49,19 +49,19 @@ impl Limits {
         if draws.iter().all(|draw| draw.per_minute == 0.0) {
             return (Allowances::default(), Ok(()));
         }
-        let TokenGrant { taken, left } = match self.0.draw(&key.id, draws).await {
+        let TokenGrant { granted, remaining } = match self.0.take(&key.id, draws).await {
             Ok(drawn) => drawn,
             Err(error) => return (Allowances::default(), Err(error.into())),
         };
         let [requests, bytes] = [0, 1].map(|index| {
             let limit = draws[index].per_minute;
-            (limit > 0.0).then(|| (limit, left[index]))
+            (limit > 0.0).then(|| (limit, remaining[index]))
         });
         let allowances = Allowances {
             requests: requests.map(|(limit, left)| allowance(limit, left)),
             bytes: bytes.map(|(limit, left)| allowance(limit, left)),
         };
-        if taken {
+        if granted {
             return (allowances, Ok(()));
         }
         let (pause, what) = match (requests, bytes) {
@@ -95,9 +95,9 @@ impl Limits {
         if key.limits.bytes_per_minute.is_none() || count == 0 {
             return;
         }
-        let requests = TokenRequest { needed: f64::MIN, taken: 0.0, ..requests(key) };
+        let requests = TokenRequest { required: f64::MIN, amount: 0.0, ..requests(key) };
         if let Err(error) =
-            self.0.draw(&key.id, [requests, bytes(key, f64::MIN, count as f64)]).await
+            self.0.take(&key.id, [requests, bytes(key, f64::MIN, count as f64)]).await
         {
             tracing::warn!(%error, "the bytes of a body are not counted");
         }
@@ -107,14 +107,14 @@ impl Limits {
 fn requests(key: &ApiKey) -> TokenRequest {
     key.limits.requests_per_minute.map_or(TokenRequest::UNLIMITED, |limit| TokenRequest {
         per_minute: f64::from(limit),
-        needed: 1.0,
-        taken: 1.0,
+        required: 1.0,
+        amount: 1.0,
     })
 }
 
 /// A body may be larger than what is left: then there is less than nothing for a while.
-fn bytes(key: &ApiKey, needed: f64, taken: f64) -> TokenRequest {
-    let bytes = |limit| TokenRequest { per_minute: limit as f64, needed, taken };
+fn bytes(key: &ApiKey, required: f64, amount: f64) -> TokenRequest {
+    let bytes = |limit| TokenRequest { per_minute: limit as f64, required, amount };
     key.limits.bytes_per_minute.map_or(TokenRequest::UNLIMITED, bytes)
 }
 

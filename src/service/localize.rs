@@ -15,7 +15,7 @@ use whereabouts_core::{Calibration, Candidate, Digest, Estimate, Map, MapName, P
 use whereabouts_index::SearchMode;
 use whereabouts_store::StoreError;
 use whereabouts_telemetry::traces;
-use whereabouts_vision::{AdmissionRequest, Extraction, WorkClass};
+use whereabouts_vision::{AdmissionRequest, Extraction, FeatureSet, WorkClass};
 
 /// When a caller no longer wants the answer, if it said so.
 #[derive(Debug, Clone, Copy, Default)]
@@ -74,8 +74,11 @@ impl Service {
         let compared = if refined { self.settings.candidates } else { 0 };
         let followed = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
         let wanted = k.max(compared).max(COMPARED).max(followed);
+        let features =
+            if refined { FeatureSet::DescriptorAndDense } else { FeatureSet::DescriptorOnly };
+        let search = (wanted, SearchMode::Fast);
         let Retrieved { map, model, extraction, mut candidates, searched } =
-            self.retrieve(&request.map, &request.frame, wanted, SearchMode::Fast, demand).await?;
+            self.retrieve(&request.map, &request.frame, search, features, demand).await?;
 
         let calibration = self.maps.calibration(&map).await?.unwrap_or_default();
         let track = match request.track {
@@ -91,6 +94,7 @@ impl Service {
                 query_id,
                 bytes: request.frame,
                 model,
+                digest: extraction.digest,
                 media_type: extraction.media_type,
                 descriptor: extraction.descriptor,
                 dense: extraction.dense,
@@ -143,14 +147,15 @@ impl Service {
         &self,
         map: &MapName,
         frame: &Bytes,
-        k: usize,
-        mode: SearchMode,
+        (k, mode): (usize, SearchMode),
+        features: FeatureSet,
         demand: AdmissionRequest,
     ) -> Result<Retrieved, ServiceError> {
         let mut left = SUPERSEDED;
         loop {
             let (map, extractor) = self.usable_map(map).await?;
-            let extracting = self.extract(&extractor, frame.clone(), map.descriptor, demand);
+            let (frame, kind) = (frame.clone(), map.descriptor);
+            let extracting = self.extract(&extractor, frame, kind, features, demand);
             let extraction = extracting.instrument(traces::stage("extract")).await?;
             self.metrics.observe_extraction(&extraction);
             let searching = Instant::now();

@@ -45,7 +45,7 @@ impl Service {
         let settings = self.settings.once;
         let progress = Progress::Running { process: self.process, job: None };
         let reserved = IdempotencyRecord { fingerprint, at: now, progress };
-        Ok(match self.answers.reserve_answer(id, reserved, settings.since(now)).await? {
+        Ok(match self.answers.reserve_request(id, reserved, settings.since(now)).await? {
             None => Once::First,
             Some(known) if known.fingerprint != fingerprint => Once::Other,
             Some(IdempotencyRecord { progress: Progress::Answered(kept), .. }) => Once::Again(kept),
@@ -62,11 +62,11 @@ impl Service {
         kept: Option<StoredResponse>,
     ) -> Result<(), ServiceError> {
         match kept {
-            None => self.answers.forget_answer(id).await?,
+            None => self.answers.forget_request(id).await?,
             Some(kept) => {
                 let progress = Progress::Answered(kept);
                 let answer = IdempotencyRecord { fingerprint, at: Timestamp::now(), progress };
-                self.answers.keep_answer(id, answer).await?;
+                self.answers.store_response(id, answer).await?;
             }
         }
         Ok(())

@@ -14,7 +14,7 @@ use super::{Service, ServiceError};
 use whereabouts_api::{ErrorKind, MapState, Reindex, ReindexRequest, ReindexState};
 use whereabouts_core::{Descriptor, DescriptorKind, Image, Map, MapName};
 use whereabouts_store::Draft;
-use whereabouts_vision::{AdmissionRequest, Extractor};
+use whereabouts_vision::{AdmissionRequest, Extractor, FeatureSet};
 
 /// Images that are looked up at a time.
 const PAGE: usize = 256;
@@ -184,7 +184,8 @@ impl Service {
         };
         let _turn = self.reindexes.turn.acquire().await;
         // It waits for as long as anybody else does.
-        match self.extract(extractor, bytes, descriptor, AdmissionRequest::BACKGROUND).await {
+        let (features, demand) = (FeatureSet::DescriptorOnly, AdmissionRequest::BACKGROUND);
+        match self.extract(extractor, bytes, descriptor, features, demand).await {
             Ok(extraction) => Ok(Some(extraction.descriptor)),
             Err(error) => Err(left_behind(image, &error.detail)),
         }

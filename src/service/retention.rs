@@ -9,7 +9,7 @@ use tokio_util::sync::CancellationToken;
 use super::IdempotencySettings;
 use crate::ServiceMetrics;
 use whereabouts_core::utc_day;
-use whereabouts_store::{IdempotencyStore, KeepJobs, RemovedJobs, Retention, StoreError};
+use whereabouts_store::{IdempotencyStore, JobRetention, RemovedJobs, Retention, StoreError};
 
 /// How long what is kept, and how it is removed.
 #[derive(Debug, Clone, Copy)]
@@ -60,10 +60,10 @@ impl Janitor {
         let now = Timestamp::now();
         let days = SignedDuration::from_hours(24 * i64::from(self.settings.usage_days));
         self.store.forget_usage(utc_day(now).saturating_sub(days)).await?;
-        self.store.clear_left().await?;
+        self.store.collect_garbage().await?;
         let once = self.settings.once;
-        self.answers.forget_answers(once.since(now), once.most).await?;
-        let keep = KeepJobs {
+        self.answers.prune_responses(once.since(now), once.most).await?;
+        let keep = JobRetention {
             since: self.settings.keep.map(|keep| before(now, keep)),
             most: self.settings.most,
             settled: before(now, self.settings.settle),

@@ -28,9 +28,11 @@ pub(super) struct Frame {
     pub bytes: Bytes,
     /// The identity of the model that looked at it.
     pub model: Digest,
+    /// SHA-256 of the bytes.
+    pub digest: Digest,
     pub media_type: MediaType,
     pub descriptor: Descriptor,
-    pub dense: DenseFeatures,
+    pub dense: Option<DenseFeatures>,
 }
 
 impl Service {
@@ -64,13 +66,15 @@ impl Service {
         }
         let query = Query {
             id: frame.query_id,
-            digest: Digest::of(&frame.bytes),
+            digest: frame.digest,
             media_type: frame.media_type,
             created_at: Timestamp::now(),
             descriptor: refiner.wants_descriptor().then_some(frame.descriptor),
         };
         let key = DenseKey { model: frame.model, picture: query.digest };
-        self.dense.insert(key, Arc::new(frame.dense));
+        if let Some(dense) = frame.dense {
+            self.dense.insert(key, Arc::new(dense));
+        }
         let trace = traces::current();
         let job = Job {
             priority,
@@ -134,7 +138,7 @@ impl Service {
         let pause = match why.reason {
             NoJobReason::QueueFull => {
                 let pace = self.job_pace.lock();
-                self.admission.within_bounds(pace.until_done(1))
+                self.admission.clamp_pause(pace.until_done(1))
             }
             _ => self.admission.retry_after(),
         };

@@ -9,7 +9,7 @@ use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, Image, ImageId, Map, MapName, MediaType};
 use whereabouts_store::{Added, StoreError};
-use whereabouts_vision::AdmissionRequest;
+use whereabouts_vision::{AdmissionRequest, FeatureSet};
 
 /// The most numbers in a descriptor that comes from elsewhere.
 const MAX_DIM: usize = 1 << 16;
@@ -98,7 +98,8 @@ impl Service {
             }
             None => {
                 let (_, extractor) = self.usable_map(name).await?;
-                self.extract(&extractor, bytes.clone(), map.descriptor, demand).await?.descriptor
+                let (bytes, features) = (bytes.clone(), FeatureSet::DescriptorOnly);
+                self.extract(&extractor, bytes, map.descriptor, features, demand).await?.descriptor
             }
         };
         let _pin = self.blobs.put_blob(image.digest, bytes).await?;
@@ -108,7 +109,7 @@ impl Service {
 }
 
 fn fits(map: &Map, from: &Map) -> bool {
-    map.is_like(from) && map.frame == from.frame
+    map.is_compatible_with(from) && map.frame == from.frame
 }
 
 fn unlike(map: &Map, from: &Map) -> ServiceError {

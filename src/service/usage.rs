@@ -33,7 +33,7 @@ impl Service {
 
     /// The budget of today, if the refiner asks models outside.
     pub fn today(&self) -> Option<Today> {
-        let levels = self.refiner.as_ref()?.levels()?;
+        let levels = self.refiner.as_ref()?.paid_calls()?.levels();
         Some(Today {
             date: utc_day(Timestamp::now()),
             tokens: levels.spent_today.tokens,

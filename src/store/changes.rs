@@ -1,17 +1,17 @@
-//! What a change makes of a record, whichever store keeps it.
+//! State transitions of records and the errors they share, the same for every store.
 
 use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::{IdempotencyRecord, JobRecord, Progress, Release, Step, StoreError, StoredDelivery};
 use whereabouts_core::{
-    Attempt, Delivery, DeliveryState, Descriptor, Image, Job, JobState, Map, Message, Priority,
-    StoredWebhook, Then, Usage, WebhookEvent,
+    Attempt, Delivery, DeliveryState, Descriptor, Disposition, Image, Job, JobState, Map, Message,
+    Priority, StoredWebhook, Usage, WebhookEvent,
 };
 
 impl JobRecord {
-    /// Gives the job to a worker.
-    pub(super) fn take(&mut self, now: Timestamp) {
+    /// Starts an attempt by a worker.
+    pub(super) fn start_attempt(&mut self, now: Timestamp) {
         self.job.state = JobState::Running;
         self.job.error = None;
         self.job.started_at.get_or_insert(now);
@@ -19,8 +19,8 @@ impl JobRecord {
         self.claims += 1;
     }
 
-    /// Gives the job back to the queue.
-    pub(super) fn give_back(&mut self, release: &Release) {
+    /// Returns the job to the queue.
+    pub(super) fn requeue(&mut self, release: &Release) {
         self.job.state = JobState::Queued;
         self.job.error = Some(release.why.clone());
         if !release.counts {
@@ -28,7 +28,7 @@ impl JobRecord {
         }
     }
 
-    /// Ends a job that has not ended; `false` if it has.
+    /// Cancels the job. Returns `false` if it had already ended.
     pub(super) fn cancel(&mut self, now: Timestamp) -> bool {
         if self.job.state.is_final() {
             return false;
@@ -38,8 +38,8 @@ impl JobRecord {
         true
     }
 
-    /// Queues a job again that ended without success.
-    pub(super) fn queue_again(&mut self) -> Result<(), StoreError> {
+    /// Queues a failed, cancelled or degraded job again.
+    pub(super) fn retry(&mut self) -> Result<(), StoreError> {
         let job = &mut self.job;
         match job.state {
             JobState::Failed | JobState::Cancelled | JobState::Degraded => {}
@@ -54,12 +54,12 @@ impl JobRecord {
         Ok(())
     }
 
-    /// Adds a step: its cost, and its description in the place of one of the same image.
+    /// Adds the cost of a step, and its description, which replaces an earlier one of the same image.
     pub fn add(&mut self, step: Step) {
         let Self { job, candidates, .. } = self;
         job.usage += step.usage;
         if let Some(description) = step.description {
-            job.descriptions.retain(|known| known.image_id != description.image_id);
+            job.descriptions.retain(|earlier| earlier.image_id != description.image_id);
             job.descriptions.push(description);
             job.descriptions.sort_by_key(|description| {
                 candidates.iter().position(|candidate| candidate.image_id == description.image_id)
@@ -69,18 +69,18 @@ impl JobRecord {
 }
 
 impl IdempotencyRecord {
-    /// What takes the place of `known`, which counts no more: what was queued for the same request is queued.
-    pub(super) fn in_place_of(mut self, known: &Self) -> Self {
+    /// Replaces a record that no longer counts, and inherits the job queued for the same request.
+    pub(super) fn replacing(mut self, earlier: &Self) -> Self {
         if let (Progress::Running { job, .. }, Progress::Running { job: Some(queued), .. }) =
-            (&mut self.progress, &known.progress)
-            && self.fingerprint == known.fingerprint
+            (&mut self.progress, &earlier.progress)
+            && self.fingerprint == earlier.fingerprint
         {
             *job = Some(*queued);
         }
         self
     }
 
-    /// The job that was queued for the request, while it has no answer.
+    /// Returns the job queued for the request, while the request has no response.
     pub(super) fn job(&self) -> Option<Uuid> {
         match self.progress {
             Progress::Running { job, .. } => job,
@@ -88,21 +88,21 @@ impl IdempotencyRecord {
         }
     }
 
-    /// Notes that a job was queued for the request.
-    pub(super) fn queued(&mut self, id: Uuid) {
+    /// Records the job queued for the request.
+    pub(super) fn set_job(&mut self, id: Uuid) {
         if let Progress::Running { job, .. } = &mut self.progress {
             *job = Some(id);
         }
     }
 }
 
-/// When a job ended that has ended.
+/// Returns when an ended job ended.
 pub(super) fn ended_at(job: &Job) -> Timestamp {
     job.finished_at.unwrap_or(job.created_at)
 }
 
-/// What webhooks are to be told of a job that has just ended.
-pub(super) fn news_of(
+/// Returns the deliveries to send because a job has ended.
+pub(super) fn deliveries_for(
     job: &Job,
     webhooks: impl IntoIterator<Item = StoredWebhook>,
 ) -> Result<Vec<StoredDelivery>, StoreError> {
@@ -112,44 +112,45 @@ pub(super) fn news_of(
     let message = Message { event, timestamp, data: job };
     let body =
         serde_json::to_vec(&message).map_err(|error| StoreError::Failed(error.to_string()))?;
-    let wanting = webhooks.into_iter().filter(|stored| stored.webhook.wants(event, job));
+    let subscribed = webhooks.into_iter().filter(|stored| stored.webhook.subscribes_to(event, job));
     let delivery = |stored: StoredWebhook| StoredDelivery {
         delivery: Delivery::queued(stored.webhook.id, event, Some(job.id), now),
         body: body.clone(),
     };
-    Ok(wanting.map(delivery).collect())
+    Ok(subscribed.map(delivery).collect())
 }
 
-/// The map that is stored when `wanted` is put in the place of `stored`.
+/// Returns the record to store when a map is changed from `stored` to `requested`.
 pub(super) fn changed_map(
     stored: Map,
-    wanted: Map,
+    requested: Map,
     has_images: impl FnOnce() -> bool,
 ) -> Result<Map, StoreError> {
-    if stored.revision != wanted.revision {
+    if stored.revision != requested.revision {
         return Err(StoreError::Superseded(stored.name));
     }
-    let same = stored.is_like(&wanted) && stored.frame == wanted.frame;
+    let same = stored.is_compatible_with(&requested) && stored.frame == requested.frame;
     if !same && has_images() {
         return Err(StoreError::Conflict(format!(
             "the map {} has images, so its model ({} at {} precision), descriptor ({}) and frame ({}) \
-             are fixed; `whereabouts index --reindex` changes model and descriptor, a new map has any \
-             frame",
+             are fixed; `whereabouts index --reindex` changes model and descriptor; another frame \
+             needs a new map",
             stored.name, stored.model, stored.precision, stored.descriptor, stored.frame
         )));
     }
-    // Descriptors of another shape go elsewhere.
-    let uid = if same { stored.uid } else { wanted.uid };
-    Ok(Map { uid, created_at: stored.created_at, ..wanted })
+    // A new uid gives descriptors of another shape a folder or table of their own.
+    let uid = if same { stored.uid } else { requested.uid };
+    Ok(Map { uid, created_at: stored.created_at, ..requested })
 }
 
-/// The image that is there already, if it has the bytes that were sent.
+/// Returns the stored image if it has the bytes that were sent, otherwise a conflict.
 pub(super) fn same_bytes(present: Image, sent: &Image) -> Result<Image, StoreError> {
     if present.digest == sent.digest {
         return Ok(present);
     }
     Err(StoreError::Conflict(format!(
-        "the image id {:?} is taken by other bytes ({}); choose another id, or delete that image first",
+        "the image id {:?} is taken by an image with other bytes ({}); choose another id, or delete \
+         that image first",
         sent.id.as_str(),
         present.digest
     )))
@@ -159,24 +160,24 @@ pub(super) fn removed(map: &Map) -> StoreError {
     StoreError::NotFound(format!("the map {} was removed", map.name))
 }
 
-/// Refuses a descriptor that a map cannot be searched for.
+/// Refuses a query descriptor whose dimension differs from the map's.
 pub(super) fn check_dim(map: &Map, query: &Descriptor) -> Result<(), StoreError> {
     if query.dim() == map.dim {
         return Ok(());
     }
     Err(StoreError::Conflict(format!(
-        "a descriptor of {} numbers cannot be searched in a map of {}",
+        "the query's descriptor has {} dimensions, those of the map have {}",
         query.dim(),
         map.dim
     )))
 }
 
 pub(super) fn being_reindexed(map: &Map) -> StoreError {
-    StoreError::Conflict(format!("the map {} is being reindexed already", map.name))
+    StoreError::Conflict(format!("the map {} is already being reindexed", map.name))
 }
 
-/// A priority's place in the queue; those of a lower number go first.
-pub(super) fn place(priority: Priority) -> u8 {
+/// Returns the sort key of a priority in the queue; lower numbers go first.
+pub(super) fn queue_rank(priority: Priority) -> u8 {
     match priority {
         Priority::High => 0,
         Priority::Normal => 1,
@@ -184,7 +185,7 @@ pub(super) fn place(priority: Priority) -> u8 {
     }
 }
 
-/// When a job was submitted, which its id says.
+/// Returns when a job was submitted, from the timestamp in its id.
 pub(super) fn submitted_at(id: Uuid) -> Option<Timestamp> {
     let (seconds, nanoseconds) = id.get_timestamp()?.to_unix();
     Timestamp::new(seconds.cast_signed(), nanoseconds.cast_signed()).ok()
@@ -195,26 +196,26 @@ pub(super) fn no_job(id: Uuid) -> StoreError {
 }
 
 pub(super) fn no_webhook(id: Uuid) -> StoreError {
-    StoreError::NotFound(format!("there is no webhook {id}; GET /webhooks lists those there are"))
+    StoreError::NotFound(format!("there is no webhook {id}; GET /webhooks lists the existing ones"))
 }
 
 pub(super) fn no_delivery(id: Uuid) -> StoreError {
     StoreError::NotFound(format!(
-        "the webhook has no delivery {id}; one that has ended is removed in time (webhooks.keep_days, \
-         webhooks.max_deliveries)"
+        "the webhook has no delivery {id}; ended deliveries are removed after a while \
+         (webhooks.keep_days, webhooks.max_deliveries)"
     ))
 }
 
-/// Refuses to tell a webhook something that is to be told nothing.
+/// Refuses a webhook that is disabled.
 pub(super) fn check_enabled(stored: &StoredWebhook) -> Result<(), StoreError> {
     if stored.webhook.disabled_at.is_none() {
         return Ok(());
     }
     let why = stored.webhook.disabled_reason.as_deref().unwrap_or_default();
-    Err(StoreError::Conflict(format!("the webhook is disabled ({why}); make another one")))
+    Err(StoreError::Conflict(format!("the webhook is disabled ({why}); create another one")))
 }
 
-/// From now on a webhook is to be told nothing; `false` if that was so before.
+/// Disables a webhook. Returns `false` if it already was.
 pub(super) fn disable(stored: &mut StoredWebhook, at: Timestamp, why: &str) -> bool {
     let webhook = &mut stored.webhook;
     if webhook.disabled_at.is_some() {
@@ -225,20 +226,21 @@ pub(super) fn disable(stored: &mut StoredWebhook, at: Timestamp, why: &str) -> b
     true
 }
 
-/// A delivery after an attempt; `None` if it waits no more.
-pub(super) fn attempted(known: Delivery, attempt: Attempt) -> Option<Delivery> {
-    // What was given up meanwhile has been delivered all the same.
-    let counts = known.state == DeliveryState::Waiting || attempt.then == Then::Delivered;
-    counts.then(|| known.after(attempt))
+/// Returns a delivery as it is after an attempt; `None` if it was no longer waiting.
+pub(super) fn attempted(delivery: Delivery, attempt: Attempt) -> Option<Delivery> {
+    // A success counts even if the delivery was given up while the attempt ran.
+    let counts =
+        delivery.state == DeliveryState::Waiting || attempt.disposition == Disposition::Delivered;
+    counts.then(|| delivery.with_attempt(attempt))
 }
 
-pub(super) fn too_many_webhooks(most: usize) -> StoreError {
+pub(super) fn too_many_webhooks(max: usize) -> StoreError {
     StoreError::Conflict(format!(
-        "there are {most} webhooks, the most (webhooks.max); delete one first"
+        "there are already {max} webhooks, the maximum (webhooks.max); delete one first"
     ))
 }
 
-/// Refuses to queue a delivery again that waits anyway.
+/// Refuses to requeue a delivery that is still waiting.
 pub(super) fn check_ended(delivery: &Delivery) -> Result<(), StoreError> {
     match delivery.next_attempt_at {
         None => Ok(()),

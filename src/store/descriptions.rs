@@ -1,58 +1,69 @@
-//! The cache of pairwise descriptions: paid for once, kept until evicted.
+//! The cache of pairwise descriptions: each is bought once and kept until it is evicted.
+
+use std::time::Duration;
 
 use async_trait::async_trait;
 use jiff::Timestamp;
 use uuid::Uuid;
 
+use super::StoreError;
 use whereabouts_core::{
     CacheLevels, CachedDescription, DescribedFrame, Descriptor, Digest, SimilarFrame,
 };
 
-use crate::StoreError;
+/// Bounds of the description cache.
+#[derive(Debug, Clone, Copy)]
+pub struct DescriptionBounds {
+    /// Maximum size of all records, in bytes.
+    pub max_bytes: u64,
+    /// Older descriptions have expired and are no longer returned.
+    pub max_age: Duration,
+}
 
-/// Descriptions by key. A key covers all that shapes the text: both pictures, the prompt, the model
-/// and its sampling.
+/// Descriptions by key. A key covers everything that shapes the text: both pictures, the prompt, the
+/// model and its sampling parameters.
 #[async_trait]
 pub trait DescriptionCache: Send + Sync {
-    /// The description of that key, if it is kept.
+    /// Returns the description with this key, if it is cached and has not expired.
     async fn description(&self, key: &Digest) -> Result<Option<CachedDescription>, StoreError>;
-    /// Keeps a description; it is on disk when this returns.
+    /// Caches a description; it is on disk when this returns.
     async fn keep_description(
         &self,
         key: Digest,
         value: CachedDescription,
     ) -> Result<(), StoreError>;
 
-    /// Says that this process is about to buy the description of that key, until that moment at the
-    /// latest; `false` if another process is at it, whose description will soon be kept. Only stores of many
-    /// processes need to know.
-    async fn begin_purchase(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
+    /// Acquires the right to buy the description with this key, so that no two processes pay for the
+    /// same one. The lease expires at `until`. Returns `false` while another process holds it.
+    ///
+    /// A store with a single process always grants it.
+    async fn acquire_lease(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
         let _ = (key, until);
         Ok(true)
     }
-    /// Says that nothing came of it.
-    async fn end_purchase(&self, key: &Digest) -> Result<(), StoreError> {
+    /// Releases the lease of this process without a description having been bought.
+    async fn release_lease(&self, key: &Digest) -> Result<(), StoreError> {
         let _ = key;
         Ok(())
     }
 
-    /// Earlier frames of the map that are as similar as `at_least` (cosine), the most similar
-    /// first; no more than a few.
+    /// Returns a few earlier frames of the map whose cosine similarity to a descriptor is at least
+    /// `at_least`, the most similar first.
     async fn similar_frames(
         &self,
         map: Uuid,
         to: &Descriptor,
         at_least: f32,
     ) -> Result<Vec<SimilarFrame>, StoreError>;
-    /// Remembers a frame of the map whose pairs were described; the oldest beyond `most` are
-    /// forgotten.
+    /// Stores a frame of the map whose pairs were described, and deletes the oldest frames in excess
+    /// of `max_frames`.
     async fn keep_frame(
         &self,
         map: Uuid,
         frame: DescribedFrame,
-        most: usize,
+        max_frames: usize,
     ) -> Result<(), StoreError>;
 
-    /// How full it is.
+    /// Returns the number of cached descriptions and their size.
     fn levels(&self) -> CacheLevels;
 }

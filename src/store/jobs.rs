@@ -1,4 +1,4 @@
-//! What a store promises of jobs.
+//! Jobs and their queue.
 
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -11,133 +11,135 @@ use whereabouts_core::{
     Candidate, Description, Descriptor, Digest, Job, JobState, MediaType, Usage,
 };
 
-/// What a robot posted, kept because a job needs it.
+/// A frame that a robot posted, kept because a job needs it.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Query {
-    /// Its id.
+    /// The id of the query.
     pub id: Uuid,
     /// The digest of the frame.
     pub digest: Digest,
     /// The frame's format.
     pub media_type: MediaType,
-    /// When it came.
+    /// When it was received.
     pub created_at: Timestamp,
-    /// The frame's descriptor, where the refiner wants it.
+    /// The frame's descriptor, if the refiner needs it.
     #[serde(default)]
     pub descriptor: Option<Descriptor>,
 }
 
-/// A job with what its worker needs.
+/// A job together with what its worker needs.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct JobRecord {
-    /// What callers see.
+    /// The job as the API returns it.
     pub job: Job,
-    /// Tells the map from a later one of the same name.
+    /// Distinguishes the map from a later one of the same name.
     pub map_uid: Uuid,
-    /// The revision of the map whose descriptors the query's is like.
+    /// The revision of the map that the query was searched in; its descriptor belongs to this one.
     #[serde(default)]
     pub revision: u32,
     /// The query.
     pub query: Query,
     /// The candidates in coarse order.
     pub candidates: Vec<Candidate>,
-    /// How often a worker has claimed it, whatever became of that.
+    /// How often a worker has claimed the job, whatever the result.
     #[serde(default)]
     pub claims: u32,
-    /// The trace of its request, for the span of its refinement (W3C Trace Context).
+    /// The trace context of the request (W3C), the parent of the refinement's span.
     #[serde(default)]
     pub traceparent: Option<String>,
 }
 
-/// The right of one worker to a job, which ends when the job is cancelled, or when its lease runs out
-/// and another worker claims it.
+/// One worker's claim to a job. It ends when the job is cancelled, or when its lease expires and another
+/// worker claims the job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Claim {
     /// The job.
     pub job: Uuid,
-    /// Which of its claims.
+    /// Counts the claims of this job.
     number: u32,
 }
 
 impl JobRecord {
-    /// The claim of the worker that this record was given to.
+    /// Returns the claim of the worker that received this record.
     pub fn claim(&self) -> Claim {
         Claim { job: self.job.id, number: self.claims }
     }
 
-    /// Whether the job is still that worker's.
+    /// Whether this claim still holds.
     pub fn is_held_by(&self, claim: Claim) -> bool {
         self.job.state == JobState::Running && self.claim() == claim
     }
 }
 
-/// A step of a job that runs.
+/// A completed step of a running job.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Step {
-    /// What the step cost.
+    /// The cost of the step.
     pub usage: Usage,
-    /// The pair that is described now, if the step was that.
+    /// The description of a pair, if the step produced one.
     pub description: Option<Description>,
 }
 
-/// How a claimed job goes back to the queue.
+/// How a claimed job returns to the queue.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Release {
-    /// Why.
+    /// The reason, shown as the job's error.
     pub why: String,
-    /// Nobody takes it before then.
+    /// The job cannot be claimed before this moment.
     pub not_before: Option<Timestamp>,
-    /// Whether the attempt counts.
+    /// Whether the attempt counts against the limit of attempts.
     pub counts: bool,
 }
 
 /// Jobs and their queue.
 #[async_trait]
 pub trait JobStore: Send + Sync {
-    /// Queues a job unless `limit` jobs wait already ([`StoreError::QueueFull`]).
+    /// Queues a job unless `limit` jobs are already queued or running ([`StoreError::QueueFull`]).
     async fn submit(&self, record: JobRecord, limit: usize) -> Result<(), StoreError>;
-    /// The same for a request that was reserved with that id ([`IdempotencyStore::reserve_answer`](super::AnswerStore::reserve_answer)); the job and
-    /// the note that it was queued for this request are one change. If one was queued for it before, by a
-    /// process that ended too soon to answer, gives that one and queues nothing.
+    /// Queues a job for a request that was reserved under this id
+    /// ([`IdempotencyStore::reserve_request`]), and records it there in the same transaction. If an
+    /// earlier process queued a job for the request and ended before it could answer, returns that job
+    /// and queues nothing.
+    ///
+    /// [`IdempotencyStore::reserve_request`]: super::IdempotencyStore::reserve_request
     async fn submit_once(
         &self,
         record: JobRecord,
         limit: usize,
         request: &str,
     ) -> Result<Option<Job>, StoreError>;
-    /// Jobs that wait.
+    /// Returns the number of jobs that are queued or running.
     async fn queued(&self) -> Result<usize, StoreError>;
-    /// When the oldest job that has not ended was submitted.
-    async fn oldest_open(&self) -> Result<Option<Timestamp>, StoreError>;
-    /// One job.
+    /// Returns when the oldest unfinished job was submitted.
+    async fn oldest_unfinished(&self) -> Result<Option<Timestamp>, StoreError>;
+    /// Returns one job.
     async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError>;
-    /// Jobs, newest first, those older than `before`, at most `limit`. A search for a text may look at a
-    /// bounded number of jobs only, and says so.
+    /// Returns up to `limit` jobs older than `before`, newest first. A text search examines a bounded
+    /// number of jobs; [`JobList::searched_to`] says where it stopped.
     async fn jobs(
         &self,
         filter: &JobFilter,
         before: Option<Uuid>,
         limit: usize,
     ) -> Result<JobList, StoreError>;
-    /// Takes, until `lease_until`, a job that waits or whose lease ran out: one of the highest
-    /// priority, and of those the oldest.
+    /// Claims, until `lease_until`, the oldest job of the highest priority among those that are queued
+    /// or whose lease has expired.
     async fn claim(
         &self,
         now: Timestamp,
         lease_until: Timestamp,
     ) -> Result<Option<JobRecord>, StoreError>;
-    /// Adds a step to a claimed job: its cost, and its description in the place of one of the same
-    /// image.
+    /// Adds the cost of a step to a claimed job, and its description, which replaces an earlier one of
+    /// the same image. Does nothing if the claim has ended.
     async fn progress(&self, claim: Claim, step: Step) -> Result<(), StoreError>;
-    /// Gives a claimed job back to the queue.
+    /// Returns a claimed job to the queue. Does nothing if the claim has ended.
     async fn release(&self, claim: Claim, release: Release) -> Result<(), StoreError>;
-    /// Ends a claimed job with what its worker found. As with the two above, nothing happens to a job
-    /// that is no longer that worker's.
+    /// Ends a claimed job with its worker's result. Does nothing if the claim has ended.
     async fn finish(&self, claim: Claim, job: Job) -> Result<(), StoreError>;
-    /// Cancels a job that has not ended; returns it as it then is.
+    /// Cancels a job that has not ended, and returns its new state.
     async fn cancel(&self, id: Uuid) -> Result<Job, StoreError>;
-    /// Queues a job again that ended without success. Its attempts and its cost begin anew.
+    /// Queues a failed, cancelled or degraded job again, with its attempts and cost reset to zero.
     async fn retry(&self, id: Uuid) -> Result<Job, StoreError>;
-    /// The ids of jobs that changed, as they change. A slow listener loses the oldest.
+    /// Returns a receiver of the ids of jobs as they change. A slow receiver misses the oldest ones.
     fn changes(&self) -> broadcast::Receiver<Uuid>;
 }

@@ -1,5 +1,4 @@
-//! Limits that processes keep together: how often something may be done in a minute, and how much may be spent
-//! on a day.
+//! Limits that all processes of a store share: token buckets per minute, and a daily budget.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -12,115 +11,122 @@ use tokio::time::Instant;
 use super::StoreError;
 use whereabouts_core::Spent;
 
-/// What is wanted of a bucket, which fills steadily up to a minute's worth. What it holds may go below zero.
+/// A request to one token bucket. A bucket refills steadily up to one minute's worth of tokens; its
+/// level may be negative.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TokenRequest {
-    /// A minute's worth; 0: there is no limit.
+    /// Tokens per minute, which is also the capacity; 0 for no limit.
     pub per_minute: f64,
-    /// So much must be in it.
-    pub needed: f64,
-    /// So much is taken; below zero, it is given back.
-    pub taken: f64,
+    /// Tokens that the bucket must hold for the request to be granted.
+    pub required: f64,
+    /// Tokens to take; a negative amount returns them.
+    pub amount: f64,
 }
 
 impl TokenRequest {
-    /// Of a bucket without a limit.
-    pub const UNLIMITED: Self = Self { per_minute: 0.0, needed: f64::MIN, taken: 0.0 };
+    /// A request to a bucket without a limit, which is always granted.
+    pub const UNLIMITED: Self = Self { per_minute: 0.0, required: f64::MIN, amount: 0.0 };
 }
 
-/// What two buckets hold after a draw.
+/// The result of a request to two token buckets.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TokenGrant {
-    /// Whether both held enough, so that something was taken from both; else from neither.
-    pub taken: bool,
-    /// What is left in each.
-    pub left: [f64; 2],
+    /// Whether both buckets held enough. If not, nothing was taken from either.
+    pub granted: bool,
+    /// The level of each bucket afterwards.
+    pub remaining: [f64; 2],
 }
 
 /// The limits of all processes that share a store.
 #[async_trait]
 pub trait SharedLimits: Send + Sync {
-    /// Draws from the two buckets of that name; full ones, if there are none yet.
-    async fn draw(&self, name: &str, draws: [TokenRequest; 2]) -> Result<TokenGrant, StoreError>;
-    /// Sets aside what a call may cost at the most on that day; `false` if what was spent and set aside would
-    /// then pass the limit, of which 0 is none. What is spent is taken from it by
-    /// [`UsageStore::add_usage`](super::UsageStore::add_usage).
-    async fn set_aside(&self, day: Date, most: Spent, limit: Spent) -> Result<bool, StoreError>;
-    /// Gives back what was set aside and not needed.
-    async fn give_back(&self, day: Date, unneeded: Spent) -> Result<(), StoreError>;
+    /// Takes tokens from both buckets of this name, or from neither. New buckets are full.
+    async fn take_tokens(
+        &self,
+        name: &str,
+        requests: [TokenRequest; 2],
+    ) -> Result<TokenGrant, StoreError>;
+    /// Reserves the maximum cost of a call in the budget of a day. Returns `false` if spending and
+    /// reservations together would exceed the limit; a limit of 0 means none.
+    ///
+    /// [`UsageStore::add_usage`](super::UsageStore::add_usage) converts reservations into spending.
+    async fn reserve(&self, day: Date, max_cost: Spent, limit: Spent) -> Result<bool, StoreError>;
+    /// Releases the unused part of a reservation.
+    async fn release(&self, day: Date, unused: Spent) -> Result<(), StoreError>;
 }
 
-/// Buckets of this process, or of all.
-pub enum Buckets {
+/// Pairs of token buckets by name, local to this process or shared by all.
+pub enum TokenBuckets {
     /// In memory.
-    Here(Mutex<HashMap<String, Levels>>),
-    /// In a store that processes share.
+    Local(Mutex<HashMap<String, BucketLevels>>),
+    /// In a store that several processes share.
     Shared(Arc<dyn SharedLimits>),
 }
 
-/// What two buckets held at a moment.
+/// The levels of two buckets at a moment.
 #[derive(Debug, Clone, Copy)]
-pub struct Levels {
-    left: [f64; 2],
+pub struct BucketLevels {
+    tokens: [f64; 2],
     at: Instant,
 }
 
-impl Default for Buckets {
+impl Default for TokenBuckets {
     fn default() -> Self {
-        Self::Here(Mutex::default())
+        Self::Local(Mutex::default())
     }
 }
 
-impl std::fmt::Debug for Buckets {
+impl std::fmt::Debug for TokenBuckets {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
-            Self::Here(_) => "Buckets::Here",
-            Self::Shared(_) => "Buckets::Shared",
+            Self::Local(_) => "TokenBuckets::Local",
+            Self::Shared(_) => "TokenBuckets::Shared",
         })
     }
 }
 
-impl Buckets {
-    /// Those of all processes that share a store, or of this one if it has its own.
-    pub fn of(shared: Option<Arc<dyn SharedLimits>>) -> Self {
+impl TokenBuckets {
+    /// Uses the shared limits if there are any, otherwise buckets of this process.
+    pub fn new(shared: Option<Arc<dyn SharedLimits>>) -> Self {
         shared.map_or_else(Self::default, Self::Shared)
     }
 
-    /// See [`SharedLimits::draw`].
-    pub async fn draw(
+    /// Takes tokens from both buckets of this name, or from neither; see
+    /// [`SharedLimits::take_tokens`].
+    pub async fn take(
         &self,
         name: &str,
-        draws: [TokenRequest; 2],
+        requests: [TokenRequest; 2],
     ) -> Result<TokenGrant, StoreError> {
         match self {
-            Self::Shared(shared) => shared.draw(name, draws).await,
-            Self::Here(levels) => {
-                let mut levels = levels.lock();
+            Self::Shared(shared) => shared.take_tokens(name, requests).await,
+            Self::Local(buckets) => {
+                let mut buckets = buckets.lock();
                 let now = Instant::now();
-                let full = Levels { left: draws.map(|draw| draw.per_minute), at: now };
-                let known = levels.entry(name.to_owned()).or_insert(full);
-                Ok(known.draw(draws, now))
+                let full = BucketLevels { tokens: requests.map(|r| r.per_minute), at: now };
+                let levels = buckets.entry(name.to_owned()).or_insert(full);
+                Ok(levels.take(requests, now))
             }
         }
     }
 }
 
-impl Levels {
-    fn draw(&mut self, draws: [TokenRequest; 2], now: Instant) -> TokenGrant {
+impl BucketLevels {
+    fn take(&mut self, requests: [TokenRequest; 2], now: Instant) -> TokenGrant {
         let minutes = (now - self.at).as_secs_f64() / 60.0;
-        let filled = |index: usize| {
-            let TokenRequest { per_minute, .. } = draws[index];
-            (self.left[index] + minutes * per_minute).min(per_minute)
+        let refilled = |index: usize| {
+            let TokenRequest { per_minute, .. } = requests[index];
+            (self.tokens[index] + minutes * per_minute).min(per_minute)
         };
-        let filled = [filled(0), filled(1)];
-        // Less than a thousandth is a rounding error.
-        let enough = |index: usize| filled[index] + 1e-3 > draws[index].needed;
-        let taken = enough(0) && enough(1);
-        let left = match taken {
-            true => [filled[0] - draws[0].taken, filled[1] - draws[1].taken],
-            false => filled,
+        let refilled = [refilled(0), refilled(1)];
+        // Allow for a rounding error of a thousandth of a token.
+        let holds_enough = |index: usize| refilled[index] + 1e-3 > requests[index].required;
+        let granted = holds_enough(0) && holds_enough(1);
+        let remaining = match granted {
+            true => [refilled[0] - requests[0].amount, refilled[1] - requests[1].amount],
+            false => refilled,
         };
-        *self = Self { left, at: now };
-        TokenGrant { taken, left }
+        *self = Self { tokens: remaining, at: now };
+        TokenGrant { granted, remaining }
     }
 }

@@ -1,37 +1,36 @@
-//! Lists of jobs: which ones, and how far a search for them went.
+//! Filtered lists of jobs.
 
 use uuid::Uuid;
 
 use super::JobRecord;
 use whereabouts_core::{Job, JobState, MapName};
 
-/// Jobs that one search for a text looks at, at the most: records are read and decoded for it.
-pub(super) const SEARCHED: usize = 5_000;
+/// Jobs that one text search examines at most, because it reads and decodes every record.
+pub(super) const MAX_EXAMINED: usize = 5_000;
 
 /// Which jobs to list.
 #[derive(Debug, Clone, Default)]
 pub struct JobFilter {
-    /// Only those of this map.
+    /// Only jobs of this map.
     pub map: Option<MapName>,
-    /// Only those in this state.
+    /// Only jobs in this state.
     pub state: Option<JobState>,
-    /// Only those that contain this text, in upper or lower case: in their id, query id, map, state,
-    /// refiner, error, reasoning or descriptions, or in the ids of their candidates.
+    /// Only jobs that contain this text, ignoring case, in their id, query id, map, state, refiner,
+    /// error, reasoning or descriptions, or in the ids of their candidates.
     pub text: Option<String>,
 }
 
-/// Some jobs, newest first.
+/// A page of jobs, newest first.
 #[derive(Debug, Clone, Default)]
 pub struct JobList {
     /// The jobs.
     pub jobs: Vec<Job>,
-    /// The last job that was looked at, if the search for a text ended there although older jobs may
-    /// contain it too.
+    /// The last job examined, if a text search stopped there before it had examined all older jobs.
     pub searched_to: Option<Uuid>,
 }
 
 impl JobFilter {
-    /// Whether a job is one of those.
+    /// Whether a job matches the filter.
     pub fn matches(&self, record: &JobRecord) -> bool {
         let job = &record.job;
         self.map.as_ref().is_none_or(|map| *map == job.map)
@@ -42,8 +41,8 @@ impl JobFilter {
 
 fn contains(record: &JobRecord, text: &str) -> bool {
     let job = &record.job;
-    let has = |of: &str| folded(of).contains(text);
-    // Those that are short and asked for most come first.
+    let has = |field: &str| folded(field).contains(text);
+    // Short and commonly searched fields first.
     has(&job.id.to_string())
         || has(&job.query_id.to_string())
         || has(job.map.as_str())
@@ -55,7 +54,7 @@ fn contains(record: &JobRecord, text: &str) -> bool {
         || job.descriptions.iter().any(|description| has(&description.text))
 }
 
-/// The same whatever its case. Letter by letter, so that a part of a text stays a part of it.
+/// Folds case letter by letter, so that a substring of a text stays a substring of its folded form.
 fn folded(text: &str) -> String {
     match text.is_ascii() {
         true => text.to_ascii_lowercase(),
@@ -113,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_is_found_in_all_that_a_job_tells_and_in_nothing_else() {
+    fn a_text_search_covers_the_visible_fields_and_no_others() {
         let record = record();
         let found = |text: &str| {
             JobFilter { text: Some(text.into()), ..JobFilter::default() }.matches(&record)
@@ -139,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn all_that_is_asked_for_must_be_true() {
+    fn a_job_must_match_every_condition_of_the_filter() {
         let record = record();
         let filter = |map: &str, state, text: &str| JobFilter {
             map: Some(map.parse().unwrap()),

@@ -1,4 +1,4 @@
-//! Image bytes in an object store: any that speaks S3, or a folder.
+//! Image bytes in an object store: any that is S3-compatible, or a local folder.
 
 use std::path::Path as Folder;
 use std::sync::Arc;
@@ -13,22 +13,22 @@ use object_store::{BackoffConfig, ClientOptions, Error, ObjectStore, ObjectStore
 use super::StoreError;
 use whereabouts_core::Digest;
 
-/// Where an object store is.
+/// How to reach an object store.
 #[derive(Debug, Clone)]
 pub struct ObjectSettings {
     /// `s3://bucket/prefix`, or `file:///folder`.
     pub url: String,
-    /// The address of a server that speaks S3; empty for Amazon's.
+    /// The endpoint of an S3-compatible server; empty for Amazon's.
     pub endpoint: String,
     /// The region; empty for the default one.
     pub region: String,
-    /// Whether the server may be spoken to without TLS.
+    /// Whether plain HTTP is allowed.
     pub allow_http: bool,
-    /// The longest a call may take, all its tries together.
+    /// Time limit of a call, including its retries.
     pub timeout: Duration,
 }
 
-/// An object store, or part of one.
+/// An object store, or a prefix within one.
 #[derive(Debug, Clone)]
 pub struct Objects {
     store: Arc<dyn ObjectStore>,
@@ -36,11 +36,11 @@ pub struct Objects {
     timeout: Duration,
 }
 
-/// The shortest pause before a call is tried again.
-const FIRST_PAUSE: Duration = Duration::from_millis(100);
+/// The initial backoff before a retry.
+const INITIAL_BACKOFF: Duration = Duration::from_millis(100);
 
 impl Objects {
-    /// The store of these settings. Nothing is sent yet.
+    /// Prepares access to the store without contacting it.
     pub fn open(settings: &ObjectSettings) -> Result<Self, StoreError> {
         let unusable = |why: String| {
             StoreError::Failed(format!(
@@ -50,7 +50,7 @@ impl Objects {
         let (scheme, rest) = settings
             .url
             .split_once("://")
-            .ok_or_else(|| unusable(format!("{:?} is no address", settings.url)))?;
+            .ok_or_else(|| unusable(format!("{:?} is not a valid URL", settings.url)))?;
         match scheme {
             "file" => Self::folder(Folder::new(rest), settings.timeout),
             "s3" => {
@@ -59,15 +59,15 @@ impl Objects {
                 let store = Arc::new(s3(settings, bucket)?);
                 Ok(Self { store, prefix, timeout: settings.timeout })
             }
-            other => Err(unusable(format!("{other}:// is not known"))),
+            other => Err(unusable(format!("the scheme {other}:// is not supported"))),
         }
     }
 
-    /// A folder, which is made if it is not there.
+    /// Opens a folder as an object store, and creates it if it does not exist.
     pub fn folder(folder: &Folder, timeout: Duration) -> Result<Self, StoreError> {
         let failed = |error: &dyn std::fmt::Display| {
             let folder = folder.display();
-            StoreError::Failed(format!("cannot keep pictures in {folder}: {error} (objects.url)"))
+            StoreError::Failed(format!("cannot store pictures in {folder}: {error} (objects.url)"))
         };
         std::fs::create_dir_all(folder).map_err(|error| failed(&error))?;
         let store = LocalFileSystem::new_with_prefix(folder)
@@ -76,13 +76,13 @@ impl Objects {
         Ok(Self { store: Arc::new(store), prefix: Path::default(), timeout })
     }
 
-    /// Stores bytes, unless they are there.
+    /// Stores bytes, unless they are already stored.
     pub async fn put(&self, digest: &Digest, bytes: Bytes) -> Result<(), StoreError> {
         let path = self.path(digest);
         let length = bytes.len() as u64;
         self.call(async {
             match self.store.head(&path).await {
-                // Objects come whole or not at all.
+                // An object appears complete or not at all, so its size is proof enough.
                 Ok(found) if found.size == length => return Ok(()),
                 Ok(_) | Err(Error::NotFound { .. }) => {}
                 Err(error) => return Err(error),
@@ -92,7 +92,7 @@ impl Objects {
         .await
     }
 
-    /// The bytes of that digest.
+    /// Returns the bytes of this digest.
     pub async fn get(&self, digest: &Digest) -> Result<Option<Bytes>, StoreError> {
         let path = self.path(digest);
         self.call(async {
@@ -105,7 +105,7 @@ impl Objects {
         .await
     }
 
-    /// Removes bytes; none is no error.
+    /// Removes the bytes of this digest, if they are stored.
     pub async fn remove(&self, digest: &Digest) -> Result<(), StoreError> {
         let path = self.path(digest);
         self.call(async {
@@ -138,8 +138,8 @@ impl Objects {
             }
             Ok(Err(error @ (Error::PermissionDenied { .. } | Error::Unauthenticated { .. }))) => {
                 Err(StoreError::Failed(format!(
-                    "the object store lets nobody in with these credentials: {error}; check \
-                     AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, and what they may do"
+                    "the object store rejects the credentials: {error}; check AWS_ACCESS_KEY_ID, \
+                     AWS_SECRET_ACCESS_KEY and their permissions"
                 )))
             }
             Ok(Err(error)) => Err(unavailable(&error)),
@@ -148,9 +148,9 @@ impl Objects {
 }
 
 fn s3(settings: &ObjectSettings, bucket: &str) -> Result<object_store::aws::AmazonS3, StoreError> {
-    // Whoever came first has chosen for all.
+    // Fails if a provider is installed already, which serves as well.
     let _ = rustls::crypto::ring::default_provider().install_default();
-    // Credentials come from the environment, as for every program that speaks S3.
+    // Credentials come from the environment, as with every S3 client.
     let mut builder = AmazonS3Builder::from_env()
         .with_bucket_name(bucket)
         .with_allow_http(settings.allow_http)
@@ -161,8 +161,8 @@ fn s3(settings: &ObjectSettings, bucket: &str) -> Result<object_store::aws::Amaz
                 .with_allow_http(settings.allow_http),
         )
         .with_retry(RetryConfig {
-            backoff: BackoffConfig { init_backoff: FIRST_PAUSE, ..BackoffConfig::default() },
-            // As many as there is time for.
+            backoff: BackoffConfig { init_backoff: INITIAL_BACKOFF, ..BackoffConfig::default() },
+            // `retry_timeout` is the bound that matters.
             max_retries: 10,
             retry_timeout: settings.timeout,
         });

@@ -1,4 +1,4 @@
-//! What a store promises of webhooks.
+//! Webhooks and the outbox of their deliveries.
 
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -8,53 +8,54 @@ use uuid::Uuid;
 use super::StoreError;
 use whereabouts_core::{Attempt, Delivery, DeliveryState, StoredWebhook};
 
-/// A delivery with what is posted.
+/// A delivery with the message to post.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StoredDelivery {
-    /// What callers see.
+    /// The delivery as the API returns it.
     pub delivery: Delivery,
-    /// The body of the message, the same in every attempt.
+    /// The body of the message, identical in every attempt.
     pub body: Vec<u8>,
 }
 
-/// Which deliveries are kept.
+/// Which deliveries to keep.
 #[derive(Debug, Clone, Copy)]
-pub struct KeepDeliveries {
-    /// Of those that have ended, only those that ended since then, if it is given.
+pub struct DeliveryRetention {
+    /// Removes deliveries that ended before this moment.
     pub since: Option<Timestamp>,
-    /// Only so many: the first to end go first, and if that is not enough, the oldest of those that wait.
+    /// Keeps at most this many deliveries: those that ended first are removed first, then the oldest
+    /// waiting ones.
     pub most: usize,
 }
 
 /// How many deliveries were removed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct ForgottenDeliveries {
-    /// That had ended.
+pub struct RemovedDeliveries {
+    /// Deliveries that had ended.
     pub ended: usize,
-    /// That were still waiting.
+    /// Deliveries that were still waiting.
     pub waiting: usize,
 }
 
 /// Webhooks and their deliveries.
 ///
-/// The store queues the deliveries of a job's end itself, in the change that ends the job: neither is
-/// there without the other.
+/// The store is a transactional outbox: it queues the deliveries about a job's end in the transaction
+/// that ends the job.
 #[async_trait]
 pub trait WebhookStore: Send + Sync {
-    /// Adds a webhook unless there are `most` ([`StoreError::Conflict`]).
-    async fn add_webhook(&self, webhook: StoredWebhook, most: usize) -> Result<(), StoreError>;
-    /// All webhooks, oldest first.
+    /// Adds a webhook unless there are already `max` ([`StoreError::Conflict`]).
+    async fn add_webhook(&self, webhook: StoredWebhook, max: usize) -> Result<(), StoreError>;
+    /// Returns all webhooks, oldest first.
     async fn webhooks(&self) -> Result<Vec<StoredWebhook>, StoreError>;
-    /// One webhook.
+    /// Returns one webhook.
     async fn webhook(&self, id: Uuid) -> Result<Option<StoredWebhook>, StoreError>;
-    /// From now on a webhook is told nothing; what waits for it is left as it is.
+    /// Disables a webhook: nothing more is queued for it. Its waiting deliveries are not changed.
     async fn disable_webhook(&self, id: Uuid, at: Timestamp, why: &str) -> Result<(), StoreError>;
-    /// Removes a webhook with all its deliveries; `false` if there was none.
+    /// Deletes a webhook with all its deliveries. Returns `false` if there was no such webhook.
     async fn delete_webhook(&self, id: Uuid) -> Result<bool, StoreError>;
 
     /// Queues a delivery; [`StoreError::Conflict`] if its webhook is disabled.
     async fn queue_delivery(&self, delivery: StoredDelivery) -> Result<(), StoreError>;
-    /// Queues a delivery anew that does not wait; [`StoreError::Conflict`] if it does, or its webhook is
+    /// Queues an ended delivery again; [`StoreError::Conflict`] if it is still waiting or its webhook is
     /// disabled.
     async fn queue_again(
         &self,
@@ -62,7 +63,7 @@ pub trait WebhookStore: Send + Sync {
         id: Uuid,
         now: Timestamp,
     ) -> Result<Delivery, StoreError>;
-    /// Deliveries of a webhook, newest first, those older than `before`, at most `limit`.
+    /// Returns up to `limit` deliveries of a webhook older than `before`, newest first.
     async fn deliveries(
         &self,
         webhook: Uuid,
@@ -70,21 +71,21 @@ pub trait WebhookStore: Send + Sync {
         before: Option<Uuid>,
         limit: usize,
     ) -> Result<Vec<Delivery>, StoreError>;
-    /// Deliveries of a webhook that wait and are due, those that are due for longest first, at most `limit`.
+    /// Returns up to `limit` waiting deliveries of a webhook that are due, the longest overdue first.
     async fn due_deliveries(
         &self,
         webhook: Uuid,
         now: Timestamp,
         limit: usize,
     ) -> Result<Vec<StoredDelivery>, StoreError>;
-    /// Notes an attempt; the delivery as it then is, or `None` if it waits no more.
+    /// Records an attempt. Returns the delivery in its new state, or `None` if it was no longer waiting.
     async fn note_attempt(
         &self,
         webhook: Uuid,
         id: Uuid,
         attempt: Attempt,
     ) -> Result<Option<Delivery>, StoreError>;
-    /// Gives up deliveries of a webhook that wait, at most `limit`. Returns how many.
+    /// Gives up at most `limit` waiting deliveries of a webhook. Returns the number given up.
     async fn give_up_deliveries(
         &self,
         webhook: Uuid,
@@ -92,14 +93,15 @@ pub trait WebhookStore: Send + Sync {
         why: &str,
         limit: usize,
     ) -> Result<usize, StoreError>;
-    /// Removes deliveries that are not to be kept, at most `batch` of them, so that no change waits long.
+    /// Removes up to `batch` deliveries that need not be kept. Small batches keep other writes from
+    /// waiting long.
     async fn forget_deliveries(
         &self,
-        keep: KeepDeliveries,
+        keep: DeliveryRetention,
         batch: usize,
-    ) -> Result<ForgottenDeliveries, StoreError>;
-    /// Deliveries that wait.
+    ) -> Result<RemovedDeliveries, StoreError>;
+    /// Returns the number of waiting deliveries.
     async fn waiting_deliveries(&self) -> Result<usize, StoreError>;
-    /// Told when deliveries were queued.
+    /// Returns a receiver that is notified when deliveries were queued.
     fn queued_deliveries(&self) -> watch::Receiver<()>;
 }

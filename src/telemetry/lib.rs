@@ -1,5 +1,5 @@
-//! Logs, traces, the metrics registry, and what an operator looks at first: the last hour and the last warnings.
-//! Knows no types of the other members.
+//! Logs, traces, the metrics registry, and a summary for operators: statistics of the last hour and recent log issues.
+//! This member does not depend on the types of other members.
 
 pub mod metrics;
 mod recent;
@@ -14,7 +14,7 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, fmt};
 
-use self::recent::Listener;
+use self::recent::IssueCollector;
 pub use self::recent::{HourlyStats, LogIssue, LogIssues, Minute};
 pub use self::traces::{TraceSettings, Traces};
 
@@ -22,26 +22,26 @@ pub use self::traces::{TraceSettings, Traces};
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LogSettings {
-    /// How lines look.
+    /// Format of log lines.
     pub format: LogFormat,
-    /// What is logged.
+    /// Filter directives, as of `tracing_subscriber::EnvFilter`.
     pub filter: String,
 }
 
-/// How log lines look.
+/// The format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LogFormat {
-    /// Pretty on a terminal, JSON elsewhere.
+    /// Pretty on a terminal, JSON otherwise.
     Auto,
-    /// For people.
+    /// Human-readable lines.
     Pretty,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Json,
 }
 
-/// Starts logging to standard error and tracing, and gives the last warnings and errors, and what sends the
-/// traces. A second call changes nothing.
+/// Starts logging to standard error and exporting traces. Returns the recent log issues and the trace exporter. Only the
+/// first call installs the subscriber.
 pub fn init(log: &LogSettings, traces: &TraceSettings) -> Result<(Arc<LogIssues>, Traces), String> {
     let filter = EnvFilter::try_new(&log.filter)
         .map_err(|error| format!("log.filter cannot be read: {error}"))?;
@@ -55,14 +55,14 @@ pub fn init(log: &LogSettings, traces: &TraceSettings) -> Result<(Arc<LogIssues>
         true => lines.with_target(false).boxed(),
         false => lines.json().flatten_event(true).boxed(),
     };
-    let troubles = Arc::new(LogIssues::default());
-    let listener = Listener(Arc::clone(&troubles)).with_filter(LevelFilter::WARN);
+    let issues = Arc::new(LogIssues::default());
+    let collector = IssueCollector(Arc::clone(&issues)).with_filter(LevelFilter::WARN);
     let traces = Traces::start(traces)?;
-    let no_span_of_a_trace = filter_fn(|about| !(about.is_span() && traces::is_ours(about)));
+    let no_trace_spans = filter_fn(|span| !(span.is_span() && traces::is_trace_span(span)));
     let _ = tracing_subscriber::registry()
         .with(traces.layer())
-        .with(lines.with_filter(filter.and(no_span_of_a_trace)))
-        .with(listener)
+        .with(lines.with_filter(filter.and(no_trace_spans)))
+        .with(collector)
         .try_init();
-    Ok((troubles, traces))
+    Ok((issues, traces))
 }

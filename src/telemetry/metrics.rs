@@ -1,5 +1,4 @@
-//! The metrics registry and what all metric families share. Each member defines and registers its own families;
-//! this one knows none of them.
+//! The metrics registry and helpers shared by all metric families. Each member defines and registers its own families.
 
 use std::fmt;
 
@@ -8,7 +7,7 @@ use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::Metric;
 pub use prometheus_client::registry::Registry;
 
-/// An empty registry. Every metric name in it begins with `whereabouts_`.
+/// Creates an empty registry. All metric names are prefixed with `whereabouts_`.
 pub fn registry() -> Registry {
     Registry::with_prefix("whereabouts")
 }
@@ -24,12 +23,12 @@ pub fn register<M: Metric + Clone>(
     metric
 }
 
-/// A latency histogram in seconds: 16 buckets that double from 0.5 ms to about 16 s.
+/// Creates a latency histogram in seconds, with 16 exponential buckets from 0.5 ms to about 16 s.
 pub fn latency() -> Histogram {
     Histogram::new(exponential_buckets(0.0005, 2.0, 16))
 }
 
-/// All metrics of a registry in the OpenMetrics text format.
+/// Encodes all metrics of a registry in the OpenMetrics text format.
 pub fn encode(registry: &Registry) -> Result<String, fmt::Error> {
     let mut out = String::new();
     text::encode(&mut out, registry)?;

@@ -1,4 +1,4 @@
-//! The last hour, minute by minute, and the last warnings and errors: what an operator looks at first.
+//! Statistics of the last hour per minute, and recent warnings and errors, for the operator console.
 
 use std::collections::VecDeque;
 use std::fmt::{self, Write as _};
@@ -13,72 +13,72 @@ use tracing_subscriber::Layer;
 use tracing_subscriber::layer::Context;
 use utoipa::ToSchema;
 
-/// Minutes that are kept.
+/// Number of minutes kept.
 const MINUTES: usize = 60;
 
-/// Kinds of troubles that are kept.
-const TROUBLES: usize = 50;
+/// Number of distinct log issues kept.
+const MAX_ISSUES: usize = 50;
 
-/// The longest text of a trouble, in bytes.
-const LONGEST: usize = 500;
+/// Maximum length of the text of an issue in bytes.
+const MAX_DETAIL_BYTES: usize = 500;
 
-/// Times of answers are counted in steps of 2^(1/8) from half a millisecond on, to about a minute.
-const STEPS_AN_OCTAVE: f64 = 8.0;
-const STEPS: usize = 136;
-const SHORTEST_MS: f64 = 0.5;
+/// Response times are counted in buckets that grow by 2^(1/8), from half a millisecond to about a minute.
+const BUCKETS_PER_OCTAVE: f64 = 8.0;
+const BUCKETS: usize = 136;
+const FIRST_BUCKET_MS: f64 = 0.5;
 
-/// What was done in one minute.
+/// Activity in one minute.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 pub struct Minute {
-    /// When it began.
+    /// Start of the minute.
     pub at: Timestamp,
     /// Requests answered.
     pub requests: u64,
-    /// Of these, those that the server could not do: 429 and 5xx.
+    /// Requests answered with 429 or 5xx.
     pub errors: u64,
     /// Frames localized.
     pub frames: u64,
-    /// The median time of the answers to these, in milliseconds, to within 5 %.
+    /// Median response time for frames in milliseconds, accurate to 5 %.
     pub p50_ms: Option<f64>,
-    /// The 95th percentile.
+    /// 95th percentile of the response time for frames in milliseconds.
     pub p95_ms: Option<f64>,
-    /// The longest.
+    /// Maximum response time for frames in milliseconds.
     pub max_ms: Option<f64>,
-    /// Jobs that ended.
+    /// Jobs that finished.
     pub jobs_ended: u64,
-    /// Of these, those that failed.
+    /// Jobs that failed.
     pub jobs_failed: u64,
 }
 
-/// Something that the log warned of, or an error in it.
+/// A warning or error in the log.
 #[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
 #[schema(as = Trouble)]
 pub struct LogIssue {
-    /// When it last happened.
+    /// Time of the last occurrence.
     pub at: Timestamp,
-    /// Which part of the server said so.
+    /// Part of the server that logged the issue.
     #[serde(rename = "where")]
     pub place: String,
-    /// What it said.
+    /// Log message with its fields.
     pub detail: String,
-    /// How often it has said so.
+    /// Number of occurrences.
     pub count: u64,
 }
 
-/// The last hour. Minutes in which nothing was done are left out.
+/// Statistics of the last hour. Minutes without activity have no entry.
 #[derive(Debug, Default)]
 pub struct HourlyStats(Mutex<VecDeque<Counts>>);
 
 #[derive(Debug)]
 struct Counts {
-    /// Minutes since 1970.
+    /// Minutes since the Unix epoch.
     minute: i64,
     requests: u64,
     errors: u64,
     jobs_ended: u64,
     jobs_failed: u64,
-    /// Frames by the time of their answers.
-    times: [u32; STEPS],
+    /// Histogram of the response times for frames.
+    times: [u32; BUCKETS],
     longest_ms: f64,
 }
 
@@ -90,22 +90,22 @@ impl Counts {
             errors: 0,
             jobs_ended: 0,
             jobs_failed: 0,
-            times: [0; STEPS],
+            times: [0; BUCKETS],
             longest_ms: 0.0,
         }
     }
 
-    fn told(&self) -> Minute {
+    fn to_minute(&self) -> Minute {
         let frames: u64 = self.times.iter().map(|&count| u64::from(count)).sum();
         let quantile = |share: f64| {
             let rank = (share * frames as f64).ceil().max(1.0) as u64;
             let mut below = 0;
-            let step = self.times.iter().position(|&count| {
+            let bucket = self.times.iter().position(|&count| {
                 below += u64::from(count);
                 below >= rank
             })?;
-            // The middle of the step, on the scale on which the steps are even.
-            let middle = SHORTEST_MS * ((step as f64 + 0.5) / STEPS_AN_OCTAVE).exp2();
+            // The middle of the bucket on the logarithmic scale.
+            let middle = FIRST_BUCKET_MS * ((bucket as f64 + 0.5) / BUCKETS_PER_OCTAVE).exp2();
             Some(middle.min(self.longest_ms))
         };
         Minute {
@@ -123,21 +123,21 @@ impl Counts {
 }
 
 impl HourlyStats {
-    /// Counts an answer; of a frame that was localized, with the time it took.
+    /// Counts a response. For a localized frame, `frame` is the response time.
     pub fn answered(&self, now: Timestamp, status: u16, frame: Option<Duration>) {
         self.count(now, |counts| {
             counts.requests += 1;
             counts.errors += u64::from(status == 429 || status >= 500);
             if let Some(took) = frame {
                 let ms = took.as_secs_f64() * 1e3;
-                let step = ((ms / SHORTEST_MS).log2() * STEPS_AN_OCTAVE).max(0.0) as usize;
-                counts.times[step.min(STEPS - 1)] += 1;
+                let bucket = ((ms / FIRST_BUCKET_MS).log2() * BUCKETS_PER_OCTAVE).max(0.0) as usize;
+                counts.times[bucket.min(BUCKETS - 1)] += 1;
                 counts.longest_ms = counts.longest_ms.max(ms);
             }
         });
     }
 
-    /// Counts a job that ended.
+    /// Counts a finished job.
     pub fn job_ended(&self, now: Timestamp, failed: bool) {
         self.count(now, |counts| {
             counts.jobs_ended += 1;
@@ -145,16 +145,16 @@ impl HourlyStats {
         });
     }
 
-    /// The minutes in which something was done, the oldest first.
+    /// The minutes of the last hour with activity, oldest first.
     pub fn minutes(&self, now: Timestamp) -> Vec<Minute> {
         let from = now.as_second().div_euclid(60) - MINUTES as i64;
-        self.lock().iter().filter(|counts| counts.minute > from).map(Counts::told).collect()
+        self.lock().iter().filter(|counts| counts.minute > from).map(Counts::to_minute).collect()
     }
 
     fn count(&self, now: Timestamp, change: impl FnOnce(&mut Counts)) {
         let minute = now.as_second().div_euclid(60);
         let mut minutes = self.lock();
-        // A clock that was set back counts in the last minute there is.
+        // If the clock was set back, count in the newest minute.
         if minutes.back().is_none_or(|last| last.minute < minute) {
             minutes.push_back(Counts::new(minute));
         }
@@ -171,23 +171,23 @@ impl HourlyStats {
     }
 }
 
-/// The last warnings and errors of the log, the newest first; the same one again is counted.
+/// Recent warnings and errors of the log, newest first. Repetitions are counted.
 #[derive(Debug, Default)]
 pub struct LogIssues(Mutex<VecDeque<LogIssue>>);
 
 impl LogIssues {
-    /// What there is.
+    /// All issues, newest first.
     pub fn last(&self) -> Vec<LogIssue> {
         self.lock().iter().cloned().collect()
     }
 
     fn add(&self, place: &str, detail: String) {
-        let mut troubles = self.lock();
-        let known = troubles.iter().position(|of| of.place == place && of.detail == detail);
-        let count = known.and_then(|at| troubles.remove(at)).map_or(0, |before| before.count);
+        let mut issues = self.lock();
+        let known = issues.iter().position(|issue| issue.place == place && issue.detail == detail);
+        let count = known.and_then(|index| issues.remove(index)).map_or(0, |issue| issue.count);
         let at = Timestamp::now();
-        troubles.push_front(LogIssue { at, place: place.to_owned(), detail, count: count + 1 });
-        troubles.truncate(TROUBLES);
+        issues.push_front(LogIssue { at, place: place.to_owned(), detail, count: count + 1 });
+        issues.truncate(MAX_ISSUES);
     }
 
     fn lock(&self) -> MutexGuard<'_, VecDeque<LogIssue>> {
@@ -195,16 +195,16 @@ impl LogIssues {
     }
 }
 
-/// Listens to the log for [`LogIssues`].
-pub(super) struct Listener(pub std::sync::Arc<LogIssues>);
+/// Collects warnings and errors of the log into [`LogIssues`].
+pub(super) struct IssueCollector(pub std::sync::Arc<LogIssues>);
 
-impl<S: Subscriber> Layer<S> for Listener {
+impl<S: Subscriber> Layer<S> for IssueCollector {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
-        let mut words = MessageVisitor::default();
-        event.record(&mut words);
-        let mut detail = words.message;
-        detail.push_str(&words.fields);
-        if let Some(end) = (0..=LONGEST).rev().find(|&at| detail.is_char_boundary(at)) {
+        let mut visitor = MessageVisitor::default();
+        event.record(&mut visitor);
+        let mut detail = visitor.message;
+        detail.push_str(&visitor.fields);
+        if let Some(end) = (0..=MAX_DETAIL_BYTES).rev().find(|&at| detail.is_char_boundary(at)) {
             detail.truncate(end);
         }
         let place = event.metadata().target();
@@ -212,7 +212,7 @@ impl<S: Subscriber> Layer<S> for Listener {
     }
 }
 
-/// An event in words.
+/// Formats the message and the fields of an event.
 #[derive(Default)]
 struct MessageVisitor {
     message: String,
@@ -221,8 +221,8 @@ struct MessageVisitor {
 
 impl Visit for MessageVisitor {
     fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
-        // Writing to a string does not fail. What tells one request from another would make each trouble
-        // another one.
+        // Writing to a string cannot fail. The request id is left out, because it would make every occurrence
+        // a distinct issue.
         let _ = match field.name() {
             "message" => write!(self.message, "{value:?}"),
             "request_id" => Ok(()),
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_minute_knows_its_quantiles_and_an_hour_forgets() {
+    fn minutes_have_quantiles_and_expire_after_an_hour() {
         let hour = HourlyStats::default();
         for ms in 1..=100 {
             hour.answered(at(120 + ms % 60), 200, Some(Duration::from_millis(ms as u64)));
@@ -268,13 +268,13 @@ mod tests {
     }
 
     #[test]
-    fn the_same_trouble_again_is_counted() {
-        let troubles = LogIssues::default();
+    fn a_repeated_issue_is_counted() {
+        let issues = LogIssues::default();
         for index in 0..60 {
-            troubles.add("a", format!("{index}"));
+            issues.add("a", format!("{index}"));
         }
-        troubles.add("a", "30".into());
-        let last = troubles.last();
-        assert_eq!((last.len(), &*last[0].detail, last[0].count), (TROUBLES, "30", 2));
+        issues.add("a", "30".into());
+        let last = issues.last();
+        assert_eq!((last.len(), &*last[0].detail, last[0].count), (MAX_ISSUES, "30", 2));
     }
 }

@@ -1,8 +1,8 @@
-//! Traces for OpenTelemetry: a span for each request and its stages, for the refinement job in whichever process,
-//! and for each call to a model.
+//! OpenTelemetry traces: spans of requests and their stages, of refinement jobs (which may run in another process), and
+//! of calls to a model.
 //!
-//! These spans have a target of their own and appear in no log. Without `traces.url` they are disabled and cost
-//! next to nothing. Sending them over OTLP needs the Cargo feature `otel`.
+//! These spans have a separate target and do not appear in logs. Without `traces.url` they are disabled and cost almost
+//! nothing. Exporting them over OTLP needs the Cargo feature `otel`.
 
 #[cfg(feature = "otel")]
 mod export;
@@ -16,7 +16,7 @@ use tracing::{Metadata, Span, field};
 
 pub use self::export::{Traces, current};
 
-/// The target of all spans that are sent.
+/// Target of all exported spans.
 const TARGET: &str = "whereabouts::trace";
 
 const TRACEPARENT: &str = "traceparent";
@@ -26,35 +26,34 @@ const TRACESTATE: &str = "tracestate";
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TraceSettings {
-    /// A collector that takes OTLP over HTTP; empty for none.
+    /// URL of a collector that accepts OTLP over HTTP; empty to disable tracing.
     pub url: String,
-    /// The share of requests that are traced, 0 to 1, where the caller does not say.
+    /// Sampling rate of requests, 0 to 1, unless the caller decides by a trace context.
     pub share: f64,
-    /// The longest that sending may take, in milliseconds.
+    /// Timeout of an export in milliseconds.
     pub timeout_ms: u64,
 }
 
 impl TraceSettings {
-    /// Why these settings cannot be used, if so.
+    /// Returns why the settings are invalid, or `None` if they are valid.
     pub fn validate(&self) -> Option<String> {
         if !(0.0..=1.0).contains(&self.share) {
             return Some("traces.share must be from 0 to 1".into());
         }
-        let is_address = self.url.starts_with("http://") || self.url.starts_with("https://");
-        if !self.url.is_empty() && !is_address {
+        let is_url = self.url.starts_with("http://") || self.url.starts_with("https://");
+        if !self.url.is_empty() && !is_url {
             return Some("traces.url must begin with http:// or https://".into());
         }
         (self.timeout_ms == 0).then(|| "traces.timeout_ms must be at least 1".into())
     }
 }
 
-/// Whether a span is of a trace.
-pub(crate) fn is_ours(about: &Metadata<'_>) -> bool {
-    about.target() == TARGET
+/// Whether a span is exported with traces.
+pub(crate) fn is_trace_span(span: &Metadata<'_>) -> bool {
+    span.target() == TARGET
 }
 
-/// The span of a request; it belongs to the trace that its headers name, if they do
-/// (W3C Trace Context).
+/// Creates the span of a request. It continues the trace named by the headers, if any (W3C Trace Context).
 pub fn request(method: &str, route: &str, headers: &HeaderMap) -> Span {
     let span = tracing::info_span!(
         target: TARGET,
@@ -76,7 +75,7 @@ pub fn request(method: &str, route: &str, headers: &HeaderMap) -> Span {
     span
 }
 
-/// Notes what a request was answered with.
+/// Records the response status of a request.
 pub fn answered(span: &Span, status: u16) {
     span.record("http.response.status_code", status);
     if status >= 500 {
@@ -84,12 +83,12 @@ pub fn answered(span: &Span, status: u16) {
     }
 }
 
-/// The span of a stage of a request.
+/// Creates the span of a stage of a request.
 pub fn stage(name: &'static str) -> Span {
     tracing::info_span!(target: TARGET, "stage", otel.name = name)
 }
 
-/// The span of one attempt at a job, which belongs to the trace of its request.
+/// Creates the span of one attempt at a job. It continues the trace of the request that submitted the job.
 pub fn job(id: uuid::Uuid, refiner: &str, attempt: u32, traceparent: Option<&str>) -> Span {
     let span = tracing::info_span!(
         target: TARGET,
@@ -103,7 +102,7 @@ pub fn job(id: uuid::Uuid, refiner: &str, attempt: u32, traceparent: Option<&str
     span
 }
 
-/// The span of one call to a model, in the words of OpenTelemetry's conventions for generative AI.
+/// Creates the span of a call to a model, following the OpenTelemetry semantic conventions for generative AI.
 pub fn model_call(model: &str, what: &'static str) -> Span {
     tracing::info_span!(
         target: TARGET,
@@ -120,7 +119,7 @@ pub fn model_call(model: &str, what: &'static str) -> Span {
     )
 }
 
-/// Notes how a call to a model ended.
+/// Records the token usage or the error of a call to a model.
 pub fn model_answered(span: &Span, tokens: Result<(u64, u64), String>) {
     match tokens {
         Ok((input, output)) => {

@@ -1,4 +1,4 @@
-//! A pinhole camera, and how flat rectangles look through it.
+//! A pinhole camera, and the projection of flat rectangles.
 //!
 //! On a plane, inverse depth and both surface coordinates divided by depth are *linear* in the
 //! pixel position. A [`View`] holds those three linear forms, which makes perspective exact and
@@ -9,10 +9,10 @@ use super::geometry::{Panel, Vec3, vec3};
 /// Horizontal field of view, in radians (72°).
 const FIELD_OF_VIEW: f32 = 1.256_637;
 
-/// Surfaces nearer than this many metres are cut off.
+/// Distance of the near clipping plane in metres.
 const NEAR: f32 = 0.15;
 
-/// Where a camera stands and looks, in the street's frame.
+/// The pose of a camera in the street's frame.
 #[derive(Clone, Copy)]
 pub(super) struct Pose {
     pub eye: Vec3,
@@ -78,7 +78,7 @@ impl Camera {
         vec3(self.forward.y, -self.forward.x, 0.0).unit()
     }
 
-    /// Whether anything within `reach` metres of a point is in front of the camera and near enough
+    /// Whether anything within `reach` metres of a point is in front of the camera and close enough
     /// to matter.
     pub fn may_see(&self, point: Vec3, reach: f32) -> bool {
         const HORIZON: f32 = 60.0;
@@ -86,7 +86,7 @@ impl Camera {
         depth > -reach && depth < HORIZON
     }
 
-    /// How `panel` appears, or `None` when it is edge-on or behind the camera.
+    /// Projects `panel`; `None` if it is edge-on or behind the camera.
     pub fn view(&self, panel: &Panel) -> Option<View> {
         let normal = panel.normal();
         let reach = normal.dot(panel.corner - self.eye);
@@ -127,7 +127,7 @@ impl Camera {
         (self.centre.0 + self.focal * seen.x / seen.z, self.centre.1 - self.focal * seen.y / seen.z)
     }
 
-    /// The panel's corners in pixels, after cutting off what lies nearer than [`NEAR`].
+    /// The panel's corners in pixels, after clipping at [`NEAR`].
     fn outline(&self, panel: &Panel) -> Vec<(f32, f32)> {
         let corners = panel.corners().map(|corner| self.in_frame(corner));
         let mut outline = Vec::with_capacity(5);

@@ -1,4 +1,4 @@
-//! Where things are: streets, the lots along them, street furniture, and the camera's places.
+//! Layout of the town: streets, lots, street furniture, and camera places.
 //!
 //! Every street is its own small world with a local frame (see [`geometry`](super::geometry)) and
 //! a position on the town plan, spaced so that streets never overlap.
@@ -101,7 +101,7 @@ impl Building {
     }
 }
 
-/// What fills a piece of one side of the street.
+/// The use of a lot along one side of the street.
 pub(super) enum Lot {
     Built(Building),
     /// A side street comes in at road level.
@@ -173,7 +173,7 @@ impl Street {
         self.dice.fork(tag)
     }
 
-    /// Where the map image of a place is taken from.
+    /// Camera pose of the map image of a place.
     pub fn survey_pose(&self, slot: usize) -> Pose {
         let mut dice = self.dice.fork(100 + slot as u64);
         let side = if dice.chance(0.5) { 1.0 } else { -1.0 };
@@ -207,7 +207,7 @@ impl Street {
     }
 }
 
-/// What tends to be built in one street.
+/// Distribution of buildings in one street.
 struct Taste {
     styles: [&'static Style; 3],
     shops: f32,
@@ -272,7 +272,7 @@ fn close_end(end: f32, taste: &Taste, dice: &mut Dice, into: &mut Vec<Building>)
     }
 }
 
-/// What neighbours built together share.
+/// Properties shared by neighbouring buildings of one development.
 struct Terrace {
     style: &'static Style,
     colour: Rgb,

@@ -1,14 +1,13 @@
-//! A procedural town for demonstrations, load tests and honest accuracy checks without a data set.
+//! A procedural town for demos, load tests and accuracy checks without a data set.
 //!
-//! A [`Town`] renders what a camera on a street sees: façades, shop signs, trees, traffic and
-//! people, in true perspective, with exact ground-truth poses. [`Town::reference`] gives the map
-//! image of a place and [`Town::query`] a later visit to it: from a couple of metres away, turned
-//! by up to 13°, in another light and other traffic. Building styles and shop chains come from a
-//! small pool and recur in every street, so places look alike and recognising one is real work.
+//! A [`Town`] renders street views: façades, shop signs, trees, traffic and people, in correct perspective and with
+//! exact ground-truth poses. [`Town::reference`] renders the map image of a place. [`Town::query`] renders a later
+//! visit, displaced by a couple of metres, rotated by up to 13°, and in different light and traffic. Building styles
+//! and shop chains come from a small pool and recur in every street, so places look alike and recognising them is
+//! hard.
 //!
-//! Every picture is a pure function of the seed and the numbers asked for; nothing is cached, and
-//! places may be asked for in any order and from any thread. Writing files, building a map and
-//! scoring answers are left to the callers.
+//! Every picture is a pure function of the seed and its arguments. Nothing is cached, and places can be rendered in any
+//! order and from any thread. Writing files, building a map and scoring results are left to the callers.
 
 mod camera;
 mod dice;
@@ -41,18 +40,17 @@ use traffic::{Bustle, Traffic};
 
 pub use light::Light;
 
-/// A retrieved reference counts as correct when it was taken within this distance of the query,
-/// in metres.
+/// Maximum distance in metres between a query and a correct reference.
 ///
-/// Places are at least 16 m apart and a query at most 2.6 m from its place, so the true place is
+/// Places are at least 16 m apart and a query is at most 2.6 m from its place, so the true place is
 /// always inside the radius and every other one outside. Each place has a single heading, so
 /// distance alone is a fair criterion.
 pub const SUCCESS_RADIUS_M: f64 = 10.0;
 
-/// Which town to render, and at what size.
+/// Parameters of a town and its pictures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TownSpec {
-    /// Two towns with the same seed are the same to the last pixel.
+    /// Seed of the town. Towns with the same seed are identical to the last pixel.
     pub seed: u64,
     /// Number of places; 0 is treated as 1.
     pub places: usize,
@@ -68,7 +66,7 @@ impl Default for TownSpec {
     }
 }
 
-/// A town whose places can be photographed.
+/// A town from whose places pictures can be rendered.
 #[derive(Clone, Debug)]
 pub struct Town {
     spec: TownSpec,
@@ -77,7 +75,7 @@ pub struct Town {
 /// A rendered picture with its ground truth.
 #[derive(Clone, Debug)]
 pub struct Shot {
-    /// The place shown, in `0..Town::places()`.
+    /// Index of the place, in `0..Town::places()`.
     pub place: usize,
     /// The picture, in display (sRGB-like) colours.
     pub image: RgbImage,
@@ -87,12 +85,12 @@ pub struct Shot {
     pub y: f64,
     /// Compass heading of the optical axis, in degrees `0.0..360.0`, clockwise from north.
     pub heading: f64,
-    /// The light the picture was taken in.
+    /// Light in which the picture was taken.
     pub light: Light,
 }
 
 impl Town {
-    /// Lays out a town. Nothing is rendered yet.
+    /// Lays out a town without rendering anything.
     pub fn new(spec: TownSpec) -> Town {
         Town {
             spec: TownSpec {
@@ -109,7 +107,7 @@ impl Town {
         self.spec.places
     }
 
-    /// The map image of a place, taken by day in thin traffic. `place` wraps around at
+    /// Renders the map image of a place, taken by day in light traffic. `place` wraps around at
     /// [`Town::places`].
     pub fn reference(&self, place: usize) -> Shot {
         let place = place % self.places();
@@ -118,8 +116,8 @@ impl Town {
         self.photograph(place, &street, pose, Light::Day, Bustle::SURVEY, &mut dice)
     }
 
-    /// A later visit to a place; each `variant` is another visit, and any four consecutive
-    /// variants are taken in the four lights. `place` wraps around at [`Town::places`].
+    /// Renders a later visit to a place. Each `variant` is a different visit, and any four consecutive
+    /// variants cover the four lights. `place` wraps around at [`Town::places`].
     pub fn query(&self, place: usize, variant: u32) -> Shot {
         let place = place % self.places();
         let (street, survey) = self.survey(place);
@@ -162,7 +160,7 @@ impl Town {
     }
 }
 
-/// The pose of a camera that comes by a place again.
+/// The camera pose of a later visit to a place.
 fn revisit(survey: Pose, dice: &mut Dice) -> Pose {
     let turn = dice.between(-13.0, 13.0).to_radians();
     Pose {

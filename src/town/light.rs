@@ -5,7 +5,7 @@ use super::dice::{Dice, drift, floor, speckle};
 use super::geometry::{Rgb, Vec3, vec3};
 use super::layout::{FRONT, Fixture, Lot, PAVEMENT_HEIGHT, STREET_END, STREET_START, Street};
 
-/// The light a picture is taken in.
+/// Lighting conditions of a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Light {
     /// Sun with cast shadows.
@@ -46,7 +46,7 @@ impl Indoors {
     }
 }
 
-/// How a surface lies to the light: all of its illumination that is the same at each of its points.
+/// The illumination of a surface that is constant over its points, given its orientation.
 pub(super) struct Turned {
     normal: Vec3,
     /// Arriving from the sky under which nothing stands.
@@ -110,7 +110,7 @@ impl Lighting {
         }
     }
 
-    /// How a surface with the given normal lies to the light.
+    /// The constant illumination of a surface with the given normal.
     pub fn turned(&self, normal: Vec3) -> Turned {
         let facing = normal.dot(self.sun_direction).max(0.0);
         Turned {

@@ -1,4 +1,4 @@
-//! Turns a scene into pixels.
+//! Rasterisation of a scene.
 //!
 //! Visibility is found at two samples per pixel with a depth buffer, so that silhouettes are
 //! smooth; a pixel is then shaded once per surface in it, because paints filter themselves.

@@ -1,4 +1,4 @@
-//! One street at one moment: all surfaces a camera may see, and the colour of any point on them.
+//! The scene of one street at one moment: all visible surfaces, and the colour of any point on them.
 
 use super::camera::{Camera, Footprint};
 use super::facade::facade;

@@ -1,5 +1,5 @@
-//! What the renderer draws: flat panels, the outline cut out of them and the paint on them; and
-//! what a paint is asked ([`Glance`]) and answers ([`Material`]).
+//! The surfaces that are drawn: flat panels with an outline and a paint. A paint maps a pixel's view of the panel
+//! ([`Glance`]) to a [`Material`].
 
 use super::dice::{drift, floor, speckle, whole};
 use super::geometry::{Panel, Rgb, Vec3};

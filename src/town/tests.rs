@@ -23,7 +23,7 @@ fn the_same_seed_gives_the_same_bytes() {
 }
 
 #[test]
-fn another_seed_gives_another_town() {
+fn different_seeds_give_different_towns() {
     let (one, other) = (town(3, 9, 96, 72), town(4, 9, 96, 72));
     assert_ne!(one.reference(0).image, other.reference(0).image);
 }
@@ -50,7 +50,7 @@ fn a_query_is_within_the_radius_of_its_own_place_and_of_no_other() {
 }
 
 #[test]
-fn a_query_sees_its_place_from_elsewhere_but_looks_the_same_way() {
+fn a_query_is_displaced_but_faces_the_same_way() {
     let town = town(7, 24, 1, 1);
     let mut moved = 0.0_f64;
     for place in 0..town.places() {
@@ -88,7 +88,7 @@ fn places_wrap_around() {
 }
 
 #[test]
-fn a_point_of_a_facade_projects_where_the_camera_geometry_says() {
+fn a_point_of_a_facade_projects_as_the_camera_geometry_predicts() {
     let pose = Pose { eye: vec3(0.0, 0.0, 2.0), yaw: 90_f32.to_radians(), pitch: 0.0, roll: 0.0 };
     let camera = Camera::new(&pose, 640, 480);
     let focal = 320.0 / 36_f32.to_radians().tan();

@@ -1,4 +1,4 @@
-//! What differs between two visits to the same place: parked and passing vehicles, and people.
+//! Traffic, which differs between visits to the same place: parked and passing vehicles, and people.
 
 use super::dice::Dice;
 use super::geometry::{Vec3, vec3};
@@ -72,7 +72,7 @@ fn parked(street: &Street, eye: Vec3, bustle: Bustle, dice: &mut Dice) -> Vec<Ve
     vehicles
 }
 
-/// Nobody parks on a crossing or in the mouth of a side street.
+/// No vehicle parks on a crossing or in the mouth of a side street.
 fn may_park(street: &Street, centre: Vec3) -> bool {
     let at_crossing = street.crossings.iter().any(|crossing| (crossing - centre.x).abs() < 4.5);
     let at_mouth = street.lots.iter().any(|lot| match lot {

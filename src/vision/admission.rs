@@ -1,7 +1,7 @@
-//! Who may have a picture decoded and inferred, and who waits for that.
+//! Admission control for decoding and inference.
 //!
-//! A permit stands for one picture in work. There are just as many as keep decoding and inference
-//! busy; all others wait here, where their order is known and little memory is held, or are refused.
+//! A permit stands for one picture in progress. There are as many permits as it takes to keep decoding and
+//! inference busy. Further requests wait here, ordered by priority and holding little memory, or are rejected.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -12,64 +12,64 @@ use tokio::sync::oneshot;
 
 use whereabouts_core::ServiceTime;
 
-/// Bounds on what is in work and what waits.
+/// Limits on pictures in progress and in the queue.
 #[derive(Debug, Clone, Copy)]
 pub struct AdmissionSettings {
-    /// Pictures in work at a time.
+    /// Maximum pictures in progress.
     pub permits: usize,
-    /// Pictures that wait, those in the background not counted.
+    /// Maximum waiting pictures, not counting background work.
     pub queue: usize,
-    /// The longest wait.
+    /// Maximum wait for a permit.
     pub max_wait: Duration,
-    /// The longest time that a caller is told to stay away.
+    /// Maximum `Retry-After`.
     pub max_retry_after: Duration,
 }
 
-/// What a permit is for, the most urgent first.
+/// The priority class of a request, most urgent first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum WorkClass {
-    /// A robot wants to know where it is.
+    /// Localization of a frame.
     Localize,
-    /// A map grows, or a person looks at it.
+    /// Indexing or showing an image.
     Index,
-    /// Nobody waits for an answer: never refused, and served when no other waits.
+    /// Work without a waiting caller: never rejected, and served when no other request is waiting.
     Background,
 }
 
-/// What a permit is for, and until when it is of use.
+/// A request for a permit.
 #[derive(Debug, Clone, Copy)]
 pub struct AdmissionRequest {
-    /// What it is for.
+    /// Priority class.
     pub class: WorkClass,
-    /// When the caller no longer wants the answer.
+    /// When the result is no longer useful to the caller.
     pub deadline: Option<Instant>,
 }
 
 impl AdmissionRequest {
-    /// Of work that nobody waits for.
+    /// A request for background work.
     pub const BACKGROUND: Self = Self { class: WorkClass::Background, deadline: None };
 }
 
-/// Why there is no permit.
+/// Why a request was rejected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RejectReason {
-    /// As many wait as may wait.
+    /// The queue is full.
     QueueFull,
-    /// It would wait longer than is allowed, or has.
+    /// The wait would exceed the maximum, or has exceeded it.
     WaitTooLong,
-    /// The answer would come after the deadline.
+    /// The result would not be ready before the deadline.
     DeadlineTooSoon,
 }
 
-/// There is no permit.
+/// A request was rejected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{}", self.sentence())]
 pub struct Rejected {
-    /// Why not.
+    /// Why the request was rejected.
     pub reason: RejectReason,
-    /// When what is in work and waits now should be done, at the pace of late, within bounds.
+    /// Estimated time until the current work is done, clamped to the configured maximum.
     pub retry_after: Duration,
-    /// Pictures that wait.
+    /// Pictures in the queue.
     pub waiting: usize,
 }
 
@@ -78,52 +78,52 @@ impl Rejected {
         let Self { waiting, .. } = self;
         match self.reason {
             RejectReason::QueueFull => {
-                format!("{waiting} pictures wait already, the bound (image.queue)")
+                format!("the queue is full with {waiting} pictures (image.queue)")
             }
             RejectReason::WaitTooLong => format!(
-                "{waiting} pictures wait already, and another would wait for longer than \
+                "{waiting} pictures are waiting, and another would wait longer than \
                  image.max_wait_ms allows"
             ),
             RejectReason::DeadlineTooSoon => format!(
-                "{waiting} pictures wait already, so that the answer would come after the \
-                 X-Deadline-Ms of the request"
+                "{waiting} pictures are waiting, so the answer would miss the X-Deadline-Ms of the \
+                 request"
             ),
         }
     }
 }
 
-/// What is in work and what waits at the moment.
+/// Permits in use and requests waiting.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct AdmissionLevels {
-    /// Permits that there are.
+    /// Total permits.
     pub permits: usize,
     /// Permits in use.
     pub in_use: usize,
-    /// Frames that wait.
+    /// Waiting frames.
     pub localize: usize,
-    /// Images that wait to be indexed or shown.
+    /// Images waiting to be indexed or shown.
     pub index: usize,
-    /// Pictures that wait in the background.
+    /// Waiting background work.
     pub background: usize,
 }
 
-/// Gives out permits. Clones share them.
+/// Issues permits. Clones share the same queue.
 #[derive(Debug, Clone)]
 pub struct Admission {
     shared: Arc<Shared>,
 }
 
-/// One picture in work; given back when dropped.
+/// Permission to process one picture. Dropping it admits the next request.
 #[derive(Debug)]
 pub struct Permit {
     shared: Arc<Shared>,
-    since: Instant,
+    acquired: Instant,
 }
 
 #[derive(Debug)]
 struct Shared {
     settings: AdmissionSettings,
-    line: Mutex<WaitQueue>,
+    queue: Mutex<WaitQueue>,
 }
 
 type Waiter = oneshot::Sender<Permit>;
@@ -131,177 +131,178 @@ type Waiter = oneshot::Sender<Permit>;
 #[derive(Debug, Default)]
 struct WaitQueue {
     in_use: usize,
-    /// By class. Who has gone is still here until somebody looks.
+    /// Waiters by class. A waiter whose caller has left stays until the next [`WaitQueue::prune`].
     waiting: [VecDeque<Waiter>; 3],
-    pace: ServiceTime,
+    service_time: ServiceTime,
 }
 
-enum Place {
-    Inside(Permit),
-    Waiting(oneshot::Receiver<Permit>),
+enum Admitted {
+    AtOnce(Permit),
+    Queued(oneshot::Receiver<Permit>),
 }
 
 impl Admission {
-    /// All permits are free.
+    /// Creates an admission control with all permits free.
     pub fn new(settings: AdmissionSettings) -> Self {
         let settings = AdmissionSettings { permits: settings.permits.max(1), ..settings };
-        Self { shared: Arc::new(Shared { settings, line: Mutex::default() }) }
+        Self { shared: Arc::new(Shared { settings, queue: Mutex::default() }) }
     }
 
-    /// Whether a permit is to be had; who would be refused hears so before it sends its picture.
-    pub fn check(&self, demand: AdmissionRequest) -> Result<(), Rejected> {
-        self.shared.check(&mut self.shared.lock(), demand)
+    /// Checks whether a request would be rejected, so that the caller can be told before it uploads its picture.
+    pub fn check(&self, request: AdmissionRequest) -> Result<(), Rejected> {
+        self.shared.check(&mut self.shared.lock(), request)
     }
 
-    /// Waits for a permit. A future that is dropped waits no longer.
-    pub async fn enter(&self, demand: AdmissionRequest) -> Result<Permit, Rejected> {
-        let waiting = match self.shared.join(demand)? {
-            Place::Inside(permit) => return Ok(permit),
-            Place::Waiting(waiting) => waiting,
+    /// Waits for a permit. Dropping the future leaves the queue.
+    pub async fn acquire(&self, request: AdmissionRequest) -> Result<Permit, Rejected> {
+        let permit = match self.shared.join(request)? {
+            Admitted::AtOnce(permit) => return Ok(permit),
+            Admitted::Queued(permit) => permit,
         };
-        let refused = |reason| self.shared.refused(&self.shared.lock(), reason);
-        let admitted = if demand.class == WorkClass::Background {
-            waiting.await
+        let rejected = |reason| self.shared.rejected(&self.shared.lock(), reason);
+        let permit = if request.class == WorkClass::Background {
+            permit.await
         } else {
-            match tokio::time::timeout(self.shared.settings.max_wait, waiting).await {
-                Ok(admitted) => admitted,
-                Err(_) => return Err(refused(RejectReason::WaitTooLong)),
+            match tokio::time::timeout(self.shared.settings.max_wait, permit).await {
+                Ok(permit) => permit,
+                Err(_) => return Err(rejected(RejectReason::WaitTooLong)),
             }
         };
-        // Nobody else drops the other end but to make room.
-        admitted.map_err(|_| refused(RejectReason::QueueFull))
+        // The sender is dropped only when the request is evicted to make room for a frame.
+        permit.map_err(|_| rejected(RejectReason::QueueFull))
     }
 
-    /// The share of the queue that is taken, from 0 to 1.
+    /// The fill level of the queue, 0 to 1.
     pub fn pressure(&self) -> f64 {
-        let mut line = self.shared.lock();
-        line.prune();
-        line.bounded() as f64 / self.shared.settings.queue.max(1) as f64
+        let mut queue = self.shared.lock();
+        queue.prune();
+        queue.bounded() as f64 / self.shared.settings.queue.max(1) as f64
     }
 
-    /// When what is in work and waits now should be done, at the pace of late.
+    /// Estimated time until the current work is done, clamped to the configured maximum.
     pub fn retry_after(&self) -> Duration {
         self.shared.retry_after(&self.shared.lock())
     }
 
-    /// A pause that callers may be told to make.
-    pub fn within_bounds(&self, pause: Duration) -> Duration {
-        self.shared.within_bounds(pause)
+    /// Clamps a `Retry-After` to between one second and the configured maximum.
+    pub fn clamp_pause(&self, pause: Duration) -> Duration {
+        self.shared.clamp_pause(pause)
     }
 
-    /// What is in work and what waits at the moment.
+    /// Permits in use and requests waiting.
     pub fn levels(&self) -> AdmissionLevels {
-        let mut line = self.shared.lock();
-        line.prune();
-        let [localize, index, background] = line.waiting.each_ref().map(VecDeque::len);
+        let mut queue = self.shared.lock();
+        queue.prune();
+        let [localize, index, background] = queue.waiting.each_ref().map(VecDeque::len);
         let permits = self.shared.settings.permits;
-        AdmissionLevels { permits, in_use: line.in_use, localize, index, background }
+        AdmissionLevels { permits, in_use: queue.in_use, localize, index, background }
     }
 }
 
 impl Permit {
-    /// The work was done to its end: its time tells those who come how long it takes.
-    pub fn served(&self) {
-        let mut line = self.shared.lock();
-        let side_by_side = line.in_use;
-        line.pace.record(self.since.elapsed(), side_by_side);
+    /// Records that the work was completed, so that its duration counts towards the average service time.
+    pub fn complete(&self) {
+        let mut queue = self.shared.lock();
+        let concurrency = queue.in_use;
+        queue.service_time.record(self.acquired.elapsed(), concurrency);
     }
 }
 
 impl Drop for Permit {
     fn drop(&mut self) {
         self.shared.lock().in_use -= 1;
-        self.shared.hand_out();
+        self.shared.admit_waiting();
     }
 }
 
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, WaitQueue> {
-        self.line.lock()
+        self.queue.lock()
     }
 
     fn permit(self: &Arc<Self>) -> Permit {
-        Permit { shared: Arc::clone(self), since: Instant::now() }
+        Permit { shared: Arc::clone(self), acquired: Instant::now() }
     }
 
-    fn join(self: &Arc<Self>, demand: AdmissionRequest) -> Result<Place, Rejected> {
-        let mut line = self.lock();
-        self.check(&mut line, demand)?;
-        if line.in_use < self.settings.permits {
-            line.in_use += 1;
-            return Ok(Place::Inside(self.permit()));
+    fn join(self: &Arc<Self>, request: AdmissionRequest) -> Result<Admitted, Rejected> {
+        let mut queue = self.lock();
+        self.check(&mut queue, request)?;
+        if queue.in_use < self.settings.permits {
+            queue.in_use += 1;
+            return Ok(Admitted::AtOnce(self.permit()));
         }
-        if demand.class == WorkClass::Localize && line.bounded() >= self.settings.queue {
-            // What is to be indexed makes room: the last of it, which has waited least.
-            line.waiting[WorkClass::Index as usize].pop_back();
+        if request.class == WorkClass::Localize && queue.bounded() >= self.settings.queue {
+            // Evict the index request that has waited least.
+            queue.waiting[WorkClass::Index as usize].pop_back();
         }
-        let (waiter, waiting) = oneshot::channel();
-        line.waiting[demand.class as usize].push_back(waiter);
-        Ok(Place::Waiting(waiting))
+        let (waiter, permit) = oneshot::channel();
+        queue.waiting[request.class as usize].push_back(waiter);
+        Ok(Admitted::Queued(permit))
     }
 
-    fn check(&self, line: &mut WaitQueue, demand: AdmissionRequest) -> Result<(), Rejected> {
-        line.prune();
-        // Whoever is alone is served, whatever took long before.
-        if demand.class == WorkClass::Background || line.in_use < self.settings.permits {
+    fn check(&self, queue: &mut WaitQueue, request: AdmissionRequest) -> Result<(), Rejected> {
+        queue.prune();
+        // A request is never rejected while a permit is free, however slow earlier work was.
+        if request.class == WorkClass::Background || queue.in_use < self.settings.permits {
             return Ok(());
         }
-        let gives_way = match demand.class {
-            WorkClass::Localize => line.waiting[WorkClass::Index as usize].len(),
+        let evictable = match request.class {
+            WorkClass::Localize => queue.waiting[WorkClass::Index as usize].len(),
             WorkClass::Index | WorkClass::Background => 0,
         };
-        if line.bounded() - gives_way >= self.settings.queue {
-            return Err(self.refused(line, RejectReason::QueueFull));
+        if queue.bounded() - evictable >= self.settings.queue {
+            return Err(self.rejected(queue, RejectReason::QueueFull));
         }
-        let first = line.waiting.iter().take(demand.class as usize + 1);
-        let wait = line.pace.until_done(first.map(VecDeque::len).sum::<usize>() + 1);
+        let ahead = queue.waiting.iter().take(request.class as usize + 1);
+        let wait = queue.service_time.until_done(ahead.map(VecDeque::len).sum::<usize>() + 1);
         if wait > self.settings.max_wait {
-            return Err(self.refused(line, RejectReason::WaitTooLong));
+            return Err(self.rejected(queue, RejectReason::WaitTooLong));
         }
-        let answered = Instant::now() + wait + line.pace.one();
-        if demand.deadline.is_some_and(|deadline| deadline < answered) {
-            return Err(self.refused(line, RejectReason::DeadlineTooSoon));
+        let finished = Instant::now() + wait + queue.service_time.mean();
+        if request.deadline.is_some_and(|deadline| deadline < finished) {
+            return Err(self.rejected(queue, RejectReason::DeadlineTooSoon));
         }
         Ok(())
     }
 
-    fn refused(&self, line: &WaitQueue, reason: RejectReason) -> Rejected {
-        Rejected { reason, retry_after: self.retry_after(line), waiting: line.bounded() }
+    fn rejected(&self, queue: &WaitQueue, reason: RejectReason) -> Rejected {
+        Rejected { reason, retry_after: self.retry_after(queue), waiting: queue.bounded() }
     }
 
-    fn retry_after(&self, line: &WaitQueue) -> Duration {
-        self.within_bounds(line.pace.until_done(line.bounded() + line.in_use))
+    fn retry_after(&self, queue: &WaitQueue) -> Duration {
+        self.clamp_pause(queue.service_time.until_done(queue.bounded() + queue.in_use))
     }
 
-    fn within_bounds(&self, pause: Duration) -> Duration {
+    fn clamp_pause(&self, pause: Duration) -> Duration {
         pause.min(self.settings.max_retry_after).max(Duration::from_secs(1))
     }
 
-    /// Gives free permits to those who wait.
-    fn hand_out(self: &Arc<Self>) {
+    /// Gives free permits to waiting requests.
+    fn admit_waiting(self: &Arc<Self>) {
         loop {
-            let mut line = self.lock();
-            if line.in_use >= self.settings.permits {
+            let mut queue = self.lock();
+            if queue.in_use >= self.settings.permits {
                 return;
             }
-            let next = line.waiting.iter_mut().find_map(VecDeque::pop_front);
+            let next = queue.waiting.iter_mut().find_map(VecDeque::pop_front);
             let Some(waiter) = next else { return };
-            line.in_use += 1;
-            drop(line);
-            // If the waiter has gone, the permit comes back and is handed out again.
+            queue.in_use += 1;
+            drop(queue);
+            // If the waiter has left, the permit is dropped here, which admits the next one.
             let _ = waiter.send(self.permit());
         }
     }
 }
 
 impl WaitQueue {
+    /// Removes waiters whose caller has left.
     fn prune(&mut self) {
         for class in &mut self.waiting {
             class.retain(|waiter| !waiter.is_closed());
         }
     }
 
-    /// Those whose number is bounded.
+    /// Number of waiting requests that count towards the limit of the queue.
     fn bounded(&self) -> usize {
         self.waiting[..WorkClass::Background as usize].iter().map(VecDeque::len).sum()
     }

@@ -1,4 +1,4 @@
-//! The queue before inference, and the threads that empty it.
+//! The queue in front of inference, and the session threads that serve it.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -7,57 +7,69 @@ use std::thread::{self, JoinHandle};
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use serde::{Deserialize, Serialize};
 use tokio::sync::oneshot;
+use whereabouts_core::{DenseFeatures, Descriptor, DescriptorKind};
 
+use super::manifest::Manifest;
+use super::pooling::FeatureSet;
 use super::preprocess::Tensor;
 use super::provider::Execution;
-use super::session::{InferenceError, Model, RawOutput, Runner};
+use super::session::{InferenceError, Model, Runner};
 
-/// How inference shares its threads among pictures.
+/// How inference divides its threads among sessions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Layout {
-    /// Threads of all inference.
+    /// Total inference threads.
     pub threads: usize,
-    /// Pictures that are run side by side while several wait, each by its share of the threads; 1:
-    /// one after another, by all threads.
+    /// Sessions that run concurrently under load, each with an equal share of the threads. With 1, a
+    /// single session runs one batch after another on all threads.
     pub sessions: usize,
-    /// The most pictures in one run.
+    /// Maximum pictures per batch.
     pub max_batch: usize,
 }
 
-/// The sessions of one model.
+/// The sessions of one model and the queue in front of them.
 ///
-/// A picture that comes alone is run at once by the *wide* session, which has all threads. While
-/// pictures overlap, *narrow* sessions run side by side instead, each with its share of the threads:
-/// threads that work on pictures of their own need not wait for each other after every layer, so that
-/// more pictures are done in the same time. No timer holds a picture back: a free session takes what
-/// waits as one batch.
+/// A picture that arrives alone is run at once by the *latency session*, which has all threads. While
+/// pictures overlap, *throughput sessions* run concurrently instead, each with its share of the threads:
+/// threads that work on separate pictures need not synchronise after every layer, which raises throughput.
+/// No timer delays a picture: a free session takes what is waiting as one batch.
 ///
-/// Dropping it waits until its threads have ended: ONNX Runtime goes when the process ends, and a session
-/// that is loaded or runs meanwhile would crash.
+/// Dropping the batcher joins its threads, because ONNX Runtime is unloaded at process exit and a session
+/// that is loading or running at that time would crash.
 #[derive(Debug)]
 pub(super) struct Batcher {
     queue: Arc<Queue>,
     threads: Vec<JoinHandle<()>>,
 }
 
-/// An answer that is to come. Dropping it takes the picture out of the queue.
+/// The result for one picture.
 #[derive(Debug)]
-pub(super) struct PendingInference(oneshot::Receiver<Result<RawOutput, InferenceError>>);
+pub(super) struct Pooled {
+    pub descriptor: Descriptor,
+    /// The dense features, if they were requested.
+    pub dense: Option<DenseFeatures>,
+    /// Size of the batch that the picture was part of.
+    pub batch: usize,
+}
+
+/// A picture in the queue or in a session. Dropping it removes the picture from the queue.
+#[derive(Debug)]
+pub(super) struct PendingInference(oneshot::Receiver<Result<Pooled, InferenceError>>);
 
 impl PendingInference {
-    /// Blocks until the answer is there.
-    pub fn wait(self) -> Result<RawOutput, InferenceError> {
+    /// Blocks until the result is available.
+    pub fn wait(self) -> Result<Pooled, InferenceError> {
         self.0.blocking_recv().map_err(|_| InferenceError::Stopped)?
     }
 
-    /// Waits for the answer.
-    pub async fn answer(self) -> Result<RawOutput, InferenceError> {
+    /// Waits for the result.
+    pub async fn result(self) -> Result<Pooled, InferenceError> {
         self.0.await.map_err(|_| InferenceError::Stopped)?
     }
 }
 
 impl Batcher {
-    /// Loads the wide session, which is enough to begin with. Its first run takes longer than others.
+    /// Loads the latency session, which is enough to start serving. Its first run is slower than others.
     pub fn start(
         model: &Model,
         execution: Execution,
@@ -68,19 +80,25 @@ impl Batcher {
         let layout = Layout { threads, sessions, max_batch: layout.max_batch.max(1) };
         let queue = Arc::new(Queue {
             state: Mutex::default(),
-            work: Condvar::new(),
-            room: Condvar::new(),
+            work_available: Condvar::new(),
+            room_available: Condvar::new(),
             layout,
+            manifest: Arc::clone(&model.manifest),
         });
-        let wide = model.load(execution, threads, layout.max_batch)?;
+        let latency = model.load(execution, threads, layout.max_batch)?;
         let serving = Arc::clone(&queue);
-        let threads = vec![spawn("inference", move || serving.serve(wide, Kind::Wide))?];
+        let serve = move || serving.serve(latency, SessionKind::Latency);
+        let threads = vec![spawn("inference", serve)?];
         Ok(Self { queue, threads })
     }
 
-    /// Loads the narrow sessions in the background, one after another, so that a core is left for
-    /// those who come meanwhile.
-    pub fn add_narrow(&mut self, model: Model, execution: Execution) -> Result<(), InferenceError> {
+    /// Loads the throughput sessions in the background, one after another, so that a core stays free for
+    /// pictures that arrive meanwhile.
+    pub fn add_throughput_sessions(
+        &mut self,
+        model: Model,
+        execution: Execution,
+    ) -> Result<(), InferenceError> {
         let Layout { threads, sessions, .. } = self.queue.layout;
         if sessions == 1 {
             return Ok(());
@@ -93,41 +111,47 @@ impl Batcher {
                 if queue.lock().closed {
                     break;
                 }
-                match add_narrow(&queue, &model, execution, threads / sessions, index) {
+                match start_throughput_session(&queue, &model, execution, threads / sessions, index)
+                {
                     Ok(thread) => serving.push(thread),
-                    Err(error) => tracing::error!(%error, "there is one session less"),
+                    Err(error) => tracing::error!(%error, "cannot load a throughput session"),
                 }
                 queue.lock().loading -= 1;
-                queue.room.notify_all();
+                queue.room_available.notify_all();
             }
             join(serving);
         })?);
         Ok(())
     }
 
-    /// Blocks until every session is loaded, or cannot be.
+    /// Blocks until every session has been loaded or has failed to load.
     pub fn wait_until_complete(&self) {
         let mut state = self.queue.lock();
         while state.loading > 0 && !state.closed {
-            self.queue.room.wait(&mut state);
+            self.queue.room_available.wait(&mut state);
         }
     }
 
-    /// Hands in one picture; blocks while the queue is full.
-    pub fn submit(&self, tensor: Tensor) -> Result<PendingInference, InferenceError> {
-        let (answer, inferring) = oneshot::channel();
+    /// Queues one picture. Blocks while the queue is full.
+    pub fn submit(
+        &self,
+        tensor: Tensor,
+        kind: DescriptorKind,
+        features: FeatureSet,
+    ) -> Result<PendingInference, InferenceError> {
+        let (reply, result) = oneshot::channel();
         let mut state = self.queue.lock();
         while state.waiting.len() >= self.queue.layout.capacity() && !state.closed {
-            self.queue.room.wait(&mut state);
+            self.queue.room_available.wait(&mut state);
         }
         if state.closed {
             return Err(InferenceError::Stopped);
         }
         state.overlapped |= state.in_progress();
-        state.waiting.push_back(Request { tensor, answer });
+        state.waiting.push_back(Request { tensor, kind, features, reply });
         drop(state);
-        self.queue.work.notify_all();
-        Ok(PendingInference(inferring))
+        self.queue.work_available.notify_all();
+        Ok(PendingInference(result))
     }
 }
 
@@ -139,63 +163,69 @@ impl Drop for Batcher {
 }
 
 impl Layout {
-    /// Pictures that wait at the most: twice what the sessions take at once.
+    /// Maximum pictures in the queue: twice what the sessions take at once.
     pub(super) fn capacity(self) -> usize {
         2 * self.sessions * self.max_batch
     }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
-    Wide,
-    Narrow,
+enum SessionKind {
+    /// Has all threads; serves pictures that arrive alone.
+    Latency,
+    /// Has a share of the threads; serves while pictures overlap.
+    Throughput,
 }
 
 #[derive(Debug)]
 struct Request {
     tensor: Tensor,
-    answer: Answer,
+    kind: DescriptorKind,
+    features: FeatureSet,
+    reply: Reply,
 }
 
-type Answer = oneshot::Sender<Result<RawOutput, InferenceError>>;
+type Reply = oneshot::Sender<Result<Pooled, InferenceError>>;
 
 #[derive(Debug)]
 struct Queue {
     state: Mutex<State>,
-    /// Told when there may be something to do.
-    work: Condvar,
-    /// Told when there is room for another picture, and when a session is loaded.
-    room: Condvar,
+    /// Notified when a session may be able to take a batch.
+    work_available: Condvar,
+    /// Notified when the queue has room and when a session has been loaded.
+    room_available: Condvar,
     layout: Layout,
+    manifest: Arc<Manifest>,
 }
 
 #[derive(Debug, Default)]
 struct State {
     waiting: VecDeque<Request>,
-    /// Narrow sessions that are not loaded yet, and that are.
+    /// Throughput sessions that are still to be loaded.
     loading: usize,
-    narrow_sessions: usize,
-    wide_runs: bool,
-    narrow_runs: usize,
-    /// Whether narrow sessions take what comes.
-    crowded: bool,
-    /// Whether a picture came while another was in progress, since none was.
+    /// Throughput sessions that have been loaded.
+    throughput_sessions: usize,
+    latency_running: bool,
+    throughput_running: usize,
+    /// Whether throughput sessions serve the queue.
+    throughput_mode: bool,
+    /// Whether a picture arrived while another was in progress, since the queue was last idle.
     overlapped: bool,
     closed: bool,
 }
 
 impl State {
     fn in_progress(&self) -> bool {
-        self.wide_runs || self.narrow_runs > 0 || !self.waiting.is_empty()
+        self.latency_running || self.throughput_running > 0 || !self.waiting.is_empty()
     }
 
-    fn may_take(&self, kind: Kind) -> bool {
-        let crowded = self.crowded && self.narrow_sessions > 0;
+    fn may_take(&self, kind: SessionKind) -> bool {
+        let throughput_mode = self.throughput_mode && self.throughput_sessions > 0;
         !self.waiting.is_empty()
-            && !self.wide_runs
+            && !self.latency_running
             && match kind {
-                Kind::Wide => !crowded && self.narrow_runs == 0,
-                Kind::Narrow => crowded,
+                SessionKind::Latency => !throughput_mode && self.throughput_running == 0,
+                SessionKind::Throughput => throughput_mode,
             }
     }
 }
@@ -207,94 +237,104 @@ impl Queue {
 
     fn close(&self) {
         self.lock().closed = true;
-        self.work.notify_all();
-        self.room.notify_all();
+        self.work_available.notify_all();
+        self.room_available.notify_all();
     }
 
     /// Runs one batch after another until the queue is closed.
-    fn serve(&self, mut runner: Runner, kind: Kind) {
+    fn serve(&self, mut runner: Runner, kind: SessionKind) {
         while let Some(batch) = self.take(kind) {
-            let run = Run { queue: self, kind };
-            let mut answered: Vec<(Answer, Result<RawOutput, InferenceError>)> = Vec::new();
-            for (tensors, answers) in by_shape(batch) {
+            let running = Running { queue: self, kind };
+            let mut results = Vec::with_capacity(batch.len());
+            for group in group_by_shape(batch) {
+                let tensors: Vec<&Tensor> = group.iter().map(|request| &request.tensor).collect();
+                let batch = tensors.len();
                 match runner.run(&tensors) {
                     Ok(outputs) => {
-                        answered.extend(answers.into_iter().zip(outputs.into_iter().map(Ok)))
+                        for (request, local) in group.into_iter().zip(outputs) {
+                            let Request { kind, features, reply, .. } = request;
+                            let pooled = local
+                                .pool(kind, features, &self.manifest.pooling)
+                                .map(|(descriptor, dense)| Pooled { descriptor, dense, batch });
+                            results.push((reply, pooled.map_err(InferenceError::from)));
+                        }
                     }
                     Err(error) => {
-                        answered
-                            .extend(answers.into_iter().map(|answer| (answer, Err(error.clone()))));
+                        let replies = group.into_iter().map(|request| request.reply);
+                        results.extend(replies.map(|reply| (reply, Err(error.clone()))));
                     }
                 }
             }
-            // Before the answers: whoever sends one picture after another is alone each time.
-            drop(run);
-            for (answer, result) in answered {
-                let _ = answer.send(result);
+            // End the run before replying: a caller that sends one picture after another must not find
+            // its own previous picture in progress.
+            drop(running);
+            for (reply, result) in results {
+                let _ = reply.send(result);
             }
         }
     }
 
-    /// Waits for something to do, less what nobody waits for any more; `None` when closed.
-    fn take(&self, kind: Kind) -> Option<Vec<Request>> {
+    /// Waits for the next batch, discarding pictures whose caller has left. Returns `None` once the queue
+    /// is closed.
+    fn take(&self, kind: SessionKind) -> Option<Vec<Request>> {
         let mut state = self.lock();
         loop {
             if state.closed {
                 return None;
             }
             let waiting = state.waiting.len();
-            state.waiting.retain(|request| !request.answer.is_closed());
+            state.waiting.retain(|request| !request.reply.is_closed());
             if state.waiting.len() < waiting {
-                self.room.notify_all();
+                self.room_available.notify_all();
             }
             if state.may_take(kind) {
                 break;
             }
-            self.work.wait(&mut state);
+            self.work_available.wait(&mut state);
         }
-        let fair = match kind {
-            Kind::Wide => state.waiting.len(),
-            Kind::Narrow => state.waiting.len().div_ceil(state.narrow_sessions),
+        let share = match kind {
+            SessionKind::Latency => state.waiting.len(),
+            SessionKind::Throughput => state.waiting.len().div_ceil(state.throughput_sessions),
         };
-        let batch = state.waiting.drain(..fair.min(self.layout.max_batch)).collect();
+        let batch = state.waiting.drain(..share.min(self.layout.max_batch)).collect();
         match kind {
-            Kind::Wide => state.wide_runs = true,
-            Kind::Narrow => state.narrow_runs += 1,
+            SessionKind::Latency => state.latency_running = true,
+            SessionKind::Throughput => state.throughput_running += 1,
         }
         drop(state);
-        self.room.notify_all();
+        self.room_available.notify_all();
         Some(batch)
     }
 }
 
-/// A run in progress; its end is noted whatever becomes of it.
-struct Run<'a> {
+/// Marks a session as running until it is dropped, even by a panic.
+struct Running<'a> {
     queue: &'a Queue,
-    kind: Kind,
+    kind: SessionKind,
 }
 
-impl Drop for Run<'_> {
+impl Drop for Running<'_> {
     fn drop(&mut self) {
         if thread::panicking() {
-            // Whoever waits should hear of it rather than wait for ever.
+            // Fail the waiting callers instead of leaving them waiting for a dead session.
             return self.queue.close();
         }
         let mut state = self.queue.lock();
         match self.kind {
-            Kind::Wide => state.wide_runs = false,
-            Kind::Narrow => state.narrow_runs -= 1,
+            SessionKind::Latency => state.latency_running = false,
+            SessionKind::Throughput => state.throughput_running -= 1,
         }
-        state.crowded |= state.overlapped;
+        state.throughput_mode |= state.overlapped;
         if !state.in_progress() {
-            state.crowded = state.overlapped;
+            state.throughput_mode = state.overlapped;
             state.overlapped = false;
         }
         drop(state);
-        self.queue.work.notify_all();
+        self.queue.work_available.notify_all();
     }
 }
 
-fn add_narrow(
+fn start_throughput_session(
     queue: &Arc<Queue>,
     model: &Model,
     execution: Execution,
@@ -304,8 +344,9 @@ fn add_narrow(
     let mut runner = model.load(execution, threads, queue.layout.max_batch)?;
     runner.warm_up()?;
     let serving = Arc::clone(queue);
-    let thread = spawn(&format!("inference-{index}"), move || serving.serve(runner, Kind::Narrow))?;
-    queue.lock().narrow_sessions += 1;
+    let serve = move || serving.serve(runner, SessionKind::Throughput);
+    let thread = spawn(&format!("inference-{index}"), serve)?;
+    queue.lock().throughput_sessions += 1;
     Ok(thread)
 }
 
@@ -317,26 +358,24 @@ fn spawn(
     spawned.map_err(|error| InferenceError::Load(error.to_string()))
 }
 
-/// Waits until these threads have ended; what one panicked about has been told where it did.
+/// Joins the threads. A panic of one has already been reported by the panic hook.
 fn join(threads: Vec<JoinHandle<()>>) {
     for thread in threads {
         let _ = thread.join();
     }
 }
 
-/// Groups a batch by the shape of its tensors: only like shapes run together.
-fn by_shape(batch: Vec<Request>) -> Vec<(Vec<Tensor>, Vec<Answer>)> {
-    let mut groups: Vec<(Vec<Tensor>, Vec<Answer>)> = Vec::new();
-    for Request { tensor, answer } in batch {
-        let like = |group: &&mut (Vec<Tensor>, Vec<Answer>)| {
-            group.0[0].height == tensor.height && group.0[0].width == tensor.width
+/// Groups a batch by the shape of the tensors, because one run takes tensors of one shape.
+fn group_by_shape(batch: Vec<Request>) -> Vec<Vec<Request>> {
+    let mut groups: Vec<Vec<Request>> = Vec::new();
+    for request in batch {
+        let Tensor { height, width, .. } = request.tensor;
+        let same_shape = |group: &&mut Vec<Request>| {
+            group[0].tensor.height == height && group[0].tensor.width == width
         };
-        match groups.iter_mut().find(like) {
-            Some(group) => {
-                group.0.push(tensor);
-                group.1.push(answer);
-            }
-            None => groups.push((vec![tensor], vec![answer])),
+        match groups.iter_mut().find(same_shape) {
+            Some(group) => group.push(request),
+            None => groups.push(vec![request]),
         }
     }
     groups

@@ -1,4 +1,4 @@
-//! What a model does on this machine, by each way of running it.
+//! Benchmark of a model on this machine, over executions and layouts.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -6,76 +6,78 @@ use std::time::{Duration, Instant};
 use ort::value::TensorRef;
 
 use super::batcher::{Batcher, Layout};
-use super::extractor::{ExtractError, Opened, sample};
+use super::extractor::{ExtractError, VerifiedModel, sample};
 use super::manifest;
+use super::pooling::FeatureSet;
 use super::preprocess::Tensor;
-use super::provider::{self, Execution, LEAST_SIMILARITY, ProviderPreference};
+use super::provider::{self, Execution, MIN_SIMILARITY, ProviderPreference};
 use super::runtime::Assets;
 use super::session::{InferenceError, Model};
+use whereabouts_core::DescriptorKind;
 
-/// 8 products of 1024 × 1024 matrices, see deploy/models/make_gemm.py.
+/// A graph of 8 products of 1024 × 1024 matrices, made by deploy/models/make_gemm.py.
 const GEMM: &[u8] = include_bytes!("gemm.onnx");
 const GEMM_SIZE: usize = 1024;
 const GEMM_FLOP: f64 = 8.0 * 2.0 * 1024.0 * 1024.0 * 1024.0;
 
-/// What to try.
+/// What to measure.
 #[derive(Debug, Clone)]
 pub struct BenchSettings {
-    /// By whom and at which precision.
-    pub wanted: ProviderPreference,
-    /// How threads are shared.
+    /// Execution providers and precisions to measure.
+    pub preference: ProviderPreference,
+    /// Layouts to measure.
     pub layouts: Vec<Layout>,
-    /// How long each figure is measured.
+    /// Duration of each measurement.
     pub duration: Duration,
 }
 
-/// One way of running a model, and what it does.
+/// The measurements of one execution and layout.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BenchRow {
-    /// By whom, and at which precision.
+    /// Execution provider and precision.
     pub execution: Execution,
-    /// How threads are shared.
+    /// How threads are divided among sessions.
     pub layout: Layout,
-    /// The figures, or why there are none.
-    pub outcome: Result<Figures, String>,
+    /// The figures, or why they could not be measured.
+    pub outcome: Result<BenchFigures, String>,
 }
 
-/// Figures of inference alone, without decoding or search.
+/// Figures of inference and pooling, without decoding or search.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Figures {
-    /// The median time of a picture that comes alone.
+pub struct BenchFigures {
+    /// Median latency of a picture that arrives alone.
     pub alone: Duration,
-    /// Pictures a second while enough of them wait.
+    /// Pictures per second with a full queue.
     pub per_second: f64,
-    /// The least cosine similarity of a descriptor to that of the CPU at full precision.
+    /// Lowest cosine similarity of a descriptor to that of the CPU at full precision.
     pub similarity: f32,
-    /// What this provider reaches with plain matrix products at this precision and so many threads,
-    /// in floating-point operations a second.
+    /// Floating-point operations per second of plain matrix products on this execution and number of
+    /// threads.
     pub peak: f64,
 }
 
 impl BenchRow {
-    /// The figures of a way whose descriptors are right.
-    pub fn right(&self) -> Option<&Figures> {
-        self.outcome.as_ref().ok().filter(|figures| figures.similarity >= LEAST_SIMILARITY)
+    /// The figures, if the descriptors are similar enough to those of the reference.
+    pub fn accepted(&self) -> Option<&BenchFigures> {
+        self.outcome.as_ref().ok().filter(|figures| figures.similarity >= MIN_SIMILARITY)
     }
 }
 
-/// A model on the bench.
+/// A model to be measured.
 #[derive(Debug)]
 pub struct Bench {
-    opened: Opened,
+    opened: VerifiedModel,
     sample: Vec<Tensor>,
 }
 
 impl Bench {
-    /// Finds and reads a model. Only the executions that `wanted` allows can be tried.
+    /// Opens a model. Only executions allowed by `preference` can be measured.
     pub fn open(
         assets: &Assets,
         model: &str,
-        wanted: ProviderPreference,
+        preference: ProviderPreference,
     ) -> Result<Self, ExtractError> {
-        let opened = Opened::open(assets, model, wanted.provider)?;
+        let opened = VerifiedModel::open(assets, model, preference.provider)?;
         let sample = sample(&opened.model.manifest.input)?;
         Ok(Self { opened, sample })
     }
@@ -100,63 +102,66 @@ impl Bench {
         Some(2.0 * weights * tokens + 4.0 * tokens * tokens * channels * layers)
     }
 
-    /// Tries one way after another, and tells each as it is done.
+    /// Measures every combination of execution and layout, and passes each row to `on_row` as it is done.
     pub fn run(
         &self,
         settings: &BenchSettings,
-        mut done: impl FnMut(&BenchRow),
+        mut on_row: impl FnMut(&BenchRow),
     ) -> Result<Vec<BenchRow>, InferenceError> {
         let model = &self.opened.model;
         let reference = provider::descriptors(model, Execution::REFERENCE, 1, &self.sample)?;
         let mut rows = Vec::new();
-        for execution in Execution::candidates(settings.wanted) {
+        for execution in Execution::candidates(settings.preference) {
             let similarity = provider::descriptors(model, execution, 1, &self.sample)
-                .map(|tried| provider::least_similarity(&tried, &reference));
+                .map(|descriptors| provider::min_similarity(&descriptors, &reference));
             let mut peaks = BTreeMap::new();
             for &layout in &settings.layouts {
                 let outcome = similarity.clone().and_then(|similarity| {
-                    let (alone, per_second) = self.pace(execution, layout, settings.duration)?;
+                    let (alone, per_second) =
+                        self.latency_and_throughput(execution, layout, settings.duration)?;
                     let peak = match peaks.get(&layout.threads) {
                         Some(&peak) => peak,
                         None => gemm_peak(model, execution, layout.threads, settings.duration)?,
                     };
                     peaks.insert(layout.threads, peak);
-                    Ok(Figures { alone, per_second, similarity, peak })
+                    Ok(BenchFigures { alone, per_second, similarity, peak })
                 });
                 let outcome = outcome.map_err(|error| error.to_string());
                 let row = BenchRow { execution, layout, outcome };
-                done(&row);
+                on_row(&row);
                 rows.push(row);
             }
         }
         Ok(rows)
     }
 
-    /// The median time of one picture alone, and pictures a second while the queue is kept full.
-    fn pace(
+    /// Measures the median latency of a single picture, and pictures per second with a full queue.
+    fn latency_and_throughput(
         &self,
         execution: Execution,
         layout: Layout,
         duration: Duration,
     ) -> Result<(Duration, f64), InferenceError> {
         let mut batcher = Batcher::start(&self.opened.model, execution, layout)?;
-        batcher.add_narrow(self.opened.model.clone(), execution)?;
+        batcher.add_throughput_sessions(self.opened.model.clone(), execution)?;
         batcher.wait_until_complete();
         let mut pictures = self.sample.iter().cycle();
         let mut next = || pictures.next().cloned().unwrap_or_else(|| Tensor::grey(1, 1));
+        let submit =
+            |picture| batcher.submit(picture, DescriptorKind::Gem, FeatureSet::DescriptorOnly);
         let mut times = Vec::new();
         let start = Instant::now();
         while times.len() < 3 || start.elapsed() < duration {
             let picture = next();
             let start = Instant::now();
-            batcher.submit(picture)?.wait()?;
+            submit(picture)?.wait()?;
             times.push(start.elapsed());
         }
         times.sort_unstable();
         let mut in_progress = VecDeque::new();
         let ahead = layout.capacity();
         for _ in 0..ahead {
-            in_progress.push_back(batcher.submit(next())?);
+            in_progress.push_back(submit(next())?);
         }
         let (mut finished, start) = (0, Instant::now());
         while finished < ahead || start.elapsed() < duration {
@@ -164,13 +169,13 @@ impl Bench {
                 first.wait()?;
                 finished += 1;
             }
-            in_progress.push_back(batcher.submit(next())?);
+            in_progress.push_back(submit(next())?);
         }
         Ok((times[times.len() / 2], finished as f64 / start.elapsed().as_secs_f64()))
     }
 }
 
-/// The best of what one session reaches with products of large matrices.
+/// Measures the peak rate of large matrix products in one session, in floating-point operations per second.
 fn gemm_peak(
     model: &Model,
     execution: Execution,

@@ -1,4 +1,4 @@
-//! Bytes to pixels, for bytes that nobody vouches for.
+//! Decoding of untrusted bytes to pixels.
 
 use std::io::Cursor;
 
@@ -7,45 +7,45 @@ use image::{DynamicImage, ImageDecoder, ImageReader, Limits, RgbImage};
 use super::jpeg::{self, Malformed, Outline};
 use whereabouts_core::MediaType;
 
-/// Bounds on a picture, checked before its pixels are decoded.
+/// Limits on a picture, checked before its pixels are decoded.
 #[derive(Debug, Clone, Copy)]
 pub struct ImageLimits {
-    /// The most pixels (width × height) that are decoded.
+    /// Maximum pixels (width × height).
     pub max_pixels: u64,
 }
 
 /// A decoded picture, upright.
 #[derive(Debug, Clone)]
 pub struct Picture {
-    /// Its pixels, turned as its EXIF orientation says; fewer than the file's if [`Needed`] allows.
+    /// The pixels, with the EXIF orientation applied; at a reduced resolution if [`Needed`] allows it.
     pub pixels: RgbImage,
-    /// Width in pixels of the picture in the file, upright.
+    /// Width of the picture in the file in pixels, upright.
     pub width: u32,
-    /// Height in pixels of the picture in the file, upright.
+    /// Height of the picture in the file in pixels, upright.
     pub height: u32,
-    /// The format it came in.
+    /// Format of the file.
     pub media_type: MediaType,
 }
 
-/// How many pixels the caller needs. A JPEG with at least twice as many in each direction is decoded
-/// at a half, a quarter or an eighth of its size, which takes a fraction of the time.
+/// The resolution that the caller needs. A JPEG with at least twice that resolution is decoded at a half, a quarter
+/// or an eighth of its size, which takes a fraction of the time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Needed {
-    /// All that there are.
+    /// Full resolution.
     All,
-    /// No fewer than this width and this height, upright.
+    /// At least this width and height, upright.
     Size(u32, u32),
-    /// A longer edge of no less than this.
+    /// A longer edge of at least this length.
     LongestEdge(u32),
 }
 
-/// Why bytes could not become a picture.
+/// Why bytes cannot be decoded.
 #[derive(Debug, thiserror::Error)]
 pub enum DecodeError {
-    /// The first bytes are not those of JPEG, PNG or WebP.
+    /// The magic bytes are not those of JPEG, PNG or WebP.
     #[error("the bytes are not a JPEG, PNG or WebP picture; send one of these formats")]
     UnknownFormat,
-    /// The picture is larger than the configured bound.
+    /// The picture exceeds the configured limit.
     #[error(
         "the picture has {width}×{height} pixels, more than the {max_pixels} that this server \
          decodes (image.max_pixels); scale it down before sending"
@@ -55,26 +55,25 @@ pub enum DecodeError {
         width: u32,
         /// Height in pixels.
         height: u32,
-        /// The bound.
+        /// The limit.
         max_pixels: u64,
     },
-    /// The file stops before its end.
+    /// The file is truncated.
     #[error("the JPEG is truncated: its data ends before the end-of-image marker; send it whole")]
     Truncated,
-    /// The decoder gave up.
+    /// The decoder failed.
     #[error("the {format} cannot be decoded: {reason}")]
     Damaged {
-        /// The format by its first bytes.
+        /// Format by the magic bytes.
         format: &'static str,
-        /// What the decoder said.
+        /// Message of the decoder.
         reason: String,
     },
 }
 
 /// Decodes a JPEG, PNG or WebP picture to upright RGB.
 ///
-/// The size is read from the header first, so that a small file that claims a huge picture costs
-/// nothing.
+/// The size is checked in the header first, so that a small file that claims a huge picture is rejected at no cost.
 pub fn decode(bytes: &[u8], limits: ImageLimits, needed: Needed) -> Result<Picture, DecodeError> {
     match MediaType::sniff(bytes).ok_or(DecodeError::UnknownFormat)? {
         MediaType::Jpeg => decode_jpeg(bytes, limits, needed),
@@ -92,7 +91,7 @@ fn decode_jpeg(bytes: &[u8], limits: ImageLimits, needed: Needed) -> Result<Pict
     })?;
     within(limits, outline.width, outline.height)?;
     if !matches!(outline.components, 1 | 3) {
-        // Colours for print.
+        // CMYK, which libjpeg-turbo does not convert to RGB.
         return decode_whole(bytes, limits, MediaType::Jpeg);
     }
     let (width, height) = outline.upright();
@@ -137,7 +136,7 @@ fn within(limits: ImageLimits, width: u32, height: u32) -> Result<(), DecodeErro
 }
 
 impl Needed {
-    /// The least of 1, 2, 4 and 8 eighths of a picture that are enough.
+    /// The smallest of 1, 2, 4 and 8 eighths that gives the needed resolution.
     fn eighths(self, width: u32, height: u32) -> u8 {
         let enough = |eighths: &u8| {
             let at_least = |edge: u32, needed: u32| {
@@ -153,7 +152,7 @@ impl Needed {
     }
 }
 
-/// Encodes a picture for people to look at.
+/// Encodes a picture as JPEG, for display.
 pub fn encode_jpeg(pixels: &RgbImage) -> Result<Vec<u8>, DecodeError> {
     const QUALITY: u8 = 85;
     let mut bytes = Vec::new();
@@ -163,8 +162,7 @@ pub fn encode_jpeg(pixels: &RgbImage) -> Result<Vec<u8>, DecodeError> {
     Ok(bytes)
 }
 
-/// What the decoder itself may allocate: 8 bytes a pixel hold 16-bit RGBA, and as much again is
-/// left for its working memory.
+/// Memory that the decoder may allocate: 8 bytes per pixel for 16-bit RGBA, and the same again for working memory.
 fn allocation_limits(limits: ImageLimits) -> Limits {
     let mut allowed = Limits::default();
     allowed.max_alloc = Some(limits.max_pixels.saturating_mul(16).max(1 << 20));
@@ -190,7 +188,7 @@ mod tests {
         bytes.into_inner()
     }
 
-    /// A TIFF block with the orientation tag alone, as cameras write it.
+    /// A JPEG whose EXIF block has only the orientation tag.
     fn with_orientation(orientation: u8) -> Vec<u8> {
         let exif = [
             b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(),
@@ -205,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn the_three_formats_decode() {
+    fn all_three_formats_are_decoded() {
         for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png, image::ImageFormat::WebP]
         {
             let picture = decode(&encode(format), LIMITS, Needed::All).unwrap();
@@ -214,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn exif_orientation_turns_the_picture_upright() {
+    fn the_exif_orientation_is_applied() {
         let plain = decode(&with_orientation(1), LIMITS, Needed::All).unwrap().pixels;
         let turned = decode(&with_orientation(6), LIMITS, Needed::All).unwrap().pixels;
         assert_eq!(turned.dimensions(), (20, 40));
@@ -222,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_large_jpeg_is_reduced_to_what_is_needed_and_no_further() {
+    fn a_large_jpeg_is_reduced_to_the_needed_resolution() {
         let mut jpeg = Vec::new();
         let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 95);
         encoder.encode_image(&gradient(401, 200)).unwrap();
@@ -244,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reduced_picture_is_the_area_average() {
+    fn a_reduced_picture_is_an_area_average() {
         let mut jpeg = Vec::new();
         let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 100);
         let smooth = RgbImage::from_fn(320, 160, |x, y| {
@@ -263,10 +261,10 @@ mod tests {
     }
 
     #[test]
-    fn headers_that_contradict_each_other_are_refused() {
+    fn contradicting_frame_headers_are_rejected() {
         let mut bytes = encode(image::ImageFormat::Jpeg);
         let frame = bytes.windows(2).position(|pair| pair == [0xFF, 0xC0]).unwrap();
-        // A second frame header ahead of the real one, with a modest size.
+        // A second frame header, with a small size, before the real one.
         let mut small = bytes[frame..frame + 19].to_vec();
         small[5..9].copy_from_slice(&[0, 8, 0, 8]);
         bytes.splice(frame..frame, small);
@@ -274,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_of_endless_scans_is_refused_before_it_is_decoded() {
+    fn a_file_with_too_many_scans_is_rejected_before_decoding() {
         let mut bytes = encode(image::ImageFormat::Jpeg);
         let scan = bytes.windows(2).position(|pair| pair == [0xFF, 0xDA]).unwrap();
         let header = bytes[scan..scan + 14].to_vec();
@@ -284,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn every_flipped_byte_gives_a_picture_or_an_error() {
+    fn every_corrupted_byte_yields_a_picture_or_an_error() {
         let whole = encode(image::ImageFormat::Jpeg);
         for at in 0..whole.len() {
             let mut bytes = whole.clone();
@@ -297,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_cut_anywhere_is_refused() {
+    fn a_truncated_file_is_rejected() {
         for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png, image::ImageFormat::WebP]
         {
             let whole = encode(format);
@@ -311,14 +309,14 @@ mod tests {
     }
 
     #[test]
-    fn a_huge_picture_is_refused_by_its_header() {
+    fn a_huge_picture_is_rejected_by_its_header() {
         let tight = ImageLimits { max_pixels: 799 };
         let error = decode(&encode(image::ImageFormat::Png), tight, Needed::All).unwrap_err();
         assert!(matches!(error, DecodeError::TooManyPixels { width: 40, height: 20, .. }));
     }
 
     #[test]
-    fn text_is_no_picture() {
+    fn text_is_rejected() {
         assert!(matches!(
             decode(b"hello, robot", LIMITS, Needed::All),
             Err(DecodeError::UnknownFormat)

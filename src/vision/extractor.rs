@@ -1,55 +1,56 @@
-//! From the bytes of a picture to its descriptor and dense features.
+//! Extraction: from the bytes of a picture to its descriptor and dense features.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::batcher::{Batcher, Layout, PendingInference};
+use super::batcher::{Batcher, Layout, PendingInference, Pooled};
 use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jpeg};
 use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest};
-use super::pooling::PoolingError;
+use super::pooling::{FeatureSet, PoolingError};
 use super::preprocess::{self, PreprocessError, Tensor, preprocess};
 use super::provider::{self, Execution, Provider, ProviderPreference};
 use super::runtime::{Assets, RuntimeError};
-use super::session::{InferenceError, Model, RawOutput};
+use super::session::{InferenceError, Model};
 use whereabouts_core::{DenseFeatures, Descriptor, DescriptorKind, Digest, MediaType};
 
-/// How pictures are decoded and run through the model.
+/// How a model is loaded and its pictures are decoded.
 #[derive(Debug, Clone)]
 pub struct ExtractorSettings {
-    /// The model's name.
+    /// Name of the model.
     pub model: String,
-    /// How inference shares its threads among pictures.
+    /// How inference divides its threads among sessions.
     pub layout: Layout,
-    /// By whom and at which precision it may be run.
-    pub wanted: ProviderPreference,
-    /// Where the choice among these is remembered; measured at each start if nowhere.
-    pub remember: Option<PathBuf>,
-    /// Bounds on a picture.
+    /// Execution providers and precisions that may be used.
+    pub preference: ProviderPreference,
+    /// File that caches the chosen execution; without one, the choice is measured at every start.
+    pub choice_file: Option<PathBuf>,
+    /// Limits on the size of a picture.
     pub limits: ImageLimits,
-    /// Whether every pixel of a large JPEG is decoded before it is scaled down.
+    /// Whether a large JPEG is decoded at full resolution before it is scaled down.
     pub exact_decode: bool,
 }
 
 impl ExtractorSettings {
-    /// One session of a model on the CPU at full precision, one picture at a time, exactly decoded.
+    /// The reference settings: one session on the CPU at full precision, batches of one picture, exact
+    /// decoding.
     pub fn plain(model: &str, threads: usize, limits: ImageLimits) -> Self {
         let reference = Execution::REFERENCE;
         Self {
             model: model.into(),
             layout: Layout { threads, sessions: 1, max_batch: 1 },
-            wanted: ProviderPreference {
+            preference: ProviderPreference {
                 provider: Some(reference.provider),
                 precision: Some(reference.precision),
             },
-            remember: None,
+            choice_file: None,
             limits,
             exact_decode: true,
         }
     }
 }
 
-/// One loaded model with everything around it. Its calls block; run them on a pool thread.
+/// A loaded model with its preprocessing and pooling.
 #[derive(Debug)]
 pub struct Extractor {
     manifest: Arc<Manifest>,
@@ -60,100 +61,120 @@ pub struct Extractor {
     exact_decode: bool,
 }
 
-/// A picture that was handed to inference. Dropping it gives that up.
+/// A decoded picture whose inference is in progress. Dropping it cancels the inference if it has not started.
 #[derive(Debug)]
 pub struct PendingExtraction {
-    shown: DecodedMeta,
-    inferring: PendingInference,
-}
-
-/// What inference gave for one picture.
-#[derive(Debug)]
-pub struct Inference {
-    shown: DecodedMeta,
-    raw: RawOutput,
+    inference: PendingInference,
+    picture: SubmittedPicture,
 }
 
 #[derive(Debug)]
-struct DecodedMeta {
+struct SubmittedPicture {
+    digest: Digest,
+    media_type: MediaType,
     width: u32,
     height: u32,
-    media_type: MediaType,
-    cells: (usize, usize),
     decode: Duration,
-    decoded: Instant,
+    submitted: Instant,
 }
 
 impl PendingExtraction {
     /// Waits for inference.
-    pub async fn inferred(self) -> Result<Inference, ExtractError> {
-        Ok(Inference { raw: self.inferring.answer().await?, shown: self.shown })
+    pub async fn result(self) -> Result<Extraction, ExtractError> {
+        let Self { inference, picture } = self;
+        Ok(picture.with(inference.result().await?))
+    }
+
+    /// Blocks until inference is done.
+    fn wait(self) -> Result<Extraction, ExtractError> {
+        let Self { inference, picture } = self;
+        Ok(picture.with(inference.wait()?))
     }
 }
 
-/// What was extracted from one picture.
+impl SubmittedPicture {
+    fn with(self, Pooled { descriptor, dense, batch }: Pooled) -> Extraction {
+        let Self { digest, media_type, width, height, decode, submitted } = self;
+        let times = StageTimes { decode, extract: submitted.elapsed() };
+        Extraction { descriptor, dense, digest, media_type, width, height, times, batch }
+    }
+}
+
+/// The result of extracting one picture.
 #[derive(Debug)]
 pub struct Extraction {
-    /// The global descriptor.
+    /// Global descriptor.
     pub descriptor: Descriptor,
-    /// The local features.
-    pub dense: DenseFeatures,
-    /// The picture's format.
+    /// Dense features, if they were requested.
+    pub dense: Option<DenseFeatures>,
+    /// SHA-256 of the picture's bytes.
+    pub digest: Digest,
+    /// Format of the picture.
     pub media_type: MediaType,
-    /// Width in pixels, upright.
+    /// Width in pixels, after applying the EXIF orientation.
     pub width: u32,
-    /// Height in pixels, upright.
+    /// Height in pixels, after applying the EXIF orientation.
     pub height: u32,
-    /// How long the stages took.
+    /// Durations of the stages.
     pub times: StageTimes,
-    /// Pictures that the model was run on together, this one included.
+    /// Size of the batch that the picture was part of.
     pub batch: usize,
 }
 
-/// How long the stages of one extraction took.
+/// Durations of the stages of one extraction.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct StageTimes {
     /// Decoding and resizing.
     pub decode: Duration,
-    /// Waiting for a session, inference and pooling.
+    /// Queueing for a session, inference and pooling.
     pub extract: Duration,
 }
 
-/// Why nothing could be extracted.
+/// Why an extraction failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ExtractError {
-    /// The bytes are no picture.
+    /// The bytes cannot be decoded as a picture.
     #[error(transparent)]
     Decode(#[from] DecodeError),
     /// The picture cannot be resized.
     #[error(transparent)]
     Preprocess(#[from] PreprocessError),
-    /// The model failed.
+    /// Inference failed.
     #[error(transparent)]
-    Inference(#[from] InferenceError),
-    /// The output cannot be pooled.
+    Inference(InferenceError),
+    /// The output of the model cannot be pooled.
     #[error(transparent)]
     Pooling(#[from] PoolingError),
-    /// The model's manifest is wrong.
+    /// The manifest of the model is invalid.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
     /// ONNX Runtime or the model is missing.
     #[error(transparent)]
     Runtime(#[from] RuntimeError),
-    /// The model file cannot be read or is not the one that the manifest pins.
+    /// A model file cannot be read or does not match the digest pinned in the manifest.
     #[error("{0}")]
     ModelFile(String),
-    /// Nobody wanted the answer any more.
-    #[error("the caller has gone")]
+    /// The caller left before inference started.
+    #[error("the caller has left")]
     Abandoned,
 }
 
+impl From<InferenceError> for ExtractError {
+    fn from(error: InferenceError) -> Self {
+        match error {
+            InferenceError::Pooling(error) => Self::Pooling(error),
+            error => Self::Inference(error),
+        }
+    }
+}
+
 impl Extractor {
-    /// Loads a model and checks it by running one picture through it.
+    /// Loads a model and validates it by running one picture through it. Throughput sessions are loaded in
+    /// the background.
     pub fn load(assets: &Assets, settings: &ExtractorSettings) -> Result<Self, ExtractError> {
-        let Opened { model, digest } =
-            Opened::open(assets, &settings.model, settings.wanted.provider)?;
-        let execution = chosen(&model, digest, settings)?;
+        let VerifiedModel { model, digest } =
+            VerifiedModel::open(assets, &settings.model, settings.preference.provider)?;
+        let execution = choose_execution(&model, digest, settings)?;
         let batcher = Batcher::start(&model, execution, settings.layout)?;
         let mut extractor = Self {
             manifest: Arc::clone(&model.manifest),
@@ -163,43 +184,50 @@ impl Extractor {
             limits: settings.limits,
             exact_decode: settings.exact_decode,
         };
-        extractor.check()?;
-        extractor.batcher.add_narrow(model, execution)?;
+        extractor.run_test_picture()?;
+        extractor.batcher.add_throughput_sessions(model, execution)?;
         Ok(extractor)
     }
 
-    /// What the model says about itself.
+    /// The manifest of the model.
     pub fn manifest(&self) -> &Manifest {
         &self.manifest
     }
 
-    /// The digest of all that decides a descriptor: weights, and how they are fed and pooled.
+    /// Digest of everything that determines a descriptor: weights, preprocessing and pooling.
     pub fn digest(&self) -> Digest {
         self.digest
     }
 
-    /// Who runs the model, and at which precision.
+    /// The execution provider and precision in use.
     pub fn execution(&self) -> Execution {
         self.execution
     }
 
-    /// Bounds on the pictures it takes.
+    /// Limits on the size of a picture.
     pub fn limits(&self) -> ImageLimits {
         self.limits
     }
 
-    /// Decodes a picture, runs it through the model and makes its descriptor; blocks.
-    pub fn extract(&self, bytes: &[u8], kind: DescriptorKind) -> Result<Extraction, ExtractError> {
-        let PendingExtraction { shown, inferring } = self.begin(bytes, || true)?;
-        self.finish(Inference { shown, raw: inferring.wait()? }, kind)
+    /// Extracts the descriptor, and the dense features if requested. Blocks; call it on a pool thread.
+    pub fn extract(
+        &self,
+        bytes: &[u8],
+        kind: DescriptorKind,
+        features: FeatureSet,
+    ) -> Result<Extraction, ExtractError> {
+        self.begin(bytes, kind, features, || true)?.wait()
     }
 
-    /// Decodes a picture and hands it to inference; blocks for the one, and while the queue before
-    /// the other is full. What is no longer `wanted` once it is decoded goes no further.
+    /// Decodes a picture and queues it for inference. Blocks while decoding and while the queue is full; call
+    /// it on a pool thread. Fails with [`ExtractError::Abandoned`] if `is_wanted` returns `false` after
+    /// decoding.
     pub fn begin(
         &self,
         bytes: &[u8],
-        wanted: impl Fn() -> bool,
+        kind: DescriptorKind,
+        features: FeatureSet,
+        is_wanted: impl Fn() -> bool,
     ) -> Result<PendingExtraction, ExtractError> {
         let start = Instant::now();
         let input = &self.manifest.input;
@@ -207,53 +235,38 @@ impl Extractor {
         let Picture { pixels, width, height, media_type } = decode(bytes, self.limits, needed)?;
         let tensor = preprocess(&pixels, (width, height), input)?;
         drop(pixels);
-        let cells = self.manifest.output.cells(&tensor);
-        if !wanted() {
+        if !is_wanted() {
             return Err(ExtractError::Abandoned);
         }
-        let decoded = Instant::now();
-        let inferring = self.batcher.submit(tensor)?;
-        let decode = decoded - start;
-        Ok(PendingExtraction {
-            shown: DecodedMeta { width, height, media_type, cells, decode, decoded },
-            inferring,
-        })
+        let submitted = Instant::now();
+        let inference = self.batcher.submit(tensor, kind, features)?;
+        // Hashed after submitting, so that it overlaps with inference.
+        let digest = Digest::of(bytes);
+        let decode = submitted - start;
+        let picture = SubmittedPicture { digest, media_type, width, height, decode, submitted };
+        Ok(PendingExtraction { inference, picture })
     }
 
-    /// Makes the descriptor of what inference gave; blocks for less than a millisecond.
-    pub fn finish(
-        &self,
-        inferred: Inference,
-        kind: DescriptorKind,
-    ) -> Result<Extraction, ExtractError> {
-        let Inference { shown, raw } = inferred;
-        let local = raw.local_features(&self.manifest.output, shown.cells)?;
-        let descriptor = local.descriptor(kind, &self.manifest.pooling)?;
-        let dense = local.into_dense()?;
-        let DecodedMeta { width, height, media_type, decode, decoded, .. } = shown;
-        let times = StageTimes { decode, extract: decoded.elapsed() };
-        Ok(Extraction { descriptor, dense, media_type, width, height, times, batch: raw.batch })
-    }
-
-    /// A manifest that does not fit its model should stop the start, not the first request; and that
-    /// request should not wait for the graph's first run.
-    fn check(&self) -> Result<(), ExtractError> {
+    /// Extracts a generated picture, so that a manifest that does not match its model fails at startup
+    /// instead of at the first request, and that request does not pay for the slow first run.
+    fn run_test_picture(&self) -> Result<(), ExtractError> {
         let Input { width, height, .. } = self.manifest.input;
         let pixels = image::RgbImage::from_fn(width, height, |x, y| {
             image::Rgb([(x * 7 + y * 13) as u8, (x * y) as u8, (x * 3 + y) as u8])
         });
-        self.extract(&encode_jpeg(&pixels)?, DescriptorKind::Gem).map(drop)
+        let picture = encode_jpeg(&pixels)?;
+        self.extract(&picture, DescriptorKind::Gem, FeatureSet::DescriptorAndDense).map(drop)
     }
 }
 
-/// A model that was found and is the one that its manifest means.
+/// A model whose files match the digests pinned in its manifest.
 #[derive(Debug)]
-pub(super) struct Opened {
+pub(super) struct VerifiedModel {
     pub model: Model,
     pub digest: Digest,
 }
 
-impl Opened {
+impl VerifiedModel {
     pub fn open(
         assets: &Assets,
         name: &str,
@@ -263,14 +276,14 @@ impl Opened {
         let folder = assets.model(name)?;
         let manifest = Arc::new(Manifest::read(&folder.join(MANIFEST))?);
         let file = folder.join(&manifest.file);
-        let digest = manifest.digest(&checked_digests(&folder, &manifest)?);
+        let digest = manifest.digest(&verified_digests(&folder, &manifest)?);
         Ok(Self { model: Model { environment, file, manifest }, digest })
     }
 }
 
-/// The execution that was chosen at an earlier start under the same conditions, or the best of
-/// those that are tried now.
-fn chosen(
+/// Returns the execution cached by an earlier start under the same conditions, or measures the candidates and
+/// returns the best.
+fn choose_execution(
     model: &Model,
     digest: Digest,
     settings: &ExtractorSettings,
@@ -278,39 +291,39 @@ fn chosen(
     let key = format!(
         "model {digest}, {} threads, {}, processor {}, {}",
         settings.layout.threads,
-        settings.wanted,
+        settings.preference,
         provider::processor(),
         ort::info()
     );
-    let remembered = settings.remember.as_deref();
-    if let Some(known) = remembered.and_then(|file| provider::recall(file, &key)) {
-        return Ok(known);
+    let choice_file = settings.choice_file.as_deref();
+    if let Some(cached) = choice_file.and_then(|file| provider::read_choice(file, &key)) {
+        return Ok(cached);
     }
     let sample = sample(&model.manifest.input)?;
     let (execution, trials) =
-        provider::choose(model, settings.wanted, settings.layout.threads, &sample)?;
+        provider::choose(model, settings.preference, settings.layout.threads, &sample)?;
     for trial in &trials {
         match &trial.outcome {
             Ok(measured) => tracing::info!(
                 execution = %trial.execution,
                 ms = measured.latency.as_secs_f64() * 1e3,
                 similarity = measured.similarity,
-                "tried"
+                "execution measured"
             ),
-            Err(why) => tracing::info!(execution = %trial.execution, why, "cannot be used"),
+            Err(why) => tracing::info!(execution = %trial.execution, why, "execution unusable"),
         }
     }
-    if let Some(file) = remembered.filter(|_| !trials.is_empty()) {
-        provider::remember(file, &key, execution);
+    if let Some(file) = choice_file.filter(|_| !trials.is_empty()) {
+        provider::write_choice(file, &key, execution);
     }
     Ok(execution)
 }
 
-/// Two pictures of streets, by day and by night, to time a model on.
+/// Two street scenes, by day and by night, on which models are measured.
 const SAMPLES: [&[u8]; 2] =
     [include_bytes!("samples/street-day.jpg"), include_bytes!("samples/street-night.jpg")];
 
-/// The bundled sample pictures as input tensors.
+/// Decodes the bundled sample pictures to input tensors.
 pub(super) fn sample(input: &Input) -> Result<Vec<Tensor>, ExtractError> {
     let limits = ImageLimits { max_pixels: 1 << 20 };
     let tensors = SAMPLES.iter().map(|bytes| {
@@ -320,9 +333,9 @@ pub(super) fn sample(input: &Input) -> Result<Vec<Tensor>, ExtractError> {
     tensors.collect()
 }
 
-/// The digests of a model's files, which are those that its manifest pins.
-fn checked_digests(folder: &Path, manifest: &Manifest) -> Result<Vec<Digest>, ExtractError> {
-    let checked = manifest.files().map(|(file, pinned)| {
+/// Hashes a model's files and checks the digests against those pinned in the manifest.
+fn verified_digests(folder: &Path, manifest: &Manifest) -> Result<Vec<Digest>, ExtractError> {
+    let digests = manifest.files().map(|(file, pinned)| {
         let file = folder.join(file);
         let (digest, _) = file_digest(&file).map_err(|error| {
             ExtractError::ModelFile(format!(
@@ -332,12 +345,12 @@ fn checked_digests(folder: &Path, manifest: &Manifest) -> Result<Vec<Digest>, Ex
         })?;
         match pinned {
             Some(pinned) if pinned != digest => Err(ExtractError::ModelFile(format!(
-                "{} is {digest}, but its manifest pins {pinned}; `whereabouts model verify` says \
-                 how to put it right",
+                "{} has the digest {digest}, but its manifest pins {pinned}; `whereabouts model verify` \
+                 explains how to repair it",
                 file.display()
             ))),
             _ => Ok(digest),
         }
     });
-    checked.collect()
+    digests.collect()
 }

@@ -1,5 +1,5 @@
-//! JPEG: what the markers say, and pixels from libjpeg-turbo's decoder, which robots' pictures and
-//! the published models met in training too.
+//! JPEG decoding: the markers are parsed here, the pixels are decoded by libjpeg-turbo, which also decoded the
+//! training images of the published models.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -7,36 +7,36 @@ use image::RgbImage;
 use image::metadata::Orientation;
 use mozjpeg::Decompress;
 
-/// Scans of a progressive JPEG that are decoded. Cameras write about ten; each costs a pass over
-/// the whole picture, so that a small file with thousands would keep a core busy for minutes.
-const MOST_SCANS: usize = 200;
+/// Maximum scans of a progressive JPEG. Cameras write about ten. Each scan costs a pass over the whole picture,
+/// so a small file with thousands of scans would keep a core busy for minutes.
+const MAX_SCANS: usize = 200;
 
-/// What the markers of a JPEG (ISO/IEC 10918-1, annex B) say.
+/// The contents of a JPEG's markers (ISO/IEC 10918-1, annex B).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Outline {
     /// Width in pixels, as stored.
     pub width: u32,
     /// Height in pixels, as stored.
     pub height: u32,
-    /// Colour components: 1 for grey, 3 for colour, 4 for print.
+    /// Colour components: 1 for grey, 3 for colour, 4 for CMYK.
     pub components: u8,
-    /// How it is to be turned.
+    /// EXIF orientation.
     pub orientation: Orientation,
 }
 
-/// Why the markers give no outline.
+/// Why the markers are malformed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Malformed {
-    /// They do not lead to the end-of-image marker.
+    /// The end-of-image marker is missing.
     Truncated,
     /// There is no frame header.
     NoFrame,
-    /// There are more than [`MOST_SCANS`].
+    /// There are more than [`MAX_SCANS`].
     TooManyScans,
 }
 
 impl Outline {
-    /// Width and height in pixels once it is turned.
+    /// Width and height in pixels, after applying the orientation.
     pub fn upright(&self) -> (u32, u32) {
         use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
         match self.orientation {
@@ -45,11 +45,11 @@ impl Outline {
         }
     }
 
-    /// Walks the markers of a file to its end-of-image marker.
+    /// Parses the markers of a file up to its end-of-image marker.
     ///
-    /// Decoders for browsers fill a missing rest with grey and report success. A robot's frame that
-    /// was cut in transit must not be localized by its upper half. Bytes behind the end are
-    /// allowed, as some cameras append a preview.
+    /// Decoders made for browsers fill the missing part of a truncated file with grey and report success. A
+    /// frame that was truncated in transit must not be localized by its upper half. Bytes after the
+    /// end-of-image marker are allowed, because some cameras append a preview.
     pub fn read(bytes: &[u8]) -> Result<Self, Malformed> {
         const END_OF_IMAGE: u8 = 0xD9;
         const START_OF_SCAN: u8 = 0xDA;
@@ -62,7 +62,7 @@ impl Outline {
                     let (width, height, components) = frame.ok_or(Malformed::NoFrame)?;
                     return Ok(Self { width, height, components, orientation });
                 }
-                // Markers that stand alone: restarts, start of image, and TEM.
+                // Markers without a segment: restarts, start of image, and TEM.
                 0xD0..=0xD8 | 0x01 => at = next,
                 _ => {
                     let Some(length) = bytes.get(next..next + 2) else { break };
@@ -71,7 +71,7 @@ impl Outline {
                     match marker {
                         START_OF_SCAN => {
                             scans += 1;
-                            if scans > MOST_SCANS {
+                            if scans > MAX_SCANS {
                                 return Err(Malformed::TooManyScans);
                             }
                             at = end_of_scan(bytes, at);
@@ -79,7 +79,7 @@ impl Outline {
                         APPLICATION_1 => {
                             orientation = exif_orientation(segment).unwrap_or(orientation)
                         }
-                        // Frame headers, less the three codes among them that are not.
+                        // Frame headers; three codes in the range are not.
                         0xC0..=0xCF if !matches!(marker, 0xC4 | 0xC8 | 0xCC) => {
                             frame = frame.or_else(|| frame_header(segment));
                         }
@@ -92,16 +92,16 @@ impl Outline {
     }
 }
 
-/// Decodes a picture in grey or colour at `eighths` / 8 of its size (1, 2, 4 or 8; both edges are
-/// rounded up), not turned.
+/// Decodes a picture at `eighths` / 8 of its size (1, 2, 4 or 8; both edges are rounded up), without applying the
+/// orientation.
 ///
-/// A reduced size is made in the frequency domain, by inverse transforms of the low frequencies
-/// alone: it is an area average, and costs a fraction of the time.
+/// The reduction happens in the frequency domain, by inverse transforms of the low frequencies only. The result
+/// is an area average and takes a fraction of the time.
 pub(super) fn decode(bytes: &[u8], outline: Outline, eighths: u8) -> Result<RgbImage, String> {
-    // libjpeg reports an error by unwinding from its callback, so that its C frames are left.
+    // libjpeg reports an error by unwinding from its callback.
     let decoded = catch_unwind(AssertUnwindSafe(|| {
         let mut decoder = Decompress::new_mem(bytes)?;
-        // What was checked against the bounds must be what is decoded.
+        // The size that was checked against the limits must be the size that is decoded.
         if decoder.size() != (outline.width as usize, outline.height as usize) {
             return Err(std::io::Error::other("its headers contradict each other"));
         }
@@ -122,14 +122,14 @@ pub(super) fn decode(bytes: &[u8], outline: Outline, eighths: u8) -> Result<RgbI
     RgbImage::from_raw(width, height, pixels).ok_or_else(|| "rows are missing".to_owned())
 }
 
-/// The next marker code at or after `at`, and where the bytes behind it begin.
+/// Finds the next marker at or after `at`. Returns its code and the position of the bytes after it.
 fn next_marker(bytes: &[u8], at: usize) -> Option<(u8, usize)> {
     let start = at + bytes.get(at..)?.iter().position(|&b| b == 0xFF)?;
     let code = start + bytes[start..].iter().position(|&b| b != 0xFF)?;
     Some((bytes[code], code + 1))
 }
 
-/// Where entropy-coded data ends: at the first marker that is neither a stuffed byte nor a restart.
+/// Finds the end of entropy-coded data: the first marker that is neither a stuffed byte nor a restart.
 fn end_of_scan(bytes: &[u8], mut at: usize) -> usize {
     while let Some(offset) = bytes.get(at..).and_then(|rest| rest.iter().position(|&b| b == 0xFF)) {
         at += offset;
@@ -142,7 +142,7 @@ fn end_of_scan(bytes: &[u8], mut at: usize) -> usize {
     bytes.len()
 }
 
-/// Width, height and components of a frame header, which begins with the bits of a sample.
+/// Parses width, height and components from a frame header, whose first byte is the sample precision.
 fn frame_header(segment: &[u8]) -> Option<(u32, u32, u8)> {
     let &[_, h0, h1, w0, w1, components, ..] = segment else { return None };
     let (width, height) = (u16::from_be_bytes([w0, w1]), u16::from_be_bytes([h0, h1]));

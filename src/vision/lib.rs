@@ -1,10 +1,9 @@
-//! The coarse retriever: from the bytes of a picture to its global descriptor, and from a
-//! descriptor to the most similar ones.
+//! The first half of coarse retrieval: from the bytes of a picture to its global descriptor and dense
+//! features.
 //!
-//! `decode` → `preprocess` → `batcher` (inference) → `pooling` → `index`, in this order; the
-//! [`Extractor`] strings the first four together, for whoever has a permit of the
-//! [`Admission`]. Where descriptors and records are kept is the
-//! business of the store.
+//! An [`Extractor`] runs the stages `decode` → `preprocess` → `batcher` (inference) → `pooling`. Callers first
+//! obtain a permit from [`Admission`], which bounds the pictures in progress. Searching and storing descriptors
+//! is left to the index and the store.
 
 mod admission;
 mod batcher;
@@ -20,20 +19,22 @@ pub mod preprocess;
 mod provider;
 mod runtime;
 mod session;
+mod settings;
 
 pub use admission::{
     Admission, AdmissionLevels, AdmissionRequest, AdmissionSettings, Permit, RejectReason,
     Rejected, WorkClass,
 };
 pub use batcher::Layout;
-pub use bench::{Bench, BenchRow, BenchSettings, Figures};
+pub use bench::{Bench, BenchFigures, BenchRow, BenchSettings};
 pub use decode::{DecodeError, ImageLimits, Needed, Picture};
 pub use extractor::{
-    ExtractError, Extraction, Extractor, ExtractorSettings, Inference, PendingExtraction,
-    StageTimes,
+    ExtractError, Extraction, Extractor, ExtractorSettings, PendingExtraction, StageTimes,
 };
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
-pub use provider::{Execution, LEAST_SIMILARITY, Measured, Provider, ProviderPreference, Trial};
+pub use pooling::FeatureSet;
+pub use provider::{Execution, MIN_SIMILARITY, Measurement, Provider, ProviderPreference, Trial};
 pub use runtime::{AUTO, Assets, BUILT_IN_MODEL, CHOSEN, PREFERRED_MODELS, RuntimeError, WhyModel};
+pub use settings::{ImageSettings, auto, threads_or_cores};

@@ -1,4 +1,4 @@
-//! The models in memory: loaded when they are first needed, no more than so many at a time.
+//! A cache of loaded models. Models are loaded on first use and evicted least recently used first.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,19 +12,19 @@ use super::runtime::{Assets, RuntimeError};
 use parking_lot::{Mutex, MutexGuard};
 use whereabouts_core::{Digest, Map, Precision};
 
-/// How models are kept in memory.
+/// How models are loaded and cached.
 #[derive(Debug, Clone)]
 pub struct LoadedSettings {
-    /// The most models; one that nobody uses makes room, the least recently used first.
-    pub most: usize,
-    /// The folder where the choice of a provider is remembered for each model.
-    pub remember: PathBuf,
-    /// How each of them is loaded. Its model is the default one; its precision, if there is one,
-    /// holds for all.
-    pub each: ExtractorSettings,
+    /// Maximum models in memory. The least recently used idle model is evicted.
+    pub max_loaded: usize,
+    /// Folder in which the chosen execution of each model is cached.
+    pub choice_dir: PathBuf,
+    /// How each model is loaded. Its model is the default model; its precision, if set, applies to all
+    /// models.
+    pub extractor: ExtractorSettings,
 }
 
-/// The models in memory. Clones share them.
+/// Loaded models. Clones share the same cache.
 #[derive(Debug, Clone)]
 pub struct LoadedModels {
     shared: Arc<Shared>,
@@ -34,96 +34,97 @@ pub struct LoadedModels {
 struct Shared {
     assets: Assets,
     settings: LoadedSettings,
-    /// The least recently used first.
+    /// Least recently used first.
     loaded: Mutex<Vec<Loaded>>,
-    /// Held while a model is loaded, so that none is loaded twice, and not two at once.
+    /// Held while a model is loaded, so that models are loaded one at a time and none twice.
     loading: tokio::sync::Mutex<()>,
 }
 
 #[derive(Debug)]
 struct Loaded {
     extractor: Arc<Extractor>,
-    files: Files,
+    files: FileStamps,
 }
 
-/// Tells whether a model was installed anew since it was loaded.
+/// Sizes and modification times of a model's files. They differ if the model was reinstalled since it was
+/// loaded.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Files(Vec<(u64, Option<SystemTime>)>);
+struct FileStamps(Vec<(u64, Option<SystemTime>)>);
 
 /// Why a model cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
-    /// It is not installed.
+    /// The model is not installed.
     #[error(transparent)]
     NotInstalled(RuntimeError),
-    /// It cannot be loaded.
+    /// The model cannot be loaded.
     #[error("the model {name:?} cannot be loaded: {why}")]
     Broken {
-        /// The model.
+        /// Name of the model.
         name: String,
-        /// Why not.
+        /// Why it cannot be loaded.
         why: String,
     },
-    /// All that may be in memory are in use.
-    #[error("{0} models are in use, the most that may be in memory (model.loaded)")]
+    /// The cache is full of models in use.
+    #[error("all {0} models that may be in memory are in use (model.loaded)")]
     AllInUse(usize),
 }
 
 impl LoadedModels {
-    /// None yet.
+    /// Creates an empty cache.
     pub fn new(assets: Assets, settings: LoadedSettings) -> Self {
         let (loaded, loading) = (Mutex::default(), tokio::sync::Mutex::default());
         Self { shared: Arc::new(Shared { assets, settings, loaded, loading }) }
     }
 
-    /// Those in memory, the most recently used first: their names, and how they run.
+    /// Names and executions of the models in memory, most recently used first.
     pub fn in_memory(&self) -> Vec<(String, Execution)> {
         let loaded = self.shared.loaded();
-        let told = |loaded: &Loaded| {
+        let entry = |loaded: &Loaded| {
             (loaded.extractor.manifest().name.clone(), loaded.extractor.execution())
         };
-        loaded.iter().rev().map(told).collect()
+        loaded.iter().rev().map(entry).collect()
     }
 
-    /// The model of maps for which none is named.
+    /// The model of maps that are created without naming one.
     pub fn default_model(&self) -> &str {
-        &self.shared.settings.each.model
+        &self.shared.settings.extractor.model
     }
 
-    /// Bounds on the pictures that models take.
+    /// Limits on the size of a picture.
     pub fn limits(&self) -> ImageLimits {
-        self.shared.settings.each.limits
+        self.shared.settings.extractor.limits
     }
 
-    /// The precision that the settings prescribe, if any.
+    /// The precision required by the settings, if any.
     pub fn precision(&self) -> Option<Precision> {
-        self.shared.settings.each.wanted.precision
+        self.shared.settings.extractor.preference.precision
     }
 
-    /// What an installed model says about itself. Reads a file.
+    /// Reads the manifest of an installed model from disk.
     pub fn manifest(&self, name: &str) -> Result<Manifest, ModelError> {
         self.shared.manifest(name).map(|(_, manifest)| manifest)
     }
 
-    /// The model of a map: the very one, if it is in memory or installed; else the one of that name,
-    /// as far as the settings allow in the map's precision.
+    /// Returns the model of a map. Prefers a loaded model with the map's digest and precision; otherwise
+    /// loads the installed model of that name, at the map's precision unless the settings require another.
     pub async fn of(&self, map: &Map) -> Result<Arc<Extractor>, ModelError> {
-        if let Some(extractor) = self.shared.take(|loaded| loaded.extractor.is_of(map)) {
+        if let Some(extractor) = self.shared.find(|loaded| loaded.extractor.is_of(map)) {
             return Ok(extractor);
         }
         self.installed(&map.model, self.precision().or(Some(map.precision))).await
     }
 
-    /// The model of that name as it is installed now, at `precision`, or at any if there is none.
+    /// Returns the currently installed model of that name, at `precision` or, without one, at any precision.
     pub async fn installed(
         &self,
         name: &str,
         precision: Option<Precision>,
     ) -> Result<Arc<Extractor>, ModelError> {
         let (shared, name) = (Arc::clone(&self.shared), name.to_owned());
-        // A task of its own: a caller who leaves does not break off what others wait for.
+        // A separate task, so that a caller that leaves does not cancel a load that others wait for.
         let loading = tokio::spawn(async move {
-            let _alone = shared.loading.lock().await;
+            let _guard = shared.loading.lock().await;
             let (loader, model) = (Arc::clone(&shared), name.clone());
             tokio::task::spawn_blocking(move || loader.load(&model, precision))
                 .await
@@ -134,25 +135,26 @@ impl LoadedModels {
 }
 
 impl Shared {
-    /// The model as it is installed now, from memory or from its files. Blocks; call it alone.
+    /// Returns the currently installed model, from the cache or from disk. Blocks; the caller holds `loading`.
     fn load(&self, name: &str, precision: Option<Precision>) -> Result<Arc<Extractor>, ModelError> {
         let (folder, manifest) = self.manifest(name)?;
-        let files = Files::of(&[folder.join(MANIFEST), folder.join(&manifest.file)]);
-        let wanted = |loaded: &Loaded| {
+        let files = FileStamps::of(&[folder.join(MANIFEST), folder.join(&manifest.file)]);
+        let matches = |loaded: &Loaded| {
             loaded.files == files
                 && loaded.extractor.manifest().name == name
-                && precision.is_none_or(|wanted| loaded.extractor.execution().precision == wanted)
+                && precision
+                    .is_none_or(|required| loaded.extractor.execution().precision == required)
         };
-        if let Some(extractor) = self.take(wanted) {
+        if let Some(extractor) = self.find(matches) {
             return Ok(extractor);
         }
-        self.make_room()?;
-        let LoadedSettings { remember, each, .. } = &self.settings;
+        self.evict_if_full()?;
+        let LoadedSettings { choice_dir, extractor, .. } = &self.settings;
         let settings = ExtractorSettings {
             model: name.to_owned(),
-            wanted: ProviderPreference { precision, ..each.wanted },
-            remember: Some(remember.join(format!("inference-{name}.toml"))),
-            ..each.clone()
+            preference: ProviderPreference { precision, ..extractor.preference },
+            choice_file: Some(choice_dir.join(format!("inference-{name}.toml"))),
+            ..extractor.clone()
         };
         let loaded = Extractor::load(&self.assets, &settings);
         let extractor = Arc::new(loaded.map_err(|error| broken(name, &error))?);
@@ -167,7 +169,7 @@ impl Shared {
         let manifest = Manifest::read(&folder.join(MANIFEST)).map_err(|e| broken(name, &e))?;
         if manifest.name != name {
             let why = format!(
-                "the manifest in {} is of {:?}; `whereabouts model add --name {name}` installs a \
+                "the manifest in {} names {:?}; `whereabouts model add --name {name}` installs a \
                  model under another name",
                 folder.display(),
                 manifest.name
@@ -177,28 +179,28 @@ impl Shared {
         Ok((folder, manifest))
     }
 
-    /// One that is in memory, and that is now the most recently used.
-    fn take(&self, wanted: impl Fn(&Loaded) -> bool) -> Option<Arc<Extractor>> {
+    /// Finds a loaded model and marks it as most recently used.
+    fn find(&self, matches: impl Fn(&Loaded) -> bool) -> Option<Arc<Extractor>> {
         let mut loaded = self.loaded();
-        let place = loaded.iter().position(wanted)?;
-        let used = loaded.remove(place);
+        let position = loaded.iter().position(matches)?;
+        let used = loaded.remove(position);
         let extractor = Arc::clone(&used.extractor);
         loaded.push(used);
         Some(extractor)
     }
 
-    /// Drops one that nobody uses, if one more would be too many.
-    fn make_room(&self) -> Result<(), ModelError> {
+    /// Evicts the least recently used idle model if the cache is full.
+    fn evict_if_full(&self) -> Result<(), ModelError> {
         let mut loaded = self.loaded();
-        if loaded.len() < self.settings.most {
+        if loaded.len() < self.settings.max_loaded {
             return Ok(());
         }
-        // Only under this lock does anybody get hold of one.
+        // References are handed out only under this lock, so an idle model stays idle.
         let idle = |loaded: &Loaded| Arc::strong_count(&loaded.extractor) == 1;
-        let place = loaded.iter().position(idle);
-        let place = place.ok_or(ModelError::AllInUse(self.settings.most))?;
-        let dropped = loaded.remove(place).extractor;
-        tracing::info!(model = dropped.manifest().name, "model dropped to make room");
+        let position = loaded.iter().position(idle);
+        let position = position.ok_or(ModelError::AllInUse(self.settings.max_loaded))?;
+        let evicted = loaded.remove(position).extractor;
+        tracing::info!(model = evicted.manifest().name, "model evicted");
         Ok(())
     }
 
@@ -208,27 +210,27 @@ impl Shared {
 }
 
 impl Extractor {
-    /// Whether it makes the descriptors that the map holds.
+    /// Whether descriptors of this model are comparable to those of the map.
     pub fn is_of(&self, map: &Map) -> bool {
         self.manifest().name == map.model
             && self.digest() == map.model_digest
             && self.execution().precision == map.precision
     }
 
-    /// Tells its dense features from those of any other model.
+    /// Identifies the model and precision, so that dense features of different models are not mixed.
     pub fn identity(&self) -> Digest {
         let (digest, precision) = (self.digest(), self.execution().precision);
         Digest::of(format!("{digest} at {precision} precision").as_bytes())
     }
 }
 
-impl Files {
+impl FileStamps {
     fn of(paths: &[PathBuf]) -> Self {
-        let seen = |path: &PathBuf| {
-            let found = Path::metadata(path).ok();
-            found.map_or((0, None), |found| (found.len(), found.modified().ok()))
+        let stamp = |path: &PathBuf| {
+            let metadata = Path::metadata(path).ok();
+            metadata.map_or((0, None), |metadata| (metadata.len(), metadata.modified().ok()))
         };
-        Self(paths.iter().map(seen).collect())
+        Self(paths.iter().map(stamp).collect())
     }
 }
 

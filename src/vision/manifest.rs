@@ -1,4 +1,4 @@
-//! The manifest: what a TOML file beside an ONNX file says about it.
+//! The manifest: a TOML file next to an ONNX file that describes it.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -13,62 +13,62 @@ use whereabouts_core::{DescriptorKind, Digest};
 /// The manifest's file name in a model's folder.
 pub const MANIFEST: &str = "manifest.toml";
 
-/// All that is needed to feed a model and to pool what comes out.
+/// Describes a model: its input, its output and how the output is pooled.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
-    /// The name by which maps refer to the model.
+    /// Name by which maps refer to the model.
     pub name: String,
     /// One sentence for people.
     #[serde(default)]
     pub description: String,
-    /// The ONNX file, beside the manifest.
+    /// The ONNX file, next to the manifest.
     pub file: PathBuf,
-    /// The digest that the file must have, if pinned.
+    /// Pinned digest of the ONNX file, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sha256: Option<Digest>,
-    /// The licence of the weights.
+    /// Licence of the weights.
     pub licence: String,
-    /// Where the weights come from.
+    /// Origin of the weights.
     pub source: String,
-    /// The weights, where they are not in the ONNX file, which holds two gigabytes at most.
+    /// External weights, for models above the 2 GB limit of an ONNX file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub data: Option<DataFile>,
-    /// What goes in.
+    /// The input tensor.
     pub input: Input,
-    /// What comes out.
+    /// The output tensors.
     pub output: Output,
-    /// How the output becomes a descriptor.
+    /// How the output is pooled to a descriptor.
     pub pooling: Pooling,
 }
 
-/// A file of weights beside the ONNX file, which names it.
+/// A file of external weights, referenced by the ONNX file.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DataFile {
-    /// Its name; the one that the ONNX file has for it.
+    /// File name, as referenced by the ONNX file.
     pub file: PathBuf,
-    /// The digest that it must have, if pinned.
+    /// Pinned digest, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sha256: Option<Digest>,
 }
 
-/// All in a manifest that decides a descriptor.
+/// The parts of a manifest that determine a descriptor.
 #[derive(Serialize)]
-struct Deciding<'a> {
+struct DescriptorInputs<'a> {
     input: &'a Input,
     output: &'a Output,
     pooling: &'a Pooling,
 }
 
 impl Manifest {
-    /// The files of the model and the digests that are pinned, the ONNX file first.
+    /// The files of the model and their pinned digests, the ONNX file first.
     pub fn files(&self) -> impl Iterator<Item = (&Path, Option<Digest>)> {
         let data = self.data.as_ref().map(|data| (data.file.as_path(), data.sha256));
         iter::once((self.file.as_path(), self.sha256)).chain(data)
     }
 
-    /// Pins the digests of [`files`](Self::files), in their order.
+    /// Pins the digests of the files, in the order of [`files`](Self::files).
     pub fn pin(&mut self, digests: &[Digest]) {
         self.sha256 = digests.first().copied().or(self.sha256);
         if let (Some(data), Some(digest)) = (&mut self.data, digests.get(1)) {
@@ -76,18 +76,19 @@ impl Manifest {
         }
     }
 
-    /// The digest of all that decides a descriptor: the files of weights, whose digests are `files`, and
-    /// how they are fed and pooled. What a manifest says to people does not count.
+    /// Digest of everything that determines a descriptor: the digests of the weight files, given as `files`,
+    /// and the input, output and pooling sections. Descriptive fields are not included.
     pub fn digest(&self, files: &[Digest]) -> Digest {
         let file = files.iter().map(Digest::to_string).collect::<Vec<_>>().join("\n");
         let Self { input, output, pooling, .. } = self;
-        // Structs of numbers, words and lists of these can always be written as TOML.
-        let text = toml::to_string(&Deciding { input, output, pooling }).unwrap_or_default();
+        // Serialization cannot fail: the structs contain only numbers, strings and lists of these.
+        let text =
+            toml::to_string(&DescriptorInputs { input, output, pooling }).unwrap_or_default();
         Digest::of(format!("{file}\n{text}").as_bytes())
     }
 }
 
-/// The digest and the size of a file that may not fit into memory.
+/// Computes the digest and the size of a file without reading it into memory as a whole.
 pub fn file_digest(path: &Path) -> io::Result<(Digest, u64)> {
     let (mut file, mut hasher, mut bytes) = (File::open(path)?, Sha256::new(), 0);
     let mut buffer = vec![0; 1 << 20];
@@ -106,21 +107,21 @@ pub fn file_digest(path: &Path) -> io::Result<(Digest, u64)> {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Input {
-    /// Its name in the graph.
+    /// Name in the graph.
     pub name: String,
     /// Width in pixels.
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// How a picture of another shape is fitted.
+    /// How a picture is fitted to width × height.
     pub resize: Resize,
-    /// The filter; both are antialiased.
+    /// Resampling filter, with antialiasing.
     pub interpolation: Interpolation,
-    /// Both edges are multiples of this many pixels.
+    /// Width and height are multiples of this.
     pub multiple: u32,
-    /// Subtracted from each channel after scaling to 0..1.
+    /// Subtracted from each channel, after scaling to 0..1.
     pub mean: [f32; 3],
-    /// Divides each channel after that.
+    /// Divides each channel, after subtracting the mean.
     pub std: [f32; 3],
 }
 
@@ -130,10 +131,10 @@ pub struct Input {
 pub enum Resize {
     /// Stretch to width × height.
     Squash,
-    /// Cut the largest centred part of the right shape, then scale it.
+    /// Crop the largest centred region with the aspect ratio of the input, then scale it.
     CentreCrop,
-    /// Keep the shape; the longer edge becomes the longer of width and height at the most, and
-    /// both edges are rounded to multiples.
+    /// Keep the aspect ratio: scale the longer edge to the longer of width and height, and round both edges
+    /// to multiples.
     LongestEdge,
 }
 
@@ -143,7 +144,7 @@ pub enum Resize {
 pub enum Interpolation {
     /// Keys' cubic convolution with a = −0.5, as Pillow and torchvision use when antialiasing.
     Bicubic,
-    /// The triangle filter.
+    /// Triangle filter.
     Bilinear,
 }
 
@@ -151,26 +152,26 @@ pub enum Interpolation {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Output {
-    /// The name of the local features in the graph.
+    /// Name of the local features in the graph.
     pub features: String,
-    /// How they are laid out.
+    /// Layout of the local features.
     pub layout: Layout,
-    /// The name of the N × 1 × h × w reliability map, if the model has one.
+    /// Name of the N × 1 × h × w reliability map, if the model outputs one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reliability: Option<String>,
-    /// Numbers for each local feature.
+    /// Numbers in each local feature.
     pub channels: usize,
-    /// Input pixels for each cell, in both directions (the patch size of a transformer).
+    /// Input pixels per cell in both directions (the patch size of a transformer).
     pub stride: u32,
-    /// Register tokens between the `[CLS]` token and the patches.
+    /// Number of register tokens between the `[CLS]` token and the patches.
     #[serde(default)]
     pub registers: usize,
-    /// Whether a `[CLS]` token leads.
+    /// Whether the first token is a `[CLS]` token.
     #[serde(default)]
     pub cls: bool,
 }
 
-/// How local features are laid out.
+/// Layout of the local features.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Layout {
@@ -180,19 +181,19 @@ pub enum Layout {
     Tokens,
 }
 
-/// How local features become a descriptor.
+/// How local features are pooled to a descriptor.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Pooling {
-    /// The exponent of the generalised mean.
+    /// Exponent of the generalised mean.
     pub gem_p: f32,
-    /// Rows and columns of the spatial grid; `[1, 1]` pools the whole picture at once.
+    /// Rows and columns of the spatial grid; `[1, 1]` pools the whole picture.
     pub grid: [usize; 2],
-    /// Numbers in the GeM descriptor: channels × rows × columns.
+    /// Dimension of the GeM descriptor: channels × rows × columns.
     pub dimension: usize,
 }
 
-/// Why a manifest cannot be used.
+/// Why a manifest is invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum ManifestError {
     /// The file cannot be read.
@@ -200,38 +201,38 @@ pub enum ManifestError {
         "cannot read the manifest {path}: {source}; `whereabouts model list` shows what is installed"
     )]
     Read {
-        /// The manifest.
+        /// Path of the manifest.
         path: PathBuf,
-        /// What the system said.
+        /// Cause.
         source: std::io::Error,
     },
     /// The file is not a manifest.
     #[error("{path} is not a model manifest: {detail}")]
     Malformed {
-        /// The manifest.
+        /// Path of the manifest.
         path: PathBuf,
-        /// What the reader said.
+        /// Message of the parser.
         detail: String,
     },
-    /// The numbers contradict each other.
+    /// The values contradict each other.
     #[error("{path}: {detail}")]
     Inconsistent {
-        /// The manifest.
+        /// Path of the manifest.
         path: PathBuf,
-        /// Which ones, and how.
+        /// Which values, and how.
         detail: String,
     },
 }
 
 impl Manifest {
-    /// Reads and checks `manifest.toml` in a model's folder.
+    /// Reads and validates a `manifest.toml`.
     pub fn read(path: &Path) -> Result<Self, ManifestError> {
         let text = std::fs::read_to_string(path)
             .map_err(|source| ManifestError::Read { path: path.to_owned(), source })?;
         Self::parse(&text, path)
     }
 
-    /// Reads a manifest from its text; `path` is for messages.
+    /// Parses and validates a manifest; `path` is used in error messages.
     pub fn parse(text: &str, path: &Path) -> Result<Self, ManifestError> {
         let manifest: Self = toml::from_str(text).map_err(|error| ManifestError::Malformed {
             path: path.to_owned(),
@@ -241,7 +242,7 @@ impl Manifest {
         Ok(manifest)
     }
 
-    /// Checks that the numbers fit each other; `path` is for messages.
+    /// Validates the manifest; `path` is used in error messages.
     pub fn check(&self, path: &Path) -> Result<(), ManifestError> {
         match self.validate() {
             Some(detail) => Err(ManifestError::Inconsistent { path: path.to_owned(), detail }),
@@ -249,7 +250,7 @@ impl Manifest {
         }
     }
 
-    /// The text that [`Self::parse`] reads.
+    /// Serializes the manifest to the format that [`Self::parse`] reads.
     pub fn to_toml(&self) -> Result<String, ManifestError> {
         toml::to_string(self).map_err(|error| ManifestError::Malformed {
             path: self.name.clone().into(),
@@ -257,7 +258,7 @@ impl Manifest {
         })
     }
 
-    /// Numbers in a descriptor of the given kind; `None` if the model cannot make one.
+    /// Dimension of a descriptor of the given kind; `None` if the model does not support it.
     pub fn dimension(&self, kind: DescriptorKind) -> Option<usize> {
         match kind {
             DescriptorKind::Gem => Some(self.pooling.dimension),
@@ -266,27 +267,27 @@ impl Manifest {
     }
 
     fn validate(&self) -> Option<String> {
-        const LARGEST_EDGE: u32 = 4096;
-        const MOST_CHANNELS: usize = 1 << 14;
+        const MAX_EDGE: u32 = 4096;
+        const MAX_CHANNELS: usize = 1 << 14;
         let (input, output, pooling) = (&self.input, &self.output, &self.pooling);
         let [rows, columns] = pooling.grid;
-        let plain = |file: &Path| file.components().count() == 1 && file.file_name().is_some();
-        if !self.files().all(|(file, _)| plain(file) && file != Path::new(MANIFEST)) {
-            return Some("file must be a plain file name beside the manifest".into());
+        let is_plain = |file: &Path| file.components().count() == 1 && file.file_name().is_some();
+        if !self.files().all(|(file, _)| is_plain(file) && file != Path::new(MANIFEST)) {
+            return Some("file must be a plain file name next to the manifest".into());
         }
         if self.data.as_ref().is_some_and(|data| data.file == self.file) {
-            return Some("data.file must be another file than file".into());
+            return Some("data.file must differ from file".into());
         }
         if input.multiple == 0 || output.stride == 0 {
             return Some("input.multiple and output.stride must be at least 1".into());
         }
-        if !(1..=MOST_CHANNELS).contains(&output.channels) {
-            return Some(format!("output.channels must be 1 to {MOST_CHANNELS}"));
+        if !(1..=MAX_CHANNELS).contains(&output.channels) {
+            return Some(format!("output.channels must be 1 to {MAX_CHANNELS}"));
         }
         for (edge, pixels) in [("width", input.width), ("height", input.height)] {
-            if pixels == 0 || pixels > LARGEST_EDGE || pixels % input.multiple != 0 {
+            if pixels == 0 || pixels > MAX_EDGE || pixels % input.multiple != 0 {
                 return Some(format!(
-                    "input.{edge} = {pixels} must be a multiple of {} up to {LARGEST_EDGE}",
+                    "input.{edge} = {pixels} must be a multiple of {} up to {MAX_EDGE}",
                     input.multiple
                 ));
             }
@@ -304,12 +305,12 @@ impl Manifest {
                 output.channels * rows * columns
             ));
         }
-        let usable = pooling.gem_p > 0.0 && pooling.gem_p.is_finite();
-        if !usable {
+        let is_usable = pooling.gem_p > 0.0 && pooling.gem_p.is_finite();
+        if !is_usable {
             return Some("pooling.gem_p must be above 0".into());
         }
-        let positive = input.std.iter().all(|&s| s > 0.0);
-        if !positive {
+        let is_positive = input.std.iter().all(|&s| s > 0.0);
+        if !is_positive {
             return Some("input.std must be above 0".into());
         }
         if output.layout == Layout::Map && (output.cls || output.registers > 0) {
@@ -337,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn contradictions_are_named() {
+    fn a_contradiction_names_the_value() {
         for (from, to, named) in [
             ("dimension = 576", "dimension = 64", "dimension"),
             ("width = 320", "width = 321", "width"),
@@ -353,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn the_digest_covers_what_decides_a_descriptor_and_nothing_else() {
+    fn the_digest_covers_exactly_what_determines_a_descriptor() {
         let file = Digest::of(b"weights");
         let digest = |from: &str, to: &str| {
             let text = XFEAT.replace(from, to);
@@ -368,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_key_is_refused() {
+    fn an_unknown_key_is_rejected() {
         assert!(parse(&format!("colour = 1\n{XFEAT}")).is_err());
     }
 }

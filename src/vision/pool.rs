@@ -1,4 +1,4 @@
-//! A fixed number of threads for work that would block the async runtime, with a bounded queue.
+//! A thread pool with a bounded queue, for work that would block the async runtime.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
@@ -8,23 +8,23 @@ use std::time::Duration;
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::oneshot;
 
-type Work = Box<dyn FnOnce() + Send>;
+type Job = Box<dyn FnOnce() + Send>;
 
-/// Threads that run one piece of work after another.
+/// A fixed number of threads with a bounded queue.
 ///
-/// Work that waits is bounded: when the queue is full, [`CpuPool::run`] refuses at once. Work
-/// whose caller has gone is dropped unrun. The threads end when the pool is dropped.
+/// When the queue is full, [`CpuPool::run`] fails at once. Jobs whose caller has left are dropped without being
+/// run. The threads end when the last clone of the pool is dropped.
 #[derive(Debug, Clone)]
 pub struct CpuPool {
-    queue: SyncSender<Work>,
+    queue: SyncSender<Job>,
     running: Arc<Running>,
 }
 
-/// How much work is being done at the moment.
+/// The number of jobs that are running.
 #[derive(Debug, Default)]
 struct Running {
     count: Mutex<usize>,
-    /// Told when a piece of work has ended.
+    /// Notified when a job ends.
     ended: Condvar,
 }
 
@@ -40,21 +40,21 @@ impl Running {
 #[error("all workers are busy and the queue is full")]
 pub struct Overloaded;
 
-/// Why work gave no answer.
+/// Why a job returned no result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum PoolError {
-    /// It was not taken.
+    /// The queue is full.
     #[error(transparent)]
     Overloaded(#[from] Overloaded),
-    /// It was taken and broke off: a bug in the work, or the pool is gone.
-    #[error("the work broke off")]
-    BrokeOff,
+    /// The job panicked, or the pool has been shut down.
+    #[error("the job was aborted")]
+    Aborted,
 }
 
 impl CpuPool {
-    /// Starts `threads` threads named `name`; at most `queue` pieces of work wait for them.
+    /// Starts `threads` threads named `name` with a queue of at most `queue` jobs.
     pub fn new(name: &str, threads: usize, queue: usize) -> std::io::Result<Self> {
-        let (sender, receiver) = sync_channel::<Work>(queue);
+        let (sender, receiver) = sync_channel::<Job>(queue);
         let receiver = Arc::new(Mutex::new(receiver));
         let running = Arc::new(Running::default());
         for index in 0..threads.max(1) {
@@ -66,41 +66,41 @@ impl CpuPool {
         Ok(Self { queue: sender, running })
     }
 
-    /// Runs `work` on one of the threads and waits for what it returns.
-    pub async fn run<T, F>(&self, work: F) -> Result<T, PoolError>
+    /// Runs `job` on a pool thread and waits for its result.
+    pub async fn run<T, F>(&self, job: F) -> Result<T, PoolError>
     where
         T: Send + 'static,
         F: FnOnce() -> T + Send + 'static,
     {
-        let (answer, result) = oneshot::channel();
-        let task: Work = Box::new(move || {
-            if !answer.is_closed() {
-                let _ = answer.send(work());
+        let (reply, result) = oneshot::channel();
+        let queued: Job = Box::new(move || {
+            if !reply.is_closed() {
+                let _ = reply.send(job());
             }
         });
-        self.queue.try_send(task).map_err(|error| match error {
+        self.queue.try_send(queued).map_err(|error| match error {
             TrySendError::Full(_) => PoolError::Overloaded(Overloaded),
-            TrySendError::Disconnected(_) => PoolError::BrokeOff,
+            TrySendError::Disconnected(_) => PoolError::Aborted,
         })?;
-        result.await.map_err(|_| PoolError::BrokeOff)
+        result.await.map_err(|_| PoolError::Aborted)
     }
 
-    /// Blocks until no work is being done, but no longer than `longest`. A process that ends while a
-    /// library of another language works is ended by that library, and not with its own exit code.
-    pub fn wait_until_idle(&self, longest: Duration) {
+    /// Blocks until no job is running, for at most `timeout`. If a process exits while a native library is
+    /// still working, the library may crash and replace the exit code.
+    pub fn wait_until_idle(&self, timeout: Duration) {
         let mut count = self.running.count.lock();
-        let _ = self.running.ended.wait_while_for(&mut count, |count| *count > 0, longest);
+        let _ = self.running.ended.wait_while_for(&mut count, |count| *count > 0, timeout);
     }
 }
 
-fn run_all(receiver: &Mutex<Receiver<Work>>, running: &Running) {
+fn run_all(receiver: &Mutex<Receiver<Job>>, running: &Running) {
     loop {
         let next = receiver.lock().recv();
-        let Ok(work) = next else { return };
+        let Ok(job) = next else { return };
         running.change(|count| *count += 1);
-        // A panic in one piece of work must not take the thread from all the others.
-        if std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).is_err() {
-            tracing::error!("work on a pool thread panicked; its caller was told");
+        // A panicking job must not take its thread from the jobs behind it.
+        if std::panic::catch_unwind(std::panic::AssertUnwindSafe(job)).is_err() {
+            tracing::error!("a job on a pool thread panicked; its caller received an error");
         }
         running.change(|count| *count -= 1);
     }
@@ -112,7 +112,7 @@ mod tests {
     use std::sync::mpsc;
 
     #[tokio::test]
-    async fn a_full_queue_refuses_at_once() {
+    async fn a_full_queue_fails_at_once() {
         let pool = CpuPool::new("test", 1, 1).unwrap();
         let (started, has_started) = oneshot::channel();
         let (release, wait) = mpsc::channel::<()>();
@@ -136,24 +136,24 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_panic_reaches_its_caller_and_spares_the_thread() {
+    async fn a_panic_is_reported_to_the_caller_and_the_thread_survives() {
         let pool = CpuPool::new("test", 1, 4).unwrap();
-        assert_eq!(pool.run(|| -> u8 { panic!("on purpose") }).await, Err(PoolError::BrokeOff));
+        assert_eq!(pool.run(|| -> u8 { panic!("on purpose") }).await, Err(PoolError::Aborted));
         assert_eq!(pool.run(|| 7).await, Ok(7));
     }
 
     #[tokio::test]
-    async fn idle_is_when_work_has_ended_even_if_its_caller_has_gone() {
+    async fn waiting_until_idle_includes_jobs_whose_caller_left() {
         let pool = CpuPool::new("test", 1, 4).unwrap();
         let (started, has_started) = oneshot::channel();
         let (release, wait) = mpsc::channel::<()>();
-        let mut work = Box::pin(pool.run(move || {
+        let mut job = Box::pin(pool.run(move || {
             let _ = started.send(());
             wait.recv().is_ok()
         }));
-        assert!(futures_util::poll!(&mut work).is_pending());
+        assert!(futures_util::poll!(&mut job).is_pending());
         has_started.await.unwrap();
-        drop(work);
+        drop(job);
         let waiting = pool.clone();
         let idle = thread::spawn(move || waiting.wait_until_idle(Duration::from_secs(60)));
         assert!(!idle.is_finished());

@@ -1,50 +1,59 @@
-//! Local features to a global descriptor: `[CLS]` or generalised-mean pooling.
+//! Pooling of local features to a global descriptor: the `[CLS]` token or the generalised mean.
 
 use super::manifest::{Layout, Output, Pooling};
 use whereabouts_core::dense::DenseFeaturesError;
 use whereabouts_core::{DenseFeatures, Descriptor, DescriptorError, DescriptorKind};
 
-/// What a model says about one picture, before any normalisation.
+/// The output of a model for one picture, before any normalisation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LocalFeatures {
     /// Rows of cells.
     pub height: usize,
     /// Columns of cells.
     pub width: usize,
-    /// Numbers for each cell.
+    /// Numbers in each cell.
     pub channels: usize,
     /// Row-major cells, channels innermost.
     pub cells: Vec<f32>,
-    /// The `[CLS]` token, where the model has one.
+    /// The `[CLS]` token, if the model has one.
     pub cls: Option<Vec<f32>>,
-    /// How far the model trusts each cell, 0 to 1.
+    /// The model's reliability of each cell, 0 to 1, if it outputs one.
     pub reliability: Option<Vec<f32>>,
 }
 
-/// Why an output could not be pooled.
-#[derive(Debug, thiserror::Error, PartialEq)]
+/// What to compute from the local features of a picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FeatureSet {
+    /// The global descriptor, which is enough to index or search.
+    DescriptorOnly,
+    /// The global descriptor and the dense features, which local refinement compares.
+    DescriptorAndDense,
+}
+
+/// Why the output of a model cannot be pooled.
+#[derive(Debug, Clone, thiserror::Error, PartialEq)]
 pub enum PoolingError {
-    /// The output does not have the shape that the manifest promises.
-    #[error("the model's output holds {got} numbers where its manifest promises {expected}")]
+    /// The output does not have the shape declared in the manifest.
+    #[error("the model's output has {got} numbers, but its manifest declares {expected}")]
     Shape {
         /// Numbers in the output.
         got: usize,
-        /// Numbers by the manifest.
+        /// Numbers declared in the manifest.
         expected: usize,
     },
     /// The model has no `[CLS]` token.
     #[error("this model has no [CLS] token; use a map with \"descriptor\": \"gem\"")]
     NoCls,
-    /// The output has no direction.
+    /// The descriptor has no direction.
     #[error(transparent)]
     Descriptor(#[from] DescriptorError),
-    /// The output is no feature map.
+    /// The output is not a valid feature map.
     #[error(transparent)]
     Dense(#[from] DenseFeaturesError),
 }
 
 impl LocalFeatures {
-    /// Reads one picture's part of the output tensor, for an input of `height` × `width` cells.
+    /// Reads one picture's part of the output tensor, for a feature map of `height` × `width` cells.
     pub fn from_output(
         output: &Output,
         (height, width): (usize, usize),
@@ -73,7 +82,22 @@ impl LocalFeatures {
         Ok(Self { height, width, channels, cells, cls, reliability })
     }
 
-    /// The global descriptor of the given kind.
+    /// Computes the global descriptor of the given kind, and the dense features if requested.
+    pub fn pool(
+        self,
+        kind: DescriptorKind,
+        features: FeatureSet,
+        pooling: &Pooling,
+    ) -> Result<(Descriptor, Option<DenseFeatures>), PoolingError> {
+        let descriptor = self.descriptor(kind, pooling)?;
+        let dense = match features {
+            FeatureSet::DescriptorOnly => None,
+            FeatureSet::DescriptorAndDense => Some(self.into_dense()?),
+        };
+        Ok((descriptor, dense))
+    }
+
+    /// Computes the global descriptor of the given kind.
     pub fn descriptor(
         &self,
         kind: DescriptorKind,
@@ -86,13 +110,13 @@ impl LocalFeatures {
         Ok(Descriptor::normalised(numbers)?)
     }
 
-    /// The dense features, each cell normalised.
+    /// Converts the local features to dense features, normalising each cell.
     pub fn into_dense(self) -> Result<DenseFeatures, PoolingError> {
         let Self { height, width, channels, cells, reliability, .. } = self;
         Ok(DenseFeatures::new(height, width, channels, cells, reliability)?)
     }
 
-    /// Signed generalised mean over each part of the grid, part by part, row by row.
+    /// Signed generalised mean over each part of the grid, in row-major order of the parts.
     ///
     /// m = mean(sign(x)·|x|ᵖ), g = sign(m)·|m|^(1/p): GeM (Radenović et al., 2018) as AnyLoc
     /// (Keetha et al., 2023) applies it to signed features.
@@ -100,10 +124,11 @@ impl LocalFeatures {
         let [rows, columns] = pooling.grid;
         let mut numbers = Vec::with_capacity(self.channels * rows * columns);
         for row in 0..rows {
-            let lines = row * self.height / rows..(row + 1) * self.height / rows;
+            let part_rows = row * self.height / rows..(row + 1) * self.height / rows;
             for column in 0..columns {
-                let across = column * self.width / columns..(column + 1) * self.width / columns;
-                numbers.extend(self.gem_of_part(lines.clone(), across, pooling.gem_p));
+                let part_columns =
+                    column * self.width / columns..(column + 1) * self.width / columns;
+                numbers.extend(self.gem_of_part(part_rows.clone(), part_columns, pooling.gem_p));
             }
         }
         numbers
@@ -111,18 +136,18 @@ impl LocalFeatures {
 
     fn gem_of_part(
         &self,
-        lines: std::ops::Range<usize>,
-        across: std::ops::Range<usize>,
+        rows: std::ops::Range<usize>,
+        columns: std::ops::Range<usize>,
         p: f32,
     ) -> Vec<f32> {
         let mut sums = vec![0.0_f32; self.channels];
-        let count = (lines.len() * across.len()).max(1) as f32;
-        for line in lines {
-            let start = (line * self.width + across.start) * self.channels;
-            let end = (line * self.width + across.end) * self.channels;
+        let count = (rows.len() * columns.len()).max(1) as f32;
+        for row in rows {
+            let start = (row * self.width + columns.start) * self.channels;
+            let end = (row * self.width + columns.end) * self.channels;
             for cell in self.cells[start..end].chunks_exact(self.channels) {
                 for (sum, &x) in sums.iter_mut().zip(cell) {
-                    // p is 3 in nearly every manifest, and a cube is far cheaper than a power.
+                    // Nearly every manifest has p = 3, and a cube is much cheaper than `powf`.
                     *sum += if p == 3.0 { x * x * x } else { x.signum() * x.abs().powf(p) };
                 }
             }
@@ -178,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn the_grid_pools_each_part_on_its_own() {
+    fn each_part_of_the_grid_is_pooled_separately() {
         let cells: Vec<f32> = (0..12).map(|i| i as f32).collect();
         let features = LocalFeatures::from_output(&map_output(1), (3, 4), &cells, None).unwrap();
         let numbers = features.gem(&pooling([3, 2], 1.0));
@@ -186,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn tokens_are_told_apart_from_cls_and_registers() {
+    fn patch_tokens_exclude_cls_and_registers() {
         let output = Output { layout: Layout::Tokens, registers: 1, cls: true, ..map_output(2) };
         let tokens = [9.0, 0.0, 7.0, 7.0, 1.0, 1.0, 2.0, 2.0];
         let features = LocalFeatures::from_output(&output, (1, 2), &tokens, None).unwrap();
@@ -196,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_layout_comes_out_channels_innermost() {
+    fn a_map_layout_is_transposed_to_channels_innermost() {
         let features =
             LocalFeatures::from_output(&map_output(2), (1, 3), &[1., 2., 3., 10., 20., 30.], None)
                 .unwrap();
@@ -208,7 +233,18 @@ mod tests {
     }
 
     #[test]
-    fn an_output_of_another_shape_is_refused() {
+    fn dense_features_are_made_only_on_request_and_do_not_change_the_descriptor() {
+        let cells: Vec<f32> = (1..=6).map(|i| i as f32).collect();
+        let features = LocalFeatures::from_output(&map_output(2), (1, 3), &cells, None).unwrap();
+        let pool = |set| features.clone().pool(DescriptorKind::Gem, set, &pooling([1, 1], 3.0));
+        let (descriptor, none) = pool(FeatureSet::DescriptorOnly).unwrap();
+        let (same, dense) = pool(FeatureSet::DescriptorAndDense).unwrap();
+        assert_eq!((descriptor, none), (same, None));
+        assert_eq!(dense.unwrap(), features.into_dense().unwrap());
+    }
+
+    #[test]
+    fn an_output_of_the_wrong_shape_is_rejected() {
         let result = LocalFeatures::from_output(&map_output(2), (2, 2), &[0.0; 7], None);
         assert_eq!(result, Err(PoolingError::Shape { got: 7, expected: 8 }));
     }

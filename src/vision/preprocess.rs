@@ -1,4 +1,4 @@
-//! Pixels to the input tensor that a manifest asks for.
+//! Preprocessing: from pixels to the input tensor described by a manifest.
 
 use std::borrow::Cow;
 
@@ -10,7 +10,7 @@ use image::RgbImage;
 use super::decode::Needed;
 use super::manifest::{Input, Interpolation, Resize};
 
-/// One picture as a model takes it: 3 × height × width, RGB planes.
+/// The input tensor of one picture: 3 × height × width, as RGB planes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
     /// Rows.
@@ -22,13 +22,13 @@ pub struct Tensor {
 }
 
 impl Tensor {
-    /// A picture without content.
+    /// A blank picture.
     pub(super) fn grey(width: usize, height: usize) -> Self {
         Self { height, width, data: vec![0.0; 3 * width * height] }
     }
 }
 
-/// Why a picture could not be resized.
+/// A picture cannot be resized.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot resize a picture of {width}×{height} pixels: {reason}")]
 pub struct PreprocessError {
@@ -37,7 +37,7 @@ pub struct PreprocessError {
     reason: String,
 }
 
-/// The pixels that fitting a picture to the input needs.
+/// The resolution needed to fit a picture to the input.
 pub fn needed(input: &Input) -> Needed {
     match input.resize {
         Resize::LongestEdge => Needed::LongestEdge(input.width.max(input.height)),
@@ -45,10 +45,10 @@ pub fn needed(input: &Input) -> Needed {
     }
 }
 
-/// Fits a picture to the input, with an antialiased filter, and normalises its channels.
+/// Fits a picture to the input with an antialiasing filter and normalises its channels.
 ///
-/// `size` is that of the picture in its file (width, height), which decides what becomes of its
-/// shape; `pixels` may be fewer, see [`needed`].
+/// `size` is the width and height of the picture in its file, from which the target shape is derived. `pixels` may
+/// have a lower resolution, see [`needed`].
 pub fn preprocess(
     pixels: &RgbImage,
     size: (u32, u32),
@@ -60,7 +60,7 @@ pub fn preprocess(
     let mut data = vec![0.0; 3 * plane];
     let (red, rest) = data.split_at_mut(plane);
     let (green, blue) = rest.split_at_mut(plane);
-    // One multiplication and one addition: x / 255, minus mean, over std.
+    // (x / 255 - mean) / std as one multiplication and one addition.
     let scale = input.std.map(|std| 1.0 / (255.0 * std));
     let offset = [0, 1, 2].map(|channel| -input.mean[channel] / input.std[channel]);
     let pixels = &resized[..3 * plane];
@@ -72,7 +72,7 @@ pub fn preprocess(
     Ok(Tensor { height: height as usize, width: width as usize, data })
 }
 
-/// Scales a picture so that neither edge exceeds `max_edge`; a smaller one stays as it is.
+/// Scales a picture down so that neither edge exceeds `max_edge`. A smaller picture is returned unchanged.
 pub fn shrink_to(pixels: &RgbImage, max_edge: u32) -> Result<RgbImage, PreprocessError> {
     let (width, height) = pixels.dimensions();
     let longest = width.max(height);
@@ -131,7 +131,7 @@ fn run_resize(
     height: u32,
     options: &ResizeOptions,
 ) -> Result<Vec<u8>, PreprocessError> {
-    // One pixel type, known here: the untyped call would compile the filters for every type.
+    // The typed call compiles the filters for one pixel type instead of for all.
     let source =
         TypedImageRef::<U8x3>::from_buffer(pixels.width(), pixels.height(), pixels.as_raw())
             .map_err(|error| failure(pixels, &error.to_string()))?;

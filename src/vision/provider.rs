@@ -1,8 +1,8 @@
-//! Where a model runs: by which execution provider of ONNX Runtime, and at which precision.
+//! Execution: the provider of ONNX Runtime that runs a model, and its precision.
 //!
-//! [`choose`] measures what the machine has. A faster choice is taken only if its descriptors stay
-//! within [`LEAST_SIMILARITY`] of those of the CPU at full precision, on pictures of streets rather
-//! than on noise, whose tokens resemble nothing that a model meets.
+//! [`choose`] measures the executions that the machine supports. An execution is eligible only if the cosine
+//! similarity of its descriptors to those of the CPU at full precision is at least [`MIN_SIMILARITY`]. The
+//! sample pictures are street scenes, because tokens of noise resemble nothing that a model meets in use.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -11,20 +11,18 @@ use ort::ep::{ArbitrarilyConfigurableExecutionProvider, ExecutionProvider, OpenV
 use ort::ep::{CUDA, CoreML, ExecutionProviderDispatch, TensorRT};
 use serde::{Deserialize, Serialize};
 
-use super::manifest::Manifest;
 use super::preprocess::Tensor;
 use super::session::{InferenceError, Model, Runner};
 use whereabouts_core::{Descriptor, DescriptorKind, Digest, Precision};
 
-/// The least cosine similarity between a descriptor of a faster choice and that of the CPU at full
-/// precision.
-pub const LEAST_SIMILARITY: f32 = 0.999;
+/// Minimum cosine similarity of the descriptors of an eligible execution to those of the CPU at full precision.
+pub const MIN_SIMILARITY: f32 = 0.999;
 
-/// Who runs a model.
+/// An execution provider of ONNX Runtime.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Provider {
-    /// ONNX Runtime itself.
+    /// The default CPU provider.
     Cpu,
     /// Intel's OpenVINO.
     OpenVino,
@@ -36,39 +34,39 @@ pub enum Provider {
     CoreMl,
 }
 
-/// Who runs a model, and at which precision.
+/// An execution provider and a precision.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Execution {
-    /// Who runs it.
+    /// Execution provider.
     pub provider: Provider,
-    /// At which precision.
+    /// Precision inside the model.
     pub precision: Precision,
 }
 
-/// What may be chosen from; `None` for anything.
+/// Restricts the choice of an execution.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ProviderPreference {
-    /// The provider.
+    /// Required execution provider; `None` for any.
     pub provider: Option<Provider>,
-    /// The precision.
+    /// Required precision; `None` for any.
     pub precision: Option<Precision>,
 }
 
-/// One execution that was tried.
+/// The trial run of one execution.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trial {
-    /// What was tried.
+    /// Execution that was tried.
     pub execution: Execution,
-    /// What came of it.
-    pub outcome: Result<Measured, String>,
+    /// The measurement, or why the execution is unusable.
+    pub outcome: Result<Measurement, String>,
 }
 
-/// What one execution does.
+/// The measurement of one execution.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Measured {
-    /// The median time of one picture alone, of a few.
+pub struct Measurement {
+    /// Median latency of a single picture.
     pub latency: Duration,
-    /// The least cosine similarity of a descriptor to that of the CPU at full precision.
+    /// Lowest cosine similarity of a descriptor to that of the CPU at full precision.
     pub similarity: f32,
 }
 
@@ -91,11 +89,11 @@ impl std::fmt::Display for Execution {
 }
 
 impl Execution {
-    /// What every machine can do, and what the others are measured by.
+    /// The execution that every machine supports, and to which the others are compared.
     pub const REFERENCE: Self = Self { provider: Provider::Cpu, precision: Precision::Full };
 
-    /// What can be tried for a wish, given what the library was built with.
-    pub(super) fn candidates(wanted: ProviderPreference) -> Vec<Self> {
+    /// The executions that `preference` allows and the loaded library supports.
+    pub(super) fn candidates(preference: ProviderPreference) -> Vec<Self> {
         const ALL: [Execution; 6] = [
             Execution::REFERENCE,
             Execution { provider: Provider::OpenVino, precision: Precision::Full },
@@ -104,14 +102,17 @@ impl Execution {
             Execution { provider: Provider::TensorRt, precision: Precision::Full },
             Execution { provider: Provider::CoreMl, precision: Precision::Full },
         ];
-        let fits = |execution: &Execution| {
-            wanted.provider.is_none_or(|provider| provider == execution.provider)
-                && wanted.precision.is_none_or(|precision| precision == execution.precision)
+        let allowed = |execution: &Execution| {
+            preference.provider.is_none_or(|provider| provider == execution.provider)
+                && preference.precision.is_none_or(|precision| precision == execution.precision)
         };
-        ALL.into_iter().filter(fits).filter(|execution| execution.provider.is_built_in()).collect()
+        ALL.into_iter()
+            .filter(allowed)
+            .filter(|execution| execution.provider.is_built_in())
+            .collect()
     }
 
-    /// How a session is told; `None` for the CPU, which needs no telling.
+    /// The registration of the provider with a session; `None` for the CPU, which is the default.
     pub(super) fn registration(self, threads: usize) -> Option<ExecutionProviderDispatch> {
         let dispatch = match self.provider {
             Provider::Cpu => return None,
@@ -124,7 +125,7 @@ impl Execution {
                     "INFERENCE_PRECISION_HINT": precision,
                     "PERFORMANCE_HINT": "LATENCY",
                     "INFERENCE_NUM_THREADS": threads.to_string(),
-                    // It would pin the threads of sessions side by side to the same cores.
+                    // Pinning would put the threads of concurrent sessions on the same cores.
                     "ENABLE_CPU_PINNING": "NO",
                 }});
                 OpenVINO::default()
@@ -136,13 +137,13 @@ impl Execution {
             Provider::TensorRt => TensorRT::default().build(),
             Provider::CoreMl => CoreML::default().build(),
         };
-        // Else ONNX Runtime falls back to the CPU without a word.
+        // Without this, ONNX Runtime falls back to the CPU silently.
         Some(dispatch.error_on_failure())
     }
 }
 
 impl Provider {
-    /// Whether the library that was loaded has it.
+    /// Whether the loaded library was built with this provider.
     fn is_built_in(self) -> bool {
         let built_in = match self {
             Self::Cpu => return true,
@@ -155,47 +156,45 @@ impl Provider {
     }
 }
 
-/// Tries all that a wish allows on `sample`, and returns the fastest whose descriptors are right,
-/// with all trials.
+/// Tries every allowed execution on `sample`. Returns the fastest eligible one, and all trials.
 pub(super) fn choose(
     model: &Model,
-    wanted: ProviderPreference,
+    preference: ProviderPreference,
     threads: usize,
     sample: &[Tensor],
 ) -> Result<(Execution, Vec<Trial>), InferenceError> {
-    let candidates = Execution::candidates(wanted);
+    let candidates = Execution::candidates(preference);
     if candidates.is_empty() {
         return Err(InferenceError::Load(format!(
-            "the ONNX Runtime in use cannot run a model by {wanted}; `make openvino` installs one \
-             with OpenVINO, and model.provider = \"auto\" takes what there is"
+            "the loaded ONNX Runtime does not support {preference}; `make openvino` installs one with \
+             OpenVINO, and model.provider = \"auto\" uses any provider that is available"
         )));
     }
     if let [only] = candidates.as_slice() {
         return Ok((*only, Vec::new()));
     }
-    let reference = try_one(model, Execution::REFERENCE, threads, sample)?;
+    let reference = measure(model, Execution::REFERENCE, threads, sample)?;
     let mut trials = Vec::new();
     for execution in candidates {
         let outcome = if execution == Execution::REFERENCE {
-            Ok(Measured { latency: reference.latency, similarity: 1.0 })
+            Ok(Measurement { latency: reference.latency, similarity: 1.0 })
         } else {
-            try_one(model, execution, threads, sample).map_err(|error| error.to_string()).map(
-                |tried| Measured {
-                    latency: tried.latency,
-                    similarity: least_similarity(&tried.descriptors, &reference.descriptors),
-                },
-            )
+            let measured = measure(model, execution, threads, sample);
+            measured.map_err(|error| error.to_string()).map(|run| Measurement {
+                latency: run.latency,
+                similarity: min_similarity(&run.descriptors, &reference.descriptors),
+            })
         };
         trials.push(Trial { execution, outcome });
     }
-    let right = trials.iter().filter_map(|trial| {
+    let eligible = trials.iter().filter_map(|trial| {
         let measured = trial.outcome.as_ref().ok()?;
-        (measured.similarity >= LEAST_SIMILARITY).then_some((trial.execution, measured.latency))
+        (measured.similarity >= MIN_SIMILARITY).then_some((trial.execution, measured.latency))
     });
-    match right.min_by_key(|(_, latency)| *latency) {
+    match eligible.min_by_key(|(_, latency)| *latency) {
         Some((fastest, _)) => Ok((fastest, trials)),
         None => Err(InferenceError::Load(format!(
-            "no way to run the model by {wanted} gives the right descriptors: {trials:?}"
+            "no execution by {preference} computes descriptors close enough to the reference: {trials:?}"
         ))),
     }
 }
@@ -213,39 +212,36 @@ impl std::fmt::Display for ProviderPreference {
     }
 }
 
-struct ProviderTrial {
+struct SampleRun {
     latency: Duration,
     descriptors: Vec<Descriptor>,
 }
 
-fn try_one(
+fn measure(
     model: &Model,
     execution: Execution,
     threads: usize,
     sample: &[Tensor],
-) -> Result<ProviderTrial, InferenceError> {
-    /// A large model on a small machine shows what it does in fewer.
+) -> Result<SampleRun, InferenceError> {
+    /// A slow model is measured in fewer runs.
     const RUNS: std::ops::RangeInclusive<usize> = 3..=11;
-    const LONG_ENOUGH: Duration = Duration::from_millis(500);
+    const ENOUGH_TIME: Duration = Duration::from_millis(500);
     let mut runner = model.load(execution, threads, 1)?;
     let descriptors = run_all(model, &mut runner, sample)?;
     let mut times: Vec<Duration> = Vec::with_capacity(*RUNS.end());
     for tensor in sample.iter().cycle().take(*RUNS.end()) {
-        if times.len() >= *RUNS.start() && times.iter().sum::<Duration>() > LONG_ENOUGH {
+        if times.len() >= *RUNS.start() && times.iter().sum::<Duration>() > ENOUGH_TIME {
             break;
         }
         let start = Instant::now();
-        runner.run(std::slice::from_ref(tensor))?;
+        runner.run(&[tensor])?;
         times.push(start.elapsed());
     }
     times.sort();
-    Ok(ProviderTrial {
-        latency: times.get(times.len() / 2).copied().unwrap_or_default(),
-        descriptors,
-    })
+    Ok(SampleRun { latency: times.get(times.len() / 2).copied().unwrap_or_default(), descriptors })
 }
 
-/// The descriptors of `sample` by one execution on so many threads.
+/// Computes the descriptors of `sample` by one execution on `threads` threads.
 pub(super) fn descriptors(
     model: &Model,
     execution: Execution,
@@ -260,56 +256,54 @@ fn run_all(
     runner: &mut Runner,
     sample: &[Tensor],
 ) -> Result<Vec<Descriptor>, InferenceError> {
-    let unfit = |error: super::pooling::PoolingError| InferenceError::Run(error.to_string());
-    let Manifest { output, pooling, .. } = &*model.manifest;
     let one = |tensor: &Tensor| {
-        let raw = runner.run(std::slice::from_ref(tensor))?;
-        let raw =
-            raw.first().ok_or_else(|| InferenceError::Run("the model gave nothing".into()))?;
-        raw.local_features(output, output.cells(tensor))
-            .and_then(|local| local.descriptor(DescriptorKind::Gem, pooling))
-            .map_err(unfit)
+        let outputs = runner.run(&[tensor])?;
+        let local = outputs
+            .first()
+            .ok_or_else(|| InferenceError::Run("the model returned no output".into()))?;
+        Ok(local.descriptor(DescriptorKind::Gem, &model.manifest.pooling)?)
     };
     sample.iter().map(one).collect()
 }
 
-/// The least cosine similarity of descriptors, pair by pair.
-pub(super) fn least_similarity(tried: &[Descriptor], reference: &[Descriptor]) -> f32 {
-    let pairs = tried.iter().zip(reference);
-    pairs.map(|(tried, right)| tried.similarity(right)).fold(1.0, f32::min)
+/// The lowest pairwise cosine similarity of two lists of descriptors.
+pub(super) fn min_similarity(descriptors: &[Descriptor], reference: &[Descriptor]) -> f32 {
+    let pairs = descriptors.iter().zip(reference);
+    pairs.map(|(descriptor, reference)| descriptor.similarity(reference)).fold(1.0, f32::min)
 }
 
-/// What tells this processor from one that computes in another way, where the system says so.
+/// A fingerprint of the processor model and its features, if the system exposes them. A cached choice is not
+/// used on another processor.
 pub(super) fn processor() -> String {
-    let told = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let names =
+    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let is_relevant =
         |line: &&str| ["model name", "flags", "Features"].iter().any(|name| line.starts_with(name));
-    let lines: std::collections::BTreeSet<&str> = told.lines().filter(names).collect();
+    let lines: std::collections::BTreeSet<&str> = info.lines().filter(is_relevant).collect();
     let joined: Vec<&str> = lines.into_iter().collect();
     Digest::of(joined.join("\n").as_bytes()).hex()[..12].to_owned()
 }
 
-/// A choice that was made earlier, so that a start need not measure again.
+/// A choice made at an earlier start, cached so that later starts need not measure.
 #[derive(Debug, Serialize, Deserialize)]
-struct Remembered {
-    /// All that the choice depends on.
+struct CachedChoice {
+    /// Everything that the choice depends on.
     key: String,
     execution: Execution,
 }
 
-/// The choice that was made for the same `key`, if it is known.
-pub(super) fn recall(file: &Path, key: &str) -> Option<Execution> {
-    let remembered: Remembered = toml::from_str(&std::fs::read_to_string(file).ok()?).ok()?;
-    (remembered.key == key).then_some(remembered.execution)
+/// Reads the cached choice, if there is one for the same `key`.
+pub(super) fn read_choice(file: &Path, key: &str) -> Option<Execution> {
+    let cached: CachedChoice = toml::from_str(&std::fs::read_to_string(file).ok()?).ok()?;
+    (cached.key == key).then_some(cached.execution)
 }
 
-/// Remembers a choice; where that fails, the next start measures again.
-pub(super) fn remember(file: &Path, key: &str, execution: Execution) {
-    let written = toml::to_string(&Remembered { key: key.to_owned(), execution })
+/// Caches a choice. A failure is logged, and the next start measures again.
+pub(super) fn write_choice(file: &Path, key: &str, execution: Execution) {
+    let written = toml::to_string(&CachedChoice { key: key.to_owned(), execution })
         .map_err(|error| error.to_string())
         .and_then(|text| std::fs::write(file, text).map_err(|error| error.to_string()));
     if let Err(error) = written {
-        tracing::warn!(file = %file.display(), error, "the choice of a provider is not remembered");
+        tracing::warn!(file = %file.display(), error, "cannot cache the chosen execution");
     }
 }
 
@@ -318,14 +312,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_choice_is_recalled_for_the_same_key_only() {
+    fn a_cached_choice_is_used_for_the_same_key_only() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let execution = Execution { provider: Provider::OpenVino, precision: Precision::Bf16 };
-        assert_eq!(recall(file.path(), "a"), None);
-        remember(file.path(), "a", execution);
-        assert_eq!(recall(file.path(), "a"), Some(execution));
-        assert_eq!(recall(file.path(), "b"), None);
+        assert_eq!(read_choice(file.path(), "a"), None);
+        write_choice(file.path(), "a", execution);
+        assert_eq!(read_choice(file.path(), "a"), Some(execution));
+        assert_eq!(read_choice(file.path(), "b"), None);
         std::fs::write(file.path(), "rubbish").unwrap();
-        assert_eq!(recall(file.path(), "a"), None);
+        assert_eq!(read_choice(file.path(), "a"), None);
     }
 }

@@ -1,4 +1,4 @@
-//! Where ONNX Runtime and the installed models are found.
+//! Locating ONNX Runtime and the installed models.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -11,83 +11,83 @@ use parking_lot::Mutex;
 use super::manifest::MANIFEST;
 use super::provider::Provider;
 
-/// The name that stands for whichever model [`Assets::resolve`] finds.
+/// The model name that [`Assets::resolve`] replaces by an installed model.
 pub const AUTO: &str = "auto";
 
-/// The file in `models/` that names the model which `auto` stands for.
+/// The file in `models/` that names the model to use for `auto`.
 pub const CHOSEN: &str = "chosen";
 
-/// What `auto` looks for before the built-in model. The smallest comes first: it answers a robot
-/// soonest, and whoever wants a larger one can choose it.
+/// Models that `auto` prefers over the built-in one. The smallest comes first because it has the lowest latency;
+/// a larger one can be chosen explicitly.
 pub const PREFERRED_MODELS: [&str; 3] = ["dinov2-small", "dinov2-base", "dinov2-large"];
 
 /// The model that `make build` installs.
 pub const BUILT_IN_MODEL: &str = "xfeat";
 
-/// Why a model is the one in use.
+/// How the default model was selected.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum WhyModel {
-    /// A setting or a flag names it.
+    /// Named by a setting or a flag.
     Named,
-    /// This file, which `whereabouts model use` wrote, names it.
+    /// Named by this file, which `whereabouts model use` wrote.
     Chosen(PathBuf),
-    /// It is the first of [`PREFERRED_MODELS`] that is installed.
+    /// The first of [`PREFERRED_MODELS`] that is installed.
     Preferred,
-    /// None of these is installed.
+    /// The built-in model, because none of [`PREFERRED_MODELS`] is installed.
     BuiltIn,
 }
 
 impl fmt::Display for WhyModel {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Named => f.write_str("model.name says so"),
+            Self::Named => f.write_str("set by model.name"),
             Self::Chosen(file) => write!(f, "chosen in {}", file.display()),
-            Self::Preferred => f.write_str("the first DINOv2 that is installed"),
+            Self::Preferred => f.write_str("the first installed DINOv2 model"),
             Self::BuiltIn => f.write_str("built in; no DINOv2 is installed"),
         }
     }
 }
 
-/// The folder that `make build` fills: `onnxruntime/` and `models/`.
+/// The assets folders, which hold `onnxruntime/` and `models/` and are filled by `make build`.
 #[derive(Debug, Clone)]
 pub struct Assets {
     candidates: Vec<PathBuf>,
 }
 
-/// Why ONNX Runtime or a model is not there.
+/// Why ONNX Runtime or a model is unavailable.
 #[derive(Debug, thiserror::Error)]
 pub enum RuntimeError {
-    /// No shared library was found.
+    /// The shared library was not found.
     #[error(
-        "ONNX Runtime was not found ({looked}); run `make build` in the checkout, or set \
+        "ONNX Runtime was not found (searched {searched}); run `make build` in the checkout, or set \
          ORT_DYLIB_PATH to a libonnxruntime of version 1.24 or later"
     )]
     NoLibrary {
-        /// The places that were looked at.
-        looked: String,
+        /// The folders that were searched.
+        searched: String,
     },
-    /// The library does not load.
+    /// The shared library cannot be loaded.
     #[error(
         "ONNX Runtime at {path} cannot be loaded: {reason}; `make build` installs one that can"
     )]
     Library {
-        /// The library.
+        /// Path of the library.
         path: PathBuf,
-        /// What the loader said.
+        /// Message of the loader.
         reason: String,
     },
-    /// No such model is installed.
+    /// The model is not installed.
     #[error(
-        "the model {name:?} is not installed ({looked}); `whereabouts model list` shows what can \
+        "the model {name:?} is not installed (searched {searched}); `whereabouts model list` shows what can \
          be pulled, and `make build` installs \"xfeat\""
     )]
     NoModel {
         /// The model.
         name: String,
-        /// The places that were looked at.
-        looked: String,
+        /// The folders that were searched.
+        searched: String,
     },
-    /// The model that was chosen is gone.
+    /// The chosen model is not installed any more.
     #[error(
         "{file} names the model {name:?}, which is not installed; install it again, or run \
          `whereabouts model use auto`"
@@ -101,28 +101,29 @@ pub enum RuntimeError {
 }
 
 impl Assets {
-    /// The folder given, if any, and then the usual places: `assets` beside the binary or up to
-    /// three folders above it (a checkout's `target/release`), and `/usr/lib/whereabouts`.
+    /// Searches the configured folder, if any, and then the default locations: `assets` next to the binary
+    /// or up to three folders above it (for a checkout's `target/release`), and `/usr/lib/whereabouts`.
     pub fn locate(configured: Option<&Path>) -> Self {
         let binary = std::env::current_exe().unwrap_or_default();
-        let beside = binary.ancestors().skip(1).take(4).map(|folder| folder.join("assets"));
+        let next_to_binary = binary.ancestors().skip(1).take(4).map(|folder| folder.join("assets"));
         let installed = PathBuf::from("/usr/lib/whereabouts");
         let configured = configured.map(Path::to_owned);
-        Self { candidates: configured.into_iter().chain(beside).chain([installed]).collect() }
+        Self {
+            candidates: configured.into_iter().chain(next_to_binary).chain([installed]).collect(),
+        }
     }
 
-    /// The folder of the model called `name`.
+    /// Finds the folder of the model called `name`.
     pub fn model(&self, name: &str) -> Result<PathBuf, RuntimeError> {
-        let plain = !name.is_empty() && !name.contains(['/', '\\']) && name != "..";
+        let is_plain = !name.is_empty() && !name.contains(['/', '\\']) && name != "..";
         let folders = self.candidates.iter().map(|folder| folder.join("models").join(name));
-        folders
-            .into_iter()
-            .find(|folder| plain && folder.join(MANIFEST).is_file())
-            .ok_or_else(|| RuntimeError::NoModel { name: name.to_owned(), looked: self.looked() })
+        folders.into_iter().find(|folder| is_plain && folder.join(MANIFEST).is_file()).ok_or_else(
+            || RuntimeError::NoModel { name: name.to_owned(), searched: self.searched() },
+        )
     }
 
-    /// The model that `name` stands for: itself, or for [`AUTO`] the one that was chosen, the
-    /// first of [`PREFERRED_MODELS`] that is installed, or the built-in one.
+    /// Resolves a model name. [`AUTO`] becomes the chosen model, else the first of [`PREFERRED_MODELS`] that
+    /// is installed, else the built-in model. Any other name is returned unchanged.
     pub fn resolve(&self, name: &str) -> Result<(String, WhyModel), RuntimeError> {
         if name != AUTO {
             return Ok((name.to_owned(), WhyModel::Named));
@@ -140,7 +141,7 @@ impl Assets {
         })
     }
 
-    /// The file that chooses a model, and the model's name.
+    /// The file that chooses a model, and the name in it.
     pub fn chosen(&self) -> Option<(PathBuf, String)> {
         self.candidates.iter().find_map(|folder| {
             let file = folder.join("models").join(CHOSEN);
@@ -149,7 +150,7 @@ impl Assets {
         })
     }
 
-    /// Every installed model with its folder, by name.
+    /// All installed models and their folders, by name.
     pub fn installed(&self) -> BTreeMap<String, PathBuf> {
         let entries = self
             .candidates
@@ -163,18 +164,18 @@ impl Assets {
             .collect()
     }
 
-    /// The places where models are looked for, the first of which wins.
+    /// The folders that are searched, in order of precedence.
     pub fn candidates(&self) -> &[PathBuf] {
         &self.candidates
     }
 
-    /// Loads ONNX Runtime: `ORT_DYLIB_PATH` if set, else the library among the assets; the one with
-    /// OpenVINO, if it is there and may be wanted.
+    /// Loads ONNX Runtime from `ORT_DYLIB_PATH` if set, else from the assets. A build with OpenVINO is
+    /// preferred if it is installed and `provider` allows OpenVINO.
     pub fn load_onnxruntime(
         &self,
         provider: Option<Provider>,
     ) -> Result<Arc<Environment>, RuntimeError> {
-        // ONNX Runtime allows one environment in a process, whoever asks; once made, it stays.
+        // ONNX Runtime allows a single environment per process, which lives until exit.
         static LOADED: Mutex<Option<Arc<Environment>>> = Mutex::new(None);
         let mut loaded = LOADED.lock();
         if let Some(environment) = loaded.as_ref() {
@@ -208,13 +209,13 @@ impl Assets {
             .flat_map(|folder| self.candidates.iter().map(move |assets| assets.join(folder)))
             .map(|folder| folder.join(&name))
             .find(|path| path.is_file())
-            .ok_or_else(|| RuntimeError::NoLibrary { looked: self.looked() })
+            .ok_or_else(|| RuntimeError::NoLibrary { searched: self.searched() })
     }
 
-    fn looked(&self) -> String {
-        let places: Vec<_> =
+    fn searched(&self) -> String {
+        let folders: Vec<_> =
             self.candidates.iter().map(|path| path.display().to_string()).collect();
-        format!("looked in {}", places.join(", "))
+        folders.join(", ")
     }
 }
 
@@ -224,7 +225,7 @@ mod tests {
 
     use super::*;
 
-    /// Assets of their own, without the checkout's.
+    /// Isolated assets, without those of the checkout.
     fn assets(models: &[&str]) -> (tempfile::TempDir, Assets) {
         let dir = tempfile::tempdir().unwrap();
         for model in models {
@@ -237,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn auto_is_the_fastest_dinov2_else_the_built_in_model() {
+    fn auto_resolves_to_the_smallest_dinov2_or_the_built_in_model() {
         for (installed, expected, why) in [
             (&["xfeat"][..], "xfeat", WhyModel::BuiltIn),
             (&["xfeat", "dinov2-large"], "dinov2-large", WhyModel::Preferred),
@@ -249,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn a_choice_goes_over_the_order_and_a_name_over_the_choice() {
+    fn a_name_overrides_the_choice_and_the_choice_overrides_the_preferences() {
         let (dir, assets) = assets(&["xfeat", "dinov2-small"]);
         let chosen = dir.path().join("models").join(CHOSEN);
         fs::write(&chosen, "xfeat\n").unwrap();
@@ -261,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn a_choice_that_is_gone_is_an_error_and_not_another_model() {
+    fn a_chosen_model_that_was_removed_is_an_error() {
         let (dir, assets) = assets(&["xfeat"]);
         fs::write(dir.path().join("models").join(CHOSEN), "gone").unwrap();
         let error = assets.resolve(AUTO).unwrap_err().to_string();

@@ -1,4 +1,4 @@
-//! One model, loaded once: tensors in, numbers out.
+//! One model on disk, and the ONNX Runtime sessions that run it.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -13,61 +13,42 @@ use super::pooling::{LocalFeatures, PoolingError};
 use super::preprocess::Tensor;
 use super::provider::Execution;
 
-/// One picture's part of the output tensors.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct RawOutput {
-    /// The local features, in the manifest's layout.
-    pub features: Vec<f32>,
-    /// The reliability map, if the manifest names one.
-    pub reliability: Option<Vec<f32>>,
-    /// Pictures that were run together, this one included.
-    pub batch: usize,
-}
-
-impl RawOutput {
-    /// The local features of a picture of so many cells (rows, columns).
-    pub fn local_features(
-        &self,
-        output: &Output,
-        cells: (usize, usize),
-    ) -> Result<LocalFeatures, PoolingError> {
-        LocalFeatures::from_output(output, cells, &self.features, self.reliability.as_deref())
-    }
-}
-
 impl Output {
-    /// Rows and columns of cells in a tensor.
+    /// Rows and columns of cells in the feature map of a tensor.
     pub(super) fn cells(&self, tensor: &Tensor) -> (usize, usize) {
         let stride = self.stride as usize;
         (tensor.height / stride, tensor.width / stride)
     }
 }
 
-/// Why inference gave no answer.
+/// Why inference failed.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum InferenceError {
-    /// The model could not be loaded.
+    /// The model cannot be loaded.
     #[error("the model cannot be loaded: {0}")]
     Load(String),
-    /// A run failed.
+    /// A run of the session failed.
     #[error("inference failed: {0}")]
     Run(String),
+    /// The output of the session cannot be pooled.
+    #[error(transparent)]
+    Pooling(#[from] PoolingError),
     /// The inference threads have ended.
     #[error("inference has stopped")]
     Stopped,
 }
 
-/// A model that can be loaded, as often as sessions are wanted.
+/// A model on disk. Each call to [`Model::load`] creates another session.
 #[derive(Debug, Clone)]
 pub(super) struct Model {
     pub environment: Arc<Environment>,
-    /// The ONNX file.
+    /// Path of the ONNX file.
     pub file: PathBuf,
     pub manifest: Arc<Manifest>,
 }
 
 impl Model {
-    /// Makes a session of so many threads, whose runs are of at most `max_batch` pictures.
+    /// Creates a session with `threads` threads that runs batches of up to `max_batch` pictures.
     pub fn load(
         &self,
         execution: Execution,
@@ -87,7 +68,7 @@ impl Model {
         })
     }
 
-    /// A session of so many threads that has no graph yet.
+    /// Configures a session without loading a graph into it.
     pub fn builder(
         &self,
         execution: Execution,
@@ -98,10 +79,10 @@ impl Model {
         let builder = Session::builder(&self.environment)?
             .with_optimization_level(GraphOptimizationLevel::Level3)?
             .with_intra_threads(threads)?
-            // Threads that spin for work take the cores from decoding.
+            // Spinning threads would take cores from decoding.
             .with_intra_op_spinning(false)?;
-        // A graph whose shapes are known is planned better. The names are those of our exports and of
-        // the hub's; one that a graph does not have is passed over.
+        // ONNX Runtime plans a graph with known shapes better. The dimension names are those used by our
+        // exports and by the hub's; ONNX Runtime ignores names that a graph does not have.
         let Input { resize, width, height, .. } = self.manifest.input;
         let builder = match resize {
             Resize::LongestEdge => builder,
@@ -123,28 +104,29 @@ impl Model {
     }
 }
 
-/// One session.
+/// One ONNX Runtime session.
 #[derive(Debug)]
 pub(super) struct Runner {
     session: Session,
     manifest: Arc<Manifest>,
-    /// It must outlive the session.
+    /// Must outlive the session.
     _environment: Arc<Environment>,
 }
 
 impl Runner {
-    /// Runs once on nothing in particular: the first run of a graph allocates and optimises.
+    /// Runs a blank picture, because the first run of a session allocates and is slower than others.
     pub fn warm_up(&mut self) -> Result<(), InferenceError> {
         let Input { width, height, .. } = self.manifest.input;
-        self.run(&[Tensor::grey(width as usize, height as usize)]).map(drop)
+        self.run(&[&Tensor::grey(width as usize, height as usize)]).map(drop)
     }
 
-    /// Runs pictures of one shape together.
-    pub fn run(&mut self, tensors: &[Tensor]) -> Result<Vec<RawOutput>, InferenceError> {
+    /// Runs pictures of the same shape as one batch. Returns the local features of each.
+    pub fn run(&mut self, tensors: &[&Tensor]) -> Result<Vec<LocalFeatures>, InferenceError> {
         let failed = |error: ort::Error| InferenceError::Run(error.to_string());
         let (Some(first), count) = (tensors.first(), tensors.len()) else {
             return Ok(Vec::new());
         };
+        let Manifest { input, output, .. } = &*self.manifest;
         let shape = [count, 3, first.height, first.width];
         let joined: Vec<f32>;
         let data = if count == 1 {
@@ -154,28 +136,27 @@ impl Runner {
             joined = parts.concat();
             joined.as_slice()
         };
-        let input = TensorRef::from_array_view((shape, data)).map_err(failed)?;
-        let outputs = self
-            .session
-            .run(ort::inputs![self.manifest.input.name.as_str() => input])
-            .map_err(failed)?;
-        let parts = |name: &str| {
+        let inputs = TensorRef::from_array_view((shape, data)).map_err(failed)?;
+        let outputs =
+            self.session.run(ort::inputs![input.name.as_str() => inputs]).map_err(failed)?;
+        let numbers = |name: &str| {
             let value = outputs.get(name).ok_or_else(|| {
                 InferenceError::Run(format!("the model has no output called {name:?}"))
             })?;
-            let (_, numbers) = value.try_extract_tensor::<f32>().map_err(failed)?;
-            let each = numbers.len() / count;
-            Ok((0..count).map(|i| numbers[i * each..(i + 1) * each].to_vec()).collect::<Vec<_>>())
+            value.try_extract_tensor::<f32>().map(|(_, numbers)| numbers).map_err(failed)
         };
-        let features = parts(&self.manifest.output.features)?;
-        let reliability = match &self.manifest.output.reliability {
-            Some(name) => parts(name)?.into_iter().map(Some).collect(),
-            None => vec![None; count],
+        let features = numbers(&output.features)?;
+        let reliability = output.reliability.as_deref().map(numbers).transpose()?;
+        let part = |numbers: &[f32], index: usize| {
+            let length = numbers.len() / count;
+            index * length..(index + 1) * length
         };
-        Ok(features
-            .into_iter()
-            .zip(reliability)
-            .map(|(features, reliability)| RawOutput { features, reliability, batch: count })
-            .collect())
+        let cells = output.cells(first);
+        let local = (0..count).map(|index| {
+            let features = &features[part(features, index)];
+            let reliability = reliability.map(|numbers| &numbers[part(numbers, index)]);
+            Ok(LocalFeatures::from_output(output, cells, features, reliability)?)
+        });
+        local.collect()
     }
 }

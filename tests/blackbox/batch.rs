@@ -142,7 +142,7 @@ async fn a_request_that_is_wrong_as_a_whole_says_so_and_keeps_what_came_before()
     let lonely = picture(Form::new(), "first", reference(0)).text("meta", "{}");
     assert!(send(&server, lonely).await.problem(400).contains("no \"image\" follows"));
     let twice = picture(Form::new().text("meta", "{}").text("meta", "{}"), "a", reference(1));
-    assert!(send(&server, twice).await.problem(400).contains("follow one another"));
+    assert!(send(&server, twice).await.problem(400).contains("in a row"));
     let long = picture(Form::new().text("meta", " ".repeat(70_000)), "a", reference(1));
     assert!(send(&server, long).await.problem(413).contains("65536"));
 

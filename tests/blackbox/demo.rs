@@ -67,7 +67,7 @@ async fn it_installs_dinov2_where_the_hub_answers_and_finds_it_the_next_time() {
     assert!(said.contains("downloading"), "{said}");
     assert_eq!(hub.asked().len(), 2, "one look, one download");
     let (outcome, _) = demo(&bench, &hub.url, &[]).await;
-    uses(&outcome, "dinov2-small", "the first DINOv2 that is installed");
+    uses(&outcome, "dinov2-small", "the first installed DINOv2 model");
     assert_eq!(hub.asked().len(), 2);
 }
 
@@ -77,7 +77,7 @@ async fn a_flag_decides_and_asks_nobody() {
     let (outcome, _) = demo(&bench, &hub.url, &["--offline"]).await;
     uses(&outcome, "xfeat", "--offline");
     let (outcome, _) = demo(&bench, &hub.url, &["--model", "xfeat"]).await;
-    uses(&outcome, "xfeat", "model.name says so");
+    uses(&outcome, "xfeat", "set by model.name");
     assert_eq!(hub.asked().len(), 0);
 }
 

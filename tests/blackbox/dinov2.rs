@@ -11,7 +11,7 @@ use std::process::Command;
 use serde::Deserialize;
 use tempfile::TempDir;
 use whereabouts_core::DescriptorKind;
-use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, FeatureSet, ImageLimits, Layout};
 
 /// The least cosine similarity to the descriptor of the original.
 const SAME: f64 = 0.9999;
@@ -100,7 +100,9 @@ fn check(model: &str, options: &[&str], wanted: f64) {
                     let (extractor, fixtures) = (&extractor, &fixtures);
                     scope.spawn(move || {
                         let picture = std::fs::read(fixtures.join(&expected.picture)).unwrap();
-                        let extraction = extractor.extract(&picture, expected.kind).unwrap();
+                        let features = FeatureSet::DescriptorOnly;
+                        let extraction =
+                            extractor.extract(&picture, expected.kind, features).unwrap();
                         (cosine(extraction.descriptor.as_slice(), &expected.vector), expected)
                     })
                 })

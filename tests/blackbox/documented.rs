@@ -5,7 +5,7 @@ use std::time::Duration;
 use reqwest::multipart::{Form, Part};
 use reqwest::{Method, Response};
 use serde_json::{Value, json};
-use whereabouts_server::http::{Example, ExampleBody, Taken, examples};
+use whereabouts_server::http::{Captured, Example, ExampleBody, examples};
 
 use super::support::{Server, frame, reference, server};
 
@@ -38,9 +38,14 @@ fn file(name: &str) -> Vec<u8> {
     }
 }
 
-async fn send(server: &Server, example: &Example, taken: &Taken, exported: &Value) -> Response {
+async fn send(
+    server: &Server,
+    example: &Example,
+    captured: &Captured,
+    exported: &Value,
+) -> Response {
     let method: Method = example.method().parse().unwrap();
-    let request = server.request(method, &example.path(taken));
+    let request = server.request(method, &example.path(captured));
     let request = match &example.body {
         None => request,
         Some(ExampleBody::Json(value)) => {
@@ -178,10 +183,10 @@ fn compare(at: &str, shown: &Value, real: &Value) {
 async fn the_examples_are_answered_as_they_say() {
     let recording = std::env::var_os("WHEREABOUTS_RECORD_EXAMPLES").is_some();
     let (_dir, server) = server();
-    let (mut all, mut taken, mut exported) = (examples().unwrap(), Taken::new(), Value::Null);
+    let (mut all, mut captured, mut exported) = (examples().unwrap(), Captured::new(), Value::Null);
     for example in &mut all {
-        let at = &format!("{} {}", example.method(), example.path(&taken));
-        let sending = send(&server, example, &taken, &exported);
+        let at = &format!("{} {}", example.method(), example.path(&captured));
+        let sending = send(&server, example, &captured, &exported);
         let is_stream = example.call.ends_with("/events");
         let response = if example.call == "GET /events" {
             let response = sending.await;
@@ -201,7 +206,7 @@ async fn the_examples_are_answered_as_they_say() {
             Some(_) => Some(Value::String(beginning(response, is_stream).await)),
             None => None,
         };
-        example.take(answer.as_ref().unwrap_or(&Value::Null), &mut taken);
+        example.capture(answer.as_ref().unwrap_or(&Value::Null), &mut captured);
         if let (true, Some(answer)) = (example.call.ends_with("/export"), &answer) {
             exported = answer.clone();
         }

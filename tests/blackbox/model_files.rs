@@ -330,7 +330,7 @@ fn a_file_is_added_without_a_hub_and_chosen() {
     let said = run(&["add", file, "--manifest", manifest, "--name", "mine"]).good();
     assert!(said.contains("model use mine"), "{said}");
     run(&["add", file, "--manifest", manifest, "--name", "../mine"])
-        .bad(&["cannot be a model's name"]);
+        .bad(&["is not a valid model name"]);
     run(&["add", manifest, "--manifest", manifest]).bad(&["pins"]);
     run(&["add", file, "--manifest", file]).bad(&["manifest"]);
 

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use serde_json::Value;
 use tempfile::TempDir;
-use whereabouts_core::DescriptorKind;
-use whereabouts_vision::{Assets, Extractor, ExtractorSettings, ImageLimits, Layout};
+use whereabouts_core::{Descriptor, DescriptorKind};
+use whereabouts_vision::{Assets, Extractor, ExtractorSettings, FeatureSet, ImageLimits, Layout};
 
 use super::support::{BINARY, Server, frame, reference};
 
@@ -19,6 +19,11 @@ fn load(model: &str, layout: Layout) -> Extractor {
     let limits = ImageLimits { max_pixels: 10_000_000 };
     let settings = ExtractorSettings { layout, ..ExtractorSettings::plain(model, 1, limits) };
     Extractor::load(&Assets::locate(Some(&fixtures)), &settings).unwrap()
+}
+
+fn descriptor(extractor: &Extractor, place: usize) -> Descriptor {
+    let (kind, features) = (DescriptorKind::Gem, FeatureSet::DescriptorOnly);
+    extractor.extract(&reference(place), kind, features).unwrap().descriptor
 }
 
 /// The picture that the fixture's script describes, as a PNG.
@@ -45,11 +50,12 @@ fn a_token_model_gives_the_descriptors_that_numpy_worked_out() {
     let expected: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
     for (kind, name) in [(DescriptorKind::Cls, "cls"), (DescriptorKind::Gem, "gem")] {
         let expected: Vec<f32> = serde_json::from_value(expected[name].clone()).unwrap();
-        let extraction = extractor.extract(&pattern(), kind).unwrap();
+        let extraction =
+            extractor.extract(&pattern(), kind, FeatureSet::DescriptorAndDense).unwrap();
         for (got, expected) in extraction.descriptor.as_slice().iter().zip(&expected) {
             assert!((got - expected).abs() < 1e-5, "{name}: {got} is not {expected}");
         }
-        let dense = &extraction.dense;
+        let dense = extraction.dense.unwrap();
         assert_eq!((dense.height(), dense.width(), dense.channels()), (3, 4, 8));
     }
 }
@@ -57,16 +63,12 @@ fn a_token_model_gives_the_descriptors_that_numpy_worked_out() {
 #[test]
 fn a_batch_gives_what_single_runs_give() {
     let single = load("xfeat", ONE);
-    let alone: Vec<_> = (0..8)
-        .map(|place| single.extract(&reference(place), DescriptorKind::Gem).unwrap().descriptor)
-        .collect();
+    let alone: Vec<_> = (0..8).map(|place| descriptor(&single, place)).collect();
     for layout in [EIGHT, SIDE_BY_SIDE] {
         let shared = load("xfeat", layout);
         std::thread::scope(|scope| {
             let shared = &shared;
-            let extract = move |place| {
-                shared.extract(&reference(place), DescriptorKind::Gem).unwrap().descriptor
-            };
+            let extract = move |place| descriptor(shared, place);
             // Several rounds, so that pictures come both alone and while others are in progress.
             let threads: Vec<_> =
                 (0..8).map(|place| scope.spawn(move || [(); 5].map(|()| extract(place)))).collect();

@@ -63,7 +63,7 @@ async fn a_certificate_that_is_replaced_is_taken_up_and_one_that_is_bad_is_not()
 
     std::fs::write(encrypted.files.path().join("server.pem"), "nonsense").unwrap();
     let end = Instant::now() + Duration::from_secs(30);
-    while !encrypted.server.log().contains("the one before stays") {
+    while !encrypted.server.log().contains("the previous one stays") {
         assert!(Instant::now() < end, "{}", encrypted.server.log());
         tokio::time::sleep(Duration::from_millis(200)).await;
     }

@@ -54,7 +54,7 @@ async fn a_torn_or_damaged_graph_file_is_built_again() {
     for bytes in [&whole[..whole.len() / 2], &[], &damaged] {
         std::fs::write(&file, bytes).unwrap();
         let server = Server::start(dir.path(), &[GRAPH]);
-        assert!(server.log().contains("the graph is built again"), "{}", server.log());
+        assert!(server.log().contains("rebuilding the graph"), "{}", server.log());
         // At once, while it is built, and afterwards.
         assert_eq!(first_of(&server, 7).await, "place-7");
         until_graphed(&server).await;

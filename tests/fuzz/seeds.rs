@@ -84,7 +84,9 @@ pub fn graphs() -> Vec<Vec<u8>> {
         m: 4,
         ef_construction: 20,
         ef_search: 20,
+        threads: 0,
         max_dead_share: 1.0,
+        check_s: 0,
     };
     let row = |slot: usize| {
         let numbers =

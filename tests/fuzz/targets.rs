@@ -7,10 +7,9 @@ use std::path::Path;
 
 use axum::body::Body;
 use axum::http::Request;
-use serde_json::Value;
 use tokio::runtime::{Builder, Runtime};
 use whereabouts_archive::{Item, Reader};
-use whereabouts_core::{CoordinateFrame, Pose};
+use whereabouts_core::{CoordinateFrame, Pose, PoseInput};
 use whereabouts_eval::{PictureFile, PoseSource, TruthSource};
 use whereabouts_index::SealedGraph;
 use whereabouts_refine::mllm::Labels;
@@ -69,9 +68,9 @@ fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
 }
 
 pub fn poses(bytes: &[u8]) -> bool {
-    if let Ok(value) = serde_json::from_slice::<Value>(bytes) {
-        let posed = [CoordinateFrame::Wgs84, CoordinateFrame::Metric]
-            .map(|frame| Pose::from_json(frame, value.clone()));
+    if let Ok(pose) = serde_json::from_slice::<PoseInput>(bytes) {
+        let posed =
+            [CoordinateFrame::Wgs84, CoordinateFrame::Metric].map(|frame| pose.check(frame));
         let posed: Vec<Pose> = posed.into_iter().flatten().collect();
         posed.iter().for_each(usable);
         return !posed.is_empty();
@@ -111,7 +110,7 @@ pub fn answer(bytes: &[u8]) -> bool {
     const CANDIDATES: usize = 10;
     let text = String::from_utf8_lossy(bytes);
     let labels = Labels::new((0..CANDIDATES).collect(), None);
-    let Ok(verdict) = labels.read(&text) else { return false };
+    let Ok(verdict) = labels.parse(&text) else { return false };
     let once: HashSet<usize> = verdict.order.iter().copied().collect();
     assert!(once.len() == CANDIDATES && verdict.order.len() == CANDIDATES);
     assert!(once.iter().all(|&index| index < CANDIDATES));

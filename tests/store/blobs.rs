@@ -7,7 +7,7 @@ use bytes::Bytes;
 use futures_util::future::join_all;
 use jiff::Timestamp;
 use whereabouts_core::{Digest, Job, JobState};
-use whereabouts_store::{Added, KeepJobs, StoreError};
+use whereabouts_store::{Added, JobRetention, StoreError};
 
 use crate::support::{Fixture, Tuning, add, claim, descriptor, image, is_kept, map, submit};
 
@@ -69,7 +69,7 @@ async fn bytes_of_a_frame_go_with_its_job(fixture: &Fixture) {
         store.finish(record.claim(), job).await.unwrap();
         assert!(is_kept(&*store, b"frame").await);
     }
-    let none = KeepJobs { since: None, most: Some(0), settled: Timestamp::now() };
+    let none = JobRetention { since: None, most: Some(0), settled: Timestamp::now() };
     let removed = store.remove_ended(none, 64).await.unwrap();
     assert_eq!((removed.by_count, removed.bytes), (2, 5));
     assert!(!is_kept(&*store, b"frame").await && is_kept(&*store, b"image").await);

@@ -31,7 +31,7 @@ fn key(number: usize) -> Digest {
 
 /// What the janitor does now and then.
 async fn tidy(store: &dyn Store) {
-    store.clear_left().await.unwrap();
+    store.collect_garbage().await.unwrap();
 }
 
 async fn a_description_is_kept_word_for_word(fixture: &Fixture) {
@@ -92,13 +92,13 @@ async fn a_purchase_is_begun_and_ended(fixture: &Fixture) {
     let until = Timestamp::now() + SignedDuration::from_secs(60);
     // A process does not keep itself from buying.
     for _ in 0..2 {
-        assert!(store.begin_purchase(&key(0), until).await.unwrap());
+        assert!(store.acquire_lease(&key(0), until).await.unwrap());
     }
-    store.end_purchase(&key(0)).await.unwrap();
-    store.end_purchase(&key(1)).await.unwrap();
-    assert!(store.begin_purchase(&key(0), until).await.unwrap());
+    store.release_lease(&key(0)).await.unwrap();
+    store.release_lease(&key(1)).await.unwrap();
+    assert!(store.acquire_lease(&key(0), until).await.unwrap());
     store.keep_description(key(0), description("text")).await.unwrap();
-    assert!(store.begin_purchase(&key(0), until).await.unwrap());
+    assert!(store.acquire_lease(&key(0), until).await.unwrap());
 }
 
 fn frame(number: u8, descriptor: &Descriptor) -> DescribedFrame {

@@ -14,6 +14,7 @@ use crate::support::{Fixture, add, descriptor, fill, image, map, next, odd_texts
 contract!(
     the_same_bytes_again_change_nothing_and_other_bytes_are_refused,
     images_come_in_pages_by_the_bytes_of_their_ids,
+    images_are_looked_up_by_id_in_the_order_asked_for,
     all_that_is_known_of_an_image_is_kept,
     positions_come_in_the_order_of_addition,
     the_count_and_the_changes_follow_every_addition_and_removal,
@@ -98,6 +99,26 @@ async fn images_come_in_pages_by_the_bytes_of_their_ids(fixture: &Fixture) {
         assert!(store.delete_image(&map, &id).await.unwrap());
         assert_eq!(store.image(&map, &id).await.unwrap(), None);
     }
+}
+
+async fn images_are_looked_up_by_id_in_the_order_asked_for(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let (one, _) = store.put_map(map("one", 3)).await.unwrap();
+    let (two, _) = store.put_map(map("two", 3)).await.unwrap();
+    let b = Some(add(&*store, &one, "b", b"b").await);
+    let a = Some(add(&*store, &one, "a", b"a").await);
+    let tokyo = Some(add(&*store, &one, "東京-01", b"t").await);
+    let quoted = Some(add(&*store, &one, "'; DROP TABLE images; --", b"q").await);
+    add(&*store, &two, "only in two", b"2").await;
+    let ids = |ids: &[&str]| -> Vec<ImageId> { ids.iter().map(|id| id.parse().unwrap()).collect() };
+    let wanted =
+        ids(&["東京-01", "never added", "a", "only in two", "'; DROP TABLE images; --", "b", "a"]);
+    let expected = [tokyo, None, a.clone(), None, quoted, b.clone(), a];
+    assert_eq!(store.images_by_id(&one, &wanted).await.unwrap(), expected);
+    assert_eq!(store.images_by_id(&one, &[]).await.unwrap(), []);
+    assert!(store.delete_image(&one, &wanted[2]).await.unwrap());
+    assert_eq!(store.images_by_id(&one, &ids(&["a", "b"])).await.unwrap(), [None, b]);
+    assert_eq!(store.images_by_id(&two, &ids(&["b"])).await.unwrap(), [None]);
 }
 
 async fn all_that_is_known_of_an_image_is_kept(fixture: &Fixture) {

@@ -102,7 +102,7 @@ async fn jobs_are_taken_by_priority_and_then_by_age(fixture: &Fixture) {
         assert_eq!(taken.job.id, jobs[expected]);
         store.finish(taken.claim(), ended(&taken, JobState::Succeeded)).await.unwrap();
         let oldest = left.first().map(|oldest| made_at(jobs[*oldest]));
-        assert_eq!(store.oldest_open().await.unwrap(), oldest);
+        assert_eq!(store.oldest_unfinished().await.unwrap(), oldest);
     }
     assert!(claim(&*store).await.is_none());
     assert_eq!(store.queued().await.unwrap(), 0);
@@ -463,7 +463,7 @@ async fn a_request_that_is_done_again_finds_its_job(fixture: &Fixture) {
         IdempotencyRecord { fingerprint: Digest::of(b"request"), at: Timestamp::now(), progress }
     };
     let reserve = async || {
-        store.reserve_answer("r", running(), Timestamp::UNIX_EPOCH).await.unwrap();
+        store.reserve_request("r", running(), Timestamp::UNIX_EPOCH).await.unwrap();
     };
     let _pin = store.put_blob(Digest::of(b"frame"), "frame".into()).await.unwrap();
     reserve().await;
@@ -475,7 +475,7 @@ async fn a_request_that_is_done_again_finds_its_job(fixture: &Fixture) {
     assert_eq!(store.queued().await.unwrap(), 1);
     // Another request has a job of its own; so has one that nobody remembers.
     assert_eq!(store.submit_once(record("m", b"frame"), 10, "other").await.unwrap(), None);
-    store.forget_answer("r").await.unwrap();
+    store.forget_request("r").await.unwrap();
     reserve().await;
     assert_eq!(store.submit_once(record("m", b"frame"), 10, "r").await.unwrap(), None);
     assert_eq!(store.queued().await.unwrap(), 3);

@@ -126,7 +126,7 @@ async fn is_gone(store: &dyn Store, map: &Map) {
         store.search(map, query.clone(), 1, SearchMode::Fast).await.map(drop),
         store.search(map, query, 1, SearchMode::Exact).await.map(drop),
         store.export(map, None, 1).await.map(drop),
-        store.look_alikes(map, CalibrationSettings::default(), 1).await.map(drop),
+        store.hard_negatives(map, CalibrationSettings::default(), 1).await.map(drop),
         store.put_calibration(map, measured).await,
         store.draft(next(map, 5)).await.map(drop),
     ] {
@@ -239,6 +239,6 @@ async fn what_was_measured_is_kept_for_its_revision(fixture: &Fixture) {
     let late = store.put_calibration(&known, measured).await.unwrap_err();
     assert!(matches!(late, StoreError::Superseded(_)), "{late}");
     let settings = CalibrationSettings::default();
-    let late = store.look_alikes(&known, settings, 1).await.unwrap_err();
+    let late = store.hard_negatives(&known, settings, 1).await.unwrap_err();
     assert!(matches!(late, StoreError::Superseded(_)), "{late}");
 }

@@ -165,7 +165,7 @@ async fn the_draft_of_a_deleted_map_goes_with_it_though_its_process_is_dead() {
     drop(dying);
     assert_eq!(tables(&database).await, 1);
     eventually(async || {
-        other.clear_left().await.unwrap();
+        other.collect_garbage().await.unwrap();
         (tables(&database).await == 0).then_some(())
     })
     .await;
@@ -221,7 +221,7 @@ async fn a_request_is_done_by_one_process_and_by_another_once_that_is_dead() {
     let other = database.open(Tuning::default()).await;
     let reserve = async |store: &PostgresStore, id: &str| {
         let since = Timestamp::now() + SignedDuration::from_secs(60);
-        store.reserve_answer(id, running(Uuid::now_v7()), since).await.unwrap()
+        store.reserve_request(id, running(Uuid::now_v7()), since).await.unwrap()
     };
     assert_eq!(reserve(&dying, "dying").await, None);
     assert_eq!(reserve(&alive, "alive").await, None);
@@ -289,15 +289,15 @@ async fn a_description_is_bought_by_one_process_and_by_another_if_nothing_comes_
     let other = database.open(Tuning::default()).await;
     let key = |name: &str| Digest::of(name.as_bytes());
     let begins = async |store: &PostgresStore, name: &str| {
-        store.begin_purchase(&key(name), in_a_minute()).await.unwrap()
+        store.acquire_lease(&key(name), in_a_minute()).await.unwrap()
     };
     for name in ["kept", "ended"] {
         assert!(begins(&alive, name).await);
         assert!(!begins(&other, name).await);
     }
-    other.end_purchase(&key("ended")).await.unwrap();
+    other.release_lease(&key("ended")).await.unwrap();
     assert!(!begins(&other, "ended").await);
-    alive.end_purchase(&key("ended")).await.unwrap();
+    alive.release_lease(&key("ended")).await.unwrap();
     assert!(begins(&other, "ended").await);
     let description = CachedDescription {
         text: "text".into(),
@@ -309,7 +309,7 @@ async fn a_description_is_bought_by_one_process_and_by_another_if_nothing_comes_
     assert!(begins(&other, "kept").await);
     // Its time runs out, or its process dies.
     let soon = Timestamp::now() + SignedDuration::from_millis(100);
-    assert!(alive.begin_purchase(&key("late"), soon).await.unwrap());
+    assert!(alive.acquire_lease(&key("late"), soon).await.unwrap());
     assert!(begins(&dying, "dying").await);
     eventually(async || begins(&other, "late").await.then_some(())).await;
     assert!(!begins(&other, "dying").await);
@@ -442,20 +442,22 @@ async fn a_limit_by_the_minute_is_that_of_all_processes() {
     let database = database().await;
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
     // As good as nothing comes back while this runs.
-    let draw = TokenRequest { per_minute: 0.01, needed: 0.001, taken: 0.001 };
+    let draw = TokenRequest { per_minute: 0.01, required: 0.001, amount: 0.001 };
     let mut taken = 0;
     for number in 0..30 {
-        let drawn =
-            processes[number % 2].draw("key", [draw, TokenRequest::UNLIMITED]).await.unwrap();
-        taken += usize::from(drawn.taken);
-        assert!(drawn.taken || drawn.left[0] < 0.002);
+        let drawn = processes[number % 2]
+            .take_tokens("key", [draw, TokenRequest::UNLIMITED])
+            .await
+            .unwrap();
+        taken += usize::from(drawn.granted);
+        assert!(drawn.granted || drawn.remaining[0] < 0.002);
     }
     assert!((9..=12).contains(&taken), "{taken}");
     // What is given back is there for others, and no more than a minute's worth.
-    let back = TokenRequest { needed: f64::MIN, taken: -1.0, ..draw };
-    processes[0].draw("key", [back, TokenRequest::UNLIMITED]).await.unwrap();
-    let drawn = processes[1].draw("key", [draw, TokenRequest::UNLIMITED]).await.unwrap();
-    assert!(drawn.taken && drawn.left[0] < 0.01, "{drawn:?}");
+    let back = TokenRequest { required: f64::MIN, amount: -1.0, ..draw };
+    processes[0].take_tokens("key", [back, TokenRequest::UNLIMITED]).await.unwrap();
+    let drawn = processes[1].take_tokens("key", [draw, TokenRequest::UNLIMITED]).await.unwrap();
+    assert!(drawn.granted && drawn.remaining[0] < 0.01, "{drawn:?}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -464,17 +466,17 @@ async fn the_budget_of_a_day_is_that_of_all_processes() {
     let processes = [database.open(long_lived()).await, database.open(long_lived()).await];
     let (day, limit) = (date(2026, 5, 1), Spent { tokens: 1000, money: 0.0 });
     let tokens = |tokens| Spent { tokens, money: 0.0 };
-    assert!(processes[0].set_aside(day, tokens(600), limit).await.unwrap());
-    assert!(!processes[1].set_aside(day, tokens(600), limit).await.unwrap());
+    assert!(processes[0].reserve(day, tokens(600), limit).await.unwrap());
+    assert!(!processes[1].reserve(day, tokens(600), limit).await.unwrap());
     // The call took 100 tokens: 500 go back, and the rest is spent when it is written down.
-    processes[0].give_back(day, tokens(500)).await.unwrap();
+    SharedLimits::release(&processes[0], day, tokens(500)).await.unwrap();
     let usage = Usage { calls: 1, prompt_tokens: 80, completion_tokens: 20, ..Usage::default() };
     let spent = DayUsage { date: day, map: "m".parse().unwrap(), usage, money: 0.0 };
     processes[0].add_usage(spent).await.unwrap();
-    assert!(!processes[1].set_aside(day, tokens(901), limit).await.unwrap());
-    assert!(processes[1].set_aside(day, tokens(900), limit).await.unwrap());
-    assert!(!processes[0].set_aside(day, tokens(1), limit).await.unwrap());
+    assert!(!processes[1].reserve(day, tokens(901), limit).await.unwrap());
+    assert!(processes[1].reserve(day, tokens(900), limit).await.unwrap());
+    assert!(!processes[0].reserve(day, tokens(1), limit).await.unwrap());
     // Another day, and no limit at all.
-    assert!(processes[0].set_aside(date(2026, 5, 2), tokens(1000), limit).await.unwrap());
-    assert!(processes[0].set_aside(day, tokens(5000), tokens(0)).await.unwrap());
+    assert!(processes[0].reserve(date(2026, 5, 2), tokens(1000), limit).await.unwrap());
+    assert!(processes[0].reserve(day, tokens(5000), tokens(0)).await.unwrap());
 }

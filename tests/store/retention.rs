@@ -3,7 +3,7 @@
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
 use whereabouts_core::{Digest, Job, JobState};
-use whereabouts_store::{JobFilter, KeepJobs, RemovedJobs, Store};
+use whereabouts_store::{JobFilter, JobRetention, RemovedJobs, Store};
 
 use crate::support::{Fixture, claim, submit};
 
@@ -29,10 +29,10 @@ async fn job(store: &dyn Store, frame: &str, days_ago: Option<i64>) -> Uuid {
     id
 }
 
-fn keep(days: i64, most: usize) -> KeepJobs {
+fn keep(days: i64, most: usize) -> JobRetention {
     let now = Timestamp::now();
     let since = now - SignedDuration::from_hours(24 * days);
-    KeepJobs { since: Some(since), most: Some(most), settled: now }
+    JobRetention { since: Some(since), most: Some(most), settled: now }
 }
 
 async fn has(store: &dyn Store, frame: &str) -> bool {
@@ -78,7 +78,7 @@ async fn the_first_to_end_go_while_there_are_too_many_a_batch_at_a_time(fixture:
     assert_eq!(store.remove_ended(keep(30, 1), 2).await.unwrap().by_count, 1);
     assert_eq!(listed(store, None).await, [jobs[0]]);
     // Whoever waits for it has not seen its end yet.
-    let unsettled = KeepJobs { settled: Timestamp::UNIX_EPOCH, ..keep(0, 0) };
+    let unsettled = JobRetention { settled: Timestamp::UNIX_EPOCH, ..keep(0, 0) };
     assert_eq!(store.remove_ended(unsettled, 2).await.unwrap().jobs(), 0);
 }
 
@@ -102,10 +102,10 @@ async fn jobs_go_by_their_age_before_they_go_by_their_number(fixture: &Fixture) 
     let removed = store.remove_ended(keep(30, 2), 64).await.unwrap();
     assert_eq!((removed.by_age, removed.by_count), (2, 1));
     assert_eq!(listed(store, None).await.len(), 2);
-    let by_age = KeepJobs { most: None, ..keep(2, 0) };
+    let by_age = JobRetention { most: None, ..keep(2, 0) };
     let removed = store.remove_ended(by_age, 64).await.unwrap();
     assert_eq!((removed.by_age, removed.by_count), (1, 0));
-    let by_number = KeepJobs { since: None, ..keep(0, 0) };
+    let by_number = JobRetention { since: None, ..keep(0, 0) };
     let removed = store.remove_ended(by_number, 64).await.unwrap();
     assert_eq!((removed.by_age, removed.by_count, removed.bytes), (0, 1, 5));
 }
@@ -113,7 +113,7 @@ async fn jobs_go_by_their_age_before_they_go_by_their_number(fixture: &Fixture) 
 async fn nothing_goes_where_nothing_is_bounded(fixture: &Fixture) {
     let store = fixture.open().await;
     let id = job(&*store, "a", Some(4000)).await;
-    let all = KeepJobs { since: None, most: None, settled: Timestamp::now() };
+    let all = JobRetention { since: None, most: None, settled: Timestamp::now() };
     assert_eq!(store.remove_ended(all, 64).await.unwrap(), RemovedJobs::default());
     assert_eq!(listed(&*store, None).await, [id]);
 }

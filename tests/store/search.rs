@@ -290,7 +290,7 @@ async fn look_alikes_are_the_most_similar_images_of_other_places(fixture: &Fixtu
         place_m: 4.5,
         ..CalibrationSettings::default()
     };
-    let found = store.look_alikes(&map, settings, 5).await.unwrap();
+    let found = store.hard_negatives(&map, settings, 5).await.unwrap();
     let asked: Vec<_> = (0..58).step_by(6).collect();
     let ids = |found: &[Candidate]| -> Vec<_> {
         found.iter().map(|found| found.image_id.clone()).collect()
@@ -314,6 +314,6 @@ async fn look_alikes_are_the_most_similar_images_of_other_places(fixture: &Fixtu
     }
     // Fewer, where there are not so many.
     let wide = CalibrationSettings { place_m: 38.0, ..settings };
-    let found = store.look_alikes(&map, wide, 50).await.unwrap();
+    let found = store.hard_negatives(&map, wide, 50).await.unwrap();
     assert!(found.iter().any(|found| (1..50).contains(&found.others.len())));
 }

@@ -19,7 +19,7 @@ use whereabouts_index::IndexSettings;
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
 use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
 use whereabouts_store::{
-    Added, DescriptionBounds, Draft, JobRecord, KeepJobs, ObjectSettings, Objects, Query, Store,
+    Added, DescriptionBounds, Draft, JobRecord, JobRetention, ObjectSettings, Objects, Query, Store,
 };
 
 /// Makes each of these promises a test of both stores.
@@ -133,7 +133,9 @@ fn index(tuning: Tuning) -> IndexSettings {
         m: 16,
         ef_construction: 100,
         ef_search: 64,
+        threads: 0,
         max_dead_share: 0.3,
+        check_s: 0,
     }
 }
 
@@ -382,7 +384,7 @@ pub async fn claim(store: &dyn Store) -> Option<JobRecord> {
 
 /// Whether the bytes are there once the janitor has called.
 pub async fn is_kept(store: &dyn Store, bytes: &[u8]) -> bool {
-    let all = KeepJobs { since: None, most: None, settled: Timestamp::now() };
+    let all = JobRetention { since: None, most: None, settled: Timestamp::now() };
     store.remove_ended(all, 64).await.unwrap();
     store.blob(&Digest::of(bytes)).await.unwrap().is_some()
 }

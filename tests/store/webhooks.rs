@@ -6,10 +6,10 @@ use futures_util::future::join_all;
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
 use whereabouts_core::{
-    Attempt, Delivery, DeliveryState, Job, JobState, StoredWebhook, Then, Webhook, WebhookEvent,
-    WebhookSecret,
+    Attempt, Delivery, DeliveryState, Disposition, Job, JobState, StoredWebhook, Webhook,
+    WebhookEvent, WebhookSecret,
 };
-use whereabouts_store::{ForgottenDeliveries, KeepDeliveries, Store, StoreError, StoredDelivery};
+use whereabouts_store::{DeliveryRetention, RemovedDeliveries, Store, StoreError, StoredDelivery};
 
 use crate::support::{Fixture, claim, eventually, odd_texts, submit};
 
@@ -68,8 +68,8 @@ async fn due(store: &dyn Store, webhook: Uuid, at: Timestamp) -> Vec<Uuid> {
     due.into_iter().map(|due| due.delivery.id).collect()
 }
 
-fn attempt(at: Timestamp, then: Then) -> Attempt {
-    Attempt { at, status: None, error: None, then }
+fn attempt(at: Timestamp, disposition: Disposition) -> Attempt {
+    Attempt { at, status: None, error: None, disposition }
 }
 
 fn ping(webhook: Uuid) -> StoredDelivery {
@@ -166,14 +166,16 @@ async fn a_delivery_is_due_at_its_time_until_it_has_ended(fixture: &Fixture) {
     assert_eq!(due(&*store, id, now).await, pings);
     assert_eq!(store.due_deliveries(id, now, 2).await.unwrap().len(), 2);
     let later = now + SignedDuration::from_secs(60);
-    let note = |ping: usize, then: Then| store.note_attempt(id, pings[ping], attempt(now, then));
-    note(0, Then::Again(later)).await.unwrap().unwrap();
-    note(1, Then::Delivered).await.unwrap().unwrap();
+    let note = |ping: usize, disposition: Disposition| {
+        store.note_attempt(id, pings[ping], attempt(now, disposition))
+    };
+    note(0, Disposition::RetryAt(later)).await.unwrap().unwrap();
+    note(1, Disposition::Delivered).await.unwrap().unwrap();
     assert_eq!(due(&*store, id, now).await, [pings[2]]);
     assert_eq!(due(&*store, id, later).await, [pings[2], pings[0]]);
     assert_eq!(store.waiting_deliveries().await.unwrap(), 2);
     // It has been delivered; what comes late changes nothing.
-    assert_eq!(note(1, Then::Dead).await.unwrap(), None);
+    assert_eq!(note(1, Disposition::Dead).await.unwrap(), None);
     let again = store.queue_again(id, pings[0], now).await.unwrap_err().to_string();
     assert!(again.contains("waits anyway"), "{again}");
     assert_eq!(store.queue_again(id, pings[1], now).await.unwrap().attempts, 0);
@@ -184,8 +186,8 @@ async fn a_delivery_is_due_at_its_time_until_it_has_ended(fixture: &Fixture) {
     assert_eq!(page.iter().map(|delivery| delivery.id).collect::<Vec<_>>(), [pings[0]]);
     assert_eq!(store.deliveries(id, None, None, 1).await.unwrap()[0].id, pings[2]);
     // What was given up has been delivered all the same.
-    note(2, Then::Dead).await.unwrap().unwrap();
-    let after = note(2, Then::Delivered).await.unwrap().unwrap();
+    note(2, Disposition::Dead).await.unwrap().unwrap();
+    let after = note(2, Disposition::Delivered).await.unwrap().unwrap();
     assert_eq!((after.state, after.attempts), (DeliveryState::Delivered, 2));
 }
 
@@ -198,7 +200,7 @@ async fn a_delivery_that_is_tried_again_is_due_again_when_its_time_has_come(fixt
         let failed = Attempt {
             status: Some(503),
             error: Some("busy".into()),
-            ..attempt(now, Then::Again(now + SignedDuration::from_millis(100)))
+            ..attempt(now, Disposition::RetryAt(now + SignedDuration::from_millis(100)))
         };
         let noted = store.note_attempt(id, pings[0], failed).await.unwrap().unwrap();
         assert_eq!((noted.attempts, noted.last_status), (tries, Some(503)));
@@ -219,11 +221,14 @@ async fn a_webhook_goes_with_its_deliveries_and_a_disabled_one_takes_none(fixtur
     let (gone, pings) = pinged(store, 259).await;
     let (stays, _) = pinged(store, 2).await;
     let now = Timestamp::now();
-    store.note_attempt(gone, pings[0], attempt(now, Then::Dead)).await.unwrap();
+    store.note_attempt(gone, pings[0], attempt(now, Disposition::Dead)).await.unwrap();
     assert!(store.delete_webhook(gone).await.unwrap());
     assert!(!store.delete_webhook(gone).await.unwrap());
     assert!(listed(store, gone).await.is_empty());
-    assert_eq!(store.note_attempt(gone, pings[1], attempt(now, Then::Dead)).await.unwrap(), None);
+    assert_eq!(
+        store.note_attempt(gone, pings[1], attempt(now, Disposition::Dead)).await.unwrap(),
+        None
+    );
     assert_eq!(store.waiting_deliveries().await.unwrap(), 2);
     store.disable_webhook(stays, now, "gone").await.unwrap();
     ended(store, "yard", JobState::Failed).await;
@@ -249,26 +254,26 @@ async fn the_first_to_end_are_forgotten_and_what_waits_only_if_there_is_no_other
     let day = SignedDuration::from_hours(24);
     for (ping, days) in [(4, 1), (2, 3), (3, 40)] {
         let ended = now - day * days;
-        store.note_attempt(id, pings[ping], attempt(ended, Then::Dead)).await.unwrap();
+        store.note_attempt(id, pings[ping], attempt(ended, Disposition::Dead)).await.unwrap();
     }
     let left = async || -> Vec<Uuid> {
         let mut ids: Vec<_> = listed(store, id).await.iter().map(|left| left.id).collect();
         ids.reverse();
         ids
     };
-    let keep = KeepDeliveries { since: Some(now - day * 30), most: 100 };
+    let keep = DeliveryRetention { since: Some(now - day * 30), most: 100 };
     let forgotten = store.forget_deliveries(keep, 9).await.unwrap();
-    assert_eq!(forgotten, ForgottenDeliveries { ended: 1, waiting: 0 });
-    let keep = KeepDeliveries { since: None, most: 4 };
+    assert_eq!(forgotten, RemovedDeliveries { ended: 1, waiting: 0 });
+    let keep = DeliveryRetention { since: None, most: 4 };
     assert_eq!(store.forget_deliveries(keep, 9).await.unwrap().ended, 1);
     assert_eq!(left().await, [pings[0], pings[1], pings[4], pings[5]]);
-    let keep = KeepDeliveries { since: None, most: 1 };
+    let keep = DeliveryRetention { since: None, most: 1 };
     let forgotten = store.forget_deliveries(keep, 1).await.unwrap();
-    assert_eq!(forgotten, ForgottenDeliveries { ended: 1, waiting: 0 });
+    assert_eq!(forgotten, RemovedDeliveries { ended: 1, waiting: 0 });
     let forgotten = store.forget_deliveries(keep, 9).await.unwrap();
-    assert_eq!(forgotten, ForgottenDeliveries { ended: 0, waiting: 2 });
+    assert_eq!(forgotten, RemovedDeliveries { ended: 0, waiting: 2 });
     assert_eq!(left().await, [pings[5]]);
-    assert_eq!(store.forget_deliveries(keep, 9).await.unwrap(), ForgottenDeliveries::default());
+    assert_eq!(store.forget_deliveries(keep, 9).await.unwrap(), RemovedDeliveries::default());
 }
 
 async fn what_is_queued_is_told(fixture: &Fixture) {
@@ -286,7 +291,7 @@ async fn what_is_queued_is_told(fixture: &Fixture) {
     ended(&*store, "yard", JobState::Failed).await;
     told().await;
     let now = Timestamp::now();
-    store.note_attempt(id, delivery, attempt(now, Then::Dead)).await.unwrap();
+    store.note_attempt(id, delivery, attempt(now, Disposition::Dead)).await.unwrap();
     store.queue_again(id, delivery, now).await.unwrap();
     told().await;
 }
@@ -320,7 +325,7 @@ async fn what_is_not_there_is_not_found(fixture: &Fixture) {
         let refused = refused.unwrap_err();
         assert!(matches!(refused, StoreError::NotFound(_)), "{refused}");
     }
-    assert_eq!(store.note_attempt(id, gone, attempt(now, Then::Dead)).await.unwrap(), None);
+    assert_eq!(store.note_attempt(id, gone, attempt(now, Disposition::Dead)).await.unwrap(), None);
     assert!(due(&*store, gone, now).await.is_empty() && listed(&*store, gone).await.is_empty());
     assert_eq!(store.give_up_deliveries(gone, now, "", 9).await.unwrap(), 0);
 }
@@ -335,7 +340,7 @@ async fn odd_texts_in_a_delivery_survive(fixture: &Fixture) {
         let now = Timestamp::now();
         let due = store.due_deliveries(id, now, 9).await.unwrap();
         assert_eq!(due, std::slice::from_ref(&delivery));
-        let failed = Attempt { error: Some(text.clone()), ..attempt(now, Then::Dead) };
+        let failed = Attempt { error: Some(text.clone()), ..attempt(now, Disposition::Dead) };
         store.note_attempt(id, delivery.delivery.id, failed).await.unwrap();
         let listed = &store.deliveries(id, None, None, 1).await.unwrap()[0];
         assert_eq!(listed.last_error.as_ref(), Some(&text));

@@ -12,7 +12,7 @@ use self::save::Backup;
 use super::client::{Client, ServerArg, segment};
 use super::progress::ProgressMeter;
 use whereabouts_api::MapState;
-use whereabouts_archive::{ArchivedMap, Manifest, Resumed, Writer, growing};
+use whereabouts_archive::{ArchivedMap, Manifest, Resumed, Writer, partial_path};
 use whereabouts_core::MapName;
 
 /// Save maps of a server to one file, with their descriptors and images
@@ -72,7 +72,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let (maps, gone) = backup.save_maps(&names, resumed).await.with_context(|| {
         format!(
             "the backup is incomplete; {} has what was saved so far, run the same command again to resume",
-            growing(&args.file).display()
+            partial_path(&args.file).display()
         )
     })?;
     backup.progress.finish();
@@ -112,9 +112,9 @@ async fn map_states(client: &Client, names: &[MapName]) -> anyhow::Result<Vec<Ma
 
 /// Resumes the interrupted backup of the same maps, if there is one, or begins a new file.
 fn open_writer(args: &Args, names: &[MapName]) -> anyhow::Result<(Writer, Resumed)> {
-    let partial = growing(&args.file);
+    let partial = partial_path(&args.file);
     if !args.restart
-        && let Some((writer, manifest, resumed)) = Writer::go_on(&args.file, names)?
+        && let Some((writer, manifest, resumed)) = Writer::resume(&args.file, names)?
     {
         let images: usize = resumed.maps.iter().map(|map| map.images).sum();
         eprintln!(

@@ -58,7 +58,7 @@ impl Backup {
         // The last map of an interrupted backup may be incomplete.
         let last = resumed.maps.pop();
         let resume_at = last.as_ref().and_then(|last| names.iter().position(|n| *n == last.name));
-        let mut unfinished = last.zip(resumed.begins).map(|(last, start)| MapProgress {
+        let mut unfinished = last.zip(resumed.map_start).map(|(last, start)| MapProgress {
             start,
             map: resumed.map,
             images: last.images,
@@ -68,7 +68,7 @@ impl Backup {
         let (mut saved, mut deleted) = (resumed.maps, Vec::new());
         for name in &names[resume_at.unwrap_or(0)..] {
             let progress =
-                unfinished.take().unwrap_or_else(|| MapProgress::new(self.writer.mark()));
+                unfinished.take().unwrap_or_else(|| MapProgress::new(self.writer.checkpoint()));
             match self.save_map(name, progress).await? {
                 MapOutcome::Saved(map) => saved.push(map),
                 MapOutcome::Deleted => {
@@ -93,9 +93,9 @@ impl Backup {
                 cursor.into_iter().chain([("limit", PAGE_SIZE.to_string())]).collect();
             let request =
                 || Ok(self.client.get(&format!("{}/export", map_path(name))).query(&query));
-            let response = self.client.answer_patiently(request).await?;
+            let response = self.client.response_with_retries(request).await?;
             if response.status() == StatusCode::NOT_FOUND {
-                self.writer.go_back(&progress.start)?;
+                self.writer.rewind(&progress.start)?;
                 return Ok(MapOutcome::Deleted);
             }
             if !response.status().is_success() {
@@ -113,7 +113,7 @@ impl Backup {
                     self.progress.println(&format!(
                         "{name} was reindexed or re-created during the backup; saving it from its beginning"
                     ));
-                    self.writer.go_back(&progress.start)?;
+                    self.writer.rewind(&progress.start)?;
                     progress = MapProgress::new(progress.start);
                     attempt += 1;
                     continue;
@@ -177,7 +177,7 @@ enum Content {
 async fn fetch(client: &Client, map: &MapName, image: &Image) -> anyhow::Result<Content> {
     let path = format!("{}/images/{}", map_path(map), segment(image.id.as_str()));
     let content = || Ok(client.get(&format!("{path}/content")));
-    let response = client.answer_patiently(content).await?;
+    let response = client.response_with_retries(content).await?;
     let damage = match response.status() {
         StatusCode::NOT_FOUND => return Ok(Content::Deleted),
         status if status.is_success() => {
@@ -193,7 +193,7 @@ async fn fetch(client: &Client, map: &MapName, image: &Image) -> anyhow::Result<
         StatusCode::INTERNAL_SERVER_ERROR => explained(response).await.to_string(),
         _ => return Err(explained(response).await),
     };
-    let current = client.answer_patiently(|| Ok(client.get(&path))).await?;
+    let current = client.response_with_retries(|| Ok(client.get(&path))).await?;
     match current.status().is_success() {
         true if current.json::<Image>().await?.digest == image.digest => {
             Ok(Content::Damaged(damage))

@@ -51,7 +51,7 @@ impl PendingChoice {
                 let entry = catalogue.find(smallest).cloned();
                 let entry =
                     entry.with_context(|| format!("the catalogue has no model {smallest}"))?;
-                let address = entry.address(&config.model.hub, &entry.manifest.file);
+                let address = entry.url(&config.model.hub, &entry.manifest.file);
                 let probe = tokio::spawn(probe(address, timeout));
                 let offer = Box::new(HubModel { config, assets, entry });
                 return Ok(Self::Probing { offer, probe });

@@ -1,16 +1,15 @@
 //! The flags of `whereabouts eval`, and the settings that follow from them.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use anyhow::{Context, bail};
 
 use whereabouts_core::{DescriptorKind, Digest, Scene};
 use whereabouts_eval::{RunSettings, TruthSource};
 use whereabouts_index::SearchMode;
-use whereabouts_refine::local::LocalSettings;
-use whereabouts_refine::mllm::PROMPT_VERSION;
-use whereabouts_server::config::{Config, Overrides, Refiner as ConfiguredRefiner};
+use whereabouts_refine::{REFINERS, RefinerSettings};
+use whereabouts_server::config::{Config, Overrides, RefinerChoice};
+use whereabouts_server::startup;
 
 /// Measure Recall@K on a folder of references and a folder of queries, without a server
 ///
@@ -54,7 +53,7 @@ pub struct Args {
     pub descriptor: Vec<DescriptorKind>,
     /// Refiners to evaluate: local, mllm, both, or off
     #[arg(long, value_delimiter = ',', default_value = "local")]
-    pub refine: Vec<ConfiguredRefiner>,
+    pub refine: Vec<RefinerChoice>,
     /// Number of candidates to refine [default: as configured, which is 10 with mllm, otherwise 20]
     #[arg(short, value_parser = clap::value_parser!(u8).range(1..=100))]
     k: Option<u8>,
@@ -135,8 +134,12 @@ impl Args {
 
     /// Returns the configuration of a server on the work folder.
     pub fn config(&self) -> anyhow::Result<Config> {
-        let mllm = self.refine.contains(&ConfiguredRefiner::Mllm);
-        let refiner = if mllm { ConfiguredRefiner::Mllm } else { ConfiguredRefiner::Off };
+        // The number of candidates follows from the configured refiner and applies to all of them, so the last
+        // one in the table takes precedence.
+        let configured = REFINERS.iter().rev().find_map(|entry| {
+            self.refine.iter().copied().find(|choice| choice.kind() == Some(entry.kind))
+        });
+        let refiner = configured.unwrap_or(RefinerChoice::OFF);
         let flags = Overrides::default()
             .data(Some(self.work_folder()?))
             .model(self.model.clone())
@@ -175,18 +178,19 @@ impl Args {
 
     pub fn settings(&self, config: &Config) -> anyhow::Result<RunSettings> {
         Ok(RunSettings {
-            k: config.refine.compared(),
+            k: config.compared_candidates(),
             search: if self.exact { SearchMode::Exact } else { SearchMode::Fast },
             scene: self.scene,
             concurrency: self.concurrency(),
             work_dir: config.data.dir.clone(),
-            attempts: config.jobs.attempts,
-            retry_pause: Duration::from_secs(config.jobs.retry_pause_s),
-            refiner_settings: format!(
-                "{PROMPT_VERSION} {} {:?}",
-                serde_json::to_string(&config.mllm)?,
-                LocalSettings::default()
-            ),
+            attempts: startup::attempts(config),
+            refiner_settings: fingerprint(&config.refiner_settings())?,
         })
     }
+}
+
+/// Returns a text that changes with everything that determines what the refiners return.
+fn fingerprint(settings: &RefinerSettings) -> anyhow::Result<String> {
+    let fingerprints = REFINERS.iter().map(|entry| Ok((entry.fingerprint)(settings)?));
+    Ok(fingerprints.collect::<anyhow::Result<Vec<String>>>()?.join(" "))
 }

@@ -10,18 +10,16 @@ use parking_lot::Mutex;
 
 pub use self::args::Args;
 use super::progress::ProgressMeter;
-use whereabouts_core::RefinerKind;
 use whereabouts_eval::{
     Dataset, Evaluator, Folders, Observer, RunConditions, Sampling, Summary, predictions, report,
     table,
 };
-use whereabouts_refine::local::{LocalMatcher, LocalSettings};
-use whereabouts_refine::{LocalRefiner, Refiner};
+use whereabouts_refine::{Refiner, RefinerContext};
 use whereabouts_server::Metrics;
 use whereabouts_server::config::Config;
 use whereabouts_server::startup;
+use whereabouts_server::startup::Parts;
 use whereabouts_service::Service;
-use whereabouts_vision::CpuPool;
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let folders = Folders {
@@ -41,13 +39,14 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let config = args.config()?;
     let _logs =
         whereabouts_telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
-    let service = open(config.clone()).await?;
+    let Parts { service, refiners: context, .. } = open(config.clone()).await?;
+    let service = Arc::new(service);
     let model = service.models.default_model().to_owned();
     let execution = service.installed_model(&model).await?.execution().to_string();
     let limits = service.models.limits();
     let observer = PhaseMeter::default();
     let evaluator = Evaluator {
-        refiners: refiners(&args, &service, &config)?,
+        refiners: refiners(&args, &service, &context).await?,
         service,
         settings: args.settings(&config)?,
         observer: &observer,
@@ -63,7 +62,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         truth: truth.criterion(),
         model,
         execution,
-        k: config.refine.compared(),
+        k: config.compared_candidates(),
         known_threshold: args.known_threshold.0,
         known_confidence: config.localize.known_confidence,
         search: if args.exact { "exact" } else { "fast" }.into(),
@@ -84,34 +83,27 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
 }
 
 /// Opens the service on the work folder. Its workers are not started: there is no job queue.
-async fn open(config: Config) -> anyhow::Result<Arc<Service>> {
+async fn open(config: Config) -> anyhow::Result<Parts> {
     let work = config.data.dir.clone();
     let building =
         tokio::task::spawn_blocking(move || startup::build(&config, Arc::new(Metrics::new())));
-    let parts = building
+    building
         .await?
-        .with_context(|| format!("cannot open the work folder {} (--work)", work.display()))?;
-    Ok(Arc::new(parts.service))
+        .with_context(|| format!("cannot open the work folder {} (--work)", work.display()))
 }
 
-/// Builds the refiners that --refine names, in its order.
-fn refiners(
+/// Returns the refiners that --refine names, in its order. The service's own refiner is reused.
+async fn refiners(
     args: &Args,
-    service: &Arc<Service>,
-    config: &Config,
+    service: &Service,
+    context: &RefinerContext,
 ) -> anyhow::Result<Vec<Arc<dyn Refiner>>> {
     let mut refiners: Vec<Arc<dyn Refiner>> = Vec::new();
-    for kind in args.refine.iter().filter_map(|refiner| refiner.kind()) {
-        refiners.push(match (kind, &service.refiner) {
-            (RefinerKind::Mllm, Some(mllm)) => Arc::clone(mllm),
-            _ => Arc::new(LocalRefiner {
-                maps: Arc::clone(&service.maps),
-                blobs: Arc::clone(&service.blobs),
-                models: service.models.clone(),
-                dense: Arc::clone(&service.dense),
-                pool: CpuPool::new("refine", config.jobs.workers, config.jobs.workers)?,
-                matcher: LocalMatcher::new(LocalSettings::default()),
-            }),
+    for entry in args.refine.iter().filter_map(|choice| choice.entry()) {
+        let running = service.refiner.as_ref().filter(|refiner| refiner.kind() == entry.kind);
+        refiners.push(match running {
+            Some(refiner) => Arc::clone(refiner),
+            None => (entry.build)(context).await?,
         });
     }
     Ok(refiners)

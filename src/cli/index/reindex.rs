@@ -19,7 +19,7 @@ pub async fn run(client: &Client, args: &Args) -> anyhow::Result<()> {
     let started: MapState = client.json(request).await?;
     let progress = ProgressMeter::new("images", started.images);
     let ended = loop {
-        let response = client.send_patiently(|| Ok(client.get(&path))).await;
+        let response = client.send_with_retries(|| Ok(client.get(&path))).await;
         let lost = || {
             format!(
                 "lost track of the reindex, which may still be running; GET {path} has its state"

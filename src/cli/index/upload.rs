@@ -8,7 +8,7 @@ use bytes::Bytes;
 use futures_util::StreamExt;
 use reqwest::multipart::{Form, Part};
 
-use super::super::client::{Client, LONGEST_PAUSE, PATIENCE, segment};
+use super::super::client::{Client, MAX_ATTEMPTS, MAX_PAUSE, segment};
 use super::super::progress::ProgressMeter;
 use super::{Args, FailedImage, IndexReport};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
@@ -129,7 +129,7 @@ impl Uploader<'_> {
                 Err(error) => done.push((picture.file, Err(error))),
             }
         }
-        for retries_left in (0..PATIENCE).rev() {
+        for retries_left in (0..MAX_ATTEMPTS).rev() {
             if pending.is_empty() {
                 return done;
             }
@@ -163,7 +163,7 @@ impl Uploader<'_> {
                 }
             }
             if let Some(pause) = pause {
-                tokio::time::sleep(pause.min(LONGEST_PAUSE)).await;
+                tokio::time::sleep(pause.min(MAX_PAUSE)).await;
             }
             pending = overloaded;
         }
@@ -178,7 +178,7 @@ impl Uploader<'_> {
         let has_pose = pose.is_some();
         let meta = ImageMeta {
             id: Some(picture.id.to_string()),
-            pose: pose.map(serde_json::to_value).transpose()?,
+            pose: pose.map(Into::into),
             ..ImageMeta::default()
         };
         let meta = serde_json::to_string(&meta)?;
@@ -196,7 +196,7 @@ impl Uploader<'_> {
             }
             Ok(self.client.post(&self.path).timeout(BATCH_TIMEOUT).multipart(form))
         };
-        let response = self.client.send_patiently(request).await?;
+        let response = self.client.send_with_retries(request).await?;
         let answer: BatchAnswer =
             response.json().await.context("the server's answer is not the expected JSON")?;
         ensure!(

@@ -8,7 +8,7 @@ use serde_json::json;
 use toml_edit::{DocumentMut, Item, Table, value};
 
 use super::ModelContext;
-use whereabouts_vision::{Bench, BenchRow, BenchSettings, LEAST_SIMILARITY, Layout};
+use whereabouts_vision::{Bench, BenchRow, BenchSettings, Layout, MIN_SIMILARITY};
 
 /// Benchmark a model on this machine with every provider, precision, thread count and batch size
 #[derive(Debug, clap::Args)]
@@ -39,12 +39,12 @@ pub fn run(context: &ModelContext, args: BenchArgs) -> anyhow::Result<()> {
     if !(0.05..=600.0).contains(&args.seconds) {
         bail!("--seconds must be between 0.05 and 600");
     }
-    let wanted = context.config.model.wanted();
+    let preference = context.config.model.preference();
     let (name, why) =
         context.assets.resolve(args.name.as_deref().unwrap_or(&context.config.model.name))?;
-    let bench = Bench::open(&context.assets, &name, wanted)?;
+    let bench = Bench::open(&context.assets, &name, preference)?;
     let settings = BenchSettings {
-        wanted,
+        preference,
         layouts: layouts(&args),
         duration: Duration::from_secs_f64(args.seconds),
     };
@@ -113,7 +113,7 @@ fn layouts(args: &BenchArgs) -> Vec<Layout> {
 
 /// Returns the row with the lowest latency among those with at least 95 % of the highest throughput.
 fn best(rows: &[BenchRow]) -> Option<&BenchRow> {
-    let correct = || rows.iter().filter_map(|row| Some((row, row.right()?)));
+    let correct = || rows.iter().filter_map(|row| Some((row, row.accepted()?)));
     let highest = correct().map(|(_, figures)| figures.per_second).fold(0.0, f64::max);
     correct()
         .filter(|(_, figures)| figures.per_second >= 0.95 * highest)
@@ -135,7 +135,7 @@ fn line(row: &BenchRow, flop: Option<f64>) -> String {
                 format!("{:.0} %", 100.0 * figures.per_second * flop / figures.peak)
             });
             let wrong =
-                if figures.similarity < LEAST_SIMILARITY { "  descriptors differ" } else { "" };
+                if figures.similarity < MIN_SIMILARITY { "  descriptors differ" } else { "" };
             format!(
                 "{columns}  {:>8.1}  {:>8.1}  {:.5}  {share:>12}{wrong}",
                 figures.alone.as_secs_f64() * 1e3,
@@ -191,7 +191,7 @@ fn write(file: &Path, best: &BenchRow) -> anyhow::Result<()> {
 mod tests {
     use super::*;
     use whereabouts_core::Precision;
-    use whereabouts_vision::{Execution, Figures, Provider};
+    use whereabouts_vision::{BenchFigures, Execution, Provider};
 
     fn row(
         precision: Precision,
@@ -203,7 +203,7 @@ mod tests {
         BenchRow {
             execution: Execution { provider: Provider::OpenVino, precision },
             layout: Layout { threads: 2, sessions, max_batch: 4 },
-            outcome: Ok(Figures {
+            outcome: Ok(BenchFigures {
                 alone: Duration::from_millis(ms),
                 per_second,
                 similarity,

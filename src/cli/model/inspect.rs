@@ -127,7 +127,7 @@ pub fn show(context: &ModelContext, name: &str, json: bool) -> anyhow::Result<()
         }
         None => entry.and_then(|entry| entry.bytes),
     };
-    let address = entry.map(|entry| entry.address(&context.config.model.hub, &manifest.file));
+    let address = entry.map(|entry| entry.url(&context.config.model.hub, &manifest.file));
     if json {
         let details = json!({
             "name": name, "installed": folder.is_some(), "folder": folder, "bytes": bytes,

@@ -1,16 +1,15 @@
-//! Geometric agreement: which matches moved together with what surrounds them.
+//! Geometric verification: keeps the matches that moved together with their surroundings.
 //!
-//! The check is local. A robot that drives on sees near things move more than far ones, so that no
-//! single homography explains a right pair, and a rim that is fixed to the camera would win over the
-//! scene. Neighbouring regions of the same place still move alike, which chance matches do not: the
-//! idea of grid-based motion statistics (Bian et al., "GMS", CVPR 2017), here on the cells of the
-//! feature map.
+//! The check is local. As a robot moves, near things shift more than far ones, so no single homography
+//! explains a correct pair, and a part of the robot that is fixed in the picture would win over the scene.
+//! Neighbouring regions of the same place still move alike, which chance matches do not. This is the idea
+//! of grid-based motion statistics (Bian et al., "GMS", CVPR 2017), applied to the cells of the feature map.
 
 use super::mutual::CellPair;
 use super::{LocalSettings, Match};
 use whereabouts_core::dense::DenseFeatures;
 
-/// The matches with enough neighbours that moved as they did. `located` are the positions of
+/// Returns the matches with enough neighbours that moved as they did. `located` has the positions of
 /// `pairs`; `tolerance` is `[x, y]` in fractions of the picture's edges.
 pub(super) fn agreeing<'a>(
     query: &DenseFeatures,
@@ -30,7 +29,7 @@ pub(super) fn agreeing<'a>(
 struct MotionField {
     width: usize,
     height: usize,
-    /// Cells to each side of a match that count as its neighbours, `[columns, rows]`.
+    /// The neighbourhood of a match: cells to each side, as `[columns, rows]`.
     reach: [usize; 2],
     /// Row-major; candidate position minus query position, in fractions of the picture.
     motions: Vec<Option<[f32; 2]>>,
@@ -51,8 +50,8 @@ impl MotionField {
         }
     }
 
-    /// The share of the cells around `cell` that moved as it did, 0 to 1. Fewer than two such cells
-    /// count as none: one of them may be chance.
+    /// Returns the share of the cells around `cell` that moved as it did, 0 to 1. A single such cell may be
+    /// chance and counts as none.
     fn support(&self, cell: usize, tolerance: [f32; 2]) -> f32 {
         let Some(motion) = self.motions[cell] else { return 0.0 };
         let (row, column) = (cell / self.width, cell % self.width);

@@ -1,9 +1,8 @@
-//! A pair in words: what agreed, where, how it moved, what found no counterpart, and how much that
-//! is worth.
+//! The description of a pair: how much agrees, where, how it moved, what has no counterpart, and a verdict.
 
 use super::{Motion, PairMatch};
 
-/// The ninths of a picture, row by row.
+/// The names of the ninths of a picture, row by row.
 const NINTHS: [&str; 9] = [
     "upper left",
     "top",
@@ -16,7 +15,7 @@ const NINTHS: [&str; 9] = [
     "lower right",
 ];
 
-/// Whole rows and columns of ninths, so that three names become one.
+/// The names of whole rows and columns of ninths.
 const STRIPS: [([usize; 3], &str); 6] = [
     ([0, 1, 2], "along the top edge"),
     ([6, 7, 8], "along the bottom edge"),
@@ -26,16 +25,16 @@ const STRIPS: [([usize; 3], &str); 6] = [
     ([1, 4, 7], "down the middle"),
 ];
 
-/// Votes for a candidate, per region of the query and in units of its fair share, from which the
-/// agreement is called strong. Among ten candidates compared on XFeat features of two buildings and
-/// a rendered town, two in three above it were right.
+/// The score from which agreement is called strong, in units of an even share of the votes. In comparisons
+/// of ten candidates on XFeat features of two buildings and a rendered town, two in three candidates above
+/// it were correct.
 const STRONG: f32 = 0.5;
 
-/// The same, for some agreement. Nine in ten right candidates were above it.
+/// The score from which there is some agreement, likewise. Nine in ten correct candidates were above it.
 const SOME: f32 = 0.3;
 
-/// Describes one pair in plain English, three to six sentences. The same pair always gives the same
-/// text.
+/// Describes one pair in plain English, in three to six sentences. The same pair always gives the same
+/// text. The console reads these texts, so their wording is part of its contract (`words.js`).
 pub fn describe(pair: &PairMatch) -> String {
     if pair.matches.is_empty() {
         return nothing_agrees(pair);
@@ -95,11 +94,11 @@ fn movement(pair: &PairMatch) -> String {
     )
 }
 
-/// Judged by the votes rather than by the number of matches: among ten candidates, one that shares
-/// the lens rim and the floor alone has many matches and few votes.
+/// Judges by votes and not by the number of matches: a candidate that shares only the lens rim and the floor
+/// with the query has many matches but few votes.
 fn verdict(pair: &PairMatch) -> String {
-    let fair_share = 1.0 / (pair.rivals + 1) as f32;
-    match pair.score / fair_share {
+    let even_share = 1.0 / (pair.rivals + 1) as f32;
+    match pair.score / even_share {
         evidence if evidence >= STRONG => "Strong agreement: probably the same place.",
         evidence if evidence >= SOME => {
             "Some agreement: possibly the same place, or one built like it."
@@ -125,7 +124,7 @@ fn pairs_of_regions(count: usize) -> String {
     if count == 1 { "1 pair of regions".to_owned() } else { format!("{count} pairs of regions") }
 }
 
-/// The share of each ninth of the query that agrees.
+/// The share of agreeing cells in each ninth of the query.
 struct Parts([f32; 9]);
 
 impl Parts {
@@ -155,28 +154,28 @@ impl Parts {
     }
 }
 
-/// Names a choice of ninths: whole strips first, then what is left.
+/// Names a choice of ninths: whole strips first, then single ninths.
 fn places(chosen: [bool; 9]) -> String {
     if chosen == [true; 9] {
         return "all over the picture".to_owned();
     }
-    let mut left = chosen;
+    let mut unnamed = chosen;
     let mut names: Vec<String> = Vec::new();
     for (strip, name) in STRIPS {
-        if strip.iter().all(|&ninth| chosen[ninth]) && strip.iter().any(|&ninth| left[ninth]) {
-            strip.iter().for_each(|&ninth| left[ninth] = false);
+        if strip.iter().all(|&ninth| chosen[ninth]) && strip.iter().any(|&ninth| unnamed[ninth]) {
+            strip.iter().for_each(|&ninth| unnamed[ninth] = false);
             names.push(name.to_owned());
         }
     }
     let single: Vec<&str> =
-        NINTHS.iter().zip(left).filter(|(_, left)| *left).map(|(name, _)| *name).collect();
+        NINTHS.iter().zip(unnamed).filter(|(_, unnamed)| *unnamed).map(|(name, _)| *name).collect();
     if !single.is_empty() {
         names.push(format!("in the {}", list(&single)));
     }
     list(&names)
 }
 
-/// `a`, `a and b`, `a, b and c`.
+/// Joins names to `a`, `a and b`, `a, b and c`.
 fn list(names: &[impl AsRef<str>]) -> String {
     match names {
         [] => String::new(),
@@ -188,7 +187,7 @@ fn list(names: &[impl AsRef<str>]) -> String {
     }
 }
 
-/// A motion as a reader sees it; what is too small to be seen is 0.
+/// A motion rounded for a reader; changes too small to be seen are 0.
 struct Changes {
     /// Percent of the edges, right and down positive.
     shift: [i32; 2],
@@ -210,7 +209,7 @@ impl Changes {
         }
     }
 
-    /// What happened to the regions.
+    /// Says how the regions moved.
     fn seen(&self) -> String {
         let mut seen = Vec::new();
         let [x, y] = self.shift;
@@ -234,7 +233,7 @@ impl Changes {
         if seen.is_empty() { "stayed where they were".to_owned() } else { list(&seen) }
     }
 
-    /// Where the camera must have been. A turn and a step to the side look alike here.
+    /// Says where the camera must have been. A turn and a step to the side look alike.
     fn viewpoint(&self) -> String {
         let mut from = Vec::new();
         if self.scale > 1.0 {

@@ -1,14 +1,14 @@
-//! The `local` refiner: says how a query and its candidates agree, region by region, without a
-//! language model.
+//! The refiner `local`: matches the regions of a query with those of its candidates, without a language
+//! model.
 //!
-//! Four steps, one file each. `mutual` finds the cells of two pictures that choose each other, among
-//! what `nearest` found;
-//! `agreement` keeps those whose surroundings moved the same way; `votes` lets each remaining
-//! cell of the query share one vote among the candidates, so that what every candidate shows counts
-//! for little; `motion` fits one motion to what is left. [`describe`] puts the outcome of a pair
-//! into words and [`rank`] orders the candidates.
+//! Matching has four steps, one file each. `mutual` finds mutual nearest neighbours among the cells of two
+//! pictures, with the nearest neighbours from `nearest`. `agreement` keeps the matches whose surroundings
+//! moved the same way. `votes` lets each cell of the query share one vote among the candidates, so that
+//! regions that every candidate shows count for little. `motion` fits one motion to the remaining matches.
+//! [`describe`] describes a pair in words, and [`rank`] ranks the candidates.
 //!
-//! Extracting [`DenseFeatures`], choosing the candidates and storing the result are left to others.
+//! [`LocalRefiner`] fetches the features of a job and makes a refinement of the matches. The matcher itself
+//! does no I/O.
 
 mod agreement;
 mod describe;
@@ -16,6 +16,7 @@ mod motion;
 mod mutual;
 mod nearest;
 mod rank;
+mod refiner;
 mod votes;
 
 #[cfg(test)]
@@ -24,19 +25,23 @@ mod tests;
 pub use describe::describe;
 pub use motion::Motion;
 pub use rank::rank;
+pub use refiner::LocalRefiner;
+pub(crate) use refiner::{build, fingerprint};
+
+use serde::Serialize;
 
 use mutual::Mutual;
 use nearest::Nearest;
 use votes::Votes;
 use whereabouts_core::dense::DenseFeatures;
 
-/// What the matcher takes for agreement. The defaults are those measured for XFeat; all lengths are
-/// fractions of the picture, so that they hold for any size of feature map.
-#[derive(Debug, Clone, PartialEq)]
+/// Thresholds of the matcher. The defaults were measured for XFeat. All lengths are fractions of the picture
+/// and so hold for any size of feature map.
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LocalSettings {
     /// Cosine similarity that two cells must exceed to match at all.
     pub min_similarity: f32,
-    /// How far around a match its neighbours are looked for, in fractions of the picture's edges.
+    /// The radius within which a match has neighbours, in fractions of the picture's edges.
     pub neighbourhood: f32,
     /// How much the motions of two neighbours may differ, in fractions of the picture's edges.
     /// Never less than [`grid_slack`](Self::grid_slack) cells.
@@ -45,11 +50,11 @@ pub struct LocalSettings {
     pub grid_slack: f32,
     /// The share of the cells around a match that must have moved as it did, 0 to 1.
     pub min_support: f32,
-    /// How much more alike a region must be in one candidate than in another to be e (2.7) times
-    /// as likely to be there, in units of the usual difference between the candidates of the query.
-    /// Small values let the best candidate take the whole vote.
+    /// The temperature of the votes, in units of the usual difference between the candidates of the query:
+    /// a region that is this much more similar in one candidate than in another gets e (2.7) times the
+    /// vote. Small values give the whole vote to the best candidate.
     pub vote_temperature: f32,
-    /// Rounds of re-weighting when the motion is fitted.
+    /// Rounds of re-weighting in the fit of the motion.
     pub motion_rounds: usize,
 }
 
@@ -84,48 +89,48 @@ pub struct Match {
 /// How one query and one candidate agree.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairMatch {
-    /// The matches whose surroundings moved the same way, most telling first.
+    /// The matches whose surroundings moved the same way, most distinctive first.
     pub matches: Vec<Match>,
-    /// How many of `matches` have no better counterpart in any other candidate of the query.
+    /// The number of `matches` that have no better counterpart in any other candidate of the query.
     pub distinctive: usize,
-    /// The other candidates that this one was compared beside.
+    /// The number of other candidates in the same comparison.
     pub rivals: usize,
-    /// Mutual nearest neighbours, before the geometric check.
+    /// The number of mutual nearest neighbours, before the geometric check.
     pub mutual: usize,
-    /// Cells of the query that took part: those that are not zero.
+    /// The number of cells of the query that are not zero. Only these are matched.
     pub cells: usize,
-    /// The one motion that explains most of `matches`.
+    /// The motion that explains most of `matches`.
     pub motion: Motion,
-    /// The share of the query's regions whose vote went to this candidate, 0 to 1. Higher means
-    /// more likely the same place; comparable among the candidates of one query.
+    /// The share of the query's votes that went to this candidate, 0 to 1. Higher means more likely the
+    /// same place. Comparable among the candidates of one query only.
     pub score: f32,
 }
 
-/// Why two pictures could not be compared: their features come from different models.
+/// The error of comparing features of different models.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 #[error("a query of {query} channels cannot be matched with a candidate of {candidate}")]
 pub struct LocalError {
-    /// Numbers in a cell of the query.
+    /// Channels of the query.
     pub query: usize,
-    /// Numbers in a cell of the candidate.
+    /// Channels of the candidate.
     pub candidate: usize,
 }
 
-/// Compares the dense features of a query with those of its candidates.
+/// Matches the dense features of a query with those of its candidates.
 ///
-/// It holds settings only: the same input always gives the same output, on any thread.
+/// Deterministic: the same input gives the same output, on any thread.
 #[derive(Debug, Clone, Default)]
 pub struct LocalMatcher {
     settings: LocalSettings,
 }
 
 impl LocalMatcher {
-    /// A matcher with these settings.
+    /// Creates a matcher with these settings.
     pub fn new(settings: LocalSettings) -> Self {
         Self { settings }
     }
 
-    /// Compares a query with one candidate alone: every agreeing region gives it a full vote.
+    /// Compares a query with a single candidate, which gets the full vote of every agreeing region.
     ///
     /// # Errors
     /// [`LocalError`] when the features come from different models.
@@ -134,14 +139,14 @@ impl LocalMatcher {
         query: &DenseFeatures,
         candidate: &DenseFeatures,
     ) -> Result<PairMatch, LocalError> {
-        let least = self.settings.min_similarity;
-        let mutual = mutual::find(query, candidate, least, &mut Nearest::default())?;
+        let min_similarity = self.settings.min_similarity;
+        let mutual = mutual::find(query, candidate, min_similarity, &mut Nearest::default())?;
         let votes = Votes::count(std::slice::from_ref(&mutual), self.settings.vote_temperature);
         Ok(self.judge(query, candidate, &mutual, &votes, 0))
     }
 
-    /// Compares a query with all its candidates, best coarse candidate first; the results are in
-    /// the same order. Costs one matrix product of the two feature maps for each pair.
+    /// Compares a query with all its candidates, which are in coarse order. The results are in the same
+    /// order. Costs one matrix product of the two feature maps for each pair.
     ///
     /// # Errors
     /// [`LocalError`] when any two of the features come from different models.
@@ -151,10 +156,10 @@ impl LocalMatcher {
         candidates: &[&DenseFeatures],
     ) -> Result<Vec<PairMatch>, LocalError> {
         let mut nearest = Nearest::default();
-        let least = self.settings.min_similarity;
+        let min_similarity = self.settings.min_similarity;
         let mutuals: Vec<Mutual> = candidates
             .iter()
-            .map(|candidate| mutual::find(query, candidate, least, &mut nearest))
+            .map(|candidate| mutual::find(query, candidate, min_similarity, &mut nearest))
             .collect::<Result<_, _>>()?;
         let votes = Votes::count(&mutuals, self.settings.vote_temperature);
         let rivals = candidates.len().saturating_sub(1);
@@ -201,7 +206,7 @@ impl LocalMatcher {
         }
     }
 
-    /// How far two positions may differ, `[x, y]` in fractions of the picture's edges.
+    /// Returns how far two positions may differ, as `[x, y]` in fractions of the picture's edges.
     fn tolerance(&self, query: &DenseFeatures, candidate: &DenseFeatures) -> [f32; 2] {
         let coarser = |a: usize, b: usize| self.settings.grid_slack / a.min(b) as f32;
         [

@@ -1,24 +1,24 @@
-//! The one motion that explains most of the agreeing matches, for a reader rather than for the
-//! ranking: parallax makes every single motion an approximation.
+//! The motion that explains most of the agreeing matches. It is for the description and not for the
+//! ranking, because parallax makes any single motion an approximation.
 //!
-//! Deterministic: the most telling matches propose a shift at each of a few scales, the proposal
-//! with the most weight behind it wins, and an affine motion is then fitted by iteratively
-//! re-weighted least squares with Tukey's biweight (Holland & Welsch, 1977).
+//! Deterministic: the most distinctive matches each propose a shift at a few scales, the proposal with the
+//! most support wins, and iteratively re-weighted least squares with Tukey's biweight (Holland & Welsch,
+//! 1977) then fits an affine motion.
 
 use super::Match;
 use whereabouts_core::dense::DenseFeatures;
 
-/// Matches that propose a shift.
+/// The number of matches that propose a shift.
 const PROPOSERS: usize = 12;
 
-/// Scales that each of them proposes it at: from half to double.
+/// The scales that each proposal is tried at, from half to double.
 const SCALES: [f32; 9] = [0.5, 0.6, 0.71, 0.84, 1.0, 1.19, 1.41, 1.68, 2.0];
 
-/// How firmly the fit holds on to the scale of the winning proposal, as a share of the evidence
-/// that matches spread over the whole picture would give.
-const HOLD: f32 = 0.01;
+/// The regularisation of the fit towards the scale of the winning proposal, as a share of the evidence that
+/// matches spread over the whole picture would give.
+const REGULARISATION: f32 = 0.01;
 
-/// The mean square distance from its middle of a coordinate spread evenly over the picture.
+/// The variance of a coordinate that is spread evenly over the picture.
 const EVEN_SPREAD: f32 = 1.0 / 12.0;
 
 /// An affine motion from the query to the candidate, both in fractions of the picture's edges.
@@ -27,46 +27,46 @@ pub struct Motion {
     /// `[[a, b, c], [d, e, f]]`: `(x, y)` of the query lies at `(a·x + b·y + c, d·x + e·y + f)` of
     /// the candidate.
     pub matrix: [[f32; 3]; 2],
-    /// Width over height of the grid of cells, so that a rotation can be told from a shear.
+    /// Width over height of the grid of cells, which tells a rotation from a shear.
     pub aspect: f32,
-    /// Matches within tolerance of it.
+    /// The number of matches within tolerance of the motion.
     pub support: usize,
 }
 
 impl Motion {
-    /// Nothing moved.
+    /// The identity.
     fn still(aspect: f32) -> Self {
         Self { matrix: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], aspect, support: 0 }
     }
 
-    /// A shift of the picture's centre by `shift` after scaling about it.
+    /// Scales about the picture's centre, and then shifts by `shift`.
     fn scaled(scale: f32, shift: [f32; 2], aspect: f32) -> Self {
         let [x, y] = shift.map(|s| s + 0.5 * (1.0 - scale));
         Self { matrix: [[scale, 0.0, x], [0.0, scale, y]], aspect, support: 0 }
     }
 
-    /// Where a point of the query lies in the candidate.
+    /// Maps a point of the query to the candidate.
     pub fn apply(&self, point: [f32; 2]) -> [f32; 2] {
-        // Written out: a closure for each row would be called once for each match and proposal.
+        // Written out, because this runs once for each match and proposal.
         let [[a, b, c], [d, e, f]] = self.matrix;
         let [x, y] = point;
         [a * x + b * y + c, d * x + e * y + f]
     }
 
-    /// How far the picture's centre moved, `[x, y]` in fractions of the edges; positive is right
+    /// Returns how far the picture's centre moved, as `[x, y]` in fractions of the edges; positive is right
     /// and down.
     pub fn shift(&self) -> [f32; 2] {
         self.apply([0.5, 0.5]).map(|x| x - 0.5)
     }
 
-    /// How many times larger things are in the candidate, along an edge: the square root of the
+    /// Returns how many times larger things are in the candidate, along an edge: the square root of the
     /// change of area.
     pub fn scale(&self) -> f32 {
         self.determinant().max(0.0).sqrt()
     }
 
-    /// How far things turned, in degrees, clockwise positive: the rotation nearest to the linear
-    /// part, once both axes have the same unit.
+    /// Returns how far things turned, in degrees, clockwise positive: the rotation nearest to the linear
+    /// part, with both axes in the same unit.
     pub fn rotation(&self) -> f32 {
         let [[a, b, _], [d, e, _]] = self.matrix;
         (d / self.aspect - b * self.aspect).atan2(a + e).to_degrees()
@@ -77,12 +77,12 @@ impl Motion {
         a * e - b * d
     }
 
-    /// Whether a camera could have caused it: not mirrored, and within a factor of 2.5 in size.
+    /// Returns whether a moving camera could have caused it: not mirrored, and within a factor of 2.5 in size.
     fn is_plausible(&self) -> bool {
         (0.16..=6.25).contains(&self.determinant()) && self.matrix[0][0] > 0.0
     }
 
-    /// How well it explains a match: 1 on the spot, 0 from `tolerance` on.
+    /// Returns how well it explains a match: 1 for an exact fit, 0 from `tolerance` on.
     fn explains(&self, found: &Match, tolerance: [f32; 2]) -> f32 {
         let at = self.apply(found.query);
         let x = (at[0] - found.candidate[0]) / tolerance[0];
@@ -92,7 +92,7 @@ impl Motion {
     }
 }
 
-/// Fits the motion to `matches`, most telling first, of which each counts by its weight.
+/// Fits a motion to `matches`, most distinctive first, each with its weight.
 pub(super) fn fit(
     matches: &[Match],
     weights: &[f32],
@@ -119,20 +119,20 @@ fn propose(matches: &[Match], weights: &[f32], tolerance: [f32; 2], aspect: f32)
             let shift = [0, 1]
                 .map(|axis| proposer.candidate[axis] - 0.5 - scale * (proposer.query[axis] - 0.5));
             let motion = Motion::scaled(scale, shift, aspect);
-            let mut backing = 0.0;
+            let mut support = 0.0;
             for (found, weight) in matches.iter().zip(weights) {
-                backing += weight * motion.explains(found, tolerance);
+                support += weight * motion.explains(found, tolerance);
             }
-            if backing > best.0 {
-                best = (backing, motion);
+            if support > best.0 {
+                best = (support, motion);
             }
         }
     }
     best.1
 }
 
-/// One round of weighted least squares for the correction that `motion` needs. Coordinates are
-/// taken from the picture's centre, so that size and shift hardly depend on each other.
+/// Corrects `motion` by one round of weighted least squares. Coordinates are relative to the picture's
+/// centre, so that scale and shift hardly depend on each other.
 fn improve(
     motion: &Motion,
     matches: &[Match],
@@ -155,9 +155,9 @@ fn improve(
             }
         }
     }
-    let hold = HOLD * EVEN_SPREAD * normal[2][2];
-    normal[0][0] += hold;
-    normal[1][1] += hold;
+    let regularisation = REGULARISATION * EVEN_SPREAD * normal[2][2];
+    normal[0][0] += regularisation;
+    normal[1][1] += regularisation;
     let inverse = inverse(normal)?;
 
     let mut better = *motion;
@@ -169,7 +169,7 @@ fn improve(
     Some(better)
 }
 
-/// The inverse of a symmetric 3×3 matrix by its cofactors; `None` where there is none.
+/// Inverts a symmetric 3×3 matrix by its cofactors; `None` if it is singular.
 fn inverse(m: [[f32; 3]; 3]) -> Option<[[f32; 3]; 3]> {
     let cofactor = |i: usize, j: usize| {
         let [r0, r1] = [(i + 1) % 3, (i + 2) % 3];

@@ -1,12 +1,12 @@
-//! Mutual nearest neighbours: which cells of two pictures choose each other.
+//! Mutual nearest neighbours among the cells of two pictures.
 //!
-//! Knows nothing of where a cell lies; geometry is the business of [`agreement`](super::agreement).
+//! Positions play no part here; [`agreement`](super::agreement) checks the geometry.
 
 use super::nearest::Nearest;
 use super::{LocalError, Match};
 use whereabouts_core::dense::DenseFeatures;
 
-/// Two cells that choose each other, by index into the row-major grids.
+/// Two cells that are each other's nearest neighbour, by index into the row-major grids.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct CellPair {
     pub query: usize,
@@ -14,23 +14,23 @@ pub(super) struct CellPair {
     pub similarity: f32,
 }
 
-/// What the similarities of two pictures have to say.
+/// The mutual nearest neighbours of two pictures.
 #[derive(Debug)]
 pub(super) struct Mutual {
     /// In the order of the query's cells.
     pub pairs: Vec<CellPair>,
-    /// For each query cell, its highest similarity to any cell of the candidate; `NEG_INFINITY` for
-    /// a cell that is zero or not a number.
+    /// For each query cell, its highest similarity to any cell of the candidate; `NEG_INFINITY` for a cell
+    /// that is zero or NaN.
     pub best: Vec<f32>,
 }
 
 impl Mutual {
-    /// Query cells that took part.
+    /// Returns the number of query cells that can be matched.
     pub fn cells(&self) -> usize {
         self.best.iter().filter(|best| best.is_finite()).count()
     }
 
-    /// The pairs with their positions.
+    /// Returns the pairs with their positions.
     pub fn located(&self, query: &DenseFeatures, candidate: &DenseFeatures) -> Vec<Match> {
         self.pairs
             .iter()
@@ -43,19 +43,19 @@ impl Mutual {
     }
 }
 
-/// The centre of a cell in fractions of the picture, `[x, y]`.
+/// Returns the centre of a cell as `[x, y]` in fractions of the picture.
 fn centre(features: &DenseFeatures, cell: usize) -> [f32; 2] {
     let (row, column) = (cell / features.width(), cell % features.width());
     [(column as f32 + 0.5) / features.width() as f32, (row as f32 + 0.5) / features.height() as f32]
 }
 
-/// Finds the pairs of cells that are each other's nearest neighbour by cosine similarity and more
-/// alike than `min_similarity`.
+/// Finds the pairs of cells that are each other's nearest neighbour by cosine similarity and more similar
+/// than `min_similarity`.
 ///
-/// A candidate cell is given away once: where several query cells tie for it, as in a repeated
-/// pattern, the first has it.
+/// A candidate cell is in at most one pair: if several query cells tie for it, as in a repeated pattern,
+/// the first gets it.
 ///
-/// `nearest` is memory to work in, so that not every pair asks for its own.
+/// `nearest` is working memory, reused from pair to pair.
 pub(super) fn find(
     query: &DenseFeatures,
     candidate: &DenseFeatures,
@@ -75,15 +75,15 @@ pub(super) fn find(
     Ok(keep_mutual(&nearest.of_query, &nearest.of_candidate, min_similarity))
 }
 
-/// A similarity is the same number whichever picture looks at it, so that two cells choose each
-/// other exactly when it is the highest of both its row and its column.
+/// Two cells are mutual nearest neighbours exactly when their similarity is the highest of both its row and
+/// its column.
 fn keep_mutual(nearest: &[(usize, f32)], of_candidate: &[f32], min_similarity: f32) -> Mutual {
-    let mut taken = vec![false; of_candidate.len()];
+    let mut assigned = vec![false; of_candidate.len()];
     let mut pairs = Vec::new();
     for (query, (candidate, similarity)) in nearest.iter().copied().enumerate() {
-        let chosen = similarity > min_similarity && similarity == of_candidate[candidate];
-        if chosen && !taken[candidate] {
-            taken[candidate] = true;
+        let mutual = similarity > min_similarity && similarity == of_candidate[candidate];
+        if mutual && !assigned[candidate] {
+            assigned[candidate] = true;
             pairs.push(CellPair { query, candidate, similarity });
         }
     }
@@ -95,7 +95,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_candidate_cell_is_given_to_one_query_cell_only() {
+    fn a_candidate_cell_is_matched_with_one_query_cell_only() {
         let nearest = [(0, 1.0), (0, 1.0), (1, 0.5)];
         let mutual = keep_mutual(&nearest, &[1.0, 0.8], 0.0);
         assert_eq!(mutual.pairs, [CellPair { query: 0, candidate: 0, similarity: 1.0 }]);

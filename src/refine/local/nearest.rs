@@ -1,38 +1,38 @@
-//! Every cell of one picture against every cell of another: which is the nearest of each.
+//! Nearest neighbours: compares every cell of one picture with every cell of another.
 //!
-//! A comparison of 1,200 cells with as many is a matrix product of 1.4 million similarities, of which
-//! only the highest of each row and of each column are wanted. So the product is never written out: a
-//! few cells of the query against a panel of the candidate's stay in the registers of the processor,
-//! from the first channel to the comparison with the highest so far.
+//! Comparing 1,200 cells with as many is a matrix product of 1.4 million similarities, of which only the
+//! highest of each row and each column matter. The product is therefore never stored: the sums of a few
+//! query cells against a panel of candidate cells stay in registers from the first channel to the
+//! comparison with the highest so far.
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// Vectors of the candidate's cells in a panel.
+/// Vectors of candidate cells in a panel.
 const PANEL: usize = 2;
-/// Query cells compared with a panel at a time: with [`PANEL`] as many sums as there are registers to
-/// hold, less a few, in processors of 32 wide ones and in others.
+/// Query cells that are compared with a panel at a time, on processors with 32 wide registers and on
+/// others. Times [`PANEL`], this is the number of sums, which fit into the registers with a few to spare.
 const MANY_ROWS: usize = 12;
 const FEW_ROWS: usize = 6;
-/// Numbers in a vector of a processor that has 32 wide registers.
+/// Numbers in a vector of a processor with 32 wide registers.
 const WIDE: usize = 16;
-/// Bytes in a line of the processor's cache. A vector across two of them is read twice.
+/// Bytes in a cache line. Reading a vector that straddles two lines takes two accesses.
 const LINE: usize = 64;
 
-/// The highest similarity of each cell of either picture.
+/// The highest similarity of each cell of both pictures.
 #[derive(Debug, Default)]
 pub(super) struct Nearest {
-    /// For each query cell the first of the candidate's cells that is most like it, and their
-    /// similarity; `NEG_INFINITY` where no similarity is a number.
+    /// For each query cell, the first of its most similar candidate cells and their similarity;
+    /// `NEG_INFINITY` if all similarities are NaN.
     pub of_query: Vec<(usize, f32)>,
-    /// For each of the candidate's cells its highest similarity; padded to a whole panel.
+    /// For each candidate cell, its highest similarity; padded to a whole panel.
     pub of_candidate: Vec<f32>,
-    /// The candidate's cells as the product reads them: by panel, then channel, then cell.
+    /// The candidate cells in the order in which they are read: by panel, then channel, then cell.
     panels: Vec<f32>,
 }
 
 impl Nearest {
-    /// Compares the cells of two pictures, row-major with `channels` numbers each. What was found
-    /// before is replaced, in the same memory.
+    /// Compares the cells of two pictures, row-major with `channels` numbers each. Replaces earlier results
+    /// and reuses their memory.
     pub fn find(&mut self, query: &[f32], candidate: &[f32], channels: usize) {
         self.of_query.clear();
         self.of_candidate.clear();
@@ -41,7 +41,7 @@ impl Nearest {
     }
 }
 
-/// One run of [`Nearest::find`], compiled for several processors.
+/// One call of [`Nearest::find`], compiled for several processors.
 struct Comparison<'a> {
     query: &'a [f32],
     candidate: &'a [f32],
@@ -63,7 +63,7 @@ impl WithSimd for Comparison<'_> {
 }
 
 impl Comparison<'_> {
-    // Everything is inlined into the function that the processor was chosen for.
+    // Everything is inlined into the function that is compiled for the processor.
     #[inline(always)]
     fn run<const ROWS: usize, S: Simd>(self, simd: S) {
         let Self { query, candidate, channels, found } = self;
@@ -81,9 +81,8 @@ impl Comparison<'_> {
                 }
             }
             let mut best = [[simd.splat_f32s(f32::NEG_INFINITY); PANEL]; ROWS];
-            let mut place = [[simd.splat_u32s(0); PANEL]; ROWS];
-            // Rows past the end change nothing: they are not numbers, or those of the tile before, which
-            // were compared already.
+            let mut panel_of_best = [[simd.splat_u32s(0); PANEL]; ROWS];
+            // Rows past the end change nothing: they are NaN, or repeat rows of the previous tile.
             for (index, panel) in panels.chunks_exact(channels).enumerate() {
                 let mut sums = [[simd.splat_f32s(0.0); PANEL]; ROWS];
                 for (numbers, vectors) in tile.iter().zip(panel) {
@@ -99,11 +98,12 @@ impl Comparison<'_> {
                 let mut column = columns[index];
                 for row in 0..ROWS {
                     for vector in 0..PANEL {
-                        // False for what is not a number.
+                        // A comparison with NaN is false.
                         let (sum, highest) = (sums[row][vector], &mut best[row][vector]);
                         let higher = simd.greater_than_f32s(sum, *highest);
                         *highest = simd.select_f32s(higher, sum, *highest);
-                        place[row][vector] = simd.select_u32s(higher, here, place[row][vector]);
+                        panel_of_best[row][vector] =
+                            simd.select_u32s(higher, here, panel_of_best[row][vector]);
                         let higher = simd.greater_than_f32s(sum, column[vector]);
                         column[vector] = simd.select_f32s(higher, sum, column[vector]);
                     }
@@ -112,43 +112,43 @@ impl Comparison<'_> {
             }
             for row in 0..cells.len() / channels {
                 let highest: &[f32] = bytemuck::cast_slice(&best[row]);
-                let panel: &[u32] = bytemuck::cast_slice(&place[row]);
+                let panel: &[u32] = bytemuck::cast_slice(&panel_of_best[row]);
                 found.of_query.push(first_highest(highest, panel));
             }
         }
     }
 }
 
-/// Copies cells into panels of `width`, the first at the start of a line of the processor's cache. What
-/// is missing of the last is not a number, and so the nearest of nothing.
+/// Copies cells into panels of `width`, aligned to cache lines. The last panel is padded with NaN, which is
+/// never the nearest.
 #[inline(always)]
 fn pack<'a>(cells: &[f32], channels: usize, width: usize, memory: &'a mut Vec<f32>) -> &'a [f32] {
     let count = cells.len() / channels;
     let padded = count.div_ceil(width) * width;
     memory.resize(padded * channels + LINE / size_of::<f32>(), f32::NAN);
-    // No more than a line, unless the address cannot be known.
+    // At most a line; `align_offset` may return `usize::MAX` if it cannot tell.
     let start = memory.as_ptr().align_offset(LINE).min(LINE / size_of::<f32>());
     let panels = &mut memory[start..][..padded * channels];
     for panel in 0..padded / width {
         let first = panel * width;
         for channel in 0..channels {
             let column = &mut panels[(first * channels + channel * width)..][..width];
-            for place in 0..width.min(count - first) {
-                column[place] = cells[(first + place) * channels + channel];
+            for offset in 0..width.min(count - first) {
+                column[offset] = cells[(first + offset) * channels + channel];
             }
         }
     }
     panels
 }
 
-/// The highest number of a row and its first place, from the highest in each place of a panel and the
-/// panel it was seen in.
+/// Returns the first cell with the highest similarity and that similarity, from the highest of each lane and
+/// the panel in which that lane had it.
 fn first_highest(highest: &[f32], panel: &[u32]) -> (usize, f32) {
     let mut first = (0, f32::NEG_INFINITY);
     for (offset, (similarity, panel)) in highest.iter().zip(panel).enumerate() {
-        let place = *panel as usize * highest.len() + offset;
-        if *similarity > first.1 || (*similarity == first.1 && place < first.0) {
-            first = (place, *similarity);
+        let cell = *panel as usize * highest.len() + offset;
+        if *similarity > first.1 || (*similarity == first.1 && cell < first.0) {
+            first = (cell, *similarity);
         }
     }
     first
@@ -158,7 +158,7 @@ fn first_highest(highest: &[f32], panel: &[u32]) -> (usize, f32) {
 mod tests {
     use super::*;
 
-    /// Numbers of the size that cells have, some of them equal, the same for the same seed.
+    /// Reproducible cells with numbers of a realistic size, some of them equal.
     fn cells(count: usize, channels: usize, seed: u32) -> Vec<f32> {
         let mut state = seed;
         let mut next = || {
@@ -168,17 +168,21 @@ mod tests {
         (0..count * channels).map(|_| next()).collect()
     }
 
-    /// The same, written down as it is defined.
-    fn plainly(query: &[f32], candidate: &[f32], channels: usize) -> (Vec<(usize, f32)>, Vec<f32>) {
+    /// The reference implementation.
+    fn reference(
+        query: &[f32],
+        candidate: &[f32],
+        channels: usize,
+    ) -> (Vec<(usize, f32)>, Vec<f32>) {
         let mut of_candidate = vec![f32::NEG_INFINITY; candidate.len() / channels];
         let of_query = query.chunks(channels).map(|cell| {
             let mut best = (0, f32::NEG_INFINITY);
-            for (place, other) in candidate.chunks(channels).enumerate() {
+            for (index, other) in candidate.chunks(channels).enumerate() {
                 let similarity: f32 = cell.iter().zip(other).map(|(a, b)| a * b).sum();
                 if similarity > best.1 {
-                    best = (place, similarity);
+                    best = (index, similarity);
                 }
-                of_candidate[place] = of_candidate[place].max(similarity);
+                of_candidate[index] = of_candidate[index].max(similarity);
             }
             best
         });
@@ -186,9 +190,9 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_cells_are_those_of_the_plain_product() {
+    fn the_nearest_cells_equal_those_of_the_reference_implementation() {
         let mut found = Nearest::default();
-        // The numbers are multiples of 1/256, so that no order of the sums is rounded.
+        // The numbers are multiples of 1/256, so that sums are exact in any order.
         for (ours, theirs, channels) in [
             (1, 1, 1),
             (1, 40, 3),
@@ -201,7 +205,7 @@ mod tests {
             let query = cells(ours, channels, 7);
             let candidate = cells(theirs, channels, 8);
             found.find(&query, &candidate, channels);
-            let (of_query, of_candidate) = plainly(&query, &candidate, channels);
+            let (of_query, of_candidate) = reference(&query, &candidate, channels);
             assert_eq!(found.of_query, of_query, "{ours} × {theirs} × {channels}");
             assert_eq!(found.of_candidate[..theirs], of_candidate, "{ours} × {theirs}");
             assert!(found.of_candidate[theirs..].iter().all(|x| *x == f32::NEG_INFINITY));
@@ -209,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_is_the_nearest_of_nothing() {
+    fn nan_is_never_the_nearest() {
         let mut found = Nearest::default();
         found.find(&[1.0, f32::NAN], &[f32::NAN, 0.5, 0.25], 1);
         assert_eq!(found.of_query, [(1, 0.5), (0, f32::NEG_INFINITY)]);

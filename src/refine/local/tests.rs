@@ -2,7 +2,7 @@ use super::*;
 
 const CHANNELS: usize = 16;
 
-/// A small xorshift generator: features that are unlike each other and the same in every run.
+/// A small xorshift generator for reproducible features that are unlike each other.
 struct Noise(u64);
 
 impl Noise {
@@ -14,8 +14,8 @@ impl Noise {
     }
 }
 
-/// A scene that is as wide and high as a picture, told by where a point is in it; it goes on
-/// outside the picture and changes smoothly over about a cell.
+/// A synthetic scene: the features of a point are a function of its position, which changes smoothly over
+/// about a cell and is defined outside the picture too.
 struct Scene {
     waves: Vec<[f32; 3]>,
 }
@@ -29,7 +29,7 @@ impl Scene {
         Self { waves }
     }
 
-    /// The picture in which scene point `(x, y)` lies at `(s·(x − ½) + ½ + dx, …)`.
+    /// Returns a picture in which scene point `(x, y)` lies at `(s·(x − ½) + ½ + dx, …)`.
     fn picture(&self, height: usize, width: usize, scale: f32, shift: [f32; 2]) -> DenseFeatures {
         let mut cells = Vec::with_capacity(height * width * CHANNELS);
         for row in 0..height {
@@ -59,7 +59,7 @@ fn compare(query: &DenseFeatures, candidate: &DenseFeatures) -> PairMatch {
     LocalMatcher::default().compare(query, candidate).unwrap()
 }
 
-/// A pair with nothing but a score.
+/// Returns a pair of which only the score matters.
 fn scored(score: f32) -> PairMatch {
     PairMatch { score, ..compare(&noise(1, 4, 4), &noise(2, 4, 4)) }
 }
@@ -99,7 +99,7 @@ fn a_larger_copy_recovers_its_scale() {
 }
 
 #[test]
-fn maps_of_different_size_are_compared_in_fractions_of_the_picture() {
+fn feature_maps_of_different_sizes_are_compared_in_fractions_of_the_picture() {
     let scene = Scene::new(6);
     let pair =
         compare(&scene.picture(16, 16, 1.0, [0.0; 2]), &scene.picture(24, 32, 1.0, [0.0; 2]));
@@ -118,7 +118,7 @@ fn unrelated_features_score_far_below_the_same_place() {
 }
 
 #[test]
-fn repeated_texture_gives_each_counterpart_away_once() {
+fn a_repeated_texture_matches_each_candidate_cell_at_most_once() {
     let mut tile = Noise(9);
     let tile: Vec<f32> = (0..CHANNELS).map(|_| tile.next()).collect();
     let wall = features(12, 16, tile.repeat(12 * 16));
@@ -128,7 +128,7 @@ fn repeated_texture_gives_each_counterpart_away_once() {
 }
 
 #[test]
-fn what_every_candidate_shows_counts_for_little() {
+fn regions_that_every_candidate_shows_count_for_little() {
     let mut noise_of = Noise(10);
     let picture = |rim: &[f32], seed: u64| {
         let inside = noise(seed, 16, 16);
@@ -149,7 +149,7 @@ fn what_every_candidate_shows_counts_for_little() {
 }
 
 #[test]
-fn zero_cells_match_nothing_and_take_no_part() {
+fn zero_cells_match_nothing_and_are_not_counted() {
     let scene = Scene::new(14);
     let whole = scene.picture(12, 16, 1.0, [0.0; 2]);
     let mut cells = whole.cells().to_vec();
@@ -166,7 +166,7 @@ fn zero_cells_match_nothing_and_take_no_part() {
 }
 
 #[test]
-fn cells_that_are_not_numbers_spoil_only_themselves() {
+fn cells_with_nan_or_infinity_affect_only_themselves() {
     let scene = Scene::new(15);
     let whole = scene.picture(12, 16, 1.0, [0.0; 2]);
     let mut cells = whole.cells().to_vec();
@@ -183,7 +183,7 @@ fn cells_that_are_not_numbers_spoil_only_themselves() {
 }
 
 #[test]
-fn a_single_cell_is_compared_without_a_neighbourhood() {
+fn a_single_cell_has_no_neighbourhood_and_scores_zero() {
     let pair = compare(&noise(17, 1, 1), &noise(17, 1, 1));
     assert_eq!((pair.mutual, pair.matches.len(), pair.score), (1, 0, 0.0));
 }
@@ -199,7 +199,7 @@ fn features_of_different_models_are_an_error() {
 }
 
 #[test]
-fn settings_that_make_no_sense_do_not_panic() {
+fn nonsensical_settings_do_not_panic() {
     let scene = Scene::new(18);
     let query = scene.picture(8, 8, 1.0, [0.0; 2]);
     for bad in [f32::NAN, -1.0, 0.0, f32::INFINITY] {
@@ -219,7 +219,7 @@ fn settings_that_make_no_sense_do_not_panic() {
 }
 
 #[test]
-fn no_candidates_are_no_pairs() {
+fn no_candidates_give_no_pairs() {
     let pairs = LocalMatcher::default().compare_all(&noise(19, 4, 4), &[]).unwrap();
     assert!(pairs.is_empty());
     assert!(rank(&pairs).is_empty());
@@ -230,10 +230,10 @@ fn the_same_input_gives_the_same_output() {
     let scene = Scene::new(20);
     let query = scene.picture(24, 32, 1.0, [0.0; 2]);
     let candidate = scene.picture(24, 32, 1.2, [0.1, 0.0]);
-    let once = LocalMatcher::default().compare_all(&query, &[&candidate, &query]).unwrap();
+    let first = LocalMatcher::default().compare_all(&query, &[&candidate, &query]).unwrap();
     let again = LocalMatcher::default().compare_all(&query, &[&candidate, &query]).unwrap();
-    assert_eq!(once, again);
-    assert_eq!(describe(&once[0]), describe(&again[0]));
+    assert_eq!(first, again);
+    assert_eq!(describe(&first[0]), describe(&again[0]));
 }
 
 #[test]
@@ -250,7 +250,7 @@ fn a_near_tie_keeps_the_coarse_order() {
 }
 
 #[test]
-fn a_description_tells_counts_places_and_motion() {
+fn a_description_states_counts_regions_and_motion() {
     let scene = Scene::new(21);
     let query = scene.picture(24, 32, 1.0, [0.0; 2]);
     let pair = compare(&query, &scene.picture(24, 32, 1.2, [-0.35, 0.0]));
@@ -272,7 +272,7 @@ fn a_description_of_unrelated_pictures_says_that_nothing_agrees() {
 }
 
 #[test]
-fn a_description_says_what_no_other_candidate_matches_better() {
+fn a_description_states_how_many_regions_have_no_better_counterpart_elsewhere() {
     let scene = Scene::new(23);
     let query = scene.picture(24, 32, 1.0, [0.0; 2]);
     let pairs = LocalMatcher::default()

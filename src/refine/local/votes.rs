@@ -1,17 +1,17 @@
-//! Votes: what a region says about one candidate, given what it says about the others.
+//! Votes: how strongly a region speaks for one candidate rather than the others.
 //!
-//! Every cell of the query shares one vote among the candidates in proportion to `exp(s / t)`, with
-//! `s` its highest similarity to any cell of the candidate and `t` a temperature. A wall, a lens rim
-//! or a repeated door that all candidates show gives each the same small share; a sign that one of
-//! them shows gives it nearly all. It is the reasoning of naive-Bayes nearest neighbours with a
-//! local background (McCann & Lowe, "Local NBNN", CVPR 2012), with the candidates as the classes.
+//! Every cell of the query shares one vote among the candidates in proportion to `exp(s / t)`, where `s` is
+//! its highest similarity to any cell of the candidate and `t` a temperature. A wall, a lens rim or a
+//! repeated door that all candidates show gives each the same small share; a sign that only one of them
+//! shows gives that one nearly the whole vote. This is naive-Bayes nearest neighbour with a local
+//! background (McCann & Lowe, "Local NBNN", CVPR 2012), with the candidates as the classes.
 
 use super::mutual::Mutual;
 
-/// Keeps a vote defined where all candidates are the same picture, or there is only one.
+/// Keeps votes defined if all candidates are the same picture or there is only one.
 const LEAST_TEMPERATURE: f32 = 1e-6;
 
-/// The sum over all candidates, for each cell of the query.
+/// The normalisation of the votes of each query cell over all candidates.
 #[derive(Debug)]
 pub(super) struct Votes {
     /// The highest similarity among all candidates.
@@ -22,9 +22,9 @@ pub(super) struct Votes {
 }
 
 impl Votes {
-    /// Counts what each query cell has to share. All `mutuals` are of the same query;
-    /// `temperature` is in units of the [`spread`] of their similarities, because backbones differ
-    /// tenfold in how far apart they place unlike cells.
+    /// Sums over the candidates, whose `mutuals` are all of the same query. `temperature` is in units of
+    /// the [`spread`] of their similarities, because backbones differ tenfold in how far apart they place
+    /// dissimilar cells.
     pub fn count(mutuals: &[Mutual], temperature: f32) -> Self {
         let cells = mutuals.first().map_or(0, |mutual| mutual.best.len());
         let temperature = (temperature * spread(mutuals, cells)).max(LEAST_TEMPERATURE);
@@ -36,24 +36,24 @@ impl Votes {
         Self { peak, total, temperature }
     }
 
-    /// The part of the cell's vote that a candidate with this `similarity` gets, 0 to 1.
+    /// Returns the part of the cell's vote that a candidate with this `similarity` gets, 0 to 1.
     pub fn share(&self, cell: usize, similarity: f32) -> f32 {
         let share = ((similarity - self.peak[cell]) / self.temperature).exp() / self.total[cell];
         if share.is_finite() { share } else { 0.0 }
     }
 
-    /// Whether no candidate has a better counterpart for the cell.
+    /// Returns whether no candidate has a better counterpart for the cell.
     pub fn is_best(&self, cell: usize, similarity: f32) -> bool {
         similarity >= self.peak[cell]
     }
 }
 
-/// A cell's highest similarity to each candidate in turn.
+/// Returns a cell's highest similarity to each candidate in turn.
 fn over(mutuals: &[Mutual], cell: usize) -> impl Iterator<Item = f32> {
     mutuals.iter().map(move |mutual| mutual.best[cell])
 }
 
-/// The usual difference between candidates: the standard deviation of a cell's highest similarity
+/// Returns the usual difference between candidates: the standard deviation of a cell's highest similarity
 /// over the candidates, as a quadratic mean over the cells.
 fn spread(mutuals: &[Mutual], cells: usize) -> f32 {
     let candidates = mutuals.len() as f32;

@@ -1,11 +1,12 @@
-//! A circuit breaker: a server that keeps failing is left alone for a while.
+//! A circuit breaker, which suspends calls to a server that keeps failing.
 
 use std::time::Duration;
 
 use tokio::sync::watch;
 use tokio::time::Instant;
 
-/// Lets calls pass until so many fail in a row; then none for a while; then one, whose end decides.
+/// Passes calls until several in a row have failed (closed), then refuses calls for a while (open), then
+/// passes one probe, whose outcome closes or opens it again (half-open).
 #[derive(Debug)]
 pub struct Breaker {
     failures: u32,
@@ -15,91 +16,97 @@ pub struct Breaker {
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum State {
-    /// Calls pass; so many of the last ones failed.
+    /// Calls pass. `failed` counts the last failures in a row.
     Closed { failed: u32 },
-    /// No call passes until then.
+    /// Calls are refused until then.
     Open { until: Instant },
-    /// One call has passed, to try.
-    Probing,
+    /// A probe is in progress; other calls wait for its outcome.
+    HalfOpen,
 }
 
-/// No call passes.
+/// The breaker is open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Open {
-    /// How long from now on.
+    /// Time until it passes a probe.
     pub wait: Duration,
 }
 
 /// What [`Breaker::admit`] does with a call.
-enum Verdict {
+enum Decision {
     Pass { probe: bool },
     Refuse(Open),
     Await,
 }
 
 impl Breaker {
-    /// A closed breaker that opens for `open_for` after `failures` failures in a row.
+    /// Creates a closed breaker that opens for `open_for` after `failures` failures in a row.
     pub fn new(failures: u32, open_for: Duration) -> Self {
         let state = watch::Sender::new(State::Closed { failed: 0 });
         Self { failures: failures.max(1), open_for, state }
     }
 
-    /// Asks to make a call. While another call tries the server, this one waits for how it ends.
+    /// Admits a call or refuses it. While a probe is in progress, waits for its outcome.
     pub async fn admit(&self) -> Result<Admission<'_>, Open> {
         let mut changes = self.state.subscribe();
         loop {
             match self.decide() {
-                Verdict::Pass { probe } => {
-                    return Ok(Admission { breaker: self, probe, told: false });
+                Decision::Pass { probe } => {
+                    return Ok(Admission { breaker: self, probe, reported: false });
                 }
-                Verdict::Refuse(open) => return Err(open),
-                // The sender lives as long as `self`, so that waiting cannot fail.
-                Verdict::Await => {
-                    let _ = changes.wait_for(|state| *state != State::Probing).await;
+                Decision::Refuse(open) => return Err(open),
+                // Cannot fail, because the sender lives as long as `self`.
+                Decision::Await => {
+                    let _ = changes.wait_for(|state| *state != State::HalfOpen).await;
                 }
             }
         }
     }
 
-    /// Whether no call passes at the moment.
+    /// Returns whether calls are refused at the moment.
     pub fn is_open(&self) -> bool {
         matches!(*self.state.borrow(), State::Open { until } if until > Instant::now())
     }
 
-    fn decide(&self) -> Verdict {
-        let mut verdict = Verdict::Await;
+    fn decide(&self) -> Decision {
+        let mut decision = Decision::Await;
         self.state.send_if_modified(|state| {
             let now = Instant::now();
             let (decided, next) = match *state {
-                State::Closed { .. } => (Verdict::Pass { probe: false }, *state),
+                State::Closed { .. } => (Decision::Pass { probe: false }, *state),
                 State::Open { until } if until > now => {
-                    (Verdict::Refuse(Open { wait: until - now }), *state)
+                    (Decision::Refuse(Open { wait: until - now }), *state)
                 }
-                State::Open { .. } => (Verdict::Pass { probe: true }, State::Probing),
-                State::Probing => (Verdict::Await, *state),
+                State::Open { .. } => (Decision::Pass { probe: true }, State::HalfOpen),
+                State::HalfOpen => (Decision::Await, *state),
             };
-            verdict = decided;
+            decision = decided;
             let changed = next != *state;
             *state = next;
             changed
         });
-        verdict
+        decision
     }
 
-    fn tell(&self, probe: bool, ended: Ended) {
+    fn record(&self, probe: bool, outcome: CallOutcome) {
         self.state.send_modify(|state| {
-            let opened = State::Open { until: Instant::now() + self.open_for };
-            *state = match (*state, probe, ended) {
-                (State::Probing, true, Ended::Well) => State::Closed { failed: 0 },
-                (State::Probing, true, Ended::Badly) => opened,
-                // Nobody knows; the next call tries.
-                (State::Probing, true, Ended::Dropped) => State::Open { until: Instant::now() },
-                (State::Closed { .. }, _, Ended::Well) => State::Closed { failed: 0 },
-                (State::Closed { failed }, _, Ended::Badly) if failed + 1 >= self.failures => {
-                    opened
+            let open = State::Open { until: Instant::now() + self.open_for };
+            *state = match (*state, probe, outcome) {
+                (State::HalfOpen, true, CallOutcome::Success) => State::Closed { failed: 0 },
+                (State::HalfOpen, true, CallOutcome::Failure) => open,
+                // The next call is the probe.
+                (State::HalfOpen, true, CallOutcome::Unknown) => {
+                    State::Open { until: Instant::now() }
                 }
-                (State::Closed { failed }, _, Ended::Badly) => State::Closed { failed: failed + 1 },
-                // What was sent before the breaker opened says nothing about the server now.
+                (State::Closed { .. }, _, CallOutcome::Success) => State::Closed { failed: 0 },
+                (State::Closed { failed }, _, CallOutcome::Failure)
+                    if failed + 1 >= self.failures =>
+                {
+                    open
+                }
+                (State::Closed { failed }, _, CallOutcome::Failure) => {
+                    State::Closed { failed: failed + 1 }
+                }
+                // A call from before the breaker opened says nothing about the server now.
                 (unchanged, _, _) => unchanged,
             };
         });
@@ -107,41 +114,42 @@ impl Breaker {
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Ended {
-    Well,
-    Badly,
-    Dropped,
+enum CallOutcome {
+    Success,
+    Failure,
+    /// The call was dropped.
+    Unknown,
 }
 
-/// The leave to make one call, whose end is told to the breaker.
+/// The permission to make one call, which reports the call's outcome to the breaker.
 #[derive(Debug)]
 pub struct Admission<'a> {
     breaker: &'a Breaker,
     probe: bool,
-    told: bool,
+    reported: bool,
 }
 
 impl Admission<'_> {
-    /// The server answered.
+    /// Reports that the server answered.
     pub fn succeeded(mut self) {
-        self.end(Ended::Well);
+        self.report(CallOutcome::Success);
     }
 
-    /// It did not.
+    /// Reports that the server failed.
     pub fn failed(mut self) {
-        self.end(Ended::Badly);
+        self.report(CallOutcome::Failure);
     }
 
-    fn end(&mut self, ended: Ended) {
-        self.told = true;
-        self.breaker.tell(self.probe, ended);
+    fn report(&mut self, outcome: CallOutcome) {
+        self.reported = true;
+        self.breaker.record(self.probe, outcome);
     }
 }
 
 impl Drop for Admission<'_> {
     fn drop(&mut self) {
-        if !self.told {
-            self.end(Ended::Dropped);
+        if !self.reported {
+            self.report(CallOutcome::Unknown);
         }
     }
 }
@@ -163,7 +171,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn failures_in_a_row_open_it_and_a_success_starts_the_count_anew() {
+    async fn failures_in_a_row_open_it_and_a_success_resets_the_count() {
         let breaker = Breaker::new(2, OPEN_FOR);
         breaker.admit().await.unwrap().failed();
         breaker.admit().await.unwrap().succeeded();
@@ -175,7 +183,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn half_open_lets_one_call_try_and_the_others_wait_for_it() {
+    async fn half_open_admits_one_probe_and_the_others_wait_for_it() {
         let breaker = opened().await;
         tokio::time::advance(OPEN_FOR).await;
         let probe = breaker.admit().await.unwrap();
@@ -186,7 +194,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_failed_try_opens_it_again() {
+    async fn a_failed_probe_opens_it_again() {
         let breaker = opened().await;
         tokio::time::advance(OPEN_FOR).await;
         breaker.admit().await.unwrap().failed();
@@ -194,7 +202,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_try_that_was_given_up_leaves_the_next_one_to_try() {
+    async fn after_a_dropped_probe_the_next_call_is_the_probe() {
         let breaker = opened().await;
         tokio::time::advance(OPEN_FOR).await;
         drop(breaker.admit().await.unwrap());

@@ -1,7 +1,7 @@
-//! What calls may cost, in tokens and in money, for one job and for one day.
+//! Limits on spend, in tokens and in money, for one job and for one day of this process.
 //!
-//! A call is admitted with the longest answer it may get, and settled with what it was billed, so
-//! that calls in progress together cannot pass a limit.
+//! The most that a call may cost is reserved before the call, and the reservation is settled by the bill.
+//! Concurrent calls therefore cannot exceed a limit together.
 
 use std::sync::Arc;
 
@@ -11,9 +11,9 @@ use parking_lot::{Mutex, MutexGuard};
 
 use whereabouts_core::{Spent, utc_day};
 
-/// The bounds; 0 stands for none.
+/// Limits and prices; a limit of 0 stands for none.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Limits {
+pub struct SpendLimits {
     /// Tokens of one job.
     pub tokens_per_job: u64,
     /// Money for one job.
@@ -28,19 +28,19 @@ pub struct Limits {
     pub price_completion: f64,
 }
 
-/// A limit that a call would pass.
+/// The limit that a call would exceed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Exceeded {
-    /// The job's own.
+    /// That of its job.
     Job,
-    /// The day's.
+    /// That of the day.
     Day,
 }
 
 /// The budget of a process.
 #[derive(Debug)]
 pub struct Budget {
-    limits: Limits,
+    limits: SpendLimits,
     today: Mutex<Today>,
 }
 
@@ -50,8 +50,8 @@ struct Today {
     spent: Spent,
 }
 
-impl Limits {
-    /// What so many tokens cost.
+impl SpendLimits {
+    /// Returns the cost of these tokens.
     pub fn cost(&self, prompt_tokens: u64, completion_tokens: u64) -> Spent {
         let money = prompt_tokens as f64 * self.price_prompt
             + completion_tokens as f64 * self.price_completion;
@@ -60,33 +60,33 @@ impl Limits {
 }
 
 impl Budget {
-    /// A budget of which nothing is spent today.
-    pub fn new(limits: Limits) -> Self {
+    /// Creates a budget with nothing spent today.
+    pub fn new(limits: SpendLimits) -> Self {
         Self { limits, today: Mutex::new(Today { date: Date::MIN, spent: Spent::default() }) }
     }
 
-    /// Says what was spent on the day (UTC) of `now` before this process began.
+    /// Sets what was spent on the day (UTC) of `now` before this process started.
     pub fn seed(&self, now: Timestamp, spent: Spent) {
         self.today(now).spent = spent;
     }
 
-    /// What is spent on the day (UTC) of `now`, calls in progress included.
+    /// Returns what is spent on the day (UTC) of `now`, including reservations.
     pub fn spent(&self, now: Timestamp) -> Spent {
         self.today(now).spent
     }
 
-    /// What so many tokens cost.
+    /// Returns the cost of these tokens.
     pub fn cost(&self, prompt_tokens: u64, completion_tokens: u64) -> Spent {
         self.limits.cost(prompt_tokens, completion_tokens)
     }
 
-    /// The budget of one job, of which so many tokens are spent.
+    /// Returns the budget of one job that has spent these tokens in earlier attempts.
     pub fn for_job(self: &Arc<Self>, prompt_tokens: u64, completion_tokens: u64) -> JobBudget {
         let spent = Mutex::new(self.cost(prompt_tokens, completion_tokens));
         JobBudget { budget: Arc::clone(self), spent }
     }
 
-    /// Today's account; a new day starts an empty one.
+    /// Returns today's account, and starts a new one on a new day.
     fn today(&self, now: Timestamp) -> MutexGuard<'_, Today> {
         let date = utc_day(now);
         let mut today = self.today.lock();
@@ -105,7 +105,7 @@ pub struct JobBudget {
 }
 
 impl JobBudget {
-    /// Sets aside what a call may cost at the most.
+    /// Reserves the most that a call may cost.
     pub fn reserve(
         &self,
         prompt_tokens: u64,
@@ -126,7 +126,7 @@ impl JobBudget {
         }
         *job = job_after;
         today.spent = today_after;
-        Ok(Reservation { job: self, date: today.date, held: most })
+        Ok(Reservation { job: self, date: today.date, reserved: most })
     }
 
     fn spent(&self) -> MutexGuard<'_, Spent> {
@@ -134,17 +134,17 @@ impl JobBudget {
     }
 }
 
-/// What is set aside for one call. Dropped unsettled, it goes back: the call was not answered.
+/// The reserved cost of one call. Released if it is dropped unsettled, because the call was not answered.
 #[derive(Debug)]
-#[must_use = "dropped at once, it sets nothing aside"]
+#[must_use = "dropping a reservation releases it"]
 pub struct Reservation<'a> {
     job: &'a JobBudget,
     date: Date,
-    held: Spent,
+    reserved: Spent,
 }
 
 impl Reservation<'_> {
-    /// Replaces what was set aside by what the call cost.
+    /// Replaces the reservation by the actual cost.
     pub fn settle(mut self, prompt_tokens: u64, completion_tokens: u64) {
         let cost = self.job.budget.limits.cost(prompt_tokens, completion_tokens);
         self.replace(cost);
@@ -152,18 +152,18 @@ impl Reservation<'_> {
 
     fn replace(&mut self, by: Spent) {
         let mut job = self.job.spent();
-        *job = job.minus(self.held).plus(by);
+        *job = job.minus(self.reserved).plus(by);
         let mut today = self.job.budget.today.lock();
-        // Since midnight the account is another one, and nothing is set aside there.
-        let held = if today.date == self.date { self.held } else { Spent::default() };
-        today.spent = today.spent.minus(held).plus(by);
-        self.held = Spent::default();
+        // After midnight there is another account, in which nothing was reserved.
+        let reserved = if today.date == self.date { self.reserved } else { Spent::default() };
+        today.spent = today.spent.minus(reserved).plus(by);
+        self.reserved = Spent::default();
     }
 }
 
 impl Drop for Reservation<'_> {
     fn drop(&mut self) {
-        if self.held != Spent::default() {
+        if self.reserved != Spent::default() {
             self.replace(Spent::default());
         }
     }
@@ -174,7 +174,7 @@ mod tests {
     use super::*;
     use jiff::SignedDuration;
 
-    fn budget(limits: Limits) -> Arc<Budget> {
+    fn budget(limits: SpendLimits) -> Arc<Budget> {
         Arc::new(Budget::new(limits))
     }
 
@@ -183,8 +183,8 @@ mod tests {
     }
 
     #[test]
-    fn a_call_that_might_pass_the_limit_of_its_job_is_not_made() {
-        let budget = budget(Limits { tokens_per_job: 1000, ..Limits::default() });
+    fn a_call_that_might_exceed_the_limit_of_its_job_is_refused() {
+        let budget = budget(SpendLimits { tokens_per_job: 1000, ..SpendLimits::default() });
         let job = budget.for_job(0, 0);
         let first = job.reserve(200, 400, noon()).unwrap();
         assert_eq!(job.reserve(200, 400, noon()).unwrap_err(), Exceeded::Job);
@@ -196,19 +196,19 @@ mod tests {
     }
 
     #[test]
-    fn what_an_earlier_attempt_spent_is_spent() {
-        let budget = budget(Limits { tokens_per_job: 1000, ..Limits::default() });
+    fn spend_of_earlier_attempts_counts_against_the_limit_of_the_job() {
+        let budget = budget(SpendLimits { tokens_per_job: 1000, ..SpendLimits::default() });
         assert_eq!(budget.for_job(500, 100).reserve(300, 101, noon()).unwrap_err(), Exceeded::Job);
         assert!(budget.for_job(500, 100).reserve(300, 100, noon()).is_ok());
     }
 
     #[test]
-    fn money_follows_the_prices() {
-        let limits = Limits {
+    fn money_is_computed_from_the_prices() {
+        let limits = SpendLimits {
             price_prompt: 2.5,
             price_completion: 10.0,
             money_per_day: 0.02,
-            ..Limits::default()
+            ..SpendLimits::default()
         };
         let budget = budget(limits);
         let job = budget.for_job(0, 0);
@@ -218,16 +218,16 @@ mod tests {
     }
 
     #[test]
-    fn a_new_day_starts_with_nothing_spent() {
-        let budget = budget(Limits { tokens_per_day: 100, ..Limits::default() });
+    fn a_new_day_starts_with_nothing_spent_or_reserved() {
+        let budget = budget(SpendLimits { tokens_per_day: 100, ..SpendLimits::default() });
         budget.seed(noon(), Spent { tokens: 90, money: 0.0 });
         let job = budget.for_job(0, 0);
         assert_eq!(job.reserve(20, 0, noon()).unwrap_err(), Exceeded::Day);
         let tomorrow = noon() + SignedDuration::from_hours(12);
         let over_midnight = budget.for_job(0, 0);
-        let held = over_midnight.reserve(10, 0, noon()).unwrap();
+        let reserved = over_midnight.reserve(10, 0, noon()).unwrap();
         let next = job.reserve(20, 0, tomorrow).unwrap();
-        held.settle(10, 0);
+        reserved.settle(10, 0);
         assert_eq!(budget.spent(tomorrow).tokens, 30);
         next.settle(20, 0);
     }

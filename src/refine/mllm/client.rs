@@ -1,61 +1,60 @@
-//! The client of one MLLM server: what to send, how long to wait, how often to try.
+//! The client of one MLLM server, with its timeouts, retries and rate limits.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::{Bytes, BytesMut};
 use jiff::Timestamp;
-use reqwest::header::{
-    AUTHORIZATION, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, RETRY_AFTER,
-};
+use reqwest::header::{HeaderMap, RETRY_AFTER};
 use reqwest::{Response, StatusCode, Url, redirect};
 use tokio::sync::Semaphore;
 use tracing::Instrument;
 
 use super::breaker::Breaker;
+use super::endpoint;
 use super::rate::RateLimiter;
-use super::retry::{CallError, Failure, RetryPolicy, retry_after};
-use super::settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError};
+use super::retry::{CallError, CallRetryPolicy, Failure, retry_after};
+use super::settings::{MaxTokensField, MllmSettings, MllmSettingsError};
 use super::wire::{ChatAnswer, ChatRequest, ErrorAnswer, Message, Reply, Schema};
 use whereabouts_core::Secret;
-use whereabouts_store::Buckets;
+use whereabouts_store::TokenBuckets;
 use whereabouts_telemetry::traces;
 
-/// What is read of a refusal, in bytes, and what is told of it, in characters.
-const REFUSAL_BYTES: usize = 64 << 10;
-const REFUSAL_CHARS: usize = 300;
+/// How much of an error's body is read, in bytes, and how much of it is quoted, in characters.
+const ERROR_BODY_BYTES: usize = 64 << 10;
+const QUOTED_CHARS: usize = 300;
 
-/// One question to a model.
+/// One call to a model.
 #[derive(Debug)]
 pub struct Call<'a> {
     /// The model.
     pub model: &'a str,
     /// The conversation so far.
     pub messages: Vec<Message>,
-    /// The shape of the answer, where the server can be told.
+    /// The schema of the answer, for servers that support one.
     pub schema: Option<Schema>,
-    /// What the conversation is expected to cost, in tokens.
+    /// The estimated size of the conversation, in tokens.
     pub prompt_tokens: u64,
 }
 
-/// What a model answered.
+/// A model's answer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Answer {
-    /// Its words; may be empty.
+    /// The text; may be empty.
     pub text: String,
-    /// Why there are no more of them, where that is not the usual end.
+    /// Why the text was cut, if it was.
     pub cut: Option<String>,
     /// Tokens sent.
     pub prompt_tokens: u64,
     /// Tokens received.
     pub completion_tokens: u64,
-    /// Whether the tokens are a guess, because the server does not count them.
+    /// Whether the token counts are estimates, because the server does not report them.
     pub estimated: bool,
-    /// From sending the request to the end of the answer.
+    /// Time from sending the request to the end of the answer.
     pub took: Duration,
 }
 
-/// Talks to one server, within its limits.
+/// Makes calls to one server, within its limits.
 #[derive(Debug)]
 pub struct MllmClient {
     http: reqwest::Client,
@@ -67,31 +66,32 @@ pub struct MllmClient {
     max_tokens_field: MaxTokensField,
     timeout: Duration,
     answer_max_bytes: usize,
-    /// Whether the server has not yet refused `response_format`.
+    /// Whether the server may support `response_format`: it has not rejected it yet.
     structured: AtomicBool,
-    retry: RetryPolicy,
+    retry: CallRetryPolicy,
     breaker: Breaker,
     rate: RateLimiter,
-    turns: Semaphore,
+    /// One permit for each concurrent call.
+    permits: Semaphore,
 }
 
 impl MllmClient {
-    /// A client for the server of the settings, whose limits these buckets keep. Nothing is sent yet.
-    pub fn new(settings: &MllmSettings, buckets: Buckets) -> Result<Self, MllmSettingsError> {
-        // reqwest panics without one. Only the first call sets it; a library user may have chosen
-        // another.
+    /// Creates a client for the server of the settings. The buckets enforce its rate limits.
+    pub fn new(settings: &MllmSettings, buckets: TokenBuckets) -> Result<Self, MllmSettingsError> {
+        // reqwest panics without a crypto provider. This is an error if one is installed already, which is
+        // fine.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let key = settings.key()?;
         let http = reqwest::Client::builder()
-            // A redirect would carry the key to wherever it leads.
+            // A redirect would send the key to another server.
             .redirect(redirect::Policy::none())
             .connect_timeout(settings.timeout().min(Duration::from_secs(10)))
             .build()
             .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
         Ok(Self {
             http,
-            url: endpoint(settings)?,
-            headers: headers(&key, settings.key_header)?,
+            url: endpoint::url(settings)?,
+            headers: endpoint::headers(&key, settings.key_header)?,
             key,
             temperature: (settings.temperature >= 0.0).then_some(settings.temperature),
             max_tokens: settings.max_tokens,
@@ -99,10 +99,10 @@ impl MllmClient {
             timeout: settings.timeout(),
             answer_max_bytes: settings.answer_max_bytes,
             structured: AtomicBool::new(true),
-            retry: RetryPolicy {
+            retry: CallRetryPolicy {
                 attempts: settings.attempts,
                 backoff: Duration::from_millis(settings.backoff_ms),
-                longest_wait: Duration::from_secs(settings.retry_after_max_s),
+                longest_retry_after: Duration::from_secs(settings.retry_after_max_s),
             },
             breaker: Breaker::new(
                 settings.breaker_failures,
@@ -113,33 +113,33 @@ impl MllmClient {
                 settings.tokens_per_minute,
                 buckets,
             ),
-            turns: Semaphore::new(settings.concurrency.max(1)),
+            permits: Semaphore::new(settings.concurrency.max(1)),
         })
     }
 
-    /// Asks, as often as it takes and the settings allow. Dropping the call stops it.
+    /// Makes a call, with retries as the settings allow. Dropping the future cancels it.
     pub async fn call(&self, call: &Call<'_>) -> Result<Answer, CallError> {
         self.retry.run(|| self.attempt(call)).await
     }
 
-    /// The longest answer, in tokens.
+    /// Returns the longest answer, in tokens.
     pub fn max_tokens(&self) -> u64 {
         self.max_tokens.into()
     }
 
-    /// Whether the breaker lets nothing pass at the moment.
+    /// Returns whether the circuit breaker is open.
     pub fn is_suspended(&self) -> bool {
         self.breaker.is_open()
     }
 
     async fn attempt(&self, call: &Call<'_>) -> Result<Answer, Failure> {
-        // The semaphore is never closed, so that there is a turn for everybody.
-        let _turn = self.turns.acquire().await;
+        // Cannot fail, because the semaphore is never closed.
+        let _permit = self.permits.acquire().await;
         let admission = self.breaker.admit().await.map_err(Failure::Open)?;
         let most = call.prompt_tokens + self.max_tokens();
         self.rate.take(most).await;
-        let what = if call.schema.is_some() { "reason" } else { "describe" };
-        let span = traces::model_call(call.model, what);
+        let purpose = if call.schema.is_some() { "reason" } else { "describe" };
+        let span = traces::model_call(call.model, purpose);
         let outcome = self.exchange(call).instrument(span.clone()).await;
         let tokens = outcome.as_ref().map(|a| (a.prompt_tokens, a.completion_tokens));
         traces::model_answered(&span, tokens.map_err(|failure| format!("{failure:?}")));
@@ -153,12 +153,15 @@ impl MllmClient {
         outcome
     }
 
-    /// One request; two if the server turns out not to know `response_format`.
+    /// Sends one request, and a second one if the server turns out not to support `response_format`.
     async fn exchange(&self, call: &Call<'_>) -> Result<Answer, Failure> {
         let schema = call.schema.as_ref().filter(|_| self.structured.load(Ordering::Relaxed));
         match self.send(call, schema).await {
             Err(Failure::Unstructured(why)) => {
-                tracing::info!(why, "the MLLM server takes no response_format; asking in words");
+                tracing::info!(
+                    why,
+                    "the MLLM server does not support response_format; relying on the prompt"
+                );
                 self.structured.store(false, Ordering::Relaxed);
                 self.send(call, None).await
             }
@@ -175,7 +178,7 @@ impl MllmClient {
             if response.status().is_success() {
                 self.read_answer(call, response, began).await
             } else {
-                Err(self.read_refusal(response, schema.is_some()).await)
+                Err(self.read_error(response, schema.is_some()).await)
             }
         };
         tokio::time::timeout(self.timeout, exchange).await.unwrap_or_else(|_| {
@@ -206,7 +209,7 @@ impl MllmClient {
         let broken = |why: String| Failure::Broken { why, retry_after: None };
         let body = match self.read(response, self.answer_max_bytes).await? {
             (body, false) => body,
-            // Buying it again would not make it shorter.
+            // Permanent: a retry would cost the same and be no shorter.
             (_, true) => {
                 return Err(Failure::Refused(format!(
                     "the answer is larger than {} bytes (mllm.answer_max_bytes)",
@@ -219,17 +222,17 @@ impl MllmClient {
         Ok(answered(answer.into(), call.prompt_tokens, began.elapsed()))
     }
 
-    async fn read_refusal(&self, response: Response, structured: bool) -> Failure {
+    async fn read_error(&self, response: Response, structured: bool) -> Failure {
         let status = response.status();
         let wait = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok());
         let retry_after = wait.and_then(|value| retry_after(value, Timestamp::now()));
-        let body = self.read(response, REFUSAL_BYTES).await.map(|(body, _)| body);
-        let said = self.told(&body.unwrap_or_default());
-        let why = format!("the MLLM server answered {status}: {said}");
+        let body = self.read(response, ERROR_BODY_BYTES).await.map(|(body, _)| body);
+        let message = self.quotable(&body.unwrap_or_default());
+        let why = format!("the MLLM server answered {status}: {message}");
         match status {
             StatusCode::TOO_MANY_REQUESTS => Failure::Busy { why, retry_after },
             StatusCode::BAD_REQUEST | StatusCode::UNPROCESSABLE_ENTITY
-                if structured && names_structure(&said) =>
+                if structured && rejects_schema(&message) =>
             {
                 Failure::Unstructured(why)
             }
@@ -239,7 +242,7 @@ impl MllmClient {
         }
     }
 
-    /// Reads at most `limit` bytes; says whether there were more.
+    /// Reads at most `limit` bytes, and returns whether there were more.
     async fn read(&self, mut response: Response, limit: usize) -> Result<(Bytes, bool), Failure> {
         let mut body = BytesMut::new();
         while let Some(chunk) = response.chunk().await.map_err(|error| self.broken(error))? {
@@ -252,17 +255,17 @@ impl MllmClient {
         Ok((body.freeze(), false))
     }
 
-    /// What a server said, fit for a log: short, on one line, without the key.
-    fn told(&self, body: &[u8]) -> String {
-        let said = serde_json::from_slice(body)
+    /// Returns a server's error message fit for a log: short, on one line, without the key.
+    fn quotable(&self, body: &[u8]) -> String {
+        let message = serde_json::from_slice(body)
             .map(ErrorAnswer::message)
             .unwrap_or_else(|_| String::from_utf8_lossy(body).into_owned());
-        let line: String = said.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
-        self.key.scrub(&line).chars().take(REFUSAL_CHARS).collect()
+        let line: String = message.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+        self.key.scrub(&line).chars().take(QUOTED_CHARS).collect()
     }
 
     fn broken(&self, error: reqwest::Error) -> Failure {
-        // The URL may hold credentials, and the cause is a chain of which only the end is news.
+        // The URL may contain credentials. Of the chain of causes, only the last is informative.
         let error = error.without_url();
         let mut cause: &dyn std::error::Error = &error;
         while let Some(deeper) = cause.source() {
@@ -273,18 +276,18 @@ impl MllmClient {
         } else {
             format!("{error}: {cause}")
         };
-        let why = self.key.scrub(&format!("the MLLM server cannot be talked to: {why}"));
+        let why = self.key.scrub(&format!("the MLLM server cannot be reached: {why}"));
         Failure::Broken { why, retry_after: None }
     }
 }
 
-/// The tokens are those that the server counted, or else a guess.
+/// Converts a reply, and estimates the token counts if the server does not report them.
 fn answered(reply: Reply, prompt_tokens: u64, took: Duration) -> Answer {
     let Reply { text, cut, usage } = reply;
-    let guess = estimate_tokens(&text);
+    let estimate = estimate_tokens(&text);
     Answer {
         prompt_tokens: usage.map_or(prompt_tokens, |usage| usage.prompt_tokens),
-        completion_tokens: usage.map_or(guess, |usage| usage.completion_tokens),
+        completion_tokens: usage.map_or(estimate, |usage| usage.completion_tokens),
         estimated: usage.is_none(),
         text,
         cut,
@@ -292,53 +295,28 @@ fn answered(reply: Reply, prompt_tokens: u64, took: Duration) -> Answer {
     }
 }
 
-/// About four bytes of English make a token.
+/// Estimates the tokens of a text: about four bytes of English make one.
 pub fn estimate_tokens(text: &str) -> u64 {
     text.len().div_ceil(4) as u64
 }
 
-fn names_structure(said: &str) -> bool {
-    let said = said.to_lowercase();
-    ["response_format", "json_schema", "structured output"].iter().any(|name| said.contains(name))
-}
-
-fn endpoint(settings: &MllmSettings) -> Result<Url, MllmSettingsError> {
-    let refused =
-        |reason: String| MllmSettingsError::Url { url: settings.base_url.clone(), reason };
-    let text = format!("{}/chat/completions", settings.base_url.trim_end_matches('/'));
-    let mut url = Url::parse(&text).map_err(|error| refused(error.to_string()))?;
-    if !matches!(url.scheme(), "http" | "https") {
-        return Err(refused(format!("its scheme is {}", url.scheme())));
-    }
-    if !settings.api_version.is_empty() {
-        url.query_pairs_mut().append_pair("api-version", &settings.api_version);
-    }
-    Ok(url)
-}
-
-fn headers(key: &Secret, header: KeyHeader) -> Result<HeaderMap, MllmSettingsError> {
-    let mut headers = HeaderMap::new();
-    headers.insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
-    if key.is_empty() {
-        return Ok(headers);
-    }
-    let (name, text) = match header {
-        KeyHeader::Authorization => (AUTHORIZATION, format!("Bearer {}", key.expose())),
-        KeyHeader::ApiKey => (HeaderName::from_static("api-key"), key.expose().to_owned()),
-    };
-    let mut value = HeaderValue::try_from(text).map_err(|_| MllmSettingsError::Key)?;
-    value.set_sensitive(true);
-    headers.insert(name, value);
-    Ok(headers)
+/// Returns whether an error message is about the schema of the answer.
+fn rejects_schema(message: &str) -> bool {
+    let message = message.to_lowercase();
+    ["response_format", "json_schema", "structured output"]
+        .iter()
+        .any(|name| message.contains(name))
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::settings::KeyHeader;
     use super::super::settings::tests::defaults;
     use super::*;
+    use reqwest::header::AUTHORIZATION;
 
     #[test]
-    fn azure_takes_its_version_in_the_query_and_its_key_in_a_header_of_its_own() {
+    fn azure_gets_its_version_in_the_query_and_its_key_in_an_api_key_header() {
         let settings = MllmSettings {
             base_url: "https://x.openai.azure.com/openai/deployments/gpt/".into(),
             api_version: "2024-10-21".into(),
@@ -346,7 +324,7 @@ mod tests {
             api_key: Secret::new("azure-key"),
             ..defaults()
         };
-        let client = MllmClient::new(&settings, Buckets::default()).unwrap();
+        let client = MllmClient::new(&settings, TokenBuckets::default()).unwrap();
         assert_eq!(
             client.url.as_str(),
             "https://x.openai.azure.com/openai/deployments/gpt/chat/completions\
@@ -357,11 +335,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_url_is_refused() {
+    fn an_invalid_url_is_rejected() {
         for base_url in ["", "api.openai.com/v1", "ftp://host/v1"] {
             let settings = MllmSettings { base_url: base_url.into(), ..defaults() };
             assert!(matches!(
-                MllmClient::new(&settings, Buckets::default()),
+                MllmClient::new(&settings, TokenBuckets::default()),
                 Err(MllmSettingsError::Url { .. })
             ));
         }
@@ -370,22 +348,22 @@ mod tests {
     #[test]
     fn the_client_does_not_show_its_key() {
         let settings = MllmSettings { api_key: Secret::new("sk-shown"), ..defaults() };
-        let client = MllmClient::new(&settings, Buckets::default()).unwrap();
+        let client = MllmClient::new(&settings, TokenBuckets::default()).unwrap();
         assert!(!format!("{client:?}").contains("sk-shown"));
-        assert_eq!(client.told(b"{\"error\":{\"message\":\"no sk-shown\"}}"), "no [hidden]");
-        assert_eq!(client.told(b"{\"error\":\"model not found\"}"), "model not found");
-        assert_eq!(client.told("x\n".repeat(1000).as_bytes()).len(), REFUSAL_CHARS);
+        assert_eq!(client.quotable(b"{\"error\":{\"message\":\"no sk-shown\"}}"), "no [hidden]");
+        assert_eq!(client.quotable(b"{\"error\":\"model not found\"}"), "model not found");
+        assert_eq!(client.quotable("x\n".repeat(1000).as_bytes()).len(), QUOTED_CHARS);
     }
 
     #[test]
-    fn a_key_that_no_header_can_carry_is_refused_without_showing_it() {
+    fn a_key_that_no_header_can_carry_is_rejected_without_showing_it() {
         let settings = MllmSettings { api_key: Secret::new("bad\nkey"), ..defaults() };
-        let error = MllmClient::new(&settings, Buckets::default()).unwrap_err();
+        let error = MllmClient::new(&settings, TokenBuckets::default()).unwrap_err();
         assert!(!format!("{error} {error:?}").contains("bad"));
     }
 
     #[test]
-    fn tokens_are_guessed_where_the_server_does_not_count() {
+    fn tokens_are_estimated_if_the_server_does_not_count_them() {
         let reply = Reply { text: "abcdefgh".into(), ..Reply::default() };
         let answer = answered(reply, 50, Duration::ZERO);
         assert_eq!((answer.prompt_tokens, answer.completion_tokens), (50, 2));

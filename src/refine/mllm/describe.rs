@@ -1,86 +1,54 @@
-//! One description for each pair: known, on its way, or bought.
+//! One description for each pair: cached, in flight, or bought.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use futures_util::{StreamExt, stream};
 use jiff::Timestamp;
-use parking_lot::Mutex;
-use tokio::sync::OnceCell;
+use whereabouts_core::{
+    CachedDescription, Candidate, DescribedFrame, Description, Digest, ImageId, Scene,
+    SimilarFrame, StandIn, Usage,
+};
+use whereabouts_store::Step;
 
-use super::aside::SpendReservation;
-use super::budget::{Exceeded, JobBudget};
-use super::client::{Answer, Call, estimate_tokens};
+use super::buy_once::FoundDescription;
+use super::client::{Call, estimate_tokens};
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Switches, clean};
-use super::purchase::DescriptionLease;
 use super::retry::CallError;
+use super::run::RefineRun;
+use super::spend::cost_of;
 use super::wire::{Content, ImageUrl, Message, Part, Role};
-use super::{MllmRefiner, Progress, RefineError};
-use crate::CacheLookup;
-use crate::milliseconds;
-use crate::patience::{insist, patiently};
-use whereabouts_core::{CachedDescription, DescribedFrame, SimilarFrame, Spent};
-use whereabouts_core::{
-    Candidate, Description, Descriptor, Digest, Map, Scene, StandIn, Usage, utc_day,
-};
-use whereabouts_store::{JobRecord, Step, StoreError};
+use super::{MllmRefiner, RefineError};
+use crate::{RefineInput, milliseconds};
 
-/// What one refinement goes along with.
-pub(super) struct Work<'a> {
-    pub record: &'a JobRecord,
-    pub scene: Scene,
-    pub budget: JobBudget,
-    pub progress: &'a dyn Progress,
-    /// The frame's descriptor, if it is like those that the map has now.
-    pub descriptor: Option<&'a Descriptor>,
-    /// Earlier frames that are nearly the same, whose descriptions may stand in.
-    pub similar: Vec<SimilarFrame>,
-    /// What was bought so far.
-    usage: Mutex<Usage>,
-    /// The frame, made ready when it is first needed: a job whose pairs are all known needs none.
-    frame: OnceCell<SentPicture>,
-}
-
-/// A candidate that is still in the map.
+/// The frame and a candidate that is still in the map.
 pub(super) struct Pair {
-    /// Its place among the candidates.
-    pub index: usize,
-    /// Its picture.
-    pub digest: Digest,
-    /// The key of its description.
-    pub key: Digest,
+    /// The candidate's index among the candidates.
+    index: usize,
+    /// The digest of the candidate's picture.
+    digest: Digest,
+    /// The cache key of the pair's description.
+    key: Digest,
 }
 
-/// A description, and of which frame it is if not of the job's own.
-#[derive(Debug, Clone)]
-pub(super) struct Found {
-    description: CachedDescription,
-    stands_in: Option<StandIn>,
-    /// How long the call took, if it was just made.
-    took: Option<Duration>,
-}
-
-/// A pair in words.
-pub(super) struct Described {
-    /// The candidate's place among the candidates.
+/// A described pair.
+pub(super) struct DescribedPair {
+    /// The candidate's index among the candidates.
     pub index: usize,
-    /// The words.
+    /// The description.
     pub text: String,
-    /// Whether no call was needed.
-    pub cached: bool,
-    /// The frame it is of, if that is an earlier one.
-    pub stands_in: Option<StandIn>,
-    /// How long the call took, if this job made it.
-    pub took: Option<Duration>,
-    /// What it cost this job.
-    pub usage: Usage,
+    cached: bool,
+    stands_in: Option<StandIn>,
+    /// Duration of the call, if this job made it.
+    took: Option<Duration>,
+    /// The cost to this job.
+    usage: Usage,
 }
 
-impl Described {
-    /// As the job tells it.
-    pub fn of(&self, candidates: &[Candidate]) -> Description {
+impl DescribedPair {
+    /// Returns the description as jobs report it.
+    pub fn description(&self, candidates: &[Candidate]) -> Description {
         Description {
             image_id: candidates[self.index].image_id.clone(),
             text: self.text.clone(),
@@ -92,273 +60,127 @@ impl Described {
     }
 }
 
-/// All pairs in words, as far as that went; both lists in coarse order.
+/// Which pairs were described and which failed; both in coarse order.
 #[derive(Default)]
-pub(super) struct Findings {
-    pub described: Vec<Described>,
+pub(super) struct DescribedPairs {
+    pub described: Vec<DescribedPair>,
     pub failed: Vec<CallError>,
 }
 
-impl<'a> Work<'a> {
-    pub fn new(
-        record: &'a JobRecord,
-        map: &Map,
-        budget: JobBudget,
-        progress: &'a dyn Progress,
-    ) -> Self {
-        let descriptor = record.query.descriptor.as_ref();
-        Self {
-            record,
-            scene: map.scene,
-            descriptor: descriptor.filter(|_| record.revision == map.revision),
-            budget,
-            progress,
-            similar: Vec::new(),
-            usage: Mutex::default(),
-            frame: OnceCell::new(),
-        }
-    }
-
-    /// What was bought so far.
-    pub fn usage(&self) -> Usage {
-        *self.usage.lock()
-    }
-
-    /// Takes a description into the account; what was bought is charged when it is answered.
-    fn take(&self, index: usize, found: Found, cached: bool) -> Described {
-        let Found { description: CachedDescription { text, usage, .. }, stands_in, took } = found;
-        let known = Usage { cached: 1, ..Usage::default() };
-        if cached {
-            self.charge(known);
-        }
-        let usage = if cached { known } else { usage };
-        let took = took.filter(|_| !cached);
-        Described { index, text, cached, stands_in, took, usage }
-    }
-
-    fn charge(&self, cost: Usage) {
-        *self.usage.lock() += cost;
-    }
-}
-
-pub(super) fn cost_of(answer: &Answer) -> Usage {
-    Usage {
-        calls: 1,
-        cached: 0,
-        prompt_tokens: answer.prompt_tokens,
-        completion_tokens: answer.completion_tokens,
-        estimated: answer.estimated.into(),
-    }
-}
-
 impl MllmRefiner {
-    /// The candidates that are still in the map, in coarse order.
-    pub(super) async fn pairs(
-        &self,
-        map: &Map,
-        record: &JobRecord,
-    ) -> Result<Vec<Pair>, RefineError> {
-        let mut pairs = Vec::with_capacity(record.candidates.len());
-        for (index, candidate) in record.candidates.iter().enumerate() {
-            if let Some(image) = self.maps.image(map, &candidate.image_id).await? {
-                let key = self.key(&record.query.digest, &image.digest, map.scene);
-                pairs.push(Pair { index, digest: image.digest, key });
-            }
-        }
-        Ok(pairs)
+    /// Returns the pairs whose candidates are still in the map, in coarse order.
+    pub(super) async fn pairs(&self, input: &RefineInput) -> Result<Vec<Pair>, RefineError> {
+        let ids: Vec<ImageId> =
+            input.candidates.iter().map(|candidate| candidate.image_id.clone()).collect();
+        let images = self.maps.images_by_id(&input.map, &ids).await?;
+        let present = images.into_iter().enumerate().filter_map(|(index, image)| {
+            let digest = image?.digest;
+            let key = self.key(&input.frame.digest, &digest, input.map.scene);
+            Some(Pair { index, digest, key })
+        });
+        Ok(present.collect())
     }
 
-    /// Earlier frames whose descriptions may stand in for those of this job.
+    /// Returns earlier frames whose descriptions may stand in for those of this frame.
     pub(super) async fn similar_frames(
         &self,
-        work: &Work<'_>,
+        input: &RefineInput,
     ) -> Result<Vec<SimilarFrame>, RefineError> {
         let at_least = self.settings.similar_frame_min;
-        match work.descriptor {
+        match &input.frame.descriptor {
             Some(descriptor) if at_least > 0.0 => {
-                Ok(self.cache.similar_frames(work.record.map_uid, descriptor, at_least).await?)
+                Ok(self.cache.similar_frames(input.map.uid, descriptor, at_least).await?)
             }
             _ => Ok(Vec::new()),
         }
     }
 
-    /// Describes all pairs, several at once.
-    pub(super) async fn describe_all(&self, work: &Work<'_>, pairs: &[Pair]) -> Findings {
+    /// Describes all pairs, `mllm.concurrency` at a time.
+    pub(super) async fn describe_all(&self, run: &RefineRun<'_>, pairs: &[Pair]) -> DescribedPairs {
         // Collected first: the compiler cannot see through a closure over borrowed pairs here.
-        let calls: Vec<_> = pairs.iter().map(|pair| self.describe(work, pair)).collect();
+        let calls: Vec<_> = pairs.iter().map(|pair| self.describe(run, pair)).collect();
         let mut outcomes: Vec<_> =
             stream::iter(calls).buffer_unordered(self.settings.concurrency).collect().await;
         outcomes.sort_by_key(|(index, _)| *index);
-        let mut findings = Findings::default();
+        let mut pairs = DescribedPairs::default();
         for (index, outcome) in outcomes {
             match outcome {
-                Ok(described) => findings.described.push(described),
+                Ok(described) => pairs.described.push(described),
                 Err(error) => {
-                    let image = &work.record.candidates[index].image_id;
-                    tracing::warn!(job = %work.record.job.id, %image, %error, "a pair has no text");
-                    findings.failed.push(error);
+                    let image = &run.input.candidates[index].image_id;
+                    tracing::warn!(job = %run.input.id, %image, %error, "a pair was not described");
+                    pairs.failed.push(error);
                 }
             }
         }
-        let known = findings.described.iter().filter(|described| described.cached).count();
-        if known > 0 {
-            let usage = Usage { cached: known as u32, ..Usage::default() };
-            self.keep(work, usage, None).await;
+        let cached = pairs.described.iter().filter(|described| described.cached).count();
+        if cached > 0 {
+            let usage = Usage { cached: cached as u32, ..Usage::default() };
+            self.record_spend(run, usage, None).await;
         }
-        if known < findings.described.len() {
-            self.keep_frame(work).await;
+        if cached < pairs.described.len() {
+            self.keep_frame(run).await;
         }
-        findings
+        pairs
     }
 
-    /// Remembers a frame some of whose descriptions are new.
-    async fn keep_frame(&self, work: &Work<'_>) {
-        let Some(descriptor) = work.descriptor.cloned() else { return };
-        let (query, most) = (&work.record.query, self.settings.similar_frames_kept);
-        let frame = DescribedFrame { query_id: query.id, digest: query.digest, descriptor };
-        if let Err(error) = self.cache.keep_frame(work.record.map_uid, frame, most).await {
-            // The next frame like it will have to be described.
-            tracing::error!(%error, "a described frame could not be remembered");
+    /// Remembers a frame some of whose descriptions are new, so that they can stand in later.
+    async fn keep_frame(&self, run: &RefineRun<'_>) {
+        let frame = &run.input.frame;
+        let Some(descriptor) = frame.descriptor.clone() else { return };
+        let most = self.settings.similar_frames_kept;
+        let frame = DescribedFrame { query_id: frame.query_id, digest: frame.digest, descriptor };
+        if let Err(error) = self.cache.keep_frame(run.input.map.uid, frame, most).await {
+            // Similar frames will then be described again.
+            tracing::error!(%error, "a described frame could not be recorded");
         }
     }
 
     async fn describe(
         &self,
-        work: &Work<'_>,
+        run: &RefineRun<'_>,
         pair: &Pair,
-    ) -> (usize, Result<Described, CallError>) {
-        let bought = AtomicBool::new(false);
-        let find = || self.find(work, pair, &bought);
-        let found = self.flights.join(pair.key, find).await;
-        let cached = !bought.load(Ordering::Relaxed);
-        let described = found.map(|found| work.take(pair.index, found, cached));
+    ) -> (usize, Result<DescribedPair, CallError>) {
+        let scene = run.input.map.scene;
+        let stand_in =
+            |frame: &SimilarFrame| (self.key(&frame.digest, &pair.digest, scene), frame.stand_in);
+        let stand_ins: Vec<_> = run.similar.iter().map(stand_in).collect();
+        let found = self.descriptions.find_or_buy(pair.key, &stand_ins, || self.buy(run, pair));
+        let described = found.await.map(|found| described(run, pair.index, found));
         if let Ok(described) = &described {
-            let description = Some(described.of(&work.record.candidates));
-            work.progress.step(Step { usage: described.usage, description }).await;
+            let description = Some(described.description(&run.input.candidates));
+            run.progress.step(Step { usage: described.usage, description }).await;
         }
         (pair.index, described)
     }
 
-    /// The cache is looked at inside the flight: a flight that has just landed has filled it.
-    async fn find(
-        &self,
-        work: &Work<'_>,
-        pair: &Pair,
-        bought: &AtomicBool,
-    ) -> Result<Found, CallError> {
-        if let Some(description) =
-            patiently(|| self.cache.description(&pair.key)).await.map_err(passing)?
-        {
-            self.metrics.description_lookup(CacheLookup::Hit);
-            return Ok(Found { description, stands_in: None, took: None });
-        }
-        for frame in &work.similar {
-            let key = self.key(&frame.digest, &pair.digest, work.scene);
-            if let Some(description) =
-                patiently(|| self.cache.description(&key)).await.map_err(passing)?
-            {
-                self.metrics.description_lookup(CacheLookup::Similar);
-                let stands_in = Some(frame.stand_in);
-                return Ok(Found { description, stands_in, took: None });
-            }
-        }
-        let _purchase =
-            match DescriptionLease::begin(&self.cache, &pair.key).await.map_err(passing)? {
-                Ok(purchase) => purchase,
-                Err(description) => {
-                    self.metrics.description_lookup(CacheLookup::Hit);
-                    return Ok(Found { description, stands_in: None, took: None });
-                }
-            };
-        self.metrics.description_lookup(CacheLookup::Miss);
-        let (description, took) = self.buy(work, pair).await?;
-        bought.store(true, Ordering::Relaxed);
-        Ok(Found { description, stands_in: None, took: Some(took) })
-    }
-
     async fn buy(
         &self,
-        work: &Work<'_>,
+        run: &RefineRun<'_>,
         pair: &Pair,
     ) -> Result<(CachedDescription, Duration), CallError> {
-        let frame = || self.pictures.picture(&work.record.query.digest);
-        let frame = work.frame.get_or_try_init(frame).await?;
+        let frame = || self.pictures.picture(&run.input.frame.digest);
+        let frame = run.frame.get_or_try_init(frame).await?;
         let candidate = self.pictures.picture(&pair.digest).await?;
-        let prompt = prompts::describe(work.scene, self.switches());
+        let prompt = prompts::describe(run.input.map.scene, self.switches());
         let call = Call {
             model: &self.settings.describe_model,
             prompt_tokens: estimate_tokens(&prompt) + frame.tokens + candidate.tokens,
             messages: vec![question(prompt, frame, &candidate)],
             schema: None,
         };
-        let answer = self.call(work, &call).await?;
+        let answer = self.paid_call(run, &call).await?;
         let text = clean(&answer.text, self.settings.description_max_chars);
         let usage = cost_of(&answer);
         if text.is_empty() {
-            self.keep(work, usage, None).await;
-            work.progress.step(Step { usage, description: None }).await;
+            self.record_spend(run, usage, None).await;
+            run.progress.step(Step { usage, description: None }).await;
             let why = answer.cut.as_deref().unwrap_or("the model said nothing");
             return Err(CallError::Permanent(format!("the description is empty: {why}")));
         }
         let description = CachedDescription { text, usage, created_at: Timestamp::now() };
-        self.keep(work, usage, Some((pair.key, description.clone()))).await;
+        self.record_spend(run, usage, Some((pair.key, description.clone()))).await;
         Ok((description, answer.took))
-    }
-
-    /// Writes down what was paid, and what for, on a task of its own: a job that is cancelled in this
-    /// moment must not take it along.
-    pub(super) async fn keep(
-        &self,
-        work: &Work<'_>,
-        usage: Usage,
-        bought: Option<(Digest, CachedDescription)>,
-    ) {
-        let (cache, accounts) = (Arc::clone(&self.cache), Arc::clone(&self.usage));
-        let spent = self.spent_now(work.record, usage);
-        let keeping = tokio::spawn(async move {
-            let describing = async {
-                if let Some((key, description)) = bought {
-                    let keep = || cache.keep_description(key, description.clone());
-                    insist("a description, so that the next job has to pay again", keep).await;
-                }
-            };
-            let accounting = insist("what was spent", || accounts.add_usage(spent.clone()));
-            tokio::join!(describing, accounting)
-        });
-        if let Err(error) = keeping.await {
-            tracing::error!(%error, "what was bought could not be written down");
-        }
-    }
-
-    /// Asks within the budget.
-    pub(super) async fn call(&self, work: &Work<'_>, call: &Call<'_>) -> Result<Answer, CallError> {
-        let reserved = work
-            .budget
-            .reserve(call.prompt_tokens, self.client.max_tokens(), Timestamp::now())
-            .map_err(|exceeded| match exceeded {
-                Exceeded::Job => CallError::JobSpent,
-                Exceeded::Day => CallError::DaySpent,
-            })?;
-        let aside = self.set_aside(call.prompt_tokens).await?;
-        let answer = self.client.call(call).await?;
-        reserved.settle(answer.prompt_tokens, answer.completion_tokens);
-        if let Some(aside) = aside {
-            aside.settle(self.budget.cost(answer.prompt_tokens, answer.completion_tokens));
-        }
-        work.charge(cost_of(&answer));
-        Ok(answer)
-    }
-
-    /// Sets aside what a call may cost, where other processes spend too and a day has a limit.
-    async fn set_aside(&self, prompt_tokens: u64) -> Result<Option<SpendReservation>, CallError> {
-        let limit =
-            Spent { tokens: self.settings.tokens_per_day, money: self.settings.money_per_day };
-        let Some(shared) = self.shared.clone().filter(|_| limit != Spent::default()) else {
-            return Ok(None);
-        };
-        let most = self.budget.cost(prompt_tokens, self.client.max_tokens());
-        let aside = SpendReservation::set(shared, utc_day(Timestamp::now()), most, limit).await;
-        aside.map_err(passing)?.map(Some).ok_or(CallError::DaySpent)
     }
 
     fn switches(&self) -> Switches {
@@ -368,7 +190,7 @@ impl MllmRefiner {
         }
     }
 
-    /// The key of a pair's description: all that shapes the text.
+    /// Returns the cache key of a pair's description. It covers everything that shapes the text.
     fn key(&self, query: &Digest, candidate: &Digest, scene: Scene) -> Digest {
         let settings = &self.settings;
         let shapes = format!(
@@ -384,7 +206,18 @@ impl MllmRefiner {
     }
 }
 
-/// The two pictures are named in words beside them: models lose count of which is which.
+/// Counts a description for this job. The price of a bought one was charged with the call.
+fn described(run: &RefineRun<'_>, index: usize, found: FoundDescription) -> DescribedPair {
+    let FoundDescription { description, stands_in, took, cached } = found;
+    let from_cache = Usage { cached: 1, ..Usage::default() };
+    if cached {
+        run.charge(from_cache);
+    }
+    let usage = if cached { from_cache } else { description.usage };
+    DescribedPair { index, text: description.text, cached, stands_in, took, usage }
+}
+
+/// Names each picture in the text before it, because models lose count of which is which.
 fn question(prompt: String, frame: &SentPicture, candidate: &SentPicture) -> Message {
     let text = |text: &str| Part::Text { text: text.to_owned() };
     let picture = |picture: &SentPicture| Part::ImageUrl {
@@ -398,10 +231,6 @@ fn question(prompt: String, frame: &SentPicture, candidate: &SentPicture) -> Mes
         picture(candidate),
     ];
     Message { role: Role::User, content: Content::Parts(parts) }
-}
-
-fn passing(error: StoreError) -> CallError {
-    CallError::Transient(error.to_string())
 }
 
 impl From<PictureError> for CallError {

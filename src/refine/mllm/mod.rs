@@ -1,36 +1,43 @@
-//! The refiner `mllm`: a multimodal LLM describes each pair, and another call over all descriptions
-//! orders the candidates.
+//! The refiner `mllm`: a multimodal LLM describes each pair, and another call ranks the candidates by these
+//! descriptions.
 //!
 //! | file | what it does |
 //! |---|---|
-//! | `settings`, `secret` | what can be configured; a key that is never shown |
-//! | `prompts` | what the models are asked |
-//! | `describe`, `pictures`, `flight`, `cache` | one description for each pair, bought once |
-//! | `rank`, `reason` | the reasoning call; from its answer to a permutation |
-//! | `client`, `wire` | the chat-completions format over HTTP |
-//! | `retry`, `breaker`, `rate`, `budget` | patience and limits |
+//! | `settings` | the section `[mllm]` of the configuration |
+//! | `prompts` | the prompts |
+//! | `run` | the state of one refinement |
+//! | `describe`, `pictures` | one description for each pair |
+//! | `buy_once`, `single_flight`, `lease` | a description is bought once: in this process, across processes |
+//! | `rank`, `reason`, `conclude` | the reasoning call, and from its answer to a ranking |
+//! | `client`, `endpoint`, `wire` | the chat-completions format over HTTP |
+//! | `spend`, `budget`, `reservation` | limits on spend: in this process, across processes |
+//! | `retry`, `breaker`, `rate` | retries, circuit breaker, rate limits |
 //!
-//! What a model says is untrusted: it can change the order of these candidates, and nothing else.
+//! A model's answer is untrusted input: it can change the order of these candidates, and nothing else.
 
-mod aside;
 mod breaker;
 mod budget;
+mod buy_once;
 mod client;
 mod conclude;
 mod describe;
-mod flight;
+mod endpoint;
+mod lease;
 mod pictures;
 mod prompts;
-mod purchase;
 mod rank;
 mod rate;
 mod reason;
+mod reservation;
 mod retry;
+mod run;
 mod settings;
+mod single_flight;
+mod spend;
 mod wire;
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -38,138 +45,129 @@ use std::time::Duration;
 use async_trait::async_trait;
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
+use whereabouts_core::{DayUsage, RefinerKind, Spent, utc_day};
+use whereabouts_store::{
+    BlobStore, DescriptionCache, MapStore, SharedLimits, TokenBuckets, UsageStore,
+};
+use whereabouts_vision::ImageLimits;
 
 pub use prompts::PROMPT_VERSION;
 pub use reason::{AnswerError, Labels, Verdict};
 pub use retry::{random_fraction, retry_after};
 pub use settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError, OnUnavailable};
 
-use self::budget::Budget;
+use self::buy_once::BuyOnce;
 use self::client::MllmClient;
-use self::describe::{Found, Work};
-use self::flight::SingleFlight;
 use self::pictures::Pictures;
 use self::retry::CallError;
-use super::{Progress, RefineError, Refinement, Refiner};
-use crate::RefineMetrics;
-use whereabouts_core::{CacheLevels, DayUsage, Evidence, Map, RefinerKind, Spent, Usage, utc_day};
-use whereabouts_store::{
-    BlobStore, Buckets, DescriptionCache, HardNegatives, JobRecord, MapStore, SharedLimits,
-    UsageStore,
+use self::run::RefineRun;
+use self::spend::SpendControl;
+use crate::{
+    BuildError, NegativeEvidence, PaidCallLevels, PaidCalls, Progress, RefineError, RefineInput,
+    RefineMetrics, Refinement, Refiner, RefinerContext, RefinerSettings, local,
 };
-use whereabouts_vision::ImageLimits;
 
-/// What an [`MllmRefiner`] works with.
+/// The parts that an [`MllmRefiner`] is built from.
 pub struct MllmParts {
-    /// Where the candidates' records are.
+    /// The records of the candidates.
     pub maps: Arc<dyn MapStore>,
-    /// Where their bytes are.
+    /// The pictures.
     pub blobs: Arc<dyn BlobStore>,
     /// Descriptions that were paid for.
     pub cache: Arc<dyn DescriptionCache>,
-    /// What was paid.
+    /// Accounts of what was paid.
     pub usage: Arc<dyn UsageStore>,
-    /// The limits of all processes, where there are several.
+    /// Limits that several processes share, if there are several.
     pub shared: Option<Arc<dyn SharedLimits>>,
-    /// What is counted.
+    /// Counts lookups of descriptions.
     pub metrics: Arc<RefineMetrics>,
     /// Bounds on the pictures that are decoded.
     pub limits: ImageLimits,
-    /// Who takes a job while no call may be made, if `on_unavailable` is `local`.
+    /// Refines while no call may be made, if `mllm.on_unavailable` is `local`.
     pub fallback: Option<Arc<dyn Refiner>>,
 }
 
-/// Comparing by a multimodal LLM.
+/// Compares pictures with a multimodal LLM.
 ///
-/// K + 1 calls for a job of K candidates; a pair that was described before costs none.
+/// A job of K candidates takes K + 1 calls, less those whose pair is in the description cache.
 pub struct MllmRefiner {
     maps: Arc<dyn MapStore>,
     cache: Arc<dyn DescriptionCache>,
     usage: Arc<dyn UsageStore>,
-    shared: Option<Arc<dyn SharedLimits>>,
-    metrics: Arc<RefineMetrics>,
     fallback: Option<Arc<dyn Refiner>>,
     pictures: Pictures,
     client: MllmClient,
-    budget: Arc<Budget>,
-    flights: SingleFlight<Found>,
+    descriptions: BuyOnce,
+    spend: SpendControl,
     settings: MllmSettings,
 }
 
-/// How an [`MllmRefiner`] stands.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MllmLevels {
-    /// Whether calls are suspended because the last ones failed.
-    pub suspended: bool,
-    /// What is spent today (UTC), calls in progress included.
-    pub spent_today: Spent,
-    /// What may be spent a day; 0 stands for no limit.
-    pub limit: Spent,
-    /// How full the cache of descriptions is.
-    pub cache: CacheLevels,
+/// Builds the refiner `mllm`, with `local` as its fallback.
+pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, BuildError> {
+    let store = &context.store;
+    let parts = MllmParts {
+        maps: store.clone(),
+        blobs: store.clone(),
+        cache: store.clone(),
+        usage: store.clone(),
+        shared: context.shared.clone(),
+        metrics: Arc::clone(&context.metrics),
+        limits: context.models.limits(),
+        fallback: Some(local::build(context).await?),
+    };
+    let refiner = MllmRefiner::new(parts, context.settings.mllm.clone())?;
+    // Read before the workers start, and so before this process spends anything.
+    refiner.seed_spent_today(&store.usage(utc_day(Timestamp::now())).await?);
+    Ok(Arc::new(refiner))
+}
+
+/// Returns a text that changes with everything that decides what the refiner finds.
+pub(crate) fn fingerprint(settings: &RefinerSettings) -> Result<String, BuildError> {
+    let mllm = serde_json::to_string(&settings.mllm)?;
+    Ok(format!("{PROMPT_VERSION} {mllm} {}", local::fingerprint(settings)?))
 }
 
 impl MllmRefiner {
-    /// Puts a refiner together. Reads the key; calls nobody yet.
+    /// Builds a refiner. Reads the API key from its file, but makes no call.
     pub fn new(parts: MllmParts, settings: MllmSettings) -> Result<Self, MllmSettingsError> {
-        let client = MllmClient::new(&settings, Buckets::of(parts.shared.clone()))?;
+        let client = MllmClient::new(&settings, TokenBuckets::new(parts.shared.clone()))?;
         let pictures = Pictures::new(parts.blobs, parts.limits, settings.image_max_edge)
             .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
         Ok(Self {
             maps: parts.maps,
+            descriptions: BuyOnce::new(Arc::clone(&parts.cache), parts.metrics),
             cache: parts.cache,
             usage: parts.usage,
-            shared: parts.shared,
-            metrics: parts.metrics,
             fallback: parts.fallback,
             pictures,
             client,
-            budget: Arc::new(Budget::new(settings.limits())),
-            flights: SingleFlight::default(),
+            spend: SpendControl::new(settings.limits(), parts.shared),
             settings,
         })
     }
 
-    /// Says what was spent today (UTC) before this process began.
+    /// Sets what was spent today (UTC) before this process started.
     pub fn seed_spent_today(&self, spent: &[DayUsage]) {
         let now = Timestamp::now();
         let today = utc_day(now);
         let spent = spent.iter().filter(|spent| spent.date == today);
-        self.budget.seed(now, spent.map(Spent::from).fold(Spent::default(), Spent::plus));
+        self.spend.budget.seed(now, spent.map(Spent::from).fold(Spent::default(), Spent::plus));
     }
 
-    /// What a job spends at this moment.
-    fn spent_now(&self, record: &JobRecord, usage: Usage) -> DayUsage {
-        let money = self.budget.cost(usage.prompt_tokens, usage.completion_tokens).money;
-        let date = utc_day(Timestamp::now());
-        DayUsage { date, map: record.job.map.clone(), usage, money }
-    }
-
-    fn waits(&self) -> bool {
-        self.settings.on_unavailable == OnUnavailable::Wait
-    }
-
-    async fn map(&self, record: &JobRecord) -> Result<Map, RefineError> {
-        match self.maps.map(&record.job.map).await? {
-            Some(map) if map.uid == record.map_uid => Ok(map),
-            _ => Err(RefineError::Permanent("the map was removed".into())),
-        }
-    }
-
-    /// Has another refiner do the job, and says so.
+    /// Has the fallback refine the job, and reports that in `degraded`.
     async fn fall_back(
         &self,
         fallback: &dyn Refiner,
-        work: &Work<'_>,
+        run: &RefineRun<'_>,
         why: &CallError,
     ) -> Result<Refinement, RefineError> {
-        let refinement = fallback.refine(work.record, work.progress).await?;
-        let said = format!("refined by `{}` instead of `mllm`: {why}", fallback.kind());
+        let refinement = fallback.refine(run.input, run.progress).await?;
+        let degraded = format!("refined by `{}` instead of `mllm`: {why}", fallback.kind());
         Ok(Refinement {
-            usage: work.usage() + refinement.usage,
+            usage: run.usage() + refinement.usage,
             degraded: Some(match refinement.degraded {
-                Some(also) => format!("{said}; {also}"),
-                None => said,
+                Some(also) => format!("{degraded}; {also}"),
+                None => degraded,
             }),
             ..refinement
         })
@@ -186,68 +184,60 @@ impl Refiner for MllmRefiner {
         self.settings.similar_frame_min > 0.0
     }
 
-    fn levels(&self) -> Option<MllmLevels> {
-        Some(MllmLevels {
-            suspended: self.client.is_suspended(),
-            spent_today: self.budget.spent(Timestamp::now()),
-            limit: Spent {
-                tokens: self.settings.tokens_per_day,
-                money: self.settings.money_per_day,
-            },
-            cache: self.cache.levels(),
-        })
+    /// Jobs that fall back are calibrated as the fallback's are.
+    fn negative_evidence(&self) -> Option<&dyn NegativeEvidence> {
+        self.fallback.as_ref()?.negative_evidence()
     }
 
-    /// Of the jobs that fall back.
-    async fn chance(
-        &self,
-        map: &Map,
-        asked: &HardNegatives,
-    ) -> Result<Option<Evidence>, RefineError> {
-        match &self.fallback {
-            Some(fallback) => fallback.chance(map, asked).await,
-            None => Ok(None),
-        }
+    fn paid_calls(&self) -> Option<&dyn PaidCalls> {
+        Some(self)
     }
 
     async fn refine(
         &self,
-        record: &JobRecord,
+        input: &RefineInput,
         progress: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        let map = self.map(record).await?;
-        // What earlier attempts spent is spent.
-        let spent = record.job.usage;
-        let budget = self.budget.for_job(spent.prompt_tokens, spent.completion_tokens);
-        let mut work = Work::new(record, &map, budget, progress);
-        work.similar = self.similar_frames(&work).await?;
-        let pairs = self.pairs(&map, record).await?;
-        let findings = self.describe_all(&work, &pairs).await;
-        let ranked = match (findings.described.as_slice(), conclude::gravest(&findings.failed)) {
+        let budget =
+            self.spend.budget.for_job(input.spent.prompt_tokens, input.spent.completion_tokens);
+        let similar = self.similar_frames(input).await?;
+        let run = RefineRun::new(input, budget, similar, progress);
+        let pairs = self.pairs(input).await?;
+        let pairs = self.describe_all(&run, &pairs).await;
+        let ranked = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
             ([], None) => None,
             ([], Some(error)) => Some(Err(error)),
-            (described, _) => Some(self.rank(&work, described).await),
+            (described, _) => Some(self.rank(&run, described).await),
         };
+        let waits = self.settings.on_unavailable == OnUnavailable::Wait;
         match (ranked, &self.fallback) {
-            (Some(Err(why)), _)
-                if self.waits()
-                    && let Some(after) = pause(&why) =>
-            {
+            (Some(Err(why)), _) if waits && let Some(after) = available_after(&why) => {
                 Err(RefineError::Deferred { why: why.to_string(), after })
             }
             (Some(Err(why)), Some(fallback)) if conclude::is_unavailable(&why) => {
-                self.fall_back(fallback.as_ref(), &work, &why).await
+                self.fall_back(fallback.as_ref(), &run, &why).await
             }
-            (Some(Err(why)), _) if findings.described.is_empty() => Err(conclude::given_up(&why)),
-            (ranked, _) => conclude::conclude(&work, findings, ranked),
+            (Some(Err(why)), _) if pairs.described.is_empty() => Err(conclude::failure(&why)),
+            (ranked, _) => conclude::conclude(&run, pairs, ranked),
         }
     }
 }
 
-/// How long it is until calls may be made again, where that is known.
-fn pause(why: &CallError) -> Option<Duration> {
+impl PaidCalls for MllmRefiner {
+    fn levels(&self) -> PaidCallLevels {
+        PaidCallLevels {
+            suspended: self.client.is_suspended(),
+            spent_today: self.spend.budget.spent(Timestamp::now()),
+            limit: self.spend.daily_limit(),
+            cache: self.cache.levels(),
+        }
+    }
+}
+
+/// Returns how long it is until calls may be made again, where that is known.
+fn available_after(why: &CallError) -> Option<Duration> {
     match why {
-        // At least a little: the breaker may have opened for no time at all.
+        // At least a little, because the breaker may be about to close.
         CallError::Suspended { wait } => Some((*wait).max(Duration::from_millis(100))),
         CallError::DaySpent => {
             let now = Timestamp::now();

@@ -1,4 +1,4 @@
-//! Pictures as a model is sent them: scaled down, as JPEG, in a data URL.
+//! Prepares pictures for the model: scaled down, as JPEG, in a data URL.
 
 use std::sync::Arc;
 
@@ -14,22 +14,23 @@ use whereabouts_vision::decode::{Needed, decode, encode_jpeg};
 use whereabouts_vision::preprocess::shrink_to;
 use whereabouts_vision::{CpuPool, ImageLimits};
 
-/// Threads that decode, scale and encode. A picture takes milliseconds, a call seconds.
+/// Threads that decode, scale and encode. Two are enough, because a picture takes milliseconds and a call
+/// seconds.
 const THREADS: usize = 2;
 
-/// A picture ready to be sent.
+/// A prepared picture.
 #[derive(Debug, Clone)]
 pub struct SentPicture {
     /// The data URL.
     pub url: Arc<str>,
-    /// What it is expected to cost, in tokens.
+    /// Its estimated cost in tokens.
     pub tokens: u64,
 }
 
-/// Why a picture cannot be sent.
+/// Why a picture could not be prepared.
 #[derive(Debug, thiserror::Error)]
 pub enum PictureError {
-    /// Its bytes are gone.
+    /// The store has no such picture.
     #[error("the bytes of the picture are missing from the store")]
     Missing,
     /// The store failed.
@@ -38,19 +39,19 @@ pub enum PictureError {
     /// It cannot be decoded, scaled or encoded.
     #[error("the picture cannot be prepared: {0}")]
     Unfit(String),
-    /// The work was not done.
+    /// The threads did not do the work.
     #[error("the picture was not prepared: {0}")]
     Undone(String),
 }
 
-/// Fetches pictures and makes them ready.
+/// Fetches and prepares pictures.
 pub struct Pictures {
     blobs: Arc<dyn BlobStore>,
     limits: ImageLimits,
     max_edge: u32,
     pool: CpuPool,
-    /// As many as the pool has room for, so that its queue is never full.
-    turns: Arc<Semaphore>,
+    /// One permit for each place in the pool's queue, so that the queue never overflows.
+    permits: Arc<Semaphore>,
 }
 
 impl Pictures {
@@ -61,26 +62,27 @@ impl Pictures {
         max_edge: u32,
     ) -> std::io::Result<Self> {
         let pool = CpuPool::new("mllm-pictures", THREADS, THREADS)?;
-        Ok(Self { blobs, limits, max_edge, pool, turns: Arc::new(Semaphore::new(THREADS)) })
+        Ok(Self { blobs, limits, max_edge, pool, permits: Arc::new(Semaphore::new(THREADS)) })
     }
 
-    /// The picture of that digest.
+    /// Fetches and prepares the picture with that digest.
     pub async fn picture(&self, digest: &Digest) -> Result<SentPicture, PictureError> {
         let undone = |error: &dyn std::error::Error| PictureError::Undone(error.to_string());
         let bytes = self.blobs.blob(digest).await?.ok_or(PictureError::Missing)?;
-        let turn = Arc::clone(&self.turns).acquire_owned().await.map_err(|error| undone(&error))?;
+        let permit =
+            Arc::clone(&self.permits).acquire_owned().await.map_err(|error| undone(&error))?;
         let (limits, max_edge) = (self.limits, self.max_edge);
         let work = move || {
-            // Held by the work and not by its caller, who may leave before it is done.
-            let _turn = turn;
+            // Held until the work is done, even if the caller is cancelled before.
+            let _permit = permit;
             prepare(&bytes, limits, max_edge)
         };
         self.pool.run(work).await.map_err(|error| undone(&error))?
     }
 }
 
-/// Blocks. Even a JPEG that is small enough is encoded anew: its EXIF may tell where it was taken,
-/// and that is nobody's business outside.
+/// Decodes, scales and encodes; blocks. Even a JPEG that is small enough is encoded again, because its EXIF
+/// data may contain the position, which must not leave the service.
 fn prepare(bytes: &Bytes, limits: ImageLimits, max_edge: u32) -> Result<SentPicture, PictureError> {
     let unfit = |error: &dyn std::error::Error| PictureError::Unfit(error.to_string());
     let needed = Needed::LongestEdge(max_edge);
@@ -91,8 +93,8 @@ fn prepare(bytes: &Bytes, limits: ImageLimits, max_edge: u32) -> Result<SentPict
     Ok(SentPicture { url: url.into(), tokens: estimate_tokens(&pixels) })
 }
 
-/// The rule of OpenAI's vision models: 85 tokens, and 170 for each tile of 512 pixels. Others count
-/// otherwise; this is for limits, and bills are settled by what the server counts.
+/// Estimates by the rule of OpenAI's vision models: 85 tokens, plus 170 for each tile of 512 pixels. Other
+/// models count differently; reservations use the estimate, and bills use the server's count.
 fn estimate_tokens(pixels: &RgbImage) -> u64 {
     let tiles = u64::from(pixels.width().div_ceil(512)) * u64::from(pixels.height().div_ceil(512));
     85 + 170 * tiles
@@ -105,7 +107,7 @@ mod tests {
     const LIMITS: ImageLimits = ImageLimits { max_pixels: 1_000_000 };
 
     #[test]
-    fn a_picture_is_sent_as_a_small_jpeg() {
+    fn a_picture_is_sent_as_a_scaled_down_jpeg() {
         let bytes = encode_jpeg(&RgbImage::new(800, 600)).unwrap();
         let sent = prepare(&bytes.into(), LIMITS, 400).unwrap();
         let data = sent.url.strip_prefix("data:image/jpeg;base64,").unwrap();
@@ -115,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_picture_is_not_sent() {
+    fn bytes_that_are_no_picture_are_not_sent() {
         let error = prepare(&Bytes::from_static(b"hello"), LIMITS, 400).unwrap_err();
         assert!(matches!(error, PictureError::Unfit(_)));
     }

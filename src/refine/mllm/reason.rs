@@ -1,7 +1,6 @@
-//! From the words of the reasoning model to an order of the candidates.
+//! Parses the reasoning model's answer into an order of the candidates.
 //!
-//! Whatever the model says, the outcome is a permutation: an answer can change the order of these
-//! candidates and nothing else.
+//! The outcome is always a permutation of the candidates, whatever the model says.
 
 use serde::Deserialize;
 use serde_json::json;
@@ -10,32 +9,32 @@ use uuid::Uuid;
 use super::wire::Schema;
 use whereabouts_core::Digest;
 
-/// The candidates under neutral names.
+/// Neutral names for the candidates.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Labels {
-    /// Which candidate each label stands for, in the order in which they are shown.
+    /// The candidate of each label, in the order in which the prompt shows them.
     shown: Vec<usize>,
     labels: Vec<String>,
 }
 
-/// What was understood of an answer.
+/// A parsed answer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Verdict {
-    /// Every candidate that has a label, best first.
+    /// All labelled candidates, best first.
     pub order: Vec<usize>,
-    /// How many of them the answer left out; they are at the end, in coarse order.
+    /// The number of candidates that the answer left out. They come last, in coarse order.
     pub left_out: usize,
-    /// Why, in the model's words.
+    /// The model's reasoning.
     pub reasoning: String,
 }
 
 /// Why an answer cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum AnswerError {
-    /// There is neither a JSON object with a ranking nor a line with one.
+    /// It has neither a JSON object with a ranking nor a line with one.
     #[error("it holds no JSON object with a list \"ranking\"")]
     NoRanking,
-    /// The ranking names no candidate.
+    /// Its ranking names no candidate.
     #[error("its ranking holds none of the labels")]
     NoLabel,
 }
@@ -48,8 +47,8 @@ struct AnswerJson {
 }
 
 impl Labels {
-    /// Names the candidates, which are given in coarse order: A, B, … With `shuffled_by`, they are
-    /// shown in an order that depends on the job alone, so that it is the same at the next try.
+    /// Labels the candidates, which are in coarse order, A, B, … With `shuffled_by`, their order in the
+    /// prompt depends on the job's id alone, so that it is the same in every attempt.
     pub fn new(mut candidates: Vec<usize>, shuffled_by: Option<Uuid>) -> Self {
         if let Some(job) = shuffled_by {
             candidates
@@ -59,12 +58,12 @@ impl Labels {
         Self { shown: candidates, labels }
     }
 
-    /// Label and candidate, in the order in which they are shown.
+    /// Iterates over labels and candidates, in the order of the prompt.
     pub fn iter(&self) -> impl Iterator<Item = (&str, usize)> {
         self.labels.iter().map(String::as_str).zip(self.shown.iter().copied())
     }
 
-    /// The shape that an answer must have.
+    /// Returns the schema of an answer.
     pub fn schema(&self) -> Schema {
         let properties = json!({
             "reasoning": { "type": "string" },
@@ -73,9 +72,8 @@ impl Labels {
         Schema::object("ranking", properties)
     }
 
-    /// Reads an answer. Labels that are unknown or come twice are passed over; candidates that are
-    /// missing follow in coarse order.
-    pub fn read(&self, answer: &str) -> Result<Verdict, AnswerError> {
+    /// Parses an answer. Unknown and repeated labels are skipped; missing candidates follow in coarse order.
+    pub fn parse(&self, answer: &str) -> Result<Verdict, AnswerError> {
         let AnswerJson { reasoning, ranking } = find(answer).ok_or(AnswerError::NoRanking)?;
         let mut order = Vec::with_capacity(self.shown.len());
         for label in &ranking {
@@ -102,7 +100,7 @@ impl Labels {
     }
 }
 
-/// A … Z, AA, AB, …
+/// Returns A … Z, AA, AB, …
 fn label(mut number: usize) -> String {
     let mut letters = Vec::new();
     loop {
@@ -114,20 +112,19 @@ fn label(mut number: usize) -> String {
     }
 }
 
-/// Braces at which an answer may begin.
-const MOST_BRACES: usize = 1000;
+/// The number of braces that are tried as the start of the answer.
+const MAX_BRACES: usize = 1000;
 
-/// The answer, wherever it is: the whole text, the inside of a fence, the last JSON object in the
-/// text, or a last line `RANKING: A, B, C`.
+/// Finds the answer in a text: the whole text, the inside of a code fence, the first suitable JSON object, or
+/// a last line `RANKING: A, B, C`.
 fn find(answer: &str) -> Option<AnswerJson> {
     let text = answer.trim();
     let fenced = || {
         let (_, after) = text.rsplit_once("```json")?;
         Some(after.split_once("```").map_or(after, |(inside, _)| inside))
     };
-    // The first object that is an answer, whatever stands around it.
     let object = || {
-        text.match_indices('{').take(MOST_BRACES).find_map(|(at, _)| {
+        text.match_indices('{').take(MAX_BRACES).find_map(|(at, _)| {
             serde_json::Deserializer::from_str(&text[at..]).into_iter().next()?.ok()
         })
     };
@@ -138,7 +135,7 @@ fn find(answer: &str) -> Option<AnswerJson> {
 fn last_line(text: &str) -> Option<AnswerJson> {
     let (before, line) = text.rsplit_once('\n').unwrap_or(("", text));
     let (head, list) = line.split_once(':')?;
-    // Models like to set it in bold or make it a heading.
+    // Models often format it as bold text or as a heading.
     if !head.trim_matches([' ', '*', '#']).eq_ignore_ascii_case("ranking") {
         return None;
     }
@@ -158,11 +155,11 @@ mod tests {
     }
 
     fn order(answer: &str) -> Result<(Vec<usize>, usize), AnswerError> {
-        labels(4).read(answer).map(|verdict| (verdict.order, verdict.left_out))
+        labels(4).parse(answer).map(|verdict| (verdict.order, verdict.left_out))
     }
 
     #[test]
-    fn an_answer_is_found_in_each_of_its_guises() {
+    fn an_answer_is_found_in_any_of_its_formats() {
         let json = r#"{"reasoning": "a sign", "ranking": ["C", "A", "D", "B"]}"#;
         for answer in [
             json.to_owned(),
@@ -172,13 +169,13 @@ mod tests {
             "a sign\nRANKING: C, A, D, B".to_owned(),
             "a sign\n**Ranking:** C > A > D > B.".to_owned(),
         ] {
-            let verdict = labels(4).read(&answer).unwrap();
+            let verdict = labels(4).parse(&answer).unwrap();
             assert_eq!((verdict.order, verdict.left_out), (vec![2, 0, 3, 1], 0), "{answer}");
         }
     }
 
     #[test]
-    fn unknown_and_repeated_labels_are_passed_over_and_missing_ones_follow_in_coarse_order() {
+    fn unknown_and_repeated_labels_are_skipped_and_missing_ones_follow_in_coarse_order() {
         let ranking = |list: &str| order(&format!(r#"{{"reasoning": "", "ranking": {list}}}"#));
         assert_eq!(ranking(r#"["D", "D", "X", "", "B", "d"]"#), Ok((vec![3, 1, 0, 2], 2)));
         assert_eq!(ranking(r#"["A", "B", "C", "D", "E"]"#), Ok((vec![0, 1, 2, 3], 0)));
@@ -187,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn what_holds_no_ranking_is_an_error() {
+    fn a_text_without_a_ranking_is_an_error() {
         for answer in [
             "",
             "I cannot rank these.",
@@ -204,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_do_not_leak_the_coarse_rank_and_are_the_same_at_the_next_try() {
+    fn labels_do_not_leak_the_coarse_rank_and_are_the_same_in_every_attempt() {
         let job = Uuid::from_u128(7);
         let shuffled = |job| Labels::new((0..10).collect(), Some(job));
         assert_eq!(shuffled(job), shuffled(job));
@@ -215,7 +212,7 @@ mod tests {
         let labels = shuffled(job);
         let (first, candidate) = labels.iter().next().unwrap();
         assert_eq!(first, "A");
-        let verdict = labels.read(r#"{"reasoning": "", "ranking": ["A"]}"#).unwrap();
+        let verdict = labels.parse(r#"{"reasoning": "", "ranking": ["A"]}"#).unwrap();
         assert_eq!(verdict.order[0], candidate);
         assert!(verdict.order[1..].is_sorted());
     }

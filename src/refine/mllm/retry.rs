@@ -1,29 +1,30 @@
-//! When a failed call is tried again, and how long after.
+//! The retry policy of calls to the model.
 
 use std::time::Duration;
 
+use backon::{ExponentialBuilder, Retryable};
 use jiff::Timestamp;
 use jiff::fmt::rfc2822::DateTimeParser;
 use uuid::Uuid;
 
 use super::breaker::Open;
 
-/// Why a call gave no answer in the end.
+/// Why a call got no answer, after all its attempts.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CallError {
-    /// Trying again would change nothing.
+    /// A retry would fail in the same way.
     #[error("{0}")]
     Permanent(String),
-    /// It may work another time.
+    /// A later retry may succeed.
     #[error("{0}")]
     Transient(String),
-    /// Too many calls have failed lately; none is made for a while.
+    /// The circuit breaker is open because the last calls failed.
     #[error(
         "calls to the MLLM are suspended for another {} s, because the last ones failed",
         wait.as_secs_f64().ceil()
     )]
     Suspended {
-        /// How long.
+        /// Time until it lets a call through.
         wait: Duration,
     },
     /// The day's budget is spent.
@@ -34,104 +35,120 @@ pub enum CallError {
     JobSpent,
 }
 
-/// Why one try gave no answer.
+/// Why one attempt got no answer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Failure {
-    /// The server will not have this request.
+    /// The server rejects this request.
     Refused(String),
-    /// The server is there and asks for patience.
+    /// The server is overloaded or limits the rate of calls.
     Busy {
-        /// What it said.
+        /// Its explanation.
         why: String,
-        /// When it wants to be asked again.
+        /// Its `Retry-After`.
         retry_after: Option<Duration>,
     },
-    /// The server or the way to it failed.
+    /// The server or the connection failed.
     Broken {
-        /// How.
+        /// How it failed.
         why: String,
-        /// When the server wants to be asked again.
+        /// The server's `Retry-After`.
         retry_after: Option<Duration>,
     },
-    /// The server does not know `response_format`.
+    /// The server does not support `response_format`.
     Unstructured(String),
-    /// The breaker is open.
+    /// The circuit breaker is open.
     Open(Open),
 }
 
 impl Failure {
-    /// Whether it speaks against the server rather than against the request.
+    /// Whether it is the server's fault and not the request's. The circuit breaker counts these.
     pub fn is_the_servers(&self) -> bool {
         matches!(self, Self::Broken { .. })
     }
+
+    fn is_transient(&self) -> bool {
+        matches!(self, Self::Busy { .. } | Self::Broken { .. })
+    }
+
+    fn retry_after(&self) -> Option<Duration> {
+        match self {
+            Self::Busy { retry_after, .. } | Self::Broken { retry_after, .. } => *retry_after,
+            Self::Refused(_) | Self::Unstructured(_) | Self::Open(_) => None,
+        }
+    }
 }
 
-/// How often and how soon.
+/// How often a call is attempted, and how long to pause between attempts.
 #[derive(Debug, Clone, Copy)]
-pub struct RetryPolicy {
-    /// Tries at the most.
+pub struct CallRetryPolicy {
+    /// Attempts at most, the first included.
     pub attempts: u32,
-    /// The first pause; each next one is twice as long.
+    /// The pause before the second attempt; it doubles with each further one, and jitter shortens it by up
+    /// to half.
     pub backoff: Duration,
-    /// The longest `Retry-After` that is waited for.
-    pub longest_wait: Duration,
+    /// The longest `Retry-After` that is honoured; a server that asks for more gets no further attempt.
+    pub longest_retry_after: Duration,
 }
 
-/// No pause of our own choosing is longer.
+/// The longest pause of exponential backoff.
 const LONGEST_BACKOFF: Duration = Duration::from_secs(20);
 
-impl RetryPolicy {
-    /// Tries until there is an answer, or no hope.
+impl CallRetryPolicy {
+    /// Calls `attempt` until it succeeds or is not to be retried.
     pub async fn run<T, F>(&self, mut attempt: impl FnMut() -> F) -> Result<T, CallError>
     where
         F: Future<Output = Result<T, Failure>>,
     {
-        let mut tried = 0;
-        loop {
-            let (why, retry_after) = match attempt().await {
-                Ok(answer) => return Ok(answer),
-                Err(Failure::Open(Open { wait })) => return Err(CallError::Suspended { wait }),
-                Err(Failure::Refused(why) | Failure::Unstructured(why)) => {
-                    return Err(CallError::Permanent(why));
-                }
-                Err(Failure::Busy { why, retry_after } | Failure::Broken { why, retry_after }) => {
-                    (why, retry_after)
-                }
-            };
-            tried += 1;
-            if tried >= self.attempts {
-                return Err(CallError::Transient(format!("{why} (tried {tried} times)")));
-            }
-            tokio::time::sleep(self.pause(tried, retry_after, &why)?).await;
-        }
+        let mut attempts = 0;
+        let counted = || {
+            attempts += 1;
+            attempt()
+        };
+        let outcome = counted
+            .retry(self.pauses())
+            .when(Failure::is_transient)
+            .adjust(|failure, pause| match failure.retry_after() {
+                Some(asked) if asked > self.longest_retry_after => None,
+                asked => pause.map(|pause| pause.max(asked.unwrap_or_default())),
+            })
+            .await;
+        outcome.map_err(|failure| self.give_up(failure, attempts))
     }
 
-    fn pause(
-        &self,
-        tried: u32,
-        retry_after: Option<Duration>,
-        why: &str,
-    ) -> Result<Duration, CallError> {
-        let doubled = self.backoff.saturating_mul(2_u32.saturating_pow(tried - 1));
-        let backoff = doubled.min(LONGEST_BACKOFF).mul_f64(0.5 + 0.5 * random_fraction());
-        match retry_after {
-            Some(wanted) if wanted > self.longest_wait => Err(CallError::Transient(format!(
-                "{why}; it wants to be asked again in {} s, later than mllm.retry_after_max_s",
-                wanted.as_secs()
-            ))),
-            Some(wanted) => Ok(wanted.max(backoff)),
-            None => Ok(backoff),
+    /// backon adds its jitter to the pause, and so starts from half of it.
+    fn pauses(&self) -> ExponentialBuilder {
+        ExponentialBuilder::new()
+            .with_factor(2.0)
+            .with_min_delay(self.backoff / 2)
+            .with_max_delay(LONGEST_BACKOFF / 2)
+            .with_max_times(self.attempts.saturating_sub(1) as usize)
+            .with_jitter()
+    }
+
+    fn give_up(&self, failure: Failure, attempts: u32) -> CallError {
+        match failure {
+            Failure::Open(Open { wait }) => CallError::Suspended { wait },
+            Failure::Refused(why) | Failure::Unstructured(why) => CallError::Permanent(why),
+            Failure::Busy { why, retry_after } | Failure::Broken { why, retry_after } => {
+                match retry_after.filter(|_| attempts < self.attempts) {
+                    Some(asked) => CallError::Transient(format!(
+                        "{why}; it asks for a retry after {} s, later than mllm.retry_after_max_s",
+                        asked.as_secs()
+                    )),
+                    None => CallError::Transient(format!("{why} (tried {attempts} times)")),
+                }
+            }
         }
     }
 }
 
-/// 0 to 1. The low bits of a version 7 UUID are random; this saves a generator of our own.
+/// Returns a random number from 0 to 1, from the random low bits of a version 7 UUID.
 pub fn random_fraction() -> f64 {
     let (_, low) = Uuid::now_v7().as_u64_pair();
     f64::from(low as u32) / f64::from(u32::MAX)
 }
 
-/// Reads `Retry-After`: seconds, or a date (RFC 9110, section 10.2.3).
+/// Parses a `Retry-After` header: seconds, or a date (RFC 9110, section 10.2.3).
 pub fn retry_after(value: &str, now: Timestamp) -> Option<Duration> {
     let value = value.trim();
     if let Ok(seconds) = value.parse() {
@@ -146,10 +163,10 @@ mod tests {
     use super::*;
     use tokio::time::Instant;
 
-    const POLICY: RetryPolicy = RetryPolicy {
+    const POLICY: CallRetryPolicy = CallRetryPolicy {
         attempts: 4,
         backoff: Duration::from_millis(500),
-        longest_wait: Duration::from_secs(60),
+        longest_retry_after: Duration::from_secs(60),
     };
 
     fn busy(seconds: Option<u64>) -> Failure {
@@ -157,51 +174,51 @@ mod tests {
     }
 
     async fn run(failures: Vec<Failure>) -> (Result<usize, CallError>, usize, Duration) {
-        let (start, mut tries) = (Instant::now(), 0);
+        let (start, mut attempts) = (Instant::now(), 0);
         let mut failures = failures.into_iter();
         let outcome = POLICY
             .run(|| {
-                tries += 1;
+                attempts += 1;
                 std::future::ready(failures.next().map_or(Ok(7), Err))
             })
             .await;
-        (outcome, tries, start.elapsed())
+        (outcome, attempts, start.elapsed())
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_429_is_tried_again_when_the_server_says_so() {
-        let (outcome, tries, took) = run(vec![busy(Some(17))]).await;
-        assert_eq!((outcome, tries), (Ok(7), 2));
+    async fn a_429_is_retried_after_its_retry_after() {
+        let (outcome, attempts, took) = run(vec![busy(Some(17))]).await;
+        assert_eq!((outcome, attempts), (Ok(7), 2));
         assert!((17.0..17.1).contains(&took.as_secs_f64()), "{took:?}");
     }
 
     #[tokio::test(start_paused = true)]
     async fn pauses_double_with_jitter() {
         let broken = Failure::Broken { why: "500".into(), retry_after: None };
-        let (outcome, tries, took) = run(vec![broken; 3]).await;
-        assert_eq!((outcome, tries), (Ok(7), 4));
+        let (outcome, attempts, took) = run(vec![broken; 3]).await;
+        assert_eq!((outcome, attempts), (Ok(7), 4));
         // 0.5 + 1 + 2 s, each cut by up to a half.
         assert!((1.75..3.51).contains(&took.as_secs_f64()), "{took:?}");
     }
 
     #[tokio::test(start_paused = true)]
-    async fn tries_are_bounded() {
-        let (outcome, tries, _) = run(vec![busy(None); 9]).await;
+    async fn attempts_are_bounded() {
+        let (outcome, attempts, _) = run(vec![busy(None); 9]).await;
         assert_eq!(outcome, Err(CallError::Transient("429 (tried 4 times)".into())));
-        assert_eq!(tries, 4);
+        assert_eq!(attempts, 4);
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_server_that_asks_for_an_hour_is_not_waited_for() {
-        let (outcome, tries, took) = run(vec![busy(Some(3600))]).await;
+    async fn a_retry_after_beyond_the_limit_ends_the_attempts() {
+        let (outcome, attempts, took) = run(vec![busy(Some(3600))]).await;
         assert!(matches!(outcome, Err(CallError::Transient(_))));
-        assert_eq!((tries, took), (1, Duration::ZERO));
+        assert_eq!((attempts, took), (1, Duration::ZERO));
     }
 
     #[tokio::test(start_paused = true)]
-    async fn what_is_refused_is_not_tried_again() {
-        let (outcome, tries, _) = run(vec![Failure::Refused("401".into())]).await;
-        assert_eq!((outcome, tries), (Err(CallError::Permanent("401".into())), 1));
+    async fn a_rejected_request_is_not_retried() {
+        let (outcome, attempts, _) = run(vec![Failure::Refused("401".into())]).await;
+        assert_eq!((outcome, attempts), (Err(CallError::Permanent("401".into())), 1));
     }
 
     #[test]

@@ -1,11 +1,11 @@
-//! `[mllm]`: how the multimodal LLM is reached, what it is asked, and what it may cost.
+//! The section `[mllm]`: the server, the prompts, and the limits on spend.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::budget::Limits;
+use super::budget::SpendLimits;
 use whereabouts_core::Secret;
 
 /// `[mllm]`
@@ -22,13 +22,13 @@ pub struct MllmSettings {
     pub key_header: KeyHeader,
     /// The `api-version` of the URL's query, as Azure wants it; empty for none.
     pub api_version: String,
-    /// The model that compares pictures.
+    /// The model that describes pairs.
     pub describe_model: String,
     /// The model that ranks.
     pub reason_model: String,
-    /// Calls in progress at most.
+    /// The most concurrent calls.
     pub concurrency: usize,
-    /// The longest edge of a picture that is sent, in pixels.
+    /// The longest edge of a sent picture, in pixels.
     pub image_max_edge: u32,
     /// Sampling temperature, 0 to 2; a negative number sends none.
     pub temperature: f64,
@@ -38,48 +38,48 @@ pub struct MllmSettings {
     pub max_tokens_field: MaxTokensField,
     /// The longest call, in seconds.
     pub timeout_s: u64,
-    /// How often a call is tried.
+    /// Attempts at a call.
     pub attempts: u32,
-    /// The first pause between two tries, in milliseconds.
+    /// The pause before the second attempt, in milliseconds; it doubles with each further one.
     pub backoff_ms: u64,
-    /// The longest `Retry-After` that is waited for, in seconds.
+    /// The longest `Retry-After` that is honoured, in seconds.
     pub retry_after_max_s: u64,
-    /// Calls a minute; 0 for no limit.
+    /// The most calls per minute; 0 for no limit.
     pub requests_per_minute: u32,
-    /// Tokens a minute; 0 for no limit.
+    /// The most tokens per minute; 0 for no limit.
     pub tokens_per_minute: u64,
-    /// Tokens of one job; 0 for no limit.
+    /// The most tokens for one job; 0 for no limit.
     pub tokens_per_job: u64,
-    /// Money for one job; 0 for no limit.
+    /// The most money for one job; 0 for no limit.
     pub money_per_job: f64,
-    /// Tokens of one day (UTC); 0 for no limit.
+    /// The most tokens for one day (UTC); 0 for no limit.
     pub tokens_per_day: u64,
-    /// Money for one day (UTC); 0 for no limit.
+    /// The most money for one day (UTC); 0 for no limit.
     pub money_per_day: f64,
-    /// Money for a million tokens sent.
+    /// The price of a million tokens sent.
     pub price_prompt: f64,
-    /// Money for a million tokens received.
+    /// The price of a million tokens received.
     pub price_completion: f64,
-    /// Whether each object of the frame is looked for in the candidate.
+    /// Whether the prompt asks to look for each object of the frame in the candidate.
     pub object_matching: bool,
-    /// Whether the prompt says what not to speak of.
+    /// Whether the prompt lists what not to mention.
     pub constraints: bool,
     /// Whether the coarse order is hidden from the reasoning model.
     pub hide_coarse_rank: bool,
-    /// Failed calls in a row that open the breaker.
+    /// Failed calls in a row that open the circuit breaker.
     pub breaker_failures: u32,
-    /// How long an open breaker lets nothing pass, in seconds.
+    /// How long the circuit breaker stays open, in seconds.
     pub breaker_open_s: u64,
-    /// What a job does while no call may be made.
+    /// What becomes of a job while no call may be made.
     pub on_unavailable: OnUnavailable,
-    /// The largest answer that is read, in bytes.
+    /// The largest accepted answer, in bytes.
     pub answer_max_bytes: usize,
-    /// What is kept of one description, in characters.
+    /// The longest description, in characters; longer ones are cut.
     pub description_max_chars: usize,
-    /// The cosine similarity from which the descriptions of an earlier frame stand in for those of
-    /// a new one; 0 for never.
+    /// The cosine similarity from which descriptions of an earlier frame stand in for those of a new one;
+    /// 0 for never.
     pub similar_frame_min: f32,
-    /// Described frames that are remembered for that, in each map.
+    /// Described frames that are kept for that, in each map.
     pub similar_frames_kept: usize,
 }
 
@@ -89,11 +89,11 @@ pub struct MllmSettings {
 pub enum KeyHeader {
     /// `Authorization: Bearer …`
     Authorization,
-    /// `api-key: …`, as Azure has it.
+    /// `api-key: …`, for Azure.
     ApiKey,
 }
 
-/// The field that bounds the answer.
+/// The request field that bounds the answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MaxTokensField {
@@ -103,17 +103,17 @@ pub enum MaxTokensField {
     MaxTokens,
 }
 
-/// What a job does while no call may be made.
+/// What becomes of a job while no call may be made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum OnUnavailable {
-    /// Another refiner takes it.
+    /// The refiner `local` refines it.
     Local,
-    /// It waits.
+    /// It is deferred.
     Wait,
 }
 
-/// Settings with which no model can be reached.
+/// Why the settings cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum MllmSettingsError {
     /// The key file cannot be read.
@@ -124,28 +124,28 @@ pub enum MllmSettingsError {
         /// Why.
         source: std::io::Error,
     },
-    /// The key has characters that no header can carry.
+    /// The key contains characters that are not allowed in a header.
     #[error("the key of mllm.api_key or mllm.api_key_file holds characters no header can carry")]
     Key,
-    /// The URL is none.
+    /// The URL is not valid.
     #[error("mllm.base_url {url:?} is not a URL of http or https: {reason}")]
     Url {
-        /// What was given.
+        /// The setting.
         url: String,
-        /// Why it is refused.
+        /// What is wrong with it.
         reason: String,
     },
-    /// Values contradict each other.
+    /// Settings contradict each other.
     #[error("{0}")]
     Contradiction(String),
-    /// The HTTP client cannot start.
+    /// The HTTP client cannot be created.
     #[error("the HTTP client cannot start: {0}")]
     Client(String),
 }
 
 impl MllmSettings {
-    /// What contradicts itself in these settings, if anything does. `job_timeout_s` is the longest
-    /// a job may take, in seconds.
+    /// Returns what is wrong with these settings, if anything is. `job_timeout_s` is the longest a job may
+    /// take, in seconds.
     pub fn validate(&self, job_timeout_s: u64) -> Option<String> {
         let at_least_one = [
             ("concurrency", self.concurrency as u64),
@@ -192,7 +192,7 @@ impl MllmSettings {
         None
     }
 
-    /// The key, from where the settings say.
+    /// Returns the key, or reads it from its file.
     pub fn key(&self) -> Result<Secret, MllmSettingsError> {
         if self.api_key_file.as_os_str().is_empty() {
             return Ok(self.api_key.clone());
@@ -202,14 +202,14 @@ impl MllmSettings {
         )
     }
 
-    /// The longest call.
+    /// Returns the longest time a call may take.
     pub fn timeout(&self) -> Duration {
         Duration::from_secs(self.timeout_s)
     }
 
-    /// What may be spent.
-    pub fn limits(&self) -> Limits {
-        Limits {
+    /// Returns the limits on spend.
+    pub fn limits(&self) -> SpendLimits {
+        SpendLimits {
             tokens_per_job: self.tokens_per_job,
             money_per_job: self.money_per_job,
             tokens_per_day: self.tokens_per_day,
@@ -229,30 +229,30 @@ pub(super) mod tests {
         mllm: MllmSettings,
     }
 
-    /// The defaults as the configuration file has them.
+    /// Returns the defaults of the configuration file.
     pub fn defaults() -> MllmSettings {
         toml::from_str::<File>(include_str!("../../../deploy/whereabouts.toml")).unwrap().mllm
     }
 
     #[test]
-    fn the_defaults_are_whole_and_consistent() {
+    fn the_defaults_are_complete_and_consistent() {
         assert_eq!(defaults().validate(300), None);
     }
 
     #[test]
-    fn a_call_longer_than_its_job_is_refused() {
+    fn a_call_timeout_longer_than_the_jobs_is_rejected() {
         assert!(defaults().validate(60).unwrap().contains("outlast"));
     }
 
     #[test]
-    fn a_bound_on_money_needs_prices() {
+    fn a_limit_on_money_needs_prices() {
         let settings = MllmSettings { money_per_day: 5.0, ..defaults() };
         assert!(settings.validate(300).unwrap().contains("price"));
         assert_eq!(MllmSettings { price_prompt: 2.5, ..settings }.validate(300), None);
     }
 
     #[test]
-    fn the_key_comes_from_a_file_without_its_line_end() {
+    fn a_key_read_from_a_file_loses_its_line_end() {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), "sk-from-file\n").unwrap();
         let settings = MllmSettings { api_key_file: file.path().to_owned(), ..defaults() };

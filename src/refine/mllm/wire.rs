@@ -1,4 +1,4 @@
-//! The OpenAI chat-completions format, as far as it is used here.
+//! The part of the OpenAI chat-completions format that the client uses.
 
 use std::sync::Arc;
 
@@ -8,11 +8,11 @@ use serde_json::{Value, json};
 /// The body of a request.
 #[derive(Debug, Serialize)]
 pub struct ChatRequest<'a> {
-    /// Who is to answer.
+    /// The model.
     pub model: &'a str,
-    /// What is said.
+    /// The conversation.
     pub messages: &'a [Message],
-    /// Sampling.
+    /// Sampling temperature.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub temperature: Option<f64>,
     /// The longest answer, in tokens, under its older name.
@@ -21,21 +21,21 @@ pub struct ChatRequest<'a> {
     /// The longest answer, in tokens, under its newer name.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_completion_tokens: Option<u32>,
-    /// The shape of the answer.
+    /// The schema of the answer.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub response_format: Option<ResponseFormat<'a>>,
 }
 
-/// One turn of the conversation.
+/// One message of the conversation.
 #[derive(Debug, Clone, Serialize)]
 pub struct Message {
-    /// Who speaks.
+    /// Its author.
     pub role: Role,
-    /// What is said.
+    /// Its content.
     pub content: Content,
 }
 
-/// Who speaks.
+/// The author of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
@@ -45,7 +45,7 @@ pub enum Role {
     Assistant,
 }
 
-/// What is said.
+/// The content of a message.
 #[derive(Debug, Clone, Serialize)]
 #[serde(untagged)]
 pub enum Content {
@@ -55,39 +55,39 @@ pub enum Content {
     Parts(Vec<Part>),
 }
 
-/// A piece of a message.
+/// A part of a message.
 #[derive(Debug, Clone, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Part {
     /// Text.
     Text {
-        /// It.
+        /// The text.
         text: String,
     },
     /// A picture.
     ImageUrl {
-        /// Where it is.
+        /// Its URL.
         image_url: ImageUrl,
     },
 }
 
-/// Where a picture is.
+/// The URL of a picture.
 #[derive(Debug, Clone, Serialize)]
 pub struct ImageUrl {
     /// A data URL.
     pub url: Arc<str>,
 }
 
-/// A JSON schema that the answer is to follow.
+/// The JSON schema of an answer.
 #[derive(Debug, Clone)]
 pub struct Schema {
     /// Its name.
     pub name: &'static str,
-    /// It.
+    /// The schema.
     pub schema: Value,
 }
 
-/// The shape of the answer.
+/// The format of the answer.
 #[derive(Debug, Serialize)]
 pub struct ResponseFormat<'a> {
     #[serde(rename = "type")]
@@ -110,8 +110,8 @@ impl<'a> From<&'a Schema> for ResponseFormat<'a> {
 }
 
 impl Schema {
-    /// An object in which every one of `properties` is required and no other is allowed, as strict
-    /// structured output demands.
+    /// Returns the schema of an object in which all `properties` are required and no others are allowed, as
+    /// strict structured output demands.
     pub fn object(name: &'static str, properties: Value) -> Self {
         let required: Vec<&String> =
             properties.as_object().map(|fields| fields.keys().collect()).unwrap_or_default();
@@ -126,17 +126,17 @@ impl Schema {
 }
 
 impl Message {
-    /// What this service says, without pictures.
+    /// Creates a message of this service, without pictures.
     pub fn user(text: String) -> Self {
         Self { role: Role::User, content: Content::Text(text) }
     }
 
-    /// What the model said.
+    /// Creates a message of the model.
     pub fn assistant(text: String) -> Self {
         Self { role: Role::Assistant, content: Content::Text(text) }
     }
 
-    /// The text of a message without pictures.
+    /// Returns the text of a message without pictures.
     pub fn text(&self) -> &str {
         match &self.content {
             Content::Text(text) => text,
@@ -145,7 +145,7 @@ impl Message {
     }
 }
 
-/// The body of an answer. Whatever else it holds is left aside.
+/// The body of an answer. Unknown fields are ignored.
 #[derive(Debug, Deserialize)]
 pub struct ChatAnswer {
     choices: Vec<Choice>,
@@ -181,7 +181,7 @@ struct AnswerPart {
     text: String,
 }
 
-/// Tokens, as the server counts them.
+/// Token counts, as the server reports them.
 #[derive(Debug, Clone, Copy, Deserialize)]
 pub struct TokenUsage {
     /// Tokens sent.
@@ -192,14 +192,14 @@ pub struct TokenUsage {
     pub completion_tokens: u64,
 }
 
-/// What an answer comes to.
+/// The content of an answer.
 #[derive(Debug, Default)]
 pub struct Reply {
-    /// What the model said; may be empty.
+    /// The text; may be empty.
     pub text: String,
-    /// Why there is no more of it, where that is not the usual end.
+    /// Why the text was cut, if it was.
     pub cut: Option<String>,
-    /// What it cost, if the server tells.
+    /// The token counts, if the server reports them.
     pub usage: Option<TokenUsage>,
 }
 
@@ -224,7 +224,7 @@ impl From<ChatAnswer> for Reply {
     }
 }
 
-/// The bodies of a refusal: `{"error": {"message"}}`, or `{"error": "…"}` as some servers have it.
+/// The body of an error: `{"error": {"message"}}`, or `{"error": "…"}` from some servers.
 #[derive(Debug, Deserialize)]
 pub struct ErrorAnswer {
     error: ErrorDetail,
@@ -238,7 +238,7 @@ enum ErrorDetail {
 }
 
 impl ErrorAnswer {
-    /// What the server says.
+    /// Returns the error message.
     pub fn message(self) -> String {
         match self.error {
             ErrorDetail::Text(message) | ErrorDetail::Object { message } => message,
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_says_why_it_is_cut() {
+    fn a_cut_answer_states_the_reason() {
         let body = json!({"choices": [{"message": {"content": ""}, "finish_reason": "length"}]});
         assert!(reply(body).cut.unwrap().contains("mllm.max_tokens"));
         let body = json!({"choices": [{"message": {"content": null, "refusal": "no"}}]});

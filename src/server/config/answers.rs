@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use whereabouts_core::RefinerKind;
+use super::RefinerChoice;
 
 /// `[idempotency]`
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -75,44 +75,11 @@ pub struct Jobs {
 #[serde(deny_unknown_fields)]
 pub struct Refine {
     /// Who refines.
-    pub refiner: Refiner,
+    pub refiner: RefinerChoice,
     /// Candidates that `mllm` compares.
     pub candidates: usize,
     /// Candidates that `local` compares.
     pub local_candidates: usize,
     /// Memory for dense features, in bytes.
     pub dense_cache_bytes: usize,
-}
-
-impl Refine {
-    /// Candidates that the configured refiner compares.
-    pub fn compared(&self) -> usize {
-        match self.refiner {
-            Refiner::Mllm => self.candidates,
-            Refiner::Local | Refiner::Off => self.local_candidates,
-        }
-    }
-}
-
-/// Who refines, if anybody.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Refiner {
-    /// Geometric matching of dense features.
-    Local,
-    /// A multimodal LLM, configured in `[mllm]`.
-    Mllm,
-    /// No refinement.
-    Off,
-}
-
-impl Refiner {
-    /// The refiner of a new job, if there is one.
-    pub fn kind(self) -> Option<RefinerKind> {
-        match self {
-            Self::Local => Some(RefinerKind::Local),
-            Self::Mllm => Some(RefinerKind::Mllm),
-            Self::Off => None,
-        }
-    }
 }

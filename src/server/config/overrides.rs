@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{KeysWanted, Refiner};
+use super::{KeysWanted, RefinerChoice};
 
 /// Settings from the command line, which go over all others.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -46,7 +46,7 @@ impl Overrides {
     }
 
     /// Sets `[refine] refiner`.
-    pub fn refiner(mut self, refiner: Option<Refiner>) -> Self {
+    pub fn refiner(mut self, refiner: Option<RefinerChoice>) -> Self {
         self.refine = refiner.map(|refiner| serde_json::json!({ "refiner": refiner }));
         self
     }

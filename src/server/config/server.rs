@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::http::{ConnectionSettings, Tls, TlsError};
+use crate::gate::{ConnectionSettings, Tls, TlsError};
 
 /// `[server]`
 #[derive(Debug, Clone, Serialize, Deserialize)]

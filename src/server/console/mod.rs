@@ -1,7 +1,6 @@
-//! The operator's console: a page of plain modules and one stylesheet, all in the binary. It knows no more than
-//! the API gives, to whoever has signed in.
+//! The operator's console: a page of plain JavaScript modules and one stylesheet, embedded in the binary. It uses
+//! the public API with the key of the operator who signed in, and nothing else.
 
-use axum::Router;
 use axum::extract::Path;
 use axum::http::header::{
     CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, ETAG, IF_NONE_MATCH,
@@ -11,6 +10,7 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 
+use crate::gate::{RoutePolicy, Routes};
 use whereabouts_core::Digest;
 
 /// The page.
@@ -45,32 +45,33 @@ const ASSETS: &[(&str, &str)] = assets![
     "words.js",
 ];
 
-/// What a browser is told to allow the page.
+/// Headers that restrict what the page may do in a browser.
 #[derive(Debug, Clone)]
-struct Guarded {
+struct PageSecurity {
     policy: Option<HeaderValue>,
     referrer: &'static str,
 }
 
-/// The routes of the page. `tiles` is the address of map tiles, from whose host pictures may come.
-pub fn routes<S: Clone + Send + Sync + 'static>(tiles: Option<&str>) -> Router<S> {
-    let guarded = Guarded {
+/// The routes of the page. `tiles` is the URL of map tiles, whose host may serve images.
+pub(crate) fn routes<S: Clone + Send + Sync + 'static>(tiles: Option<&str>) -> Routes<S> {
+    let security = PageSecurity {
         policy: HeaderValue::from_str(&policy(tiles)).ok(),
-        // Servers of tiles want to know who asks.
+        // Tile servers require a referrer.
         referrer: if tiles.is_some() { "strict-origin" } else { "no-referrer" },
     };
-    let of_page = guarded.clone();
-    Router::new()
-        .route("/", get(move |headers: HeaderMap| async move { file(PAGE, &headers, of_page) }))
-        .route(
-            "/console/{file}",
-            get(move |Path(name): Path<String>, headers: HeaderMap| async move {
-                file(&name, &headers, guarded)
-            }),
-        )
+    let for_page = security.clone();
+    let page = get(move |headers: HeaderMap| async move { file(PAGE, &headers, for_page) });
+    let files = get(move |Path(name): Path<String>, headers: HeaderMap| async move {
+        file(&name, &headers, security)
+    });
+    Routes::new().get("/", RoutePolicy::public(), page).get(
+        "/console/{file}",
+        RoutePolicy::public(),
+        files,
+    )
 }
 
-/// Nothing but what this server serves, and the tiles; no script or style within the page.
+/// The content security policy: only this server and the tiles, and no inline script or style.
 fn policy(tiles: Option<&str>) -> String {
     let origin = tiles.and_then(|url| {
         let (scheme, rest) = url.split_once("://")?;
@@ -83,23 +84,24 @@ fn policy(tiles: Option<&str>) -> String {
     )
 }
 
-fn file(name: &str, headers: &HeaderMap, guarded: Guarded) -> Response {
+fn file(name: &str, headers: &HeaderMap, security: PageSecurity) -> Response {
     let Some((_, text)) = ASSETS.iter().find(|(known, _)| *known == name) else {
         return StatusCode::NOT_FOUND.into_response();
     };
     let tag = format!("\"{}\"", &Digest::of(text.as_bytes()).hex()[..16]);
-    let known = headers.get(IF_NONE_MATCH).is_some_and(|sent| sent.as_bytes() == tag.as_bytes());
-    let mut response = match known {
+    let unchanged =
+        headers.get(IF_NONE_MATCH).is_some_and(|sent| sent.as_bytes() == tag.as_bytes());
+    let mut response = match unchanged {
         true => StatusCode::NOT_MODIFIED.into_response(),
         false => ([(CONTENT_TYPE, media_type(name))], *text).into_response(),
     };
-    let told = response.headers_mut();
-    // Asked for each time, and sent again only when it has changed.
-    told.insert(CACHE_CONTROL, HeaderValue::from_static("no-cache"));
-    told.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    told.insert(REFERRER_POLICY, HeaderValue::from_static(guarded.referrer));
-    told.extend(HeaderValue::from_str(&tag).ok().map(|tag| (ETAG, tag)));
-    told.extend(guarded.policy.map(|policy| (CONTENT_SECURITY_POLICY, policy)));
+    let headers = response.headers_mut();
+    // Revalidated on each load, and sent again only when it has changed.
+    headers.insert(CACHE_CONTROL, HeaderValue::from_static("no-cache"));
+    headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    headers.insert(REFERRER_POLICY, HeaderValue::from_static(security.referrer));
+    headers.extend(HeaderValue::from_str(&tag).ok().map(|tag| (ETAG, tag)));
+    headers.extend(security.policy.map(|policy| (CONTENT_SECURITY_POLICY, policy)));
     response
 }
 
@@ -118,22 +120,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_file_of_the_folder_is_served_and_all_are_small() {
+    fn every_asset_is_served_and_all_together_are_small() {
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("console/assets");
-        let mut there: Vec<_> = std::fs::read_dir(folder)
+        let mut present: Vec<_> = std::fs::read_dir(folder)
             .unwrap()
             .map(|entry| entry.unwrap().file_name().into_string().unwrap())
             .collect();
-        there.sort();
+        present.sort();
         let mut served: Vec<_> = ASSETS.iter().map(|(name, _)| (*name).to_owned()).collect();
         served.sort();
-        assert_eq!(served, there);
+        assert_eq!(served, present);
         let bytes: usize = ASSETS.iter().map(|(_, text)| text.len()).sum();
         assert!(bytes < 200_000, "{bytes} bytes");
     }
 
     #[test]
-    fn pictures_may_come_from_the_host_of_the_tiles_and_nothing_else_from_anywhere() {
+    fn the_policy_allows_images_from_the_tile_server_and_nothing_else() {
         assert!(policy(None).contains("img-src 'self' blob:;"));
         let with_tiles = policy(Some("https://tiles.example:8443/{z}/{x}/{y}.png"));
         assert!(with_tiles.contains("img-src 'self' blob: https://tiles.example:8443;"));

@@ -1,22 +1,21 @@
-//! Between the messages of the contract and the types of the service.
+//! Converts between the messages of the contract and the types of the service.
 
 use jiff::Timestamp;
-use serde_json::{Map as JsonObject, Value};
 
 use super::proto;
 use whereabouts_api::RefineMode;
-use whereabouts_core::{CoordinateFrame, DescriptorKind, JobState, Priority, Scene};
+use whereabouts_core::{CoordinateFrame, DescriptorKind, JobState, PoseInput, Priority, Scene};
 use whereabouts_service::ServiceError;
 
-/// The value of an enum by its number.
-fn known<T: TryFrom<i32>>(field: &str, number: i32) -> Result<T, ServiceError> {
+/// Converts the number of an enum; an unknown one is malformed.
+fn enum_value<T: TryFrom<i32>>(field: &str, number: i32) -> Result<T, ServiceError> {
     T::try_from(number).map_err(|_| {
         ServiceError::malformed(format!("{field} is {number}, which this server does not know"))
     })
 }
 
 pub(super) fn refine_mode(number: i32) -> Result<RefineMode, ServiceError> {
-    Ok(match known("refine", number)? {
+    Ok(match enum_value("refine", number)? {
         proto::RefineMode::Unspecified | proto::RefineMode::Async => RefineMode::Async,
         proto::RefineMode::Wait => RefineMode::Wait,
         proto::RefineMode::Off => RefineMode::Off,
@@ -24,16 +23,16 @@ pub(super) fn refine_mode(number: i32) -> Result<RefineMode, ServiceError> {
 }
 
 pub(super) fn priority(number: i32) -> Result<Priority, ServiceError> {
-    Ok(match known("priority", number)? {
+    Ok(match enum_value("priority", number)? {
         proto::Priority::Unspecified | proto::Priority::Normal => Priority::Normal,
         proto::Priority::Low => Priority::Low,
         proto::Priority::High => Priority::High,
     })
 }
 
-/// `None` for any.
+/// `None` stands for any state.
 pub(super) fn job_state(number: i32) -> Result<Option<JobState>, ServiceError> {
-    Ok(match known("state", number)? {
+    Ok(match enum_value("state", number)? {
         proto::JobState::Unspecified => None,
         proto::JobState::Queued => Some(JobState::Queued),
         proto::JobState::Running => Some(JobState::Running),
@@ -44,27 +43,27 @@ pub(super) fn job_state(number: i32) -> Result<Option<JobState>, ServiceError> {
     })
 }
 
-/// `None` for as it is.
+/// `None` leaves it unchanged.
 pub(super) fn scene(number: i32) -> Result<Option<Scene>, ServiceError> {
-    Ok(match known("scene", number)? {
+    Ok(match enum_value("scene", number)? {
         proto::Scene::Unspecified => None,
         proto::Scene::Indoor => Some(Scene::Indoor),
         proto::Scene::Outdoor => Some(Scene::Outdoor),
     })
 }
 
-/// `None` for as it is.
+/// `None` leaves it unchanged.
 pub(super) fn descriptor(number: i32) -> Result<Option<DescriptorKind>, ServiceError> {
-    Ok(match known("descriptor", number)? {
+    Ok(match enum_value("descriptor", number)? {
         proto::Descriptor::Unspecified => None,
         proto::Descriptor::Gem => Some(DescriptorKind::Gem),
         proto::Descriptor::Cls => Some(DescriptorKind::Cls),
     })
 }
 
-/// `None` for as it is.
+/// `None` leaves it unchanged.
 pub(super) fn frame(number: i32) -> Result<Option<CoordinateFrame>, ServiceError> {
-    Ok(match known("frame", number)? {
+    Ok(match enum_value("frame", number)? {
         proto::Frame::Unspecified => None,
         proto::Frame::Wgs84 => Some(CoordinateFrame::Wgs84),
         proto::Frame::Metric => Some(CoordinateFrame::Metric),
@@ -76,50 +75,50 @@ pub(super) fn moment(moment: prost_types::Timestamp) -> Result<Timestamp, Servic
         .map_err(|error| ServiceError::unprocessable(format!("captured_at: {error}")))
 }
 
-/// A pose in the form in which the service checks it against the map.
-pub(super) fn pose(pose: proto::Pose) -> Result<Value, ServiceError> {
-    let fields = match pose.frame {
-        None => Vec::new(),
-        Some(proto::pose::Frame::Geographic(pose)) => vec![
-            ("lat", Some(pose.lat)),
-            ("lon", Some(pose.lon)),
-            ("alt", pose.alt),
-            ("heading", pose.heading),
-        ],
+/// An error of one item among several.
+pub(super) fn problem(error: ServiceError) -> proto::Problem {
+    proto::Problem {
+        kind: error.kind.word().to_owned(),
+        detail: error.detail,
+        // No wait is too long for a duration of protobuf.
+        retry_after: error.retry_after.and_then(|pause| pause.try_into().ok()),
+    }
+}
+
+/// A pose as the service checks it against the frame of the map.
+pub(super) fn pose(pose: proto::Pose) -> PoseInput {
+    match pose.frame {
+        None => PoseInput::default(),
+        Some(proto::pose::Frame::Geographic(pose)) => PoseInput {
+            lat: Some(pose.lat),
+            lon: Some(pose.lon),
+            alt: pose.alt,
+            heading: pose.heading,
+            ..PoseInput::default()
+        },
         Some(proto::pose::Frame::Metric(pose)) => {
             let part = |of: fn(&proto::Quaternion) -> f64| pose.orientation.as_ref().map(of);
-            vec![
-                ("x", Some(pose.x)),
-                ("y", Some(pose.y)),
-                ("z", pose.z),
-                ("qx", part(|q| q.x)),
-                ("qy", part(|q| q.y)),
-                ("qz", part(|q| q.z)),
-                ("qw", part(|q| q.w)),
-            ]
+            PoseInput {
+                x: Some(pose.x),
+                y: Some(pose.y),
+                z: pose.z,
+                qx: part(|q| q.x),
+                qy: part(|q| q.y),
+                qz: part(|q| q.z),
+                qw: part(|q| q.w),
+                ..PoseInput::default()
+            }
         }
-    };
-    let mut given = JsonObject::new();
-    for (field, value) in fields {
-        let Some(value) = value else { continue };
-        // JSON has no word for it.
-        if !value.is_finite() {
-            let detail = format!("{field} is {value}; it must be a number");
-            return Err(ServiceError::unprocessable(detail));
-        }
-        given.insert(field.to_owned(), value.into());
     }
-    Ok(Value::Object(given))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use whereabouts_api::moment_to;
-    use whereabouts_core::Pose;
 
     #[test]
-    fn a_pose_comes_back_as_it_was_sent() {
+    fn a_pose_survives_the_round_trip() {
         let sent = proto::Pose {
             frame: Some(proto::pose::Frame::Metric(proto::MetricPose {
                 x: 1.5,
@@ -128,20 +127,18 @@ mod tests {
                 orientation: Some(proto::Quaternion { x: 0.0, y: 0.0, z: 0.6, w: 0.8 }),
             })),
         };
-        let read = Pose::from_json(CoordinateFrame::Metric, pose(sent).unwrap()).unwrap();
+        let read = pose(sent).check(CoordinateFrame::Metric).unwrap();
         assert_eq!(proto::Pose::from(read), sent);
-        assert!(Pose::from_json(CoordinateFrame::Wgs84, pose(sent).unwrap()).is_err());
-        assert!(
-            Pose::from_json(CoordinateFrame::Metric, pose(proto::Pose { frame: None }).unwrap())
-                .is_err()
-        );
+        assert!(pose(sent).check(CoordinateFrame::Wgs84).is_err());
+        assert!(pose(proto::Pose { frame: None }).check(CoordinateFrame::Metric).is_err());
         let nowhere = proto::MetricPose { x: 0.0, y: 0.0, z: Some(f64::NAN), orientation: None };
         let nowhere = proto::Pose { frame: Some(proto::pose::Frame::Metric(nowhere)) };
-        assert!(pose(nowhere).unwrap_err().detail.contains('z'));
+        let error = pose(nowhere).check(CoordinateFrame::Metric).unwrap_err();
+        assert!(error.to_string().starts_with("z is NaN"), "{error}");
     }
 
     #[test]
-    fn moments_before_1970_have_positive_nanoseconds() {
+    fn times_before_1970_have_positive_nanoseconds() {
         let at: Timestamp = "1969-12-31T23:59:59.25Z".parse().unwrap();
         let message = moment_to(at);
         assert_eq!((message.seconds, message.nanos), (-1, 250_000_000));

@@ -1,4 +1,4 @@
-//! The standard services of health and reflection.
+//! The standard health and reflection services.
 
 use futures_util::{StreamExt, stream};
 use tonic::{Request, Response, Status};
@@ -7,11 +7,11 @@ use tonic_health::pb::health_server::Health;
 use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
 use tonic_reflection::server::{Builder, Error};
 
-use super::streams::{Answers, until_over};
+use super::streams::{ResponseStream, until_over};
 use super::{Api, CONTRACT, status};
 use whereabouts_service::ReadinessPhase;
 
-/// The services that the contract names; the empty name is the server as a whole.
+/// Services whose health can be queried; the empty name is the server as a whole.
 const SERVICES: [&str; 4] = [
     "",
     "whereabouts.v1.LocalizationService",
@@ -19,7 +19,7 @@ const SERVICES: [&str; 4] = [
     "whereabouts.v1.JobService",
 ];
 
-fn answer(phase: ReadinessPhase) -> HealthCheckResponse {
+fn serving_status(phase: ReadinessPhase) -> HealthCheckResponse {
     let status = match phase {
         ReadinessPhase::Open => ServingStatus::Serving,
         ReadinessPhase::Starting | ReadinessPhase::Draining => ServingStatus::NotServing,
@@ -29,42 +29,42 @@ fn answer(phase: ReadinessPhase) -> HealthCheckResponse {
 
 #[tonic::async_trait]
 impl Health for Api {
-    type WatchStream = Answers<HealthCheckResponse>;
+    type WatchStream = ResponseStream<HealthCheckResponse>;
 
     async fn check(
         &self,
         request: Request<HealthCheckRequest>,
     ) -> Result<Response<HealthCheckResponse>, Status> {
-        let asked = &request.get_ref().service;
-        if !SERVICES.contains(&asked.as_str()) {
-            let shown: String = asked.chars().take(80).collect();
+        let name = &request.get_ref().service;
+        if !SERVICES.contains(&name.as_str()) {
+            let shown: String = name.chars().take(80).collect();
             let known = SERVICES[1..].join(", ");
             return Err(Status::not_found(format!(
                 "there is no service {shown:?}; there are {known}"
             )));
         }
-        Ok(Response::new(answer(*self.door.phases().borrow())))
+        Ok(Response::new(serving_status(*self.readiness.phases().borrow())))
     }
 
     async fn watch(
         &self,
         request: Request<HealthCheckRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
         if !SERVICES.contains(&request.get_ref().service.as_str()) {
-            // As the protocol has it: the service might appear later.
+            // The protocol requires an open stream: the service might appear later.
             let unknown = HealthCheckResponse { status: ServingStatus::ServiceUnknown.into() };
             let unknown = stream::iter([Ok(unknown)]).chain(stream::pending());
-            return Ok(Response::new(until_over(unknown, &self.door, asked)));
+            return Ok(Response::new(until_over(unknown, &self.readiness, context)));
         }
-        let mut phases = self.door.phases();
+        let mut phases = self.readiness.phases();
         phases.mark_changed();
         let changes = stream::unfold(phases, |mut phases| async {
             phases.changed().await.ok()?;
-            let now = answer(*phases.borrow_and_update());
+            let now = serving_status(*phases.borrow_and_update());
             Some((Ok(now), phases))
         });
-        Ok(Response::new(until_over(changes, &self.door, asked)))
+        Ok(Response::new(until_over(changes, &self.readiness, context)))
     }
 }
 

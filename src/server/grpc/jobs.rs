@@ -1,4 +1,4 @@
-//! Jobs: show, follow, list, cancel, retry.
+//! `JobService`: get, watch, list, cancel, retry.
 
 use std::time::Duration;
 
@@ -12,27 +12,27 @@ use super::proto::{
     ListJobsResponse, PairDescribed, RetryJobRequest, RetryJobResponse, WatchJobRequest,
     WatchJobResponse,
 };
-use super::streams::{Answers, until_over};
-use super::{Api, Asked, convert, status};
+use super::streams::{ResponseStream, until_over};
+use super::{Api, CallContext, convert, status};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::Job;
 use whereabouts_service::{JobEvent, ServiceError, search_text, uuid};
 use whereabouts_store::JobFilter;
 
-/// Jobs in a page unless more are asked for: clients take no more than four megabytes at a time by themselves.
+/// Default page size. By default, gRPC clients accept messages of four megabytes at most.
 const PAGE_SIZE: usize = 20;
 
 #[tonic::async_trait]
 impl JobService for Api {
-    type WatchJobStream = Answers<WatchJobResponse>;
+    type WatchJobStream = ResponseStream<WatchJobResponse>;
 
     async fn get_job(
         &self,
         request: Request<GetJobRequest>,
     ) -> Result<Response<GetJobResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
         let GetJobRequest { id, wait_s } = request.into_inner();
-        let job = asked.job(&id, wait_s).await.map_err(status::of)?;
+        let job = context.job(&id, wait_s).await.map_err(status::of)?;
         Ok(Response::new(GetJobResponse { job: Some(job.into()) }))
     }
 
@@ -40,12 +40,12 @@ impl JobService for Api {
         &self,
         request: Request<WatchJobRequest>,
     ) -> Result<Response<Self::WatchJobStream>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let following = async {
-            let id = asked.job(&request.into_inner().id, 0.0).await?.id;
-            asked.service.follow_job(id).await
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let watching = async {
+            let id = context.job(&request.into_inner().id, 0.0).await?.id;
+            context.service.follow_job(id).await
         };
-        let events = following.await.map_err(status::of)?;
+        let events = watching.await.map_err(status::of)?;
         let events = events.map(|event| {
             let event = match event {
                 JobEvent::State(now) => Event::Status(JobStatus {
@@ -62,15 +62,15 @@ impl JobService for Api {
             };
             Ok(WatchJobResponse { event: Some(event) })
         });
-        Ok(Response::new(until_over(events, &self.door, asked)))
+        Ok(Response::new(until_over(events, &self.readiness, context)))
     }
 
     async fn list_jobs(
         &self,
         request: Request<ListJobsRequest>,
     ) -> Result<Response<ListJobsResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let page = asked.jobs(request.into_inner()).await.map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let page = context.jobs(request.into_inner()).await.map_err(status::of)?;
         Ok(Response::new(page))
     }
 
@@ -78,10 +78,10 @@ impl JobService for Api {
         &self,
         request: Request<CancelJobRequest>,
     ) -> Result<Response<CancelJobResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
         let cancelling = async {
-            let id = asked.job(&request.into_inner().id, 0.0).await?.id;
-            asked.service.cancel_job(id).await
+            let id = context.job(&request.into_inner().id, 0.0).await?.id;
+            context.service.cancel_job(id).await
         };
         let job = cancelling.await.map_err(status::of)?;
         Ok(Response::new(CancelJobResponse { job: Some(job.into()) }))
@@ -91,18 +91,18 @@ impl JobService for Api {
         &self,
         request: Request<RetryJobRequest>,
     ) -> Result<Response<RetryJobResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
         let retrying = async {
-            let id = asked.job(&request.into_inner().id, 0.0).await?.id;
-            asked.service.retry_job(id).await
+            let id = context.job(&request.into_inner().id, 0.0).await?.id;
+            context.service.retry_job(id).await
         };
         let job = retrying.await.map_err(status::of)?;
         Ok(Response::new(RetryJobResponse { job: Some(job.into()) }))
     }
 }
 
-impl Asked {
-    /// A job of a map that the caller may use, at once or when it has ended.
+impl CallContext {
+    /// Returns a job of a map that the caller may use; with `wait_s`, once it has ended or the time is up.
     async fn job(&self, id: &str, wait_s: f64) -> Result<Job, ServiceError> {
         let id = uuid("job", id)?;
         let job = self.service.get_job(id, None).await?;
@@ -122,8 +122,8 @@ impl Asked {
         if map.is_none() && !self.caller.may_use_all() {
             return Err(ServiceError::new(
                 ErrorKind::Forbidden,
-                "this key is for some maps only, and the request is about all; name one in `map`, or ask an \
-                 admin for another key",
+                "this key is restricted to some maps, but the request is about all; name one in `map`, or ask \
+                 an admin for another key",
             ));
         }
         let (state, text) = (convert::job_state(state)?, search_text(&text)?);

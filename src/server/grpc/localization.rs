@@ -1,4 +1,4 @@
-//! Localizing: one frame, or the newest of many.
+//! `LocalizationService`: localizes one frame, or the newest of a stream.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -12,20 +12,20 @@ use super::proto::localize_stream_response::Outcome;
 use super::proto::{
     self, LocalizeRequest, LocalizeResponse, LocalizeStreamRequest, LocalizeStreamResponse,
 };
-use super::streams::{Answers, until_over};
-use super::{Api, Asked, convert, status};
+use super::streams::{ResponseStream, until_over};
+use super::{Api, CallContext, convert, status};
 use whereabouts_service::{ServiceError, TrackStep};
 
 #[tonic::async_trait]
 impl LocalizationService for Api {
-    type LocalizeStreamStream = Answers<LocalizeStreamResponse>;
+    type LocalizeStreamStream = ResponseStream<LocalizeStreamResponse>;
 
     async fn localize(
         &self,
         request: Request<LocalizeRequest>,
     ) -> Result<Response<LocalizeResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let answer = asked.localize(request.into_inner()).await.map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let answer = context.localize(request.into_inner()).await.map_err(status::of)?;
         Ok(Response::new(answer))
     }
 
@@ -33,25 +33,25 @@ impl LocalizationService for Api {
         &self,
         request: Request<Streaming<LocalizeStreamRequest>>,
     ) -> Result<Response<Self::LocalizeStreamStream>, Status> {
-        let asked = Arc::new(self.asked(request.extensions()).map_err(status::of)?);
+        let context = Arc::new(self.context(request.extensions()).map_err(status::of)?);
         let frames = Frames {
-            coming: request.into_inner(),
+            incoming: request.into_inner(),
             newest: None,
             skipped: 0,
-            counted: false,
+            charged: false,
             ended: None,
-            asked: Arc::clone(&asked),
+            context: Arc::clone(&context),
         };
         let answers = stream::unfold(frames, |mut frames| async {
             let answer = frames.next().await?;
             Some((answer, frames))
         });
-        let answers = until_over(answers, &self.door, asked.as_ref().clone());
+        let answers = until_over(answers, &self.readiness, context.as_ref().clone());
         Ok(Response::new(answers))
     }
 }
 
-impl Asked {
+impl CallContext {
     async fn localize(&self, request: LocalizeRequest) -> Result<LocalizeResponse, ServiceError> {
         let LocalizeRequest { map, image, k, refine, priority, track } = request;
         let track = track.map(|track| self.step(track)).transpose()?;
@@ -74,68 +74,68 @@ impl Asked {
     }
 }
 
-/// The frames of a stream, of which the newest is localized next.
+/// The frames of a stream. The newest is localized next; older ones are skipped.
 struct Frames {
-    coming: Streaming<LocalizeStreamRequest>,
+    incoming: Streaming<LocalizeStreamRequest>,
     newest: Option<(LocalizeStreamRequest, Option<OwnedSemaphorePermit>)>,
-    /// Frames that newer ones have replaced since the last answer.
+    /// Frames replaced by newer ones since the last answer.
     skipped: u32,
-    /// Whether one has been counted, as the request that the stream began with.
-    counted: bool,
-    /// How the frames ended, once they have.
+    /// Whether the first frame was charged to the rate limit, as the request that opened the stream.
+    charged: bool,
+    /// How the stream of frames ended; `None` while it is open.
     ended: Option<Result<(), Status>>,
-    asked: Arc<Asked>,
+    context: Arc<CallContext>,
 }
 
 impl Frames {
-    /// The next answer; `None` when the last has been given.
+    /// The next answer; `None` after the last.
     async fn next(&mut self) -> Option<Result<LocalizeStreamResponse, Status>> {
         while self.newest.is_none() && self.ended.is_none() {
-            let next = self.coming.message().await;
-            self.take(next);
+            let next = self.incoming.message().await;
+            self.receive(next);
         }
-        // Those that have come meanwhile are newer.
+        // Frames that arrived in the meantime are newer.
         while self.ended.is_none()
-            && let Some(next) = self.coming.message().now_or_never()
+            && let Some(next) = self.incoming.message().now_or_never()
         {
-            self.take(next);
+            self.receive(next);
         }
         let Some((frame, _memory)) = self.newest.take() else {
             return self.ended.replace(Ok(()))?.err().map(Err);
         };
         let skipped = std::mem::take(&mut self.skipped);
         let LocalizeStreamRequest { frame_number, frame } = frame;
-        let (asked, begun) = (Arc::clone(&self.asked), Instant::now());
-        let counted = std::mem::replace(&mut self.counted, true);
+        let (context, start) = (Arc::clone(&self.context), Instant::now());
+        let charged = std::mem::replace(&mut self.charged, true);
         let mut working = std::pin::pin!(async move {
-            // Each frame counts as a request of the key, of which the first is counted already.
-            if counted {
-                asked.service.keys.limits.take_one_more(&asked.caller).await?;
+            // Each frame counts as one request of the key; the gate has charged the first.
+            if charged {
+                context.service.keys.limits.take_one_more(&context.caller).await?;
             }
-            asked.localize(frame.unwrap_or_default()).await
+            context.localize(frame.unwrap_or_default()).await
         });
         let answer = loop {
             tokio::select! {
                 answer = &mut working => break answer,
-                next = self.coming.message(), if self.ended.is_none() => self.take(next),
+                next = self.incoming.message(), if self.ended.is_none() => self.receive(next),
             }
         };
-        let metrics = &self.asked.metrics;
+        let metrics = &self.context.metrics;
         let outcome = match answer {
             Ok(answer) => {
-                metrics.frame_of_stream(begun.elapsed());
+                metrics.frame_of_stream(start.elapsed());
                 Outcome::Answer(answer)
             }
-            Err(error) => Outcome::Problem(status::problem(error)),
+            Err(error) => Outcome::Problem(convert::problem(error)),
         };
         let outcome = Some(outcome);
         Some(Ok(LocalizeStreamResponse { frame_number, skipped, outcome }))
     }
 
-    fn take(&mut self, next: Result<Option<LocalizeStreamRequest>, Status>) {
+    fn receive(&mut self, next: Result<Option<LocalizeStreamRequest>, Status>) {
         match next {
             Ok(Some(frame)) => {
-                let replaced = self.newest.replace((frame, self.asked.held.take())).is_some();
+                let replaced = self.newest.replace((frame, self.context.budget.take())).is_some();
                 self.skipped += u32::from(replaced);
             }
             Ok(None) => self.ended = Some(Ok(())),

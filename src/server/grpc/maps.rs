@@ -1,4 +1,4 @@
-//! Maps: list, show, change, remove, fill.
+//! `MapService`: list, get, put, delete, add images.
 
 use futures_util::{StreamExt, TryStreamExt, stream};
 use tokio::sync::OwnedSemaphorePermit;
@@ -11,7 +11,7 @@ use super::proto::{
     GetMapRequest, GetMapResponse, ListMapsRequest, ListMapsResponse, PutMapRequest,
     PutMapResponse, Stored,
 };
-use super::{Api, Asked, convert, status};
+use super::{Api, CallContext, convert, status};
 use whereabouts_api::{ImageMeta, MapChange};
 use whereabouts_core::MapName;
 use whereabouts_service::{BulkImage, BulkResult, ServiceError};
@@ -23,9 +23,9 @@ impl MapService for Api {
         &self,
         request: Request<ListMapsRequest>,
     ) -> Result<Response<ListMapsResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let maps = asked.service.list_maps().await.map_err(status::of)?.into_iter();
-        let maps = maps.filter(|map| asked.caller.may_use(&map.name));
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let maps = context.service.list_maps().await.map_err(status::of)?.into_iter();
+        let maps = maps.filter(|map| context.caller.may_use(&map.name));
         Ok(Response::new(ListMapsResponse { maps: maps.map(Into::into).collect() }))
     }
 
@@ -33,9 +33,9 @@ impl MapService for Api {
         &self,
         request: Request<GetMapRequest>,
     ) -> Result<Response<GetMapResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let name = asked.map(&request.get_ref().map).map_err(status::of)?;
-        let map = asked.service.get_map(&name).await.map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let name = context.map(&request.get_ref().map).map_err(status::of)?;
+        let map = context.service.get_map(&name).await.map_err(status::of)?;
         Ok(Response::new(GetMapResponse { map: Some(map.into()) }))
     }
 
@@ -43,8 +43,8 @@ impl MapService for Api {
         &self,
         request: Request<PutMapRequest>,
     ) -> Result<Response<PutMapResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let answer = asked.put_map(request.into_inner()).await.map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let answer = context.put_map(request.into_inner()).await.map_err(status::of)?;
         Ok(Response::new(answer))
     }
 
@@ -52,9 +52,9 @@ impl MapService for Api {
         &self,
         request: Request<DeleteMapRequest>,
     ) -> Result<Response<DeleteMapResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let name = asked.map(&request.get_ref().map).map_err(status::of)?;
-        asked.service.delete_map(&name).await.map_err(status::of)?;
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let name = context.map(&request.get_ref().map).map_err(status::of)?;
+        context.service.delete_map(&name).await.map_err(status::of)?;
         Ok(Response::new(DeleteMapResponse {}))
     }
 
@@ -62,22 +62,22 @@ impl MapService for Api {
         &self,
         request: Request<Streaming<AddImagesRequest>>,
     ) -> Result<Response<AddImagesResponse>, Status> {
-        let asked = self.asked(request.extensions()).map_err(status::of)?;
-        let mut coming = request.into_inner();
-        let Some(first) = coming.message().await? else {
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let mut incoming = request.into_inner();
+        let Some(first) = incoming.message().await? else {
             return Ok(Response::new(AddImagesResponse { results: Vec::new() }));
         };
-        let map = asked.map(&first.map).map_err(status::of)?;
-        asked.service.get_map(&map).await.map_err(status::of)?;
-        let images = stream::iter([Ok(first)]).chain(coming);
-        let images = images.map_ok(|next| image(&map, next, asked.held.take()));
-        let until = asked.service.over(&self.door, asked.caller.clone(), asked.deadline);
-        let results = asked.service.add_images(&map, &asked.caller, images, until).await?;
+        let map = context.map(&first.map).map_err(status::of)?;
+        context.service.get_map(&map).await.map_err(status::of)?;
+        let images = stream::iter([Ok(first)]).chain(incoming);
+        let images = images.map_ok(|next| image(&map, next, context.budget.take()));
+        let until = context.service.over(&self.readiness, context.caller.clone(), context.deadline);
+        let results = context.service.add_images(&map, &context.caller, images, until).await?;
         Ok(Response::new(AddImagesResponse { results: results.into_iter().map(result).collect() }))
     }
 }
 
-impl Asked {
+impl CallContext {
     async fn put_map(&self, request: PutMapRequest) -> Result<PutMapResponse, ServiceError> {
         let PutMapRequest { map, scene, descriptor, frame, model, description } = request;
         let change = MapChange {
@@ -92,7 +92,7 @@ impl Asked {
     }
 }
 
-/// The next image of a stream, if it can be one.
+/// Converts the next image of a stream.
 fn image(
     map: &MapName,
     next: AddImagesRequest,
@@ -106,7 +106,7 @@ fn image(
     }
     let meta = ImageMeta {
         id,
-        pose: pose.map(convert::pose).transpose()?,
+        pose: pose.map(convert::pose),
         captured_at: captured_at.map(convert::moment).transpose()?,
         tags,
     };
@@ -118,7 +118,7 @@ fn result(result: BulkResult) -> AddImageResult {
         Ok(Added::Created(image)) => (image, false),
         Ok(Added::Present(image)) => (image, true),
         Err((id, error)) => {
-            let outcome = Some(Outcome::Problem(status::problem(error)));
+            let outcome = Some(Outcome::Problem(convert::problem(error)));
             let id = id.map(Into::into).unwrap_or_default();
             return AddImageResult { id, outcome };
         }

@@ -6,49 +6,41 @@ mod form;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Duration;
 
-use axum::body::{Body, BodyDataStream};
+use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::{Extension, Json};
-use bytes::Bytes;
-use futures_util::{Stream, StreamExt, stream};
-use tokio::runtime::Handle;
+use futures_util::{Stream, StreamExt};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use utoipa::ToSchema;
 
 use super::body::{Segments, content_type};
-use super::guard::{discard, too_large};
 use super::maps::map_name;
-use super::messages::no_bulk_memory;
-use super::problem::Problem;
-use super::state::{AppState, HttpSettings, Ready};
+use super::state::AppState;
+use crate::gate::{BodyPaused, GateSettings, Problem, Ready, no_bulk_memory, too_large};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 use whereabouts_api::{ErrorKind, ImageMeta};
 use whereabouts_service::{BulkImage, BulkResult, Deadline, Principal, ServiceError};
 use whereabouts_store::Added;
 
-/// The route.
-pub(super) const PATH: &str = "/maps/{map}/images:batch";
-
-/// The largest description of an image, in bytes.
+/// Largest `meta` of an image, in bytes.
 const LARGEST_META: usize = 64 << 10;
 
-/// The images of a request, each as it came in or why it cannot be stored; the first problem ends it.
+/// The images of a request in order, each with the error if it cannot be stored. A problem with the request ends it.
 type Images = Pin<Box<dyn Stream<Item = Result<Result<BulkImage, ServiceError>, Problem>> + Send>>;
 
-/// What an image may come to without getting any further, in bytes: names, heads of parts, and what lies between.
-const ASIDE: usize = 1 << 20;
+/// Most bytes around an image: names, headers of parts, and padding.
+const OVERHEAD: usize = 1 << 20;
 
-/// The largest first step of an image whose size is not known before, in bytes; few are larger.
-const STEP: usize = 4 << 20;
+/// Memory reserved at first for an image whose size is not known in advance, in bytes; few images are larger.
+const FIRST_RESERVATION: usize = 4 << 20;
 
-/// The room that there is for an image that comes in.
+/// Reserves memory for the images of a request, and bounds what is read between them.
 #[derive(Clone)]
 struct Room {
-    settings: Arc<HttpSettings>,
+    settings: Arc<GateSettings>,
     memory: Arc<Semaphore>,
-    /// How many bytes of the body may still come before whoever reads it gets on.
+    /// Bytes the reader may still receive before it must make progress.
     allowance: Arc<AtomicUsize>,
 }
 
@@ -61,27 +53,27 @@ impl Room {
         ServiceError::new(ErrorKind::TooLarge, too_large(self.settings.body_limit_bytes))
     }
 
-    /// So many bytes of the memory for bulk uploads, once images before this one have given them back.
-    async fn take(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Problem> {
+    /// Reserves `bytes` of the memory for bulk uploads, waiting until earlier images have released them.
+    async fn reserve(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Problem> {
         let count = u32::try_from(bytes).unwrap_or(u32::MAX);
-        let taking = Arc::clone(&self.memory).acquire_many_owned(count);
-        let taken = tokio::time::timeout(self.settings.request_timeout, taking).await;
-        taken.ok().and_then(Result::ok).ok_or_else(no_bulk_memory)
+        let permit = Arc::clone(&self.memory).acquire_many_owned(count);
+        let permit = tokio::time::timeout(self.settings.request_timeout, permit).await;
+        permit.ok().and_then(Result::ok).ok_or_else(no_bulk_memory)
     }
 
-    /// The reader has got on: so much may come now, and what lies between.
+    /// Notes that the reader made progress, and that an image of `bytes` may follow.
     fn allow(&self, bytes: usize) {
-        self.allowance.store(bytes.saturating_add(ASIDE), Ordering::Relaxed);
+        self.allowance.store(bytes.saturating_add(OVERHEAD), Ordering::Relaxed);
     }
 
-    /// A body that breaks off when its reader does not get on.
+    /// Ends a body with an error when its reader makes no progress.
     fn over(&self, body: Body) -> Body {
         self.allow(0);
         let allowance = Arc::clone(&self.allowance);
         let bounded = body.into_data_stream().map(move |chunk| {
             let chunk = chunk?;
-            let take = |left: usize| left.checked_sub(chunk.len());
-            match allowance.fetch_update(Ordering::Relaxed, Ordering::Relaxed, take) {
+            let consume = |allowed: usize| allowed.checked_sub(chunk.len());
+            match allowance.fetch_update(Ordering::Relaxed, Ordering::Relaxed, consume) {
                 Ok(_) => Ok(chunk),
                 Err(_) => Err(axum::Error::new(Endless)),
             }
@@ -90,10 +82,10 @@ impl Room {
     }
 }
 
-/// A body in which nothing ends.
+/// The error of a body in which no image ends.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "there is more than {ASIDE} bytes of it between two images; is it a form, or an archive of pictures?"
+    "there is more than {OVERHEAD} bytes of it between two images; is it a form, or an archive of pictures?"
 )]
 struct Endless;
 
@@ -101,7 +93,7 @@ struct Endless;
 #[derive(ToSchema)]
 #[expect(dead_code, reason = "describes the form; the body is read part by part")]
 struct BatchForm {
-    /// What is known about the image after it.
+    /// What is known about the image that follows.
     meta: Option<Vec<ImageMeta>>,
     /// The pictures. A file name is the id of an image that `meta` gives none.
     #[schema(value_type = Vec<String>, format = Binary)]
@@ -110,23 +102,23 @@ struct BatchForm {
 
 /// Add many images
 ///
-/// A form with a part `image` for each picture, after a part `meta` (JSON) if something is known about it; or
-/// a tar archive of pictures, in which what is known about `a.jpg` is in `a.jpg.json`, right before or
-/// after it. An image whose `meta` has no id has its file name as id. Several images are worked on at a time,
-/// and there is no bound on the whole, only on each (`server.body_limit_bytes`) and on their number
-/// (`bulk.max_images`). What is wrong with one image does not keep the others back; sending all of it again
-/// is safe. A problem with the request as a whole ends it; what came before that is stored.
+/// Send a form with a part `image` for each picture, preceded by a part `meta` (JSON) if something is known
+/// about it; or a tar archive of pictures, in which `a.jpg.json`, directly before or after `a.jpg`, says what
+/// is known about it. An image whose `meta` has no id gets its file name as id. Several images are processed
+/// at a time. The request as a whole is not bounded, only each image (`server.body_limit_bytes`) and their
+/// number (`bulk.max_images`). An error of one image does not affect the others, and it is safe to send the
+/// whole request again. A problem with the request itself ends it; the images before it are stored.
 #[utoipa::path(post, path = "/maps/{map}/images:batch", tag = "images", params(("map" = String, Path)),
     request_body(content(
         (BatchForm = "multipart/form-data"), (Vec<u8> = "application/x-tar"),
     )),
     responses(
-        (status = 200, body = BatchAnswer, description = "What became of each"),
+        (status = 200, body = BatchAnswer, description = "The outcome for each image"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
-        (status = 408, body = Problem, description = "The body came too slowly", content_type = "application/problem+json"),
+        (status = 408, body = Problem, description = "The body arrived too slowly", content_type = "application/problem+json"),
         (status = 415, body = Problem, description = "Neither a form nor a tar archive", content_type = "application/problem+json"),
-        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when to try again", content_type = "application/problem+json"),
     ))]
 pub(super) async fn add_images(
     State(state): State<AppState>,
@@ -138,8 +130,8 @@ pub(super) async fn add_images(
 ) -> Result<Json<BatchAnswer>, Problem> {
     let map = map_name(&map)?;
     service.get_map(&map).await?;
-    let until = service.over(&state.door, caller.clone(), deadline);
-    let (settings, memory) = (state.settings, state.bulk_memory);
+    let until = service.over(&state.gate.readiness, caller.clone(), deadline);
+    let (settings, memory) = (state.gate.settings, state.gate.bulk_memory);
     let images = images(request, Room { settings, memory, allowance: Arc::default() }).await?;
     let results = service.add_images(&map, &caller, images, until).await?;
     let results: Vec<BatchResult> = results.into_iter().map(batch_result).collect();
@@ -153,10 +145,10 @@ pub(super) async fn add_images(
 }
 
 async fn images(request: Request, room: Room) -> Result<Images, Problem> {
-    let (header, essence) = content_type(request.headers());
+    let (header, media_type) = content_type(request.headers());
     let header = header.to_owned();
     let request = request.map(|body| room.over(body));
-    match essence.as_str() {
+    match media_type.as_str() {
         "multipart/form-data" => Ok(Box::pin(form::images(request, room).await?)),
         "application/x-tar" => Ok(Box::pin(archive::images(request.into_body(), room))),
         _ => Err(Problem::new(
@@ -170,66 +162,23 @@ async fn images(request: Request, room: Room) -> Result<Images, Problem> {
     }
 }
 
-/// A body that may take any time, if nothing of it waits for long.
-pub(super) fn unhurried(body: Body, pause: Duration) -> Body {
-    let unhurried = Unhurried { body: Some(body.into_data_stream()), pause };
-    Body::from_stream(stream::unfold(unhurried, |mut unhurried| async move {
-        let next = unhurried.next().await?;
-        Some((next, unhurried))
-    }))
-}
-
-/// What of a body is still to come. What nobody reads is thrown away for a while, or the client, which is still
-/// sending, would see a reset connection instead of the answer.
-struct Unhurried {
-    body: Option<BodyDataStream>,
-    pause: Duration,
-}
-
-impl Unhurried {
-    async fn next(&mut self) -> Option<Result<Bytes, axum::Error>> {
-        let next = tokio::time::timeout(self.pause, self.body.as_mut()?.next()).await;
-        let next = next.unwrap_or_else(|_| Some(Err(axum::Error::new(Paused(self.pause)))));
-        if !matches!(next, Some(Ok(_))) {
-            self.body = None;
-        }
-        next
-    }
-}
-
-impl Drop for Unhurried {
-    fn drop(&mut self) {
-        if let (Some(body), Ok(runtime)) = (self.body.take(), Handle::try_current()) {
-            runtime.spawn(discard(body));
-        }
-    }
-}
-
-/// Nothing of a body came for so long.
-#[derive(Debug, thiserror::Error)]
-#[error(
-    "nothing of the body came for {} s (server.body_pause_s); send it again, what was stored is left as it is",
-    .0.as_secs()
-)]
-struct Paused(Duration);
-
-/// What an error of a body or its reader means, whose own words for it are these.
-fn unreadable(error: &(dyn std::error::Error + 'static), words: &str) -> Problem {
+/// The problem behind an error of a body or its parser, which describes itself as `text`.
+fn unreadable(error: &(dyn std::error::Error + 'static), text: &str) -> Problem {
     let mut causes = std::iter::successors(Some(error), |error| error.source());
-    match causes.find_map(|cause| cause.downcast_ref::<Paused>()) {
+    match causes.find_map(|cause| cause.downcast_ref::<BodyPaused>()) {
         Some(paused) => Problem::new(ErrorKind::TooSlow, paused.to_string()),
-        None => Problem::new(ErrorKind::Malformed, format!("the body cannot be read: {words}")),
+        None => Problem::new(ErrorKind::Malformed, format!("the body cannot be read: {text}")),
     }
 }
 
-/// What a caller says about an image; its name is its id unless that says otherwise.
+/// Parses the `meta` of an image. The name of its file is its id, unless `meta` has one.
 fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, ServiceError> {
     let meta: ImageMeta = meta
         .map(serde_json::from_slice)
         .transpose()
         .map_err(|error| {
             let of = name.map(|name| format!(" of {name:?}")).unwrap_or_default();
-            ServiceError::malformed(format!("what is said{of} is not the JSON expected: {error}"))
+            ServiceError::malformed(format!("the meta{of} is not the JSON expected: {error}"))
         })?
         .unwrap_or_default();
     let id = meta.id.or_else(|| name.map(str::to_owned));

@@ -1,16 +1,14 @@
-//! Reading requests: queries, JSON, pictures raw or in a form.
+//! Extracts queries, path segments, JSON, and pictures, raw or in a form.
 
 use axum::extract::{FromRequest, FromRequestParts, Multipart, Path, Query, Request};
 use axum::http::header::CONTENT_TYPE;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, StatusCode};
-use bytes::{Bytes, BytesMut};
-use futures_util::StreamExt;
+use bytes::Bytes;
 use serde::de::DeserializeOwned;
 
-use super::guard::{discard, throw_away, too_large};
-use super::problem::Problem;
 use super::state::AppState;
+use crate::gate::{Problem, read_whole, throw_away, too_large};
 use whereabouts_api::ErrorKind;
 use whereabouts_service::Service;
 use whereabouts_vision::AdmissionRequest;
@@ -50,7 +48,7 @@ impl<T: DeserializeOwned> FromRequest<AppState> for JsonBody<T> {
     type Rejection = Problem;
 
     async fn from_request(request: Request, state: &AppState) -> Result<Self, Problem> {
-        let bytes = whole(request, state).await?;
+        let bytes = read_whole(request.into_body(), state.gate.settings.body_limit_bytes).await?;
         let text: &[u8] = if bytes.is_empty() { b"{}" } else { &bytes };
         serde_json::from_slice(text).map(Self).map_err(|error| {
             Problem::new(
@@ -68,20 +66,24 @@ pub(super) struct PictureBody {
 }
 
 impl PictureBody {
-    /// Reads a picture that there is room for; else it is refused before it has come.
+    /// Reads a picture, unless the server is overloaded: then it is refused before its body is read.
     pub async fn read(
         request: Request,
         state: &AppState,
         service: &Service,
         demand: AdmissionRequest,
     ) -> Result<Self, Problem> {
-        if let Err(refused) = service.check_admission(demand) {
+        if let Err(rejected) = service.check_admission(demand) {
             throw_away(request);
-            return Err(refused.into());
+            return Err(rejected.into());
         }
         match body_type(request.headers())? {
-            BodyType::Raw => Ok(Self { picture: whole(request, state).await?, meta: None }),
-            BodyType::Form => from_form(request, state.settings.body_limit_bytes).await,
+            BodyType::Raw => Ok(Self {
+                picture: read_whole(request.into_body(), state.gate.settings.body_limit_bytes)
+                    .await?,
+                meta: None,
+            }),
+            BodyType::Form => from_form(request, state.gate.settings.body_limit_bytes).await,
         }
     }
 }
@@ -91,15 +93,15 @@ enum BodyType {
     Form,
 }
 
-/// The `Content-Type` as it was sent, and what it comes to without its parameters.
+/// The `Content-Type` as it was sent, and its media type in lower case without parameters.
 pub(super) fn content_type(headers: &HeaderMap) -> (&str, String) {
     let header = headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or("");
     (header, header.split(';').next().unwrap_or("").trim().to_ascii_lowercase())
 }
 
 fn body_type(headers: &HeaderMap) -> Result<BodyType, Problem> {
-    let (header, essence) = content_type(headers);
-    match essence.as_str() {
+    let (header, media_type) = content_type(headers);
+    match media_type.as_str() {
         "image/jpeg" | "image/png" | "image/webp" | "application/octet-stream" => Ok(BodyType::Raw),
         "multipart/form-data" => Ok(BodyType::Form),
         _ => Err(Problem::new(
@@ -113,7 +115,7 @@ fn body_type(headers: &HeaderMap) -> Result<BodyType, Problem> {
     }
 }
 
-/// Reads a form of at most `limit` bytes; the router bounds them.
+/// Reads a form. The router bounds its size; `limit` is only for the error.
 pub(super) async fn from_form(request: Request, limit: usize) -> Result<PictureBody, Problem> {
     let malformed = |detail: String| Problem::new(ErrorKind::Malformed, detail);
     let mut form = Multipart::from_request(request, &())
@@ -141,23 +143,4 @@ pub(super) async fn from_form(request: Request, limit: usize) -> Result<PictureB
     }
     let picture = picture.ok_or_else(|| malformed("the form has no part \"image\"".into()))?;
     Ok(PictureBody { picture, meta })
-}
-
-/// The whole body. What exceeds the bound is thrown away for a while, or the client, which is still
-/// sending, would see a reset connection instead of the answer.
-pub(super) async fn whole(request: Request, state: &AppState) -> Result<Bytes, Problem> {
-    let limit = state.settings.body_limit_bytes;
-    let mut chunks = request.into_body().into_data_stream();
-    let mut body = BytesMut::new();
-    while let Some(chunk) = chunks.next().await {
-        let chunk = chunk.map_err(|error| {
-            Problem::new(ErrorKind::Malformed, format!("the body cannot be read: {error}"))
-        })?;
-        if body.len() + chunk.len() > limit {
-            tokio::spawn(discard(chunks));
-            return Err(Problem::new(ErrorKind::TooLarge, too_large(limit)));
-        }
-        body.extend_from_slice(&chunk);
-    }
-    Ok(body.freeze())
 }

@@ -1,4 +1,4 @@
-//! What holds for many calls, added to the description of each.
+//! Completes the OpenAPI description with what many calls have in common: keys, roles, errors, headers.
 
 use axum::http::Method;
 use utoipa::openapi::path::{Operation, ParameterBuilder, ParameterIn};
@@ -6,19 +6,17 @@ use utoipa::openapi::schema::{ObjectBuilder, Type};
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
 use utoipa::openapi::{ContentBuilder, OpenApi, Ref, RefOr, Required, Response, ResponseBuilder};
 
-use super::auth::{Access, access};
 use super::examples;
-use super::idempotency::{LONGEST_KEY, applies};
+use crate::gate::{Access, LONGEST_KEY, Policies};
 
 /// The name of the security scheme.
 const KEY: &str = "key";
 
-/// Adds to every call what can be said of it without knowing what it does: who may make it, and how it can
-/// fail.
-pub(super) fn completed(mut description: OpenApi) -> OpenApi {
+/// Adds to every call what follows from its policy: who may call it, which headers it takes, how it can fail.
+pub(super) fn completed(mut description: OpenApi, policies: &Policies) -> OpenApi {
     let scheme = HttpBuilder::new().scheme(HttpAuthScheme::Bearer).description(Some(
-        "An API key, made by `whereabouts keys create`. A server that listens on loopback only asks for none \
-         unless it is set to.",
+        "An API key, created by `whereabouts keys create`. A server that listens on loopback only requires none \
+         unless it is configured to.",
     ));
     let components = description.components.get_or_insert_default();
     components.add_security_scheme(KEY, SecurityScheme::Http(scheme.build()));
@@ -31,11 +29,12 @@ pub(super) fn completed(mut description: OpenApi) -> OpenApi {
         ];
         for (method, operation) in operations {
             if let Some(operation) = operation
-                && let Some(Access::Role(role)) = access(&method, route)
+                && let Some(policy) = policies.of(&method, route)
+                && let Access::Role(role) = policy.access
             {
                 complete(operation, role.as_str());
-                if applies(&method, route) {
-                    take_key(operation);
+                if policy.idempotent {
+                    add_idempotency_key(operation);
                 }
             }
         }
@@ -47,7 +46,7 @@ pub(super) fn completed(mut description: OpenApi) -> OpenApi {
 fn complete(operation: &mut Operation, role: &str) {
     let scopes: [&str; 0] = [];
     operation.security = Some(vec![SecurityRequirement::new(KEY, scopes)]);
-    let note = format!("Takes the role `{role}`, where the server asks for keys.");
+    let note = format!("Requires the role `{role}`, where the server requires keys.");
     operation.description = Some(match operation.description.take() {
         Some(text) => format!("{text}\n\n{note}"),
         None => note,
@@ -58,21 +57,21 @@ fn complete(operation: &mut Operation, role: &str) {
         can_fail(operation, [("400", "Malformed")]);
     }
     if has_body {
-        can_fail(operation, [("408", "The body came too slowly"), ("413", "Too large")]);
+        can_fail(operation, [("408", "The body arrived too slowly"), ("413", "Too large")]);
     }
     can_fail(
         operation,
         [
             ("401", "No key, or one that is unknown, revoked or expired"),
-            ("403", "The key has not the role, or is not for the map"),
-            ("429", "Overloaded, or the key has used up what it may ask for in a minute"),
-            ("500", "A defect, or a disk that fails; the server's log has more"),
-            ("503", "Starting, or it took too long; Retry-After says when to try again"),
+            ("403", "The key does not have the role, or does not include the map"),
+            ("429", "Overloaded, or the rate limit of the key is exhausted"),
+            ("500", "A defect, or a failing disk; the server's log says more"),
+            ("503", "Starting, or the request timed out; Retry-After says when to try again"),
         ],
     );
 }
 
-/// Adds these problems, by status, unless the call has told of them in words of its own.
+/// Adds problems by status, except those that the call itself describes.
 fn can_fail<const N: usize>(operation: &mut Operation, problems: [(&str, &str); N]) {
     for (status, text) in problems {
         let responses = &mut operation.responses.responses;
@@ -80,8 +79,8 @@ fn can_fail<const N: usize>(operation: &mut Operation, problems: [(&str, &str); 
     }
 }
 
-/// Adds the header of a request that may be sent again.
-fn take_key(operation: &mut Operation) {
+/// Adds the header `Idempotency-Key`.
+fn add_idempotency_key(operation: &mut Operation) {
     let key = ObjectBuilder::new()
         .schema_type(Type::String)
         .min_length(Some(1))
@@ -93,9 +92,9 @@ fn take_key(operation: &mut Operation) {
         .required(Required::False)
         .schema(Some(key))
         .description(Some(
-            "A text of the sender's choice, another for each request. The same request with the same key is \
-             not done again: it gets its first answer again (with Idempotent-Replayed: true), 409 while \
-             that is in the making, and 422 if the key was another request's. Errors are not kept.",
+            "A text of the sender's choice, unique to the request. The same request with the same key is not \
+             executed again: it gets the stored answer (with Idempotent-Replayed: true), 409 while the first \
+             is in progress, and 422 if the key was used for another request. Errors are not stored.",
         ));
     operation.parameters.get_or_insert_default().push(header.build().into());
     can_fail(
@@ -103,7 +102,7 @@ fn take_key(operation: &mut Operation) {
         [
             ("400", "Malformed"),
             ("409", "A request with this Idempotency-Key is in progress"),
-            ("422", "The Idempotency-Key was another request's"),
+            ("422", "The Idempotency-Key was used for another request"),
         ],
     );
 }

@@ -1,4 +1,4 @@
-//! `/jobs/{id}/events` and `/events`: a job as it goes on, and all of them, as server-sent events.
+//! `/jobs/{id}/events` and `/events`: the progress of one job, or of all, as server-sent events.
 
 use std::time::Duration;
 
@@ -12,18 +12,19 @@ use utoipa::IntoParams;
 use super::body::{Params, Segments};
 use super::jobs::job_id;
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_service::{AnyJobEvent, Deadline, JobEvent, Principal, ServiceError};
 
-/// A comment is sent after so long without an event, so that nothing on the way hangs up.
+/// Interval of keep-alive comments, so that proxies do not close an idle stream.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 
 /// Follow a job
 ///
 /// Server-sent events until the job has ended: `state` with a `JobStatus` when its state or attempt
-/// changes, `description` with a `PairDescribed` for each pair, and at last `end` with the `Job`.
-/// What happened before is told first, so that a client that lost the connection just asks again.
+/// changes, `description` with a `PairDescribed` for each pair, and finally `end` with the `Job`.
+/// Earlier events are replayed first, so that a client that lost the connection can simply reconnect.
 #[utoipa::path(get, path = "/jobs/{id}/events", tag = "jobs",
     params(("id" = uuid::Uuid, Path)), responses(
     (status = 200, body = String, content_type = "text/event-stream"),
@@ -36,9 +37,9 @@ pub(super) async fn follow_job(
     Extension(caller): Extension<Principal>,
     Segments(id): Segments<String>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
-    let permit = state.stream()?;
+    let permit = state.gate.stream_permit()?;
     let events = service.follow_job(job_id(&id)?).await?.map(move |event| {
-        // Given back when the stream ends or the client has gone.
+        // Released when the stream ends or the client has gone.
         let _permit = &permit;
         match event {
             JobEvent::State(status) => Event::default().event("state").json_data(status),
@@ -46,7 +47,7 @@ pub(super) async fn follow_job(
             JobEvent::Ended(job) => Event::default().event("end").json_data(job),
         }
     });
-    Ok(streamed(events, service.over(&state.door, caller, Deadline::default())))
+    Ok(streamed(events, service.over(&state.gate.readiness, caller, Deadline::default())))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -59,10 +60,10 @@ pub(super) struct FollowParams {
 
 /// Follow all jobs
 ///
-/// Server-sent events, from now on and without an end: `job` with a `JobChange` whenever a job has come
-/// further or has ended, and `missed` with a `Missed` when changes came faster than they were taken. Ask
-/// for the list of jobs after the stream is open, and again after `missed`. A comment comes at once, by which
-/// clients that wait for the first bytes know that it is.
+/// An endless stream of server-sent events, starting now: `job` with a `JobChange` whenever a job makes
+/// progress or ends, and `missed` with a `Missed` when events were dropped because the client read too slowly.
+/// List the jobs once the stream is open, and again after `missed`. A comment is sent at once, so that a client
+/// that waits for the first bytes knows that the stream is open.
 #[utoipa::path(get, path = "/events", tag = "jobs", params(FollowParams), responses(
     (status = 200, body = String, content_type = "text/event-stream"),
     (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
@@ -75,7 +76,7 @@ pub(super) async fn follow_jobs(
     Params(params): Params<FollowParams>,
 ) -> Result<Sse<impl Stream<Item = Result<Event, axum::Error>>>, Problem> {
     let map = params.map.as_deref().map(map_name).transpose()?;
-    let permit = state.stream()?;
+    let permit = state.gate.stream_permit()?;
     let events = service.follow_jobs(map).map(move |event| {
         let _permit = &permit;
         match event {
@@ -84,11 +85,14 @@ pub(super) async fn follow_jobs(
         }
     });
     let opened = stream::once(async { Ok(Event::default().comment("open")) });
-    Ok(streamed(opened.chain(events), service.over(&state.door, caller, Deadline::default())))
+    Ok(streamed(
+        opened.chain(events),
+        service.over(&state.gate.readiness, caller, Deadline::default()),
+    ))
 }
 
-/// Sends events until they end, the server drains, or the caller may ask no more. A drain does not wait for
-/// jobs that nobody may finish before the next start.
+/// Sends events until they end, the server drains, or the caller's key is no longer valid. A drain does not
+/// wait for the jobs, which may not finish before the next start.
 fn streamed(
     events: impl Stream<Item = Result<Event, axum::Error>> + Send + 'static,
     over: impl Future<Output = ServiceError> + Send + 'static,

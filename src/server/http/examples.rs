@@ -1,5 +1,5 @@
-//! An example of each call, for its description. The tests execute all of them
-//! (`tests/blackbox/documented.rs`), and write the answers of `docs/examples.json`.
+//! Examples of each call for its description. `tests/blackbox/documented.rs` executes them all, and writes the
+//! answers in `docs/examples.json`.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -13,13 +13,13 @@ use utoipa::openapi::{OpenApi, RefOr};
 /// All examples, in an order in which they can be executed.
 const EXAMPLES: &str = include_str!("../../../docs/examples.json");
 
-/// A request, and how it is answered.
+/// A request with its expected answer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Example {
-    /// Method and route, as the description has them.
+    /// Method and route, as in the description.
     pub call: String,
-    /// The path of the request, with its query; what is in braces was taken from an answer before.
+    /// Path and query of the request. A name in braces stands for a value from an earlier answer.
     pub path: String,
     /// The body of the request.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -32,13 +32,13 @@ pub struct Example {
     /// The answer: JSON, or the beginning of a text; none of a picture.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub answer: Option<Value>,
-    /// What later requests take from the answer: by name, where it is (RFC 6901).
+    /// Values that later requests use: by name, the JSON pointer (RFC 6901) into the answer.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub takes: BTreeMap<String, String>,
 }
 
-/// What requests take from the answers of others, by name.
-pub type Taken = BTreeMap<String, String>;
+/// Values from earlier answers, by name.
+pub type Captured = BTreeMap<String, String>;
 
 /// The body of a request.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -60,7 +60,7 @@ pub enum ExampleBody {
 pub struct ExamplePart {
     /// Its name.
     pub name: String,
-    /// What it has: JSON, or the name of a file after `@`, or after `<` if its text is meant.
+    /// Its value: JSON, `@` and the name of a file to send, or `<` and the name of a file whose text is the value.
     pub value: Value,
 }
 
@@ -75,63 +75,63 @@ impl Example {
         self.call.split(' ').next().unwrap_or_default()
     }
 
-    /// The path with what was taken.
-    pub fn path(&self, taken: &Taken) -> String {
+    /// The path with captured values filled in.
+    pub fn path(&self, captured: &Captured) -> String {
         let fill = |path: String, (name, value): (&String, &String)| {
             path.replace(&format!("{{{name}}}"), value)
         };
-        taken.iter().fold(self.path.clone(), fill)
+        captured.iter().fold(self.path.clone(), fill)
     }
 
-    /// Takes what later requests need from an answer.
-    pub fn take(&self, answer: &Value, taken: &mut Taken) {
-        for (name, place) in &self.takes {
-            let value = answer.pointer(place).and_then(Value::as_str);
-            taken.insert(name.clone(), value.unwrap_or_default().to_owned());
+    /// Captures from an answer what later requests need.
+    pub fn capture(&self, answer: &Value, captured: &mut Captured) {
+        for (name, pointer) in &self.takes {
+            let value = answer.pointer(pointer).and_then(Value::as_str);
+            captured.insert(name.clone(), value.unwrap_or_default().to_owned());
         }
     }
 
-    /// The request as it would be typed.
-    fn curl(&self, taken: &Taken) -> String {
-        let mut typed = "curl".to_owned();
+    /// The request as a curl command line.
+    fn curl(&self, captured: &Captured) -> String {
+        let mut command = "curl".to_owned();
         let implied = if self.body.is_some() { "POST" } else { "GET" };
         if self.method() != implied {
-            typed += &format!(" -X {}", self.method());
+            command += &format!(" -X {}", self.method());
         }
         match &self.body {
             None => {}
             Some(ExampleBody::Json(value)) => {
-                let _ = write!(typed, " -H 'Content-Type: application/json' -d '{value}'");
+                let _ = write!(command, " -H 'Content-Type: application/json' -d '{value}'");
             }
             Some(ExampleBody::JsonFile(file)) => {
-                let _ = write!(typed, " -H 'Content-Type: application/json' -d @{file}");
+                let _ = write!(command, " -H 'Content-Type: application/json' -d @{file}");
             }
             Some(ExampleBody::Picture(file)) => {
-                let _ = write!(typed, " -H 'Content-Type: image/jpeg' --data-binary @{file}");
+                let _ = write!(command, " -H 'Content-Type: image/jpeg' --data-binary @{file}");
             }
             Some(ExampleBody::Form(parts)) => {
                 for ExamplePart { name, value } in parts {
                     let _ = match value.as_str() {
-                        Some(file) => write!(typed, " -F {name}={file}"),
-                        None => write!(typed, " -F '{name}={value}'"),
+                        Some(file) => write!(command, " -F {name}={file}"),
+                        None => write!(command, " -F '{name}={value}'"),
                     };
                 }
             }
         }
-        let _ = write!(typed, " 'http://localhost:8080{}'", self.path(taken));
-        typed
+        let _ = write!(command, " 'http://localhost:8080{}'", self.path(captured));
+        command
     }
 }
 
-/// Shows the examples beside their calls.
+/// Adds the examples to their calls.
 pub(super) fn show(description: &mut OpenApi) {
     let examples = match examples() {
         Ok(examples) => examples,
         Err(error) => return tracing::error!(%error, "there are no examples in the description"),
     };
-    let mut taken = Taken::new();
+    let mut captured = Captured::new();
     for example in &examples {
-        example.take(example.answer.as_ref().unwrap_or(&Value::Null), &mut taken);
+        example.capture(example.answer.as_ref().unwrap_or(&Value::Null), &mut captured);
     }
     for (route, item) in &mut description.paths.paths {
         let operations = [
@@ -147,7 +147,7 @@ pub(super) fn show(description: &mut OpenApi) {
             of_call.iter().rev().for_each(|example| show_one(operation, example));
             let typed: Vec<_> = of_call
                 .iter()
-                .map(|example| json!({"lang": "curl", "source": example.curl(&taken)}))
+                .map(|example| json!({"lang": "curl", "source": example.curl(&captured)}))
                 .collect();
             let extension = ExtensionsBuilder::new().add("x-codeSamples", typed).build();
             operation.extensions = Some(extension);
@@ -176,7 +176,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_call_of_the_description_has_an_example_of_what_it_does() {
+    fn every_described_call_has_an_example_of_a_described_answer() {
         let examples = examples().unwrap();
         let description = serde_json::to_value(super::super::openapi()).unwrap();
         let mut calls = Vec::new();

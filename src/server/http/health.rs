@@ -1,12 +1,13 @@
-//! Alive, ready, metrics, and the description of the API.
+//! Liveness, readiness, metrics, and the description of the API.
 
 use axum::Json;
 use axum::extract::State;
 use axum::http::header::{CONTENT_SECURITY_POLICY, CONTENT_TYPE};
 use axum::response::{Html, IntoResponse, Response};
 
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use crate::{Levels, Metrics};
 use whereabouts_api::ErrorKind;
 use whereabouts_service::{Service, ServiceError};
@@ -17,14 +18,14 @@ pub(super) async fn livez() -> &'static str {
     "alive\n"
 }
 
-/// Whether requests are taken
+/// Whether requests are accepted
 #[utoipa::path(get, path = "/readyz", tag = "service", responses(
     (status = 200, body = String),
     (status = 503, body = Problem, description = "Starting or draining", content_type = "application/problem+json"),
 ))]
 pub(super) async fn readyz(State(state): State<AppState>) -> Result<&'static str, Problem> {
-    state.door.service()?;
-    if state.door.draining().is_cancelled() {
+    state.gate.readiness.service()?;
+    if state.gate.readiness.draining().is_cancelled() {
         return Err(Problem::new(ErrorKind::Unavailable, "the server is draining; use another"));
     }
     Ok("ready\n")
@@ -39,7 +40,7 @@ pub(super) async fn metrics(
     Ready(service): Ready,
 ) -> Result<impl IntoResponse, Problem> {
     const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
-    let text = metrics_text(&state.metrics, &service).await?;
+    let text = metrics_text(&state.gate.metrics, &service).await?;
     Ok(([(CONTENT_TYPE, OPEN_METRICS)], text))
 }
 
@@ -47,14 +48,14 @@ pub(super) async fn openapi_json(description: utoipa::openapi::OpenApi) -> Respo
     Json(description).into_response()
 }
 
-/// The page that shows `/openapi.json` to people; all of it is in the binary.
+/// The page that renders `/openapi.json`. It loads nothing from elsewhere.
 pub(super) async fn docs() -> impl IntoResponse {
     const POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; script-src \
                           'unsafe-inline'; connect-src 'self'";
     ([(CONTENT_SECURITY_POLICY, POLICY)], Html(include_str!("docs.html")))
 }
 
-/// All metrics as text, with the levels of this moment.
+/// Encodes all metrics, with gauges as of now.
 async fn metrics_text(metrics: &Metrics, service: &Service) -> Result<String, ServiceError> {
     let maps = service.list_maps().await?.into_iter();
     let index_bytes = service.retention.index_bytes().await?.into_iter();
@@ -67,7 +68,7 @@ async fn metrics_text(metrics: &Metrics, service: &Service) -> Result<String, Se
         db_bytes: service.retention.db_bytes().await?,
         dense_cache_bytes: service.dense.bytes(),
         admission: service.admission.levels(),
-        mllm: service.refiner.as_ref().and_then(|refiner| refiner.levels()),
+        mllm: service.refiner.as_ref().and_then(|refiner| Some(refiner.paid_calls()?.levels())),
     });
     metrics.encode().map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))
 }

@@ -8,30 +8,30 @@ use axum::response::IntoResponse;
 use bytes::Bytes;
 use jiff::Timestamp;
 use serde::Deserialize;
-use serde_json::{Map as JsonObject, Value};
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody, Segments};
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
-use whereabouts_core::{Image, ImageId, MediaType};
+use whereabouts_core::{Image, ImageId, MediaType, PoseInput};
 use whereabouts_service::{Deadline, NewImage, ServiceError};
 use whereabouts_store::Added;
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
-/// What can be said about a raw image in the query string; a form says it in its part `meta`.
+/// What is known about a raw image, in the query string; a form has it in its part `meta`.
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct MetaParams {
-    /// The id; without one, the head of the digest of the bytes.
+    /// The id; by default, the beginning of the digest of the bytes.
     id: Option<String>,
     /// When it was taken (RFC 3339).
     #[param(value_type = Option<String>, format = DateTime)]
     captured_at: Option<Timestamp>,
-    /// Words, separated by commas.
+    /// Tags, separated by commas.
     tags: Option<String>,
     /// Latitude in degrees, in a `wgs84` map.
     lat: Option<f64>,
@@ -65,25 +65,10 @@ impl MetaParams {
             && self.pose().is_none()
     }
 
-    fn pose(&self) -> Option<Value> {
-        let fields = [
-            ("lat", self.lat),
-            ("lon", self.lon),
-            ("alt", self.alt),
-            ("heading", self.heading),
-            ("x", self.x),
-            ("y", self.y),
-            ("z", self.z),
-            ("qx", self.qx),
-            ("qy", self.qy),
-            ("qz", self.qz),
-            ("qw", self.qw),
-        ];
-        let given: JsonObject<String, Value> = fields
-            .into_iter()
-            .filter_map(|(field, value)| Some((field.to_owned(), value?.into())))
-            .collect();
-        (!given.is_empty()).then_some(Value::Object(given))
+    fn pose(&self) -> Option<PoseInput> {
+        let Self { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw, .. } = *self;
+        let pose = PoseInput { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw };
+        (!pose.is_empty()).then_some(pose)
     }
 
     fn into_meta(self) -> ImageMeta {
@@ -100,28 +85,28 @@ impl MetaParams {
 
 /// Add an image
 ///
-/// Either a raw picture, with what is known about it in the query string, or a form with the parts
-/// `image` (the picture) and `meta` (JSON). The same id with the same bytes again is answered 200.
+/// Send either a raw picture, with what is known about it in the query string, or a form with the parts
+/// `image` (the picture) and `meta` (JSON). Sending the same id with the same bytes again is answered 200.
 #[utoipa::path(post, path = "/maps/{map}/images", tag = "images",
     params(("map" = String, Path), MetaParams,
         ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,
-        description = "How many milliseconds from its arrival the client waits for the answer. After \
-                       504 the image may be stored or not; send it again.")),
+        description = "Milliseconds from arrival that the client waits for the answer. After 504 the \
+                       image may or may not be stored; send it again.")),
     request_body(content(
         (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"),
         (ImageForm = "multipart/form-data"),
     )),
     responses(
-        (status = 200, body = Image, description = "It was there already"),
+        (status = 200, body = Image, description = "Already stored"),
         (status = 201, body = Image, description = "Stored"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
-        (status = 409, body = Problem, description = "The id is taken by other bytes", content_type = "application/problem+json"),
-        (status = 408, body = Problem, description = "The body came too slowly", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The id exists with other bytes", content_type = "application/problem+json"),
+        (status = 408, body = Problem, description = "The body arrived too slowly", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
-        (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
+        (status = 415, body = Problem, description = "Not a supported image type", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "Cannot be decoded, or a pose out of range", content_type = "application/problem+json"),
-        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when to try again", content_type = "application/problem+json"),
         (status = 504, body = Problem, description = "X-Deadline-Ms has passed", content_type = "application/problem+json"),
         (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
     ))]
@@ -137,8 +122,8 @@ pub(super) async fn add_image(
     let body = PictureBody::read(request, &state, &service, demand).await?;
     let meta = match body.meta {
         Some(_) if !params.is_empty() => {
-            let detail = "say what is known about the image in the part \"meta\" or in the query \
-                          string, not in both";
+            let detail = "describe the image either in the part \"meta\" or in the query string, \
+                          not in both";
             return Err(Problem::new(ErrorKind::Malformed, detail));
         }
         Some(meta) => meta_from_part(&meta)?,
@@ -173,7 +158,7 @@ fn meta_from_part(part: &Bytes) -> Result<ImageMeta, Problem> {
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct PageParams {
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     pub cursor: Option<String>,
     /// Images in a page, 1 to 1000; 100 by default.
     pub limit: Option<usize>,
@@ -212,7 +197,7 @@ pub(super) async fn get_image(
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ContentParams {
-    /// The longest edge in pixels, 16 to 4096; without it the picture comes as it was sent.
+    /// Longest edge in pixels, 16 to 4096; by default, the picture is returned as it was sent.
     pub max_edge: Option<u32>,
 }
 
@@ -234,7 +219,7 @@ pub(super) async fn image_content(
     Ok(picture(media_type, bytes))
 }
 
-/// A picture, which an id keeps until it is deleted.
+/// A picture. It may be cached: the picture of an id never changes.
 pub(super) fn picture(media_type: MediaType, bytes: Bytes) -> impl IntoResponse {
     let headers = [(CONTENT_TYPE, media_type.as_str()), (CACHE_CONTROL, "private, max-age=3600")];
     (headers, bytes)
@@ -243,7 +228,7 @@ pub(super) fn picture(media_type: MediaType, bytes: Bytes) -> impl IntoResponse 
 /// Remove an image
 #[utoipa::path(delete, path = "/maps/{map}/images/{id}", tag = "images",
     params(("map" = String, Path), ("id" = String, Path)), responses(
-    (status = 204, description = "Removed: no later answer names it"),
+    (status = 204, description = "Removed; no later answer contains it"),
     (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
 ))]
 pub(super) async fn delete_image(

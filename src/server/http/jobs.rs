@@ -11,8 +11,8 @@ use uuid::Uuid;
 use super::body::{Params, Segments};
 use super::images::{ContentParams, image_id, picture};
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::Ready;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{ErrorKind, JobPage, PairRegions};
 use whereabouts_core::{Job, JobState};
 use whereabouts_service::{self};
@@ -26,16 +26,16 @@ pub(super) struct ListParams {
     map: Option<String>,
     /// Only jobs in this state.
     state: Option<JobState>,
-    /// Only jobs that contain this text, in upper or lower case, at most 200 characters: in their id, query id,
-    /// map, state, refiner, error, reasoning or descriptions, or in the ids of their candidates. A request
-    /// looks at some thousand jobs at the most: go on with `next_cursor` until it is null.
+    /// Only jobs that contain this text of at most 200 characters, ignoring case: in their id, query id, map,
+    /// state, refiner, error, reasoning or descriptions, or in the ids of their candidates. A request searches
+    /// a few thousand jobs at most: continue with `next_cursor` until it is null.
     #[param(max_length = 200)]
     q: Option<String>,
     /// Jobs in a page, 1 to 1000; 100 by default.
     limit: Option<usize>,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
-    /// Leave out `descriptions`, `ranking` and `reasoning`, which are most of a job.
+    /// Omit `descriptions`, `ranking` and `reasoning`, the largest fields of a job.
     #[serde(default)]
     #[param(required = false)]
     brief: bool,
@@ -59,7 +59,7 @@ pub(super) async fn list_jobs(
     let cursor = params.cursor.as_deref().map(job_id).transpose()?;
     let mut page = service.list_jobs(filter, cursor, params.limit).await?;
     if params.brief {
-        page.jobs = page.jobs.into_iter().map(Job::brief).collect();
+        page.jobs = page.jobs.into_iter().map(Job::summary).collect();
     }
     Ok(Json(page))
 }
@@ -68,7 +68,7 @@ pub(super) async fn list_jobs(
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct WaitParams {
-    /// Answer when the job has ended, but after so many seconds at the latest.
+    /// Wait until the job has ended, for at most this many seconds (long polling).
     wait: Option<f64>,
 }
 
@@ -107,13 +107,13 @@ pub(super) async fn frame(
 
 /// What a job's frame and a candidate have in common
 ///
-/// The regions that agree, the most telling first. Only the refiner `local` compares regions; they are compared
-/// anew, with the pictures as they are now.
+/// The regions that match, the most distinctive first. Only the refiner `local` compares regions; they are
+/// computed for this request, from the pictures as they are now.
 #[utoipa::path(get, path = "/jobs/{id}/matches/{image}", tag = "jobs",
     params(("id" = Uuid, Path), ("image" = String, Path)), responses(
     (status = 200, body = PairRegions),
     (status = 404, body = Problem, description = "No such job, or no such matches", content_type = "application/problem+json"),
-    (status = 503, body = Problem, description = "Starting, or the model is not there just now", content_type = "application/problem+json"),
+    (status = 503, body = Problem, description = "Starting, or the model is temporarily unavailable", content_type = "application/problem+json"),
 ))]
 pub(super) async fn matches(
     Ready(service): Ready,
@@ -124,7 +124,7 @@ pub(super) async fn matches(
 
 /// Cancel a job
 ///
-/// One that has ended stays as it is.
+/// A job that has ended is left unchanged.
 #[utoipa::path(post, path = "/jobs/{id}/cancel", tag = "jobs", params(("id" = Uuid, Path)), responses(
     (status = 200, body = Job),
     (status = 404, body = Problem, description = "No such job", content_type = "application/problem+json"),
@@ -140,7 +140,7 @@ pub(super) async fn cancel_job(
 #[utoipa::path(post, path = "/jobs/{id}/retry", tag = "jobs", params(("id" = Uuid, Path)), responses(
     (status = 200, body = Job),
     (status = 404, body = Problem, description = "No such job", content_type = "application/problem+json"),
-    (status = 409, body = Problem, description = "It has not ended, or succeeded", content_type = "application/problem+json"),
+    (status = 409, body = Problem, description = "The job has not ended, or has succeeded", content_type = "application/problem+json"),
 ))]
 pub(super) async fn retry_job(
     Ready(service): Ready,

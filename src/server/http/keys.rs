@@ -6,32 +6,32 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::body::{JsonBody, Segments};
-use super::problem::Problem;
-use super::state::Ready;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{MadeKey, NewKey};
 use whereabouts_core::ApiKey;
 
 /// All keys.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct KeyList {
-    /// The newest first; those that were revoked or have expired too.
+    /// The newest first, including revoked and expired keys.
     keys: Vec<ApiKey>,
 }
 
-/// Make an API key
+/// Create an API key
 ///
-/// The answer is the only place where the key is shown: a hash of it is stored.
+/// The key is shown in this answer only: the server stores a hash of it.
 #[utoipa::path(post, path = "/keys", tag = "keys", request_body = NewKey, responses(
-    (status = 201, body = MadeKey, description = "Made"),
+    (status = 201, body = MadeKey, description = "Created"),
     (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
-    (status = 409, body = Problem, description = "There are too many", content_type = "application/problem+json"),
+    (status = 409, body = Problem, description = "There are too many keys", content_type = "application/problem+json"),
     (status = 422, body = Problem, description = "A value is out of range", content_type = "application/problem+json"),
 ))]
 pub(super) async fn create_key(
     Ready(service): Ready,
-    JsonBody(wanted): JsonBody<NewKey>,
+    JsonBody(new): JsonBody<NewKey>,
 ) -> Result<(StatusCode, Json<MadeKey>), Problem> {
-    Ok((StatusCode::CREATED, Json(service.keys.create(wanted).await?)))
+    Ok((StatusCode::CREATED, Json(service.keys.create(new).await?)))
 }
 
 /// List the API keys
@@ -42,9 +42,9 @@ pub(super) async fn list_keys(Ready(service): Ready) -> Result<Json<KeyList>, Pr
 
 /// Revoke an API key
 ///
-/// From the moment this returns nobody gets in with it. It stays in the list.
+/// It takes effect before the answer is sent. The key stays in the list.
 #[utoipa::path(delete, path = "/keys/{id}", tag = "keys", params(("id" = String, Path)), responses(
-    (status = 200, body = ApiKey, description = "Revoked, now or before"),
+    (status = 200, body = ApiKey, description = "Revoked, now or earlier"),
     (status = 404, body = Problem, description = "No such key", content_type = "application/problem+json"),
 ))]
 pub(super) async fn revoke_key(

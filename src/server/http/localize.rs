@@ -7,10 +7,11 @@ use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody};
-use super::idempotency::IdempotencyId;
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::IdempotencyId;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{Answer, RefineMode};
 use whereabouts_core::Priority;
 use whereabouts_service::{Deadline, LocalizeRequest, Principal, ServiceError, TrackStep};
@@ -20,26 +21,26 @@ use whereabouts_vision::{AdmissionRequest, WorkClass};
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct LocalizeParams {
-    /// In which map.
+    /// The map to search.
     map: String,
-    /// How many candidates, 1 to 100.
+    /// Number of candidates, 1 to 100.
     k: Option<usize>,
-    /// `async` (default): a job refines the candidates. `wait`: the answer waits for it. `off`:
-    /// no job.
+    /// `async` (default): a job refines the candidates in the background. `wait`: the answer waits for the
+    /// job. `off`: no job.
     #[serde(default)]
     refine: RefineMode,
-    /// How soon the job is taken: before all others (`high`), in its turn (`normal`, default), or
-    /// when nothing else waits (`low`).
+    /// Priority of the job: before all others (`high`), in its turn (`normal`, default), or
+    /// when no other job is queued (`low`).
     #[serde(default)]
     priority: Priority,
-    /// The frames of one robot, one after another: an id of its own choice, 1 to 64 letters, digits, `-`,
-    /// `_`, `.` and `:`. The answer then says in `track` where the robot is, given all of them. The
-    /// map's images need poses; a track is forgotten when no frame comes for a while.
+    /// Id of a track, the sequence of frames of one robot, chosen by the client: 1 to 64 letters, digits, `-`,
+    /// `_`, `.` and `:`. The field `track` of the answer then estimates where the robot is, given all its
+    /// frames. The images of the map need poses. A track expires when no frame arrives for a while.
     track: Option<String>,
-    /// When the frame was taken (RFC 3339), of a frame with `track`; by default now.
+    /// When the frame was taken (RFC 3339), for a frame with `track`; by default now.
     captured_at: Option<Timestamp>,
-    /// The metres that the robot has come since the frame before, by its odometry, of a frame with
-    /// `track`; without it, it can have come as far as its greatest speed (`track.max_speed_m_s`) allows.
+    /// Metres that the robot has moved since the previous frame, by its odometry, for a frame with
+    /// `track`; by default, any distance up to the maximum speed (`track.max_speed_m_s`) is possible.
     moved_m: Option<f64>,
 }
 
@@ -47,11 +48,9 @@ impl LocalizeParams {
     fn step(&mut self, caller: &Principal) -> Result<Option<TrackStep>, ServiceError> {
         match self.track.take() {
             Some(id) => TrackStep::new(caller, id, self.captured_at, self.moved_m).map(Some),
-            None if self.captured_at.is_some() || self.moved_m.is_some() => {
-                Err(ServiceError::unprocessable(
-                    "captured_at and moved_m are of a frame with track; name the track too",
-                ))
-            }
+            None if self.captured_at.is_some() || self.moved_m.is_some() => Err(
+                ServiceError::unprocessable("captured_at and moved_m need a track; set track too"),
+            ),
             None => Ok(None),
         }
     }
@@ -68,14 +67,15 @@ struct FrameForm {
 
 /// Localize a frame
 ///
-/// Answers with the most similar images of the map; a job then compares the frame with the first of them,
-/// `refine.local_candidates` or `refine.candidates` whatever `k` is, and orders those anew. Under load, jobs are given up before frames: with `refine=async` the
-/// answer comes with `job: null` and a `no_job` that says why, with `refine=wait` it is 429.
+/// Answers with the most similar images of the map. A job then compares the frame with the first of them
+/// (`refine.local_candidates` or `refine.candidates`, independent of `k`) and ranks those again. Under load,
+/// jobs are shed before frames: `refine=async` then answers with `job: null` and the reason in `no_job`, and
+/// `refine=wait` answers 429.
 #[utoipa::path(post, path = "/localize", tag = "localize", 
     params(LocalizeParams, ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,
-        description = "How many milliseconds from its arrival the client waits for the answer. A \
-                       request that cannot be answered in time is refused with 429 at once, and one \
-                       whose time passes is given up with 504. refine=wait then answers in time, \
+        description = "Milliseconds from arrival that the client waits for the answer. A request that \
+                       cannot be answered in time is rejected with 429 at once, and one whose deadline \
+                       passes is abandoned with 504. With refine=wait, the answer is sent in time, \
                        refined or not.")),
     request_body(content(
         (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"),
@@ -85,12 +85,12 @@ struct FrameForm {
         (status = 200, body = Answer),
         (status = 400, body = Problem, description = "Malformed, or an empty body", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
-        (status = 409, body = Problem, description = "The map's model is not installed, or is another by now", content_type = "application/problem+json"),
-        (status = 408, body = Problem, description = "The body came too slowly", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The map's model is not installed, or has changed meanwhile", content_type = "application/problem+json"),
+        (status = 408, body = Problem, description = "The body arrived too slowly", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
-        (status = 415, body = Problem, description = "Not a picture type", content_type = "application/problem+json"),
+        (status = 415, body = Problem, description = "Not a supported image type", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "Cannot be decoded, k or a parameter of the track out of range, or a track in a map without poses", content_type = "application/problem+json"),
-        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when to try again", content_type = "application/problem+json"),
         (status = 504, body = Problem, description = "X-Deadline-Ms has passed", content_type = "application/problem+json"),
     ))]
 pub(super) async fn localize(
@@ -101,7 +101,8 @@ pub(super) async fn localize(
     Deadline(deadline): Deadline,
     request: Request,
 ) -> Result<Json<Answer>, Problem> {
-    let once = request.extensions().get().map(|IdempotencyId(id): &IdempotencyId| id.clone());
+    let idempotency_id =
+        request.extensions().get().map(|IdempotencyId(id): &IdempotencyId| id.clone());
     let map = map_name(&params.map)?;
     let track = params.step(&caller)?;
     let demand = AdmissionRequest { class: WorkClass::Localize, deadline };
@@ -114,7 +115,7 @@ pub(super) async fn localize(
         frame: body.picture,
         deadline,
         track,
-        once,
+        once: idempotency_id,
     };
     Ok(Json(service.localize(request).await?))
 }

@@ -6,8 +6,8 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::body::{JsonBody, Segments};
-use super::problem::Problem;
-use super::state::Ready;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{MapChange, MapState, ReindexRequest};
 use whereabouts_core::MapName;
 use whereabouts_service::Principal;
@@ -15,7 +15,7 @@ use whereabouts_service::Principal;
 /// All maps.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct MapList {
-    /// By name.
+    /// Sorted by name.
     maps: Vec<MapState>,
 }
 
@@ -25,7 +25,7 @@ pub(super) fn map_name(text: &str) -> Result<MapName, Problem> {
 
 /// List the maps
 ///
-/// Those that the caller's key is for.
+/// Only those that the caller's key includes.
 #[utoipa::path(get, path = "/maps", tag = "maps", responses(
     (status = 200, body = MapList),
     (status = 503, body = Problem, description = "Starting", content_type = "application/problem+json"),
@@ -51,15 +51,15 @@ pub(super) async fn get_map(
     Ok(Json(service.get_map(&map_name(&map)?).await?))
 }
 
-/// Create a map, or change it
+/// Create or change a map
 #[utoipa::path(put, path = "/maps/{map}", tag = "maps", params(("map" = String, Path)),
-    request_body(content = MapChange, description = "What to set; what is left out keeps its value"),
+    request_body(content = MapChange, description = "What to set; omitted fields keep their values"),
     responses(
         (status = 200, body = MapState, description = "Changed"),
         (status = 201, body = MapState, description = "Created"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
-        (status = 409, body = Problem, description = "Fixed, because the map has images", content_type = "application/problem+json"),
-        (status = 422, body = Problem, description = "Not installed, or not possible with this model", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The field is fixed, because the map has images", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "The model is not installed, or does not support this", content_type = "application/problem+json"),
     ))]
 pub(super) async fn put_map(
     Ready(service): Ready,
@@ -70,18 +70,18 @@ pub(super) async fn put_map(
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(state)))
 }
 
-/// Make all descriptors of a map anew, with another model
+/// Recompute all descriptors of a map, with another model
 ///
-/// Answers at once. The old descriptors serve until the new ones are all there; then the map changes
-/// over in one step. `reindex` of the map says how far that has come.
+/// Answers at once. The old descriptors are used until all new ones are ready; then the map switches to them
+/// atomically. The field `reindex` of the map shows the progress.
 #[utoipa::path(post, path = "/maps/{map}/reindex", tag = "maps", params(("map" = String, Path)),
-    request_body(content = ReindexRequest, description = "Which descriptors; what is left out stays as it is"),
+    request_body(content = ReindexRequest, description = "Which descriptors; omitted fields keep their values"),
     responses(
-        (status = 202, body = MapState, description = "Begun"),
+        (status = 202, body = MapState, description = "Started"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
         (status = 409, body = Problem, description = "The map is being reindexed already", content_type = "application/problem+json"),
-        (status = 422, body = Problem, description = "Not installed, or not possible with this model", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "The model is not installed, or does not support this", content_type = "application/problem+json"),
     ))]
 pub(super) async fn reindex(
     Ready(service): Ready,

@@ -1,44 +1,35 @@
-//! HTTP: extract, call the service, convert. No decision about maps or frames is taken here.
+//! HTTP: extracts a request, calls the service, converts the answer. Decides nothing about maps or frames.
 
-mod auth;
 mod batch;
 mod body;
-mod connections;
-mod deadline;
 mod description;
 mod events;
 mod examples;
-mod guard;
 mod health;
-mod idempotency;
 mod images;
-mod incoming;
 mod jobs;
 mod keys;
 mod localize;
 mod maps;
-mod messages;
-mod problem;
 mod state;
 mod status;
 mod transfer;
 mod usage;
 mod webhooks;
 
-use axum::Router;
 use axum::extract::DefaultBodyLimit;
-use axum::middleware::{from_fn, from_fn_with_state};
-use tower_http::catch_panic::CatchPanicLayer;
+use axum::http::Method;
+use axum::routing::get;
 use utoipa::OpenApi;
-use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt};
+use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouter, UtoipaMethodRouterExt};
 use utoipa_axum::routes;
 
-use crate::grpc;
+use crate::gate::{MapSource, Policies, RoutePolicy, Routes, Waits};
 
-pub use connections::{ConnectionSettings, Connections, Tls, TlsError};
-pub use examples::{Example, ExampleBody, ExamplePart, Taken, examples};
-pub use state::{AppState, HttpSettings};
-pub use status::{About, Tiles};
+pub use self::examples::{Captured, Example, ExampleBody, ExamplePart, examples};
+pub(crate) use self::state::AppState;
+pub(crate) use self::status::About;
+pub use self::status::Tiles;
 
 #[derive(OpenApi)]
 #[openapi(
@@ -46,11 +37,11 @@ pub use status::{About, Tiles};
         title = "whereabouts",
         description = "Tells a robot where it is from one camera frame. Maps of reference images \
                        are searched by global descriptor; a job then compares the frame with each \
-                       candidate and orders them anew. Errors are RFC 9457 problems.",
+                       candidate and ranks them again. Errors are RFC 9457 problems.",
         license(name = "Apache-2.0", identifier = "Apache-2.0")
     ),
     components(schemas(
-        problem::Problem,
+        crate::gate::Problem,
         whereabouts_api::JobChange,
         whereabouts_api::JobStatus,
         whereabouts_api::Missed,
@@ -60,99 +51,136 @@ pub use status::{About, Tiles};
     tags(
         (name = "maps", description = "Named sets of reference images"),
         (name = "images", description = "Reference images with their poses"),
-        (name = "localize", description = "From a frame to candidates"),
-        (name = "jobs", description = "Refinements of the candidates"),
-        (name = "keys", description = "API keys, where the server asks for them"),
-        (name = "webhooks", description = "Who is told of the ends of jobs"),
+        (name = "localize", description = "Find the candidates of a frame"),
+        (name = "jobs", description = "Refine the ranking of the candidates"),
+        (name = "keys", description = "API keys, where the server requires them"),
+        (name = "webhooks", description = "URLs that are notified when jobs end"),
         (name = "service", description = "Health, metrics and this description")
     )
 )]
 struct Description;
 
-fn described() -> OpenApiRouter<AppState> {
-    OpenApiRouter::with_openapi(Description::openapi())
-        .routes(routes!(maps::list_maps))
-        .routes(routes!(maps::get_map, maps::put_map, maps::delete_map))
-        .routes(routes!(maps::reindex))
-        .routes(routes!(transfer::export))
-        .routes(routes!(transfer::import_map, transfer::import_image))
-        .routes(routes!(images::list_images, images::add_image))
-        .routes(routes!(batch::add_images).layer(DefaultBodyLimit::disable()))
-        .routes(routes!(images::get_image, images::delete_image))
-        .routes(routes!(images::image_content))
-        .routes(routes!(localize::localize))
-        .routes(routes!(jobs::list_jobs))
-        .routes(routes!(jobs::get_job))
-        .routes(routes!(jobs::frame))
-        .routes(routes!(jobs::matches))
-        .routes(routes!(jobs::cancel_job))
-        .routes(routes!(jobs::retry_job))
-        .routes(routes!(events::follow_job))
-        .routes(routes!(events::follow_jobs))
-        .routes(routes!(usage::usage))
-        .routes(routes!(status::status))
-        .routes(routes!(keys::create_key, keys::list_keys))
-        .routes(routes!(keys::revoke_key))
-        .routes(routes!(webhooks::list_webhooks, webhooks::create_webhook))
-        .routes(routes!(webhooks::get_webhook, webhooks::delete_webhook))
-        .routes(routes!(webhooks::test_webhook))
-        .routes(routes!(webhooks::list_deliveries))
-        .routes(routes!(webhooks::redeliver))
-        .routes(routes!(health::livez))
-        .routes(routes!(health::readyz))
-        .routes(routes!(health::metrics))
+/// Routes with their descriptions and policies.
+struct Described {
+    router: OpenApiRouter<AppState>,
+    policies: Policies,
+}
+
+impl Described {
+    /// Adds a handler, whose method and path are those of its description.
+    fn route(mut self, policy: RoutePolicy, route: UtoipaMethodRouter<AppState>) -> Self {
+        for (path, item) in &route.1.paths {
+            let operations = [
+                (Method::GET, &item.get),
+                (Method::PUT, &item.put),
+                (Method::POST, &item.post),
+                (Method::DELETE, &item.delete),
+            ];
+            for (method, operation) in operations {
+                if operation.is_some() {
+                    self.policies.declare(Some(method), path, policy);
+                }
+            }
+        }
+        Self { router: self.router.routes(route), ..self }
+    }
+}
+
+/// The routes that the description covers: one line says what the gate needs to know about each.
+fn described() -> Described {
+    let (public, robot) = (RoutePolicy::public(), RoutePolicy::robot());
+    let (operator, admin) = (RoutePolicy::operator(), RoutePolicy::admin());
+    let batch = routes!(batch::add_images).layer(DefaultBodyLimit::disable());
+    let waits_for_job = Waits::WithQueryValue("refine", "wait");
+    Described {
+        router: OpenApiRouter::with_openapi(Description::openapi()),
+        policies: Policies::default(),
+    }
+    .route(robot.map(MapSource::Handler), routes!(maps::list_maps))
+    .route(robot.map(MapSource::Path), routes!(maps::get_map))
+    .route(admin.map(MapSource::Path).changes(), routes!(maps::put_map))
+    .route(admin.map(MapSource::Path).changes(), routes!(maps::delete_map))
+    .route(admin.map(MapSource::Path).changes().idempotent(), routes!(maps::reindex))
+    .route(admin.map(MapSource::Path), routes!(transfer::export))
+    .route(admin.map(MapSource::Path).changes(), routes!(transfer::import_map))
+    .route(admin.map(MapSource::Path).changes().idempotent(), routes!(transfer::import_image))
+    .route(operator.map(MapSource::Path), routes!(images::list_images))
+    .route(operator.map(MapSource::Path).changes().idempotent(), routes!(images::add_image))
+    .route(operator.map(MapSource::Path).changes().bulk(), batch)
+    .route(operator.map(MapSource::Path), routes!(images::get_image))
+    .route(operator.map(MapSource::Path).changes(), routes!(images::delete_image))
+    .route(operator.map(MapSource::Path), routes!(images::image_content))
+    .route(
+        robot.map(MapSource::Query).idempotent().waits(waits_for_job).localizes(),
+        routes!(localize::localize),
+    )
+    .route(operator.map(MapSource::Query), routes!(jobs::list_jobs))
+    .route(robot.map(MapSource::Job).waits(Waits::WithQuery("wait")), routes!(jobs::get_job))
+    .route(operator.map(MapSource::Job), routes!(jobs::frame))
+    .route(operator.map(MapSource::Job), routes!(jobs::matches))
+    .route(operator.map(MapSource::Job).changes().idempotent(), routes!(jobs::cancel_job))
+    .route(operator.map(MapSource::Job).changes().idempotent(), routes!(jobs::retry_job))
+    .route(robot.map(MapSource::Job), routes!(events::follow_job))
+    .route(operator.map(MapSource::Query), routes!(events::follow_jobs))
+    .route(operator.map(MapSource::Query), routes!(usage::usage))
+    .route(operator, routes!(status::status))
+    .route(admin.changes(), routes!(keys::create_key))
+    .route(admin, routes!(keys::list_keys))
+    .route(admin.changes(), routes!(keys::revoke_key))
+    .route(admin, routes!(webhooks::list_webhooks))
+    .route(admin.changes(), routes!(webhooks::create_webhook))
+    .route(admin, routes!(webhooks::get_webhook))
+    .route(admin.changes(), routes!(webhooks::delete_webhook))
+    .route(admin.changes().idempotent(), routes!(webhooks::test_webhook))
+    .route(admin, routes!(webhooks::list_deliveries))
+    .route(admin.changes().idempotent(), routes!(webhooks::redeliver))
+    .route(public.probe(), routes!(health::livez))
+    .route(public.probe(), routes!(health::readyz))
+    .route(operator.probe(), routes!(health::metrics))
 }
 
 /// The OpenAPI 3.1 description, generated from the handlers.
 pub fn openapi() -> utoipa::openapi::OpenApi {
-    description::completed(described().into_openapi())
+    let Described { router, policies } = described();
+    description::completed(router.into_openapi(), &policies)
 }
 
-/// All routes with what guards them.
-pub fn router(state: AppState) -> Router {
-    let (router, description) = described().split_for_parts();
-    let description = description::completed(description);
-    router
-        .merge(grpc::routes(&state.door, &state.metrics, state.settings.body_limit_bytes))
-        .route("/openapi.json", axum::routing::get(move || health::openapi_json(description)))
-        .route("/docs", axum::routing::get(health::docs))
-        .merge(crate::console::routes(state.about.tiles.as_ref().map(|tiles| tiles.url.as_str())))
-        .fallback(problem::no_such_path)
-        .method_not_allowed_fallback(problem::no_such_method)
-        .layer(DefaultBodyLimit::max(state.settings.body_limit_bytes))
-        .layer(CatchPanicLayer::custom(problem::panicked))
-        .layer(from_fn_with_state(state.clone(), idempotency::once))
-        .layer(from_fn_with_state(state.clone(), auth::admit))
-        .layer(from_fn_with_state(state.clone(), guard::bound))
-        .layer(from_fn(problem::render))
-        .layer(from_fn_with_state(state.clone(), guard::observe))
-        .with_state(state)
+/// All routes of HTTP but those of the console.
+pub(crate) fn routes() -> Routes<AppState> {
+    let Described { router, policies } = described();
+    let (router, description) = router.split_for_parts();
+    let description = description::completed(description, &policies);
+    Routes { router, policies }
+        .get("/openapi.json", RoutePolicy::public(), get(move || health::openapi_json(description)))
+        .get("/docs", RoutePolicy::public(), get(health::docs))
 }
 
-/// What a process answers that only refines: whether it is alive and ready, and its metrics.
-pub fn worker_router(state: AppState) -> Router {
-    Router::new()
-        .route("/livez", axum::routing::get(health::livez))
-        .route("/readyz", axum::routing::get(health::readyz))
-        .route("/metrics", axum::routing::get(health::metrics))
-        .fallback(problem::no_such_path)
-        .method_not_allowed_fallback(problem::no_such_method)
-        .layer(CatchPanicLayer::custom(problem::panicked))
-        .layer(from_fn_with_state(state.clone(), auth::admit))
-        .layer(from_fn_with_state(state.clone(), guard::bound))
-        .layer(from_fn(problem::render))
-        .layer(from_fn_with_state(state.clone(), guard::observe))
-        .with_state(state)
+/// Says at `/` that there is no page, in a build without the console.
+#[cfg(not(feature = "console"))]
+pub(crate) fn without_console() -> Routes<AppState> {
+    const TEXT: &str = "This server was built without the operator's console (cargo feature `console`). \
+                        GET /docs lists the calls.\n";
+    Routes::new().get("/", RoutePolicy::public(), get(async || TEXT))
 }
 
-/// Whether a request is a form that an upload can be: a part `image`, and perhaps one `meta`.
+/// The routes of a process that only refines: whether it is alive and ready, and its metrics.
+pub(crate) fn worker_routes() -> Routes<AppState> {
+    Routes::new()
+        .get("/livez", RoutePolicy::public().probe(), get(health::livez))
+        .get("/readyz", RoutePolicy::public().probe(), get(health::readyz))
+        .get("/metrics", RoutePolicy::operator().probe(), get(health::metrics))
+}
+
+/// Whether a request is a form that an upload accepts: a part `image`, and optionally one `meta`. For fuzzing.
 pub async fn is_picture_form(request: axum::extract::Request) -> bool {
     body::from_form(request, usize::MAX).await.is_ok()
 }
 
 #[cfg(test)]
 mod tests {
-    /// All that a description refers to.
+    use super::*;
+
+    /// Collects all references within a description.
     fn references(value: &serde_json::Value, found: &mut Vec<String>) {
         match value {
             serde_json::Value::Object(fields) => {
@@ -169,14 +197,37 @@ mod tests {
     }
 
     #[test]
-    fn the_description_refers_to_nothing_that_is_not_there() {
-        let description = serde_json::to_value(super::openapi()).unwrap();
+    fn every_reference_of_the_description_resolves() {
+        let description = serde_json::to_value(openapi()).unwrap();
         let mut found = Vec::new();
         references(&description, &mut found);
         assert!(found.len() > 100);
         for reference in found {
-            let place = reference.strip_prefix('#').unwrap();
-            assert!(description.pointer(place).is_some(), "{reference}");
+            let pointer = reference.strip_prefix('#').unwrap();
+            assert!(description.pointer(pointer).is_some(), "{reference}");
         }
+    }
+
+    #[test]
+    fn every_described_call_has_a_policy_and_every_post_says_whether_it_can_be_replayed() {
+        let Described { policies, .. } = described();
+        let description = serde_json::to_value(openapi()).unwrap();
+        let (mut calls, mut without_replay) = (0, Vec::new());
+        for (path, methods) in description["paths"].as_object().unwrap() {
+            for method in methods.as_object().unwrap().keys() {
+                let method: Method = method.to_uppercase().parse().unwrap();
+                let policy = policies.of(&method, path).unwrap();
+                calls += 1;
+                assert!(!policy.is_grpc() && (policy.streams == policy.bulk));
+                if method == Method::POST && !policy.idempotent {
+                    without_replay.push(path.clone());
+                }
+                let reads = method == Method::GET || policy.localizes;
+                assert_eq!(policy.changes, !reads, "{method} {path}");
+            }
+        }
+        assert!(calls > 20);
+        without_replay.sort();
+        assert_eq!(without_replay, ["/keys", "/maps/{map}/images:batch", "/webhooks"]);
     }
 }

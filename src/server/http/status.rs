@@ -1,4 +1,4 @@
-//! `/status`: how the server stands, for the people who look after it.
+//! `/status`: the state of the server, for its operators.
 
 use std::sync::Arc;
 
@@ -8,101 +8,103 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::Today;
 use whereabouts_core::RefinerKind;
 use whereabouts_service::ServiceError;
 use whereabouts_telemetry::{LogIssue, LogIssues, Minute};
 
-/// What is known of the server from its start on.
+/// What `/status` reports that is fixed at startup.
 #[derive(Debug)]
-pub struct About {
-    /// When it was started.
+pub(crate) struct About {
+    /// When the process started.
     pub started_at: Timestamp,
-    /// The settings in force in TOML, without secrets.
+    /// Effective settings in TOML, without secrets.
     pub settings: String,
-    /// Pictures that may wait.
+    /// Most pictures that may wait to be decoded.
     pub pictures: usize,
-    /// The pictures behind the plan of a map, if there are any.
+    /// The server of map tiles for the console, if one is configured.
     pub tiles: Option<Tiles>,
-    /// The last warnings and errors.
+    /// Latest warnings and errors.
     pub troubles: Arc<LogIssues>,
 }
 
 /// A server of map tiles.
 #[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 pub struct Tiles {
-    /// An address with `{z}`, `{x}` and `{y}` (Web Mercator, as OpenStreetMap has it).
+    /// URL template with `{z}`, `{x}` and `{y}` (Web Mercator, as OpenStreetMap uses).
     pub url: String,
-    /// Whom to thank for them.
+    /// Attribution to show with the tiles.
     pub attribution: String,
 }
 
-/// How the server stands.
+/// State of the server.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Status {
-    /// Its version.
+    /// Version of the server.
     version: &'static str,
-    /// When it was started.
+    /// When the process started.
     started_at: Timestamp,
-    /// Its clock.
+    /// Current time of the server.
     now: Timestamp,
-    /// Who refines; null for nobody.
+    /// The refiner; null if none is configured.
     #[schema(nullable)]
     refiner: Option<RefinerKind>,
     /// Whether callers need a key.
     keys_required: bool,
-    /// The model of maps that name none.
+    /// Default model, used by maps that name none.
     default_model: String,
-    /// The models in memory, the most recently used first.
+    /// Models in memory, most recently used first.
     models: Vec<ModelInMemory>,
-    /// Jobs that wait or run.
+    /// Jobs queued or running.
     jobs: OpenOf,
-    /// Pictures that wait to be decoded.
+    /// Pictures waiting to be decoded.
     pictures: OpenOf,
-    /// Bytes of the record database.
+    /// Size of the record database, in bytes.
     db_bytes: u64,
-    /// Bytes of the disk that are free; null where that cannot be told.
+    /// Free disk space, in bytes; null if it cannot be determined.
     #[schema(nullable)]
     free_bytes: Option<u64>,
-    /// The budget of today; null if the refiner asks no model outside.
+    /// Budget of today; null if the refiner calls no external model.
     #[schema(nullable)]
     today: Option<Today>,
     /// The server of map tiles, if one is configured.
     #[schema(nullable)]
     tiles: Option<Tiles>,
-    /// The last hour, the oldest minute first; minutes in which nothing was done are left out.
+    /// The last hour, oldest minute first; minutes without activity are omitted.
     minutes: Vec<Minute>,
-    /// The last warnings and errors of the log, the newest first.
+    /// Latest warnings and errors of the log, newest first.
     errors: Vec<LogIssue>,
-    /// The settings in force in TOML, without secrets.
+    /// Effective settings in TOML, without secrets.
     settings: String,
 }
 
-/// How many there are.
+/// Occupancy of a bounded queue.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct OpenOf {
-    /// Now.
+    /// Current number.
     open: usize,
-    /// At the most.
+    /// Upper bound.
     limit: usize,
 }
 
 /// A model in memory.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ModelInMemory {
-    /// Its name.
+    /// Name of the model.
     name: String,
-    /// Who runs it.
+    /// Execution provider.
     provider: String,
-    /// At which precision.
+    /// Precision of the weights.
     precision: String,
 }
 
-/// How the server stands
+/// State of the server
 ///
-/// What it is doing, the last hour minute by minute, the last warnings and errors, and the settings in force.
+/// Current load, statistics of the last hour by minute, the latest warnings and errors, and the effective
+/// settings.
 #[utoipa::path(get, path = "/status", tag = "service", responses((status = 200, body = Status)))]
 pub(super) async fn status(
     State(state): State<AppState>,
@@ -122,7 +124,7 @@ pub(super) async fn status(
         started_at: about.started_at,
         now,
         refiner: service.refiner.as_ref().map(|refiner| refiner.kind()),
-        keys_required: state.settings.keys_required,
+        keys_required: state.gate.settings.keys_required,
         default_model: service.models.default_model().to_owned(),
         models: models.collect(),
         jobs: OpenOf { open: service.open_jobs().await?, limit: service.settings.job_queue },
@@ -134,7 +136,7 @@ pub(super) async fn status(
         free_bytes: service.retention.free_bytes().await,
         today: service.today(),
         tiles: about.tiles.clone(),
-        minutes: state.metrics.last_hour.minutes(now),
+        minutes: state.gate.metrics.last_hour.minutes(now),
         errors: about.troubles.last(),
         settings: about.settings.clone(),
     }))

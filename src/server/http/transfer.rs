@@ -1,4 +1,4 @@
-//! `/maps/{map}/export` and `/maps/{map}/import`: what `whereabouts backup` and `restore` speak.
+//! `/maps/{map}/export` and `/maps/{map}/import`, for `whereabouts backup` and `restore`.
 
 use axum::Json;
 use axum::extract::{Request, State};
@@ -8,8 +8,9 @@ use utoipa::ToSchema;
 use super::body::{JsonBody, Params, PictureBody, Segments};
 use super::images::{PageParams, image_id};
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::{AppState, Ready};
+use super::state::AppState;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
 use whereabouts_core::{Image, Map};
 use whereabouts_store::Added;
@@ -17,8 +18,8 @@ use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 /// The images of a map with their descriptors, by id
 ///
-/// The bytes of each are at `/maps/{map}/images/{id}/content`. `whereabouts backup` writes all of it
-/// into one file.
+/// Get the bytes of each at `/maps/{map}/images/{id}/content`. `whereabouts backup` writes all of them into one
+/// file.
 #[utoipa::path(get, path = "/maps/{map}/export", tag = "maps",
     params(("map" = String, Path), PageParams), responses(
     (status = 200, body = ExportPage),
@@ -34,17 +35,16 @@ pub(super) async fn export(
     Ok(Json(service.export(&map_name(&map)?, cursor.as_ref(), page.limit).await?))
 }
 
-/// Make a map like one that was exported
+/// Create a map like one that was exported
 ///
-/// A map that is there and takes the same descriptors is left as it is. The model need not be installed
-/// yet.
+/// An existing map with the same kind of descriptors is left unchanged. The model need not be installed yet.
 #[utoipa::path(put, path = "/maps/{map}/import", tag = "maps", params(("map" = String, Path)),
     request_body(content = Map, description = "`map` of an export"),
     responses(
-        (status = 200, body = MapState, description = "It was there"),
+        (status = 200, body = MapState, description = "The map exists"),
         (status = 201, body = MapState, description = "Created"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
-        (status = 409, body = Problem, description = "It has images, and other descriptors", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The map has images with other descriptors", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "A value is out of range", content_type = "application/problem+json"),
     ))]
 pub(super) async fn import_map(
@@ -63,25 +63,25 @@ pub(super) struct ImportForm {
     /// The picture.
     #[schema(value_type = String, format = Binary)]
     image: Vec<u8>,
-    /// What the export says about it.
+    /// Its entry in the export.
     meta: ImportedImage,
 }
 
-/// Add an image with the descriptor that it has elsewhere
+/// Add an image with its exported descriptor
 ///
-/// The same id with the same bytes again is answered 200, so that it is safe to send all of it again.
+/// Sending the same id with the same bytes again is answered 200, so it is safe to repeat an import.
 #[utoipa::path(post, path = "/maps/{map}/import", tag = "maps", params(("map" = String, Path)),
     request_body(content = ImportForm, content_type = "multipart/form-data"),
     responses(
-        (status = 200, body = Image, description = "It was there already"),
+        (status = 200, body = Image, description = "Already stored"),
         (status = 201, body = Image, description = "Stored"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
-        (status = 409, body = Problem, description = "The id is taken by other bytes, or the map has other descriptors", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The id exists with other bytes, or the map has other descriptors", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
         (status = 415, body = Problem, description = "Not a form", content_type = "application/problem+json"),
-        (status = 422, body = Problem, description = "The bytes are not those of the digest, or a value is out of range", content_type = "application/problem+json"),
-        (status = 429, body = Problem, description = "Overloaded; Retry-After says when it will be less so", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "The bytes do not match the digest, or a value is out of range", content_type = "application/problem+json"),
+        (status = 429, body = Problem, description = "Overloaded; Retry-After says when to try again", content_type = "application/problem+json"),
         (status = 507, body = Problem, description = "The disk is full", content_type = "application/problem+json"),
     ))]
 pub(super) async fn import_image(

@@ -7,22 +7,22 @@ use whereabouts_api::UsageReport;
 
 use super::body::Params;
 use super::maps::map_name;
-use super::problem::Problem;
-use super::state::Ready;
+use crate::gate::Problem;
+use crate::gate::Ready;
 
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct UsageParams {
-    /// Only what was spent in this map.
+    /// Only the usage of this map.
     map: Option<String>,
-    /// How many days back, today (UTC) included; 30 by default.
+    /// Number of days to report, including today (UTC); 30 by default.
     days: Option<u32>,
 }
 
-/// What calls to models outside have cost
+/// Usage and cost of external models
 ///
-/// By day and map, as it was billed. A map that was deleted keeps its entries.
+/// By day and map, as billed. Entries of a deleted map are kept.
 #[utoipa::path(get, path = "/usage", tag = "jobs", params(UsageParams), responses(
     (status = 200, body = UsageReport),
     (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),

@@ -7,8 +7,8 @@ use utoipa::{IntoParams, ToSchema};
 use uuid::Uuid;
 
 use super::body::{JsonBody, Params, Segments};
-use super::problem::Problem;
-use super::state::Ready;
+use crate::gate::Problem;
+use crate::gate::Ready;
 use whereabouts_api::{DeliveryPage, MadeWebhook, NewWebhook};
 use whereabouts_core::{Delivery, DeliveryState, Webhook};
 use whereabouts_service::{self};
@@ -20,21 +20,21 @@ pub(super) struct WebhookList {
     webhooks: Vec<Webhook>,
 }
 
-/// Make a webhook
+/// Create a webhook
 ///
-/// From now on the ends of jobs are posted to its URL, signed as *Standard Webhooks* has it. The answer is
-/// the only place where its secret is shown.
+/// From now on, the end of each job is posted to its URL, signed as *Standard Webhooks* specifies. The secret is
+/// shown in this answer only.
 #[utoipa::path(post, path = "/webhooks", tag = "webhooks", request_body = NewWebhook, responses(
-    (status = 201, body = MadeWebhook, description = "Made"),
+    (status = 201, body = MadeWebhook, description = "Created"),
     (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
-    (status = 409, body = Problem, description = "There are too many", content_type = "application/problem+json"),
-    (status = 422, body = Problem, description = "The URL is none, or leads to an address that is not public; or no event is named", content_type = "application/problem+json"),
+    (status = 409, body = Problem, description = "There are too many webhooks", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "The URL is not valid or leads to an address that is not public, or no event is named", content_type = "application/problem+json"),
 ))]
 pub(super) async fn create_webhook(
     Ready(service): Ready,
-    JsonBody(wanted): JsonBody<NewWebhook>,
+    JsonBody(new): JsonBody<NewWebhook>,
 ) -> Result<(StatusCode, Json<MadeWebhook>), Problem> {
-    Ok((StatusCode::CREATED, Json(service.webhooks.create(wanted).await?)))
+    Ok((StatusCode::CREATED, Json(service.webhooks.create(new).await?)))
 }
 
 /// List the webhooks
@@ -57,7 +57,7 @@ pub(super) async fn get_webhook(
 
 /// Remove a webhook
 ///
-/// Its deliveries go with it. A message that is on its way arrives.
+/// Removes its deliveries too. A message that is being sent still arrives.
 #[utoipa::path(delete, path = "/webhooks/{id}", tag = "webhooks", params(("id" = Uuid, Path)), responses(
     (status = 204, description = "Removed"),
     (status = 404, body = Problem, description = "No such webhook", content_type = "application/problem+json"),
@@ -70,9 +70,9 @@ pub(super) async fn delete_webhook(
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// Try a webhook out
+/// Test a webhook
 ///
-/// Queues a message of the type `ping`; the deliveries of the webhook say what became of it.
+/// Queues a message of the type `ping`; the deliveries of the webhook show its outcome.
 #[utoipa::path(post, path = "/webhooks/{id}/test", tag = "webhooks", params(("id" = Uuid, Path)), responses(
     (status = 202, body = Delivery, description = "Queued"),
     (status = 404, body = Problem, description = "No such webhook", content_type = "application/problem+json"),
@@ -94,13 +94,13 @@ pub(super) struct ListParams {
     state: Option<DeliveryState>,
     /// Deliveries in a page, 1 to 1000; 100 by default.
     limit: Option<usize>,
-    /// `next_cursor` of the page before.
+    /// `next_cursor` of the previous page.
     cursor: Option<String>,
 }
 
 /// List the deliveries of a webhook, newest first
 ///
-/// Those that have ended are removed in time; those that are dead have been given up.
+/// Deliveries that have ended are removed after a while; a dead one is no longer retried.
 #[utoipa::path(get, path = "/webhooks/{id}/deliveries", tag = "webhooks",
     params(("id" = Uuid, Path), ListParams), responses(
     (status = 200, body = DeliveryPage),
@@ -120,12 +120,12 @@ pub(super) async fn list_deliveries(
 
 /// Deliver a message again
 ///
-/// One that was delivered or is dead is queued as if it were new; its id stays the same.
+/// A delivery that succeeded or is dead is queued again under the same id.
 #[utoipa::path(post, path = "/webhooks/{id}/deliveries/{delivery}/redeliver", tag = "webhooks",
     params(("id" = Uuid, Path), ("delivery" = Uuid, Path)), responses(
     (status = 202, body = Delivery, description = "Queued"),
     (status = 404, body = Problem, description = "No such webhook or delivery", content_type = "application/problem+json"),
-    (status = 409, body = Problem, description = "It waits anyway, or the webhook is disabled", content_type = "application/problem+json"),
+    (status = 409, body = Problem, description = "It is queued already, or the webhook is disabled", content_type = "application/problem+json"),
 ))]
 pub(super) async fn redeliver(
     Ready(service): Ready,

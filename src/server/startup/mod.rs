@@ -16,21 +16,21 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use crate::Metrics;
-use crate::config::{Config, Refiner as ConfiguredRefiner, cores_unless};
-use crate::http::{About, AppState, Connections, HttpSettings, router, worker_router};
-use whereabouts_core::{CalibrationSettings, utc_day};
-use whereabouts_refine::local::{LocalMatcher, LocalSettings};
-use whereabouts_refine::mllm::{MllmParts, MllmRefiner};
+use crate::config::Config;
+use crate::gate::{Connections, Gate, GateSettings};
+use crate::http::{About, AppState};
+use crate::router::{router, worker_router};
+use whereabouts_core::CalibrationSettings;
 use whereabouts_refine::{
-    DenseCache, JobServiceTime, LocalRefiner, Refiner, Worker, WorkerSettings,
+    AttemptPolicy, DenseCache, JobServiceTime, Refiner, RefinerContext, Worker, WorkerSettings,
 };
 use whereabouts_service::{
     Dispatcher, IdempotencySettings, Janitor, Keys, Limits, RecallCheck, Reindexes,
     RetentionSettings, Service, ServiceSettings, Tracks, Webhooks,
 };
-use whereabouts_store::{Buckets, JobStore};
+use whereabouts_store::{JobStore, TokenBuckets};
 use whereabouts_telemetry::LogIssues;
-use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings, ImageLimits};
+use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings};
 use whereabouts_vision::{LoadedModels, LoadedSettings, WhyModel};
 
 #[cfg(feature = "postgres")]
@@ -58,8 +58,8 @@ pub async fn run(
 ) -> anyhow::Result<()> {
     let address = listener.local_addr().context("the listener has no address")?;
     let metrics = Arc::new(Metrics::new());
-    let state =
-        AppState::new(http_settings(&config), about(&config, troubles)?, Arc::clone(&metrics));
+    let gate = Gate::new(gate_settings(&config), Arc::clone(&metrics));
+    let state = AppState { gate, about: Arc::new(about(&config, troubles)?) };
     let connections = Connections {
         settings: config.server.connections(),
         router: match role {
@@ -74,7 +74,7 @@ pub async fn run(
     let (drain_timeout, retention) = (config.server.drain_timeout(), retention(&config));
     let counted = Arc::clone(&metrics.service);
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
-    let Parts { service, workers, pools } = building.await.context("the start broke off")??;
+    let Parts { service, workers, pools, .. } = building.await.context("the start broke off")??;
     let janitor = Janitor {
         store: Arc::clone(&service.retention),
         answers: Arc::clone(&service.answers),
@@ -84,7 +84,7 @@ pub async fn run(
     let Webhooks { store, settings } = &service.webhooks;
     let dispatcher = Dispatcher::new(Arc::clone(store), counted, settings.clone());
     let service = Arc::new(service);
-    state.door().open(Arc::clone(&service));
+    state.gate.readiness().open(Arc::clone(&service));
     let mut running = JoinSet::new();
     if role == Role::Serve {
         let until = shutdown.clone();
@@ -102,7 +102,7 @@ pub async fn run(
 
     shutdown.cancelled().await;
     tracing::info!("draining");
-    state.door().drain();
+    state.gate.readiness().drain();
     let drained = async {
         let served = server.await;
         while running.join_next().await.is_some() {}
@@ -131,8 +131,8 @@ fn about(config: &Config, troubles: Arc<LogIssues>) -> anyhow::Result<About> {
     })
 }
 
-fn http_settings(config: &Config) -> HttpSettings {
-    HttpSettings {
+fn gate_settings(config: &Config) -> GateSettings {
+    GateSettings {
         body_limit_bytes: config.server.body_limit_bytes,
         bodies_limit_bytes: config.server.bodies_limit_bytes,
         body_timeout: Duration::from_secs(config.server.body_timeout_s),
@@ -175,6 +175,8 @@ pub struct Parts {
     pub workers: Vec<Worker>,
     /// Whoever decodes, infers and compares; to be waited for before the process ends.
     pub pools: [CpuPool; 2],
+    /// The parts that further refiners can be built from.
+    pub refiners: RefinerContext,
 }
 
 /// Opens the store, loads the model, and puts the service together. Blocks.
@@ -184,40 +186,24 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     let (models, why) = models(config)?;
     let admission = config.image.admission(config.model.layout());
     // Whoever comes to the pool has a permit, so that it need not refuse anybody.
-    let pool = CpuPool::new("frames", cores_unless(config.image.threads), admission.permits)?;
+    let pool = CpuPool::new("frames", config.image.decode_threads(), admission.permits)?;
     let job_pace = JobServiceTime::default();
     // Beside the workers, calibration and whoever looks at matches come to it, one at a time each.
     let refining = CpuPool::new("refine", config.jobs.workers.max(1), config.jobs.workers + 2)?;
     let pools = [pool.clone(), refining.clone()];
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
-    let local = Arc::new(LocalRefiner {
-        maps: store.clone(),
-        blobs: store.clone(),
+    let refiners = RefinerContext {
+        store: store.clone(),
+        shared: shared.clone(),
         models: models.clone(),
         dense: Arc::clone(&dense),
         pool: refining,
-        matcher: LocalMatcher::new(LocalSettings::default()),
-    });
-    let refiner: Option<Arc<dyn Refiner>> = match config.refine.refiner {
-        ConfiguredRefiner::Off => None,
-        ConfiguredRefiner::Local => Some(local),
-        ConfiguredRefiner::Mllm => {
-            let parts = MllmParts {
-                maps: store.clone(),
-                blobs: store.clone(),
-                cache: store.clone(),
-                usage: store.clone(),
-                shared: shared.clone(),
-                metrics: Arc::clone(&metrics.refine),
-                limits: models.limits(),
-                fallback: Some(local),
-            };
-            let refiner = MllmRefiner::new(parts, config.mllm.clone())?;
-            // Nobody else spends before the workers start.
-            let today = utc_day(Timestamp::now());
-            refiner.seed_spent_today(&Handle::current().block_on(store.usage(today))?);
-            Some(Arc::new(refiner))
-        }
+        metrics: Arc::clone(&metrics.refine),
+        settings: config.refiner_settings(),
+    };
+    let refiner: Option<Arc<dyn Refiner>> = match config.refine.refiner.entry() {
+        Some(entry) => Some(Handle::current().block_on((entry.build)(&refiners))?),
+        None => None,
     };
     let jobs: Arc<dyn JobStore> = store.clone();
     let workers = refiner.iter().flat_map(|refiner| {
@@ -226,20 +212,19 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             maps: store.clone(),
             refiner: Arc::clone(refiner),
             metrics: Arc::clone(&metrics.refine),
-            pace: Arc::clone(&job_pace),
+            service_time: Arc::clone(&job_pace),
             settings: WorkerSettings {
                 lease: Duration::from_secs(config.jobs.lease_s),
                 timeout: Duration::from_secs(config.jobs.timeout_s),
-                attempts: config.jobs.attempts,
-                retry_pause: Duration::from_secs(config.jobs.retry_pause_s),
+                attempts: attempts(config),
                 known_confidence: config.localize.known_confidence,
-                side_by_side: config.jobs.workers,
+                workers: config.jobs.workers,
             },
         })
     });
     let workers = workers.collect();
     let mut keys = Handle::current().block_on(Keys::load(store.clone()))?;
-    keys.limits = Limits::new(Buckets::of(shared));
+    keys.limits = Limits::new(TokenBuckets::new(shared));
     check_keys(config, &keys)?;
     let service = Service {
         keys,
@@ -272,11 +257,11 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             calibration: CalibrationSettings {
                 images: config.confidence.images,
                 refined: config.confidence.refined,
-                candidates: config.refine.compared(),
+                candidates: config.compared_candidates(),
                 place_images: config.confidence.place_images,
                 place_m: config.confidence.place_m,
             },
-            candidates: config.refine.compared(),
+            candidates: config.compared_candidates(),
             job_queue: config.jobs.queue,
             shed_jobs_at: config.jobs.shed_at,
             max_wait: Duration::from_secs(config.jobs.max_wait_s),
@@ -291,7 +276,16 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     tracing::info!(model, %why, "the model of maps that name none");
     service.models.manifest(model)?;
     Handle::current().block_on(service.installed_model(model))?;
-    Ok(Parts { service, workers, pools })
+    Ok(Parts { service, workers, pools, refiners })
+}
+
+/// How often a refinement is attempted.
+pub fn attempts(config: &Config) -> AttemptPolicy {
+    AttemptPolicy {
+        attempts: config.jobs.attempts,
+        pause: Duration::from_secs(config.jobs.retry_pause_s),
+        longest_pause: Duration::MAX,
+    }
 }
 
 /// Says whether callers need a key; a server that nobody could use does not start.
@@ -320,14 +314,14 @@ fn check_keys(config: &Config, keys: &Keys) -> anyhow::Result<()> {
 fn models(config: &Config) -> anyhow::Result<(LoadedModels, WhyModel)> {
     let assets = Assets::locate(config.model.assets());
     let (model, why) = assets.resolve(&config.model.name)?;
-    let each = ExtractorSettings {
+    let extractor = ExtractorSettings {
         model,
-        wanted: config.model.wanted(),
-        remember: None,
+        preference: config.model.preference(),
+        choice_file: None,
         layout: config.model.layout(),
-        limits: ImageLimits { max_pixels: config.image.max_pixels },
+        limits: config.image.limits(),
         exact_decode: config.image.exact,
     };
-    let (most, remember) = (config.model.loaded, config.data.dir.clone());
-    Ok((LoadedModels::new(assets, LoadedSettings { most, remember, each }), why))
+    let (max_loaded, choice_dir) = (config.model.loaded, config.data.dir.clone());
+    Ok((LoadedModels::new(assets, LoadedSettings { max_loaded, choice_dir, extractor }), why))
 }

@@ -4,13 +4,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use uuid::Uuid;
-use whereabouts_index::IndexSettings;
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
 use whereabouts_store::{DescriptionBounds, SharedLimits, Store};
 
 #[cfg(feature = "postgres")]
 pub use self::scale_out::postgres_settings;
-use crate::config::{Config, cores_unless};
+use crate::config::Config;
 
 /// A store and the limits that come with it.
 pub struct OpenStore {
@@ -32,26 +31,13 @@ pub fn open_store(config: &Config, process: Uuid) -> anyhow::Result<OpenStore> {
 fn embedded(config: &Config) -> anyhow::Result<EmbeddedStore> {
     Ok(EmbeddedStore::open(&EmbeddedSettings {
         dir: config.data.dir.clone(),
-        index: index(config),
-        index_threads: match config.index.threads {
-            0 => (cores_unless(0) / 2).max(1),
-            threads => threads,
-        },
+        index: config.index,
+        index_threads: config.index.build_threads(),
         min_free_bytes: config.data.min_free_bytes,
         db_cache_bytes: config.data.db_cache_bytes,
         commit_batch: config.data.commit_batch,
         descriptions: descriptions(config),
     })?)
-}
-
-fn index(config: &Config) -> IndexSettings {
-    IndexSettings {
-        exact_up_to: config.index.exact_up_to,
-        m: config.index.m,
-        ef_construction: config.index.ef_construction,
-        ef_search: config.index.ef_search,
-        max_dead_share: config.index.max_dead_share,
-    }
 }
 
 fn descriptions(config: &Config) -> DescriptionBounds {
@@ -84,7 +70,7 @@ mod scale_out {
             timeout: database.timeout(),
             lifetime: Duration::from_secs(database.lifetime_s),
             pin: Duration::from_secs(config.objects.keep_unneeded_s),
-            index: index(config),
+            index: config.index,
             index_memory_mib: database.index_memory_mib,
             descriptions: descriptions(config),
         }

@@ -15,7 +15,7 @@ use uuid::Uuid;
 use super::WebhookSettings;
 use super::messenger::{Messenger, Reply};
 use crate::{AttemptOutcome, ServiceMetrics};
-use whereabouts_core::{Attempt, Delivery, StoredWebhook, Then};
+use whereabouts_core::{Attempt, Delivery, Disposition, StoredWebhook};
 use whereabouts_refine::mllm::random_fraction;
 use whereabouts_store::{StoreError, StoredDelivery, WebhookStore};
 
@@ -129,33 +129,33 @@ impl Dispatcher {
         let attempt = match reply {
             Reply::Taken(status) => {
                 let status = Some(status.as_u16());
-                Attempt { at, status, error: None, then: Then::Delivered }
+                Attempt { at, status, error: None, disposition: Disposition::Delivered }
             }
             Reply::Gone => {
                 let why = "the answer was 410 Gone, which asks for no more messages";
                 self.store.disable_webhook(webhook, at, why).await?;
                 tracing::warn!(%webhook, why, "a webhook was disabled");
                 let error = Some(format!("{DISABLED}: {why}"));
-                Attempt { at, status: Some(410), error, then: Then::Dead }
+                Attempt { at, status: Some(410), error, disposition: Disposition::Dead }
             }
             Reply::Failed { status, why, retry_after } => {
                 let status = status.map(|status| status.as_u16());
-                let then =
+                let disposition =
                     self.settings.after_failure(attempts, retry_after, at, random_fraction());
-                Attempt { at, status, error: Some(why), then }
+                Attempt { at, status, error: Some(why), disposition }
             }
         };
         let (tried, why) = (attempts + 1, attempt.error.clone().unwrap_or_default());
-        let outcome = match attempt.then {
-            Then::Delivered => {
+        let outcome = match attempt.disposition {
+            Disposition::Delivered => {
                 tracing::debug!(%webhook, delivery = %id, %event, tried, "a message was delivered");
                 AttemptOutcome::Delivered
             }
-            Then::Again(next) => {
+            Disposition::RetryAt(next) => {
                 tracing::info!(%webhook, delivery = %id, %event, tried, why, %next, "a message was not taken");
                 AttemptOutcome::Failed
             }
-            Then::Dead => {
+            Disposition::Dead => {
                 tracing::warn!(%webhook, delivery = %id, %event, tried, why, "a message was given up");
                 AttemptOutcome::Dead
             }

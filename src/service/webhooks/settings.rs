@@ -6,8 +6,8 @@ use jiff::{SignedDuration, Timestamp};
 use serde::{Deserialize, Serialize};
 
 use super::super::retention::before;
-use whereabouts_core::Then;
-use whereabouts_store::KeepDeliveries;
+use whereabouts_core::Disposition;
+use whereabouts_store::DeliveryRetention;
 
 /// The most tries after the first, and the longest pause between two, in seconds.
 const MOST_RETRIES: usize = 32;
@@ -80,10 +80,10 @@ impl WebhookSettings {
     }
 
     /// Which deliveries are kept at that moment.
-    pub(super) fn keep(&self, now: Timestamp) -> KeepDeliveries {
+    pub(super) fn keep(&self, now: Timestamp) -> DeliveryRetention {
         let age = Duration::from_secs(u64::from(self.keep_days) * 24 * 3600);
         let since = (!age.is_zero()).then(|| before(now, age));
-        KeepDeliveries { since, most: self.max_deliveries }
+        DeliveryRetention { since, most: self.max_deliveries }
     }
 
     /// What becomes of a delivery that failed after so many attempts before. `chance` is 0 to 1.
@@ -93,13 +93,13 @@ impl WebhookSettings {
         retry_after: Option<Duration>,
         now: Timestamp,
         chance: f64,
-    ) -> Then {
-        let Some(pause) = self.retry_s.get(attempts as usize) else { return Then::Dead };
+    ) -> Disposition {
+        let Some(pause) = self.retry_s.get(attempts as usize) else { return Disposition::Dead };
         let pause = Duration::from_secs(*pause).mul_f64(1.0 + JITTER * chance);
         let asked_for = retry_after.unwrap_or_default();
         let pause = pause.max(asked_for.min(Duration::from_secs(self.retry_after_max_s)));
         let pause = SignedDuration::try_from(pause).unwrap_or(SignedDuration::ZERO);
-        Then::Again(now.saturating_add(pause).unwrap_or(now))
+        Disposition::RetryAt(now.saturating_add(pause).unwrap_or(now))
     }
 }
 
@@ -118,7 +118,7 @@ pub(super) mod tests {
     fn pauses_are_as_configured_with_some_jitter_and_then_there_is_an_end() {
         let (settings, now) = (defaults(), Timestamp::now());
         let pause = |attempts, chance| match settings.after_failure(attempts, None, now, chance) {
-            Then::Again(at) => Some(at.duration_since(now).as_secs_f64()),
+            Disposition::RetryAt(at) => Some(at.duration_since(now).as_secs_f64()),
             _ => None,
         };
         assert_eq!(pause(0, 0.0), Some(5.0));
@@ -133,7 +133,7 @@ pub(super) mod tests {
         let pause = |seconds| {
             let asked_for = Some(Duration::from_secs(seconds));
             match settings.after_failure(0, asked_for, now, 0.0) {
-                Then::Again(at) => at.duration_since(now).as_secs(),
+                Disposition::RetryAt(at) => at.duration_since(now).as_secs(),
                 _ => panic!("given up"),
             }
         };

@@ -1,4 +1,7 @@
 //! Image bytes in a content-addressed folder: `images/ab/cdef…`, named by their SHA-256.
+//!
+//! `object_store`'s local folder syncs files as durably as this, but only asynchronously; here a file is
+//! deleted under the lock of the pins, on the writer thread, so that no new pin can be missed.
 
 use std::collections::HashMap;
 use std::fs::{self, File};
@@ -10,21 +13,21 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 
 use super::super::StoreError;
-use super::make_folder;
+use super::create_folder;
 use super::trees::Trees;
 use whereabouts_core::Digest;
 
-/// The folder. Clones share it.
+/// The folder of image bytes. Clones share its pins.
 #[derive(Clone)]
 pub(super) struct Blobs {
     dir: PathBuf,
-    /// Bytes of the disk that stay free, so that records can still be written and deleted.
+    /// Disk space reserved for records, so that they can still be written and deleted.
     min_free: u64,
-    /// Bytes that were put and may not be referred to yet, with how many callers wait for that.
+    /// Blobs that no record may refer to yet, each with its number of pins.
     pinned: Arc<Mutex<HashMap<Digest, usize>>>,
 }
 
-/// Keeps bytes from being removed while it lives.
+/// Protects a blob from removal until it is dropped.
 pub(super) struct Pin {
     digest: Digest,
     pinned: Arc<Mutex<HashMap<Digest, usize>>>,
@@ -44,19 +47,20 @@ impl Drop for Pin {
 
 impl Blobs {
     pub fn open(dir: PathBuf, min_free: u64) -> Result<Self, StoreError> {
-        make_folder(&dir)?;
+        create_folder(&dir)?;
         Ok(Self { dir, min_free, pinned: Arc::default() })
     }
 
-    /// Bytes of the disk that are free.
+    /// Returns the free space of the disk, in bytes.
     pub fn free_bytes(&self) -> Result<u64, StoreError> {
         fs2::available_space(&self.dir).map_err(|error| {
             let dir = self.dir.display();
-            StoreError::Failed(format!("cannot look at the disk of {dir}: {error}"))
+            StoreError::Failed(format!("cannot read the free space of {dir}: {error}"))
         })
     }
 
-    /// Nearly every change begins with the bytes of a picture, so this guards the whole folder.
+    /// Refuses bytes that would exceed the free space. Nearly every change begins with the bytes of a
+    /// picture, so this protects the whole data folder.
     fn check_room(&self, bytes: usize) -> Result<(), StoreError> {
         let free = self.free_bytes()?;
         if free < self.min_free.saturating_add(bytes as u64) {
@@ -65,12 +69,12 @@ impl Blobs {
         Ok(())
     }
 
-    /// Stores bytes durably; the pin is taken first, so that nobody removes them in between.
+    /// Stores bytes durably. They are pinned first, so that a concurrent removal cannot delete them.
     pub fn put(&self, digest: Digest, bytes: &Bytes) -> Result<Pin, StoreError> {
         *self.pinned.lock().entry(digest).or_insert(0) += 1;
         let pin = Pin { digest, pinned: Arc::clone(&self.pinned) };
         let path = self.path(&digest);
-        // Bytes of the right length under this name were whole when they were renamed to it.
+        // Files are complete when they are renamed to this name, so the length is proof enough.
         if fs::metadata(&path).is_ok_and(|found| found.len() == bytes.len() as u64) {
             return Ok(pin);
         }
@@ -89,8 +93,8 @@ impl Blobs {
         }
     }
 
-    /// Removes bytes that nobody needs any more, and says how many. What cannot be removed stays as
-    /// rubbish, which harms nobody.
+    /// Removes a blob that is neither pinned nor referenced. Returns the number of bytes removed; a file
+    /// that cannot be removed is harmless and only takes up space.
     pub fn remove_unreferenced(&self, digest: &Digest, trees: &Trees) -> u64 {
         let pinned = self.pinned.lock();
         if pinned.contains_key(digest) || !trees.is_unreferenced(digest) {
@@ -112,7 +116,7 @@ impl Blobs {
     }
 }
 
-/// Where bytes of that digest are, in the folder of all.
+/// Returns the path of a blob in the folder of image bytes.
 pub(super) fn path_of(dir: &Path, digest: &Digest) -> PathBuf {
     let hex = digest.hex();
     dir.join(&hex[..2]).join(&hex[2..])
@@ -126,21 +130,22 @@ fn write_durably(path: &Path, bytes: &[u8]) -> io::Result<()> {
             File::open(above)?.sync_all()?;
         }
     }
-    // A name of its own, so that two writers of the same bytes do not meet.
-    let beside = path.with_extension(format!("{}.tmp", uuid::Uuid::now_v7().simple()));
-    replace_durably(path, &beside, bytes)?;
+    // A unique name, so that concurrent writers of the same bytes do not collide.
+    let temporary = path.with_extension(format!("{}.tmp", uuid::Uuid::now_v7().simple()));
+    replace_durably(path, &temporary, bytes)?;
     File::open(folder)?.sync_all()
 }
 
-/// Writes bytes `beside` a file and renames them to it, so that nobody ever sees half of them.
-pub(super) fn replace_durably(path: &Path, beside: &Path, bytes: &[u8]) -> io::Result<()> {
-    let written = File::create(beside).and_then(|mut file| {
+/// Writes and syncs a temporary file and renames it to `path`, so that readers never see a partial
+/// file.
+pub(super) fn replace_durably(path: &Path, temporary: &Path, bytes: &[u8]) -> io::Result<()> {
+    let written = File::create(temporary).and_then(|mut file| {
         file.write_all(bytes)?;
         file.sync_all()?;
-        fs::rename(beside, path)
+        fs::rename(temporary, path)
     });
     if written.is_err() {
-        let _ = fs::remove_file(beside);
+        let _ = fs::remove_file(temporary);
     }
     written
 }

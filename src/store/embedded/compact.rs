@@ -1,4 +1,5 @@
-//! The database written anew: its files do not shrink by themselves when records go.
+//! Compaction: sled's files do not shrink when records are deleted, so the records are copied to a new
+//! database.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -12,22 +13,22 @@ use super::{check_folder, lock};
 const BATCH: usize = 4096;
 const CACHE_BYTES: u64 = 64 << 20;
 
-/// Bytes of the database before and after.
+/// The size of the database before and after a compaction.
 #[derive(Debug, Clone, Copy, serde::Serialize)]
 pub struct Compacted {
-    /// Before.
+    /// Bytes before.
     pub bytes_before: u64,
-    /// After.
+    /// Bytes after.
     pub bytes_after: u64,
 }
 
-/// Writes the database of a folder anew, beside the old one, and puts it in its place. No server may use
-/// the folder meanwhile; there must be room for both.
+/// Copies the records of a data folder to a new database and replaces the old one with it. No server may
+/// use the folder meanwhile, and the disk must have room for both databases.
 pub fn compact(dir: &Path) -> Result<Compacted, StoreError> {
     check_folder(dir)?;
     let _lock = lock(dir)?;
     schema::bring_up_to_date(dir)?;
-    settle(dir)?;
+    finish_interrupted(dir)?;
     let [db, fresh, old] = paths(dir);
     let bytes_before = {
         let (from, to) = (Trees::open(&db, CACHE_BYTES)?, Trees::open(&fresh, CACHE_BYTES)?);
@@ -38,20 +39,21 @@ pub fn compact(dir: &Path) -> Result<Compacted, StoreError> {
         .and_then(|()| fs::rename(&fresh, &db))
         .and_then(|()| File::open(dir)?.sync_all());
     moved.map_err(|error| cannot("replace", &db, &error))?;
-    settle(dir)?;
+    finish_interrupted(dir)?;
     let bytes_after = Trees::open(&db, CACHE_BYTES)?.bytes()?;
     Ok(Compacted { bytes_before, bytes_after })
 }
 
-/// Ends a compaction that broke off: with the new database if it was in its place, else with the old.
-pub(super) fn settle(dir: &Path) -> Result<(), StoreError> {
+/// Finishes an interrupted compaction: keeps the new database if it was already in place, otherwise the
+/// old one.
+pub(super) fn finish_interrupted(dir: &Path) -> Result<(), StoreError> {
     let [db, fresh, old] = paths(dir);
     if old.is_dir() && !db.is_dir() {
         fs::rename(&old, &db).map_err(|error| cannot("restore", &db, &error))?;
     }
-    for rest in [fresh, old] {
-        if rest.is_dir() {
-            fs::remove_dir_all(&rest).map_err(|error| cannot("remove", &rest, &error))?;
+    for leftover in [fresh, old] {
+        if leftover.is_dir() {
+            fs::remove_dir_all(&leftover).map_err(|error| cannot("remove", &leftover, &error))?;
         }
     }
     Ok(())
@@ -70,8 +72,10 @@ fn copy(from: &Trees, to: &Trees) -> Result<(), StoreError> {
             }
         }
         if copy.len() != records {
-            let what = format!("tree {number} has {records} records, its copy {}", copy.len());
-            return Err(StoreError::Failed(what));
+            let copied = copy.len();
+            return Err(StoreError::Failed(format!(
+                "tree {number} has {records} records, but its copy has {copied}"
+            )));
         }
     }
     to.flush()
@@ -81,8 +85,8 @@ fn paths(dir: &Path) -> [PathBuf; 3] {
     ["db", "db.compact", "db.before-compact"].map(|name| dir.join(name))
 }
 
-fn cannot(what: &str, path: &Path, error: &std::io::Error) -> StoreError {
-    StoreError::Failed(format!("cannot {what} {}: {error}", path.display()))
+fn cannot(action: &str, path: &Path, error: &std::io::Error) -> StoreError {
+    StoreError::Failed(format!("cannot {action} {}: {error}", path.display()))
 }
 
 #[cfg(test)]
@@ -100,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_removed_gives_its_room_back_and_the_rest_stays() {
+    fn compaction_frees_the_space_of_deleted_records_and_keeps_the_others() {
         let dir = tempfile::tempdir().unwrap();
         let trees = fill(dir.path(), 5000);
         for number in 10..5000_u32 {
@@ -117,13 +121,13 @@ mod tests {
     }
 
     #[test]
-    fn a_compaction_that_broke_off_leaves_one_whole_database() {
+    fn an_interrupted_compaction_leaves_one_complete_database() {
         let dir = tempfile::tempdir().unwrap();
         drop(fill(dir.path(), 3));
         let [db, fresh, old] = paths(dir.path());
         fs::create_dir(&fresh).unwrap();
         fs::rename(&db, &old).unwrap();
-        settle(dir.path()).unwrap();
+        finish_interrupted(dir.path()).unwrap();
         assert_eq!(Trees::open(&db, 1 << 20).unwrap().frames.len(), 3);
         assert!(!fresh.exists() && !old.exists());
     }

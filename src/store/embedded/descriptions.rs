@@ -1,8 +1,8 @@
-//! The cache of descriptions that were paid for: records in sled, their order of use in memory; and
-//! the frames they are of.
+//! The description cache, with records in sled and the order of use in memory, and the frames whose
+//! pairs were described.
 //!
-//! Bounded in bytes and in age. The least recently used goes first; after a restart, when uses are
-//! forgotten, the oldest.
+//! The cache is bounded in bytes and in age. The least recently used description is evicted first;
+//! after a restart, which forgets uses, the oldest.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -19,63 +19,63 @@ use crate::DescriptionCache;
 use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, SimilarFrame};
 use whereabouts_core::{Descriptor, Digest, StandIn};
 
-/// As many similar frames are looked at, at the most: a pair that none of them has is bought.
-const SIMILAR_FRAMES: usize = 4;
+/// Maximum number of similar frames returned. A pair that none of them has is bought.
+const MAX_SIMILAR_FRAMES: usize = 4;
 
-/// Which descriptions there are, and in which order they were used.
-pub(super) struct DescriptionUse {
+/// The keys of the cached descriptions, in order of use.
+pub(super) struct DescriptionLru {
     bounds: DescriptionBounds,
-    order: Mutex<Order>,
+    order: Mutex<UseOrder>,
 }
 
 #[derive(Default)]
-struct Order {
-    /// Key → when it was used last, and its bytes.
-    known: HashMap<Digest, (u64, u64)>,
-    /// When it was used last → key.
+struct UseOrder {
+    /// Key → when it was last used (by `clock`), and the size of its record.
+    entries: HashMap<Digest, (u64, u64)>,
+    /// When it was last used → key.
     by_use: BTreeMap<u64, Digest>,
     bytes: u64,
     clock: u64,
 }
 
-impl Order {
+impl UseOrder {
     fn touch(&mut self, key: Digest, bytes: u64) {
         self.forget(&key);
         self.clock += 1;
-        self.known.insert(key, (self.clock, bytes));
+        self.entries.insert(key, (self.clock, bytes));
         self.by_use.insert(self.clock, key);
         self.bytes += bytes;
     }
 
     fn forget(&mut self, key: &Digest) {
-        if let Some((used, bytes)) = self.known.remove(key) {
+        if let Some((used, bytes)) = self.entries.remove(key) {
             self.by_use.remove(&used);
             self.bytes -= bytes;
         }
     }
 
-    /// Counts a use of a description, unless it has gone meanwhile.
+    /// Records a use of a description, unless it was evicted meanwhile.
     fn used(&mut self, key: Digest) {
-        if let Some(&(_, bytes)) = self.known.get(&key) {
+        if let Some(&(_, bytes)) = self.entries.get(&key) {
             self.touch(key, bytes);
         }
     }
 
-    /// Those that must go for the rest to fit.
-    fn over(&mut self, max_bytes: u64) -> Vec<Digest> {
-        let mut gone = Vec::new();
+    /// Evicts the least recently used entries until the rest fits, and returns them.
+    fn evict(&mut self, max_bytes: u64) -> Vec<Digest> {
+        let mut evicted = Vec::new();
         while self.bytes > max_bytes
             && let Some((_, &oldest)) = self.by_use.iter().next()
         {
             self.forget(&oldest);
-            gone.push(oldest);
+            evicted.push(oldest);
         }
-        gone
+        evicted
     }
 }
 
-impl DescriptionUse {
-    /// Reads which descriptions there are, oldest first.
+impl DescriptionLru {
+    /// Reads the cached descriptions and orders them by age.
     pub fn load(trees: &Trees, bounds: DescriptionBounds) -> Result<Self, StoreError> {
         let mut found = Vec::new();
         for entry in trees.descriptions.iter() {
@@ -86,20 +86,20 @@ impl DescriptionUse {
             }
         }
         found.sort_by_key(|(created, ..)| *created);
-        let mut order = Order::default();
+        let mut order = UseOrder::default();
         found.into_iter().for_each(|(_, key, bytes)| order.touch(key, bytes));
         Ok(Self { bounds, order: Mutex::new(order) })
     }
 
-    fn order(&self) -> MutexGuard<'_, Order> {
+    fn order(&self) -> MutexGuard<'_, UseOrder> {
         self.order.lock()
     }
 
-    /// Counts a new description; returns those that must go for it.
-    fn make_room(&self, key: Digest, bytes: u64) -> Vec<Digest> {
+    /// Adds a new description; returns the descriptions evicted to make room.
+    fn add(&self, key: Digest, bytes: u64) -> Vec<Digest> {
         let mut order = self.order();
         order.touch(key, bytes);
-        order.over(self.bounds.max_bytes)
+        order.evict(self.bounds.max_bytes)
     }
 
     fn is_fresh(&self, record: &CachedDescription) -> bool {
@@ -108,7 +108,7 @@ impl DescriptionUse {
     }
 }
 
-/// What a record takes on disk, key included.
+/// Estimates the size of a record on disk, key included.
 fn size(value: &[u8]) -> u64 {
     (value.len() + 64) as u64
 }
@@ -142,8 +142,8 @@ impl DescriptionCache for EmbeddedStore {
             .writer
             .commit(
                 move |trees, _| {
-                    for gone in inner.descriptions.make_room(key, size(&value)) {
-                        trees.descriptions.remove(gone.hex()).map_err(failed)?;
+                    for evicted in inner.descriptions.add(key, size(&value)) {
+                        trees.descriptions.remove(evicted.hex()).map_err(failed)?;
                     }
                     trees.descriptions.insert(key.hex(), value).map(drop).map_err(failed)
                 },
@@ -164,14 +164,14 @@ impl DescriptionCache for EmbeddedStore {
             for value in inner.trees.frames.scan_prefix(map.as_bytes()).values() {
                 let frame: DescribedFrame = decode(&value.map_err(failed)?)?;
                 let similarity = frame.descriptor.similarity(&to);
-                // A map that changed its model while it was empty keeps frames of the old one.
+                // A map whose model changed while it was empty still has frames of the old model.
                 if frame.descriptor.dim() == to.dim() && similarity >= at_least {
                     let stand_in = StandIn { query_id: frame.query_id, similarity };
                     similar.push(SimilarFrame { digest: frame.digest, stand_in });
                 }
             }
             similar.sort_by(|a, b| b.stand_in.similarity.total_cmp(&a.stand_in.similarity));
-            similar.truncate(SIMILAR_FRAMES);
+            similar.truncate(MAX_SIMILAR_FRAMES);
             Ok(similar)
         })
         .await
@@ -181,7 +181,7 @@ impl DescriptionCache for EmbeddedStore {
         &self,
         map: Uuid,
         frame: DescribedFrame,
-        most: usize,
+        max_frames: usize,
     ) -> Result<(), StoreError> {
         let key = [map.as_bytes().as_slice(), frame.query_id.as_bytes()].concat();
         self.inner
@@ -190,7 +190,7 @@ impl DescriptionCache for EmbeddedStore {
                 move |trees, _| {
                     put(&trees.frames, &key, &frame)?;
                     let of_map = || trees.frames.scan_prefix(map.as_bytes()).keys();
-                    for oldest in of_map().take(of_map().count().saturating_sub(most)) {
+                    for oldest in of_map().take(of_map().count().saturating_sub(max_frames)) {
                         trees.frames.remove(oldest.map_err(failed)?).map_err(failed)?;
                     }
                     Ok(())
@@ -202,7 +202,7 @@ impl DescriptionCache for EmbeddedStore {
 
     fn levels(&self) -> CacheLevels {
         let order = self.inner.descriptions.order();
-        CacheLevels { entries: order.known.len(), bytes: order.bytes }
+        CacheLevels { entries: order.entries.len(), bytes: order.bytes }
     }
 }
 
@@ -215,29 +215,29 @@ mod tests {
     }
 
     #[test]
-    fn the_least_recently_used_make_room() {
-        let mut order = Order::default();
+    fn the_least_recently_used_descriptions_are_evicted() {
+        let mut order = UseOrder::default();
         (0..4).for_each(|number| order.touch(key(number), 10));
         order.touch(key(0), 10);
-        assert_eq!(order.over(25), [key(1), key(2)]);
-        assert_eq!((order.bytes, order.known.len(), order.by_use.len()), (20, 2, 2));
+        assert_eq!(order.evict(25), [key(1), key(2)]);
+        assert_eq!((order.bytes, order.entries.len(), order.by_use.len()), (20, 2, 2));
     }
 
     #[test]
-    fn a_use_of_what_has_gone_is_not_counted() {
-        let mut order = Order::default();
+    fn a_use_of_an_evicted_description_is_ignored() {
+        let mut order = UseOrder::default();
         order.touch(key(0), 10);
         order.used(key(1));
-        assert_eq!((order.bytes, order.known.len()), (10, 1));
+        assert_eq!((order.bytes, order.entries.len()), (10, 1));
     }
 
     #[test]
-    fn a_description_that_grew_is_counted_once() {
-        let mut order = Order::default();
+    fn a_description_that_is_replaced_is_counted_once() {
+        let mut order = UseOrder::default();
         order.touch(key(0), 10);
         order.touch(key(0), 30);
         assert_eq!((order.bytes, order.by_use.len()), (30, 1));
-        assert_eq!(order.over(29), [key(0)]);
-        assert_eq!(order.over(0), []);
+        assert_eq!(order.evict(29), [key(0)]);
+        assert_eq!(order.evict(0), []);
     }
 }

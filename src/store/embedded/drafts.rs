@@ -1,8 +1,8 @@
-//! Descriptors made anew beside those that serve, and the step that puts them in their place.
+//! Drafts: new descriptors in a folder next to the current ones, and their atomic replacement.
 //!
-//! An image has the same slot in both, so that the step is one record: the map's, which names the
-//! revision. Every slot below a mark has its descriptor in the draft; the step is taken on the writer
-//! thread, and only while no image has a slot beyond the mark.
+//! An image has the same slot in both, so the replacement changes a single record: the map's, which
+//! names the revision. All slots below `done` have a descriptor in the draft. The replacement runs on
+//! the writer thread, and only if no image has a slot at or above `done`.
 
 #[cfg(test)]
 pub(super) mod tests;
@@ -16,23 +16,23 @@ use async_trait::async_trait;
 use super::super::changes::being_reindexed;
 use super::super::{Draft, DraftStore, StoreError};
 use super::live_map::{LiveMap, folder_of};
-use super::maps::{remove_folder, still_there};
+use super::maps::{check_revision, remove_folder};
 use super::trees::{StoredImage, put};
 use super::{EmbeddedStore, Inner, blocking};
 use whereabouts_core::{Descriptor, Image, ImageId, Map};
 
 struct EmbeddedDraft {
     inner: Arc<Inner>,
-    /// The map that serves.
+    /// The map as it is.
     old: Map,
     current: Arc<LiveMap>,
     /// The map as it will be.
     next: Arc<LiveMap>,
-    /// Every image with a slot below this one has its descriptor.
+    /// Images with slots below this one have a descriptor in the draft.
     done: usize,
-    /// Every image with a slot below this one will have it when the walk over the images has ended.
+    /// Images with slots below this one will have one after the current pass over the images.
     end: usize,
-    /// How far the walk has come.
+    /// The last image of the current pass that was returned.
     cursor: Option<ImageId>,
 }
 
@@ -47,7 +47,7 @@ impl DraftStore for EmbeddedStore {
             if drafts.contains_key(&next.uid) {
                 return Err(being_reindexed(&next));
             }
-            // What a draft that failed may have left.
+            // A failed draft may have left its folder.
             remove_folder(&folder_of(&next, &inner.descriptors));
             let next = Arc::new(LiveMap::open(next, &inner.descriptors, inner.index)?);
             drafts.insert(old.uid, Arc::clone(&next));
@@ -85,13 +85,13 @@ impl Draft for EmbeddedDraft {
             .writer
             .commit(
                 move |trees, _| {
-                    // Its id may have gone to another image, which a later walk meets.
+                    // If the id now belongs to another image, a later pass finds that one.
                     let same = |stored: &StoredImage| {
                         stored.image.digest == image.digest && stored.slot < end
                     };
                     let stored = trees.image(uid, &image.id)?.filter(same);
                     if let Some(stored) = &stored {
-                        // Synced with all others before they serve.
+                        // Synced together with all others, before the replacement.
                         writing.vectors.write(stored.slot, descriptor.as_slice())?;
                     }
                     Ok(stored)
@@ -109,7 +109,7 @@ impl Draft for EmbeddedDraft {
     async fn replace(&mut self) -> Result<bool, StoreError> {
         let (inner, next) = (Arc::clone(&self.inner), Arc::clone(&self.next));
         blocking(move || {
-            // Before it serves: a large map should not be searched exactly until its graph is there.
+            // Build the graph first, so that a large map is never searched exactly.
             inner.indexer.finish(&next);
             next.vectors.sync()?;
             sync_folder(&inner)
@@ -117,30 +117,30 @@ impl Draft for EmbeddedDraft {
         .await?;
         let (old, done) = (self.old.clone(), self.done);
         let (reading, current) = (Arc::clone(&self.current), Arc::clone(&self.current));
-        let (inner, next, wanted) =
+        let (inner, next, new_map) =
             (Arc::clone(&self.inner), Arc::clone(&self.next), self.next.map());
         let replaced = self
             .inner
             .writer
             .commit(
                 move |trees, _| {
-                    let stored = still_there(trees, &old)?;
+                    let stored = check_revision(trees, &old)?;
                     if reading.next_slot() != done {
                         return Ok(None);
                     }
-                    // Scene and description may have changed.
+                    // Scene and description may have changed meanwhile.
                     let map =
-                        Map { scene: stored.scene, description: stored.description, ..wanted };
+                        Map { scene: stored.scene, description: stored.description, ..new_map };
                     put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
-                    // Their descriptors are not like those that come now.
+                    // The descriptors of described frames belong to the old revision.
                     trees.forget_frames(map.uid)?;
                     Ok(Some(map))
                 },
                 move |map| {
                     let Some(map) = map else { return };
                     next.set_map(map.clone());
-                    next.go_on_from(&current);
-                    inner.indexer.look_at(&next);
+                    next.continue_slots_of(&current);
+                    inner.indexer.notify(&next);
                     let mut maps = inner.maps.write();
                     maps.insert(map.name.clone(), next);
                     drop(maps);
@@ -159,14 +159,14 @@ impl Draft for EmbeddedDraft {
     async fn discard(self: Box<Self>) {
         let folder = folder_of(&self.next.map(), &self.inner.descriptors);
         if let Err(error) = remove(folder).await {
-            tracing::warn!(%error, "a draft is left to the next start");
+            tracing::warn!(%error, "cannot delete a draft; the next start does");
         }
         self.inner.forget_draft(&self.old);
     }
 }
 
 impl EmbeddedDraft {
-    /// The next images of the walk.
+    /// Returns the next images of the current pass.
     async fn page(&self, limit: usize) -> Result<Vec<Image>, StoreError> {
         let (slots, after) = (self.done..self.end, self.cursor.clone());
         if slots.is_empty() {
@@ -174,10 +174,10 @@ impl EmbeddedDraft {
         }
         let (trees, uid) = (self.inner.trees.clone(), self.old.uid);
         blocking(move || {
-            let wanted = |stored: &Result<StoredImage, _>| {
+            let in_pass = |stored: &Result<StoredImage, _>| {
                 stored.as_ref().map_or(true, |stored| slots.contains(&stored.slot))
             };
-            let images = trees.images_after(uid, after.as_ref()).filter(wanted).take(limit);
+            let images = trees.images_after(uid, after.as_ref()).filter(in_pass).take(limit);
             images.map(|stored| Ok(stored?.image)).collect()
         })
         .await
@@ -198,7 +198,7 @@ async fn remove(folder: PathBuf) -> Result<(), StoreError> {
     .await
 }
 
-/// The folder of a draft is there after a power cut.
+/// Syncs the parent of the draft's folder, so that the folder survives a power cut.
 fn sync_folder(inner: &Inner) -> Result<(), StoreError> {
     let folder = &inner.descriptors;
     File::open(folder)

@@ -1,4 +1,4 @@
-//! Images with their descriptors, for another store.
+//! Export of images with their descriptors, for a backup.
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! The thread that brings graphs up to date behind the backs of searches.
+//! The background thread that brings graphs up to date while searches continue.
 
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Weak};
@@ -9,8 +9,8 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 use super::super::StoreError;
 use super::live_map::LiveMap;
 
-/// Slots put into a graph before the next map has its turn.
-const TURN: usize = 64;
+/// Slots inserted into one map's graph before it is the next map's turn.
+const SLOTS_PER_TURN: usize = 64;
 
 /// Builds graphs in the background.
 pub(super) struct Indexer {
@@ -19,7 +19,7 @@ pub(super) struct Indexer {
 }
 
 impl Indexer {
-    /// `threads` share the work on one graph.
+    /// Starts the thread, and a pool of `threads` that share the work on one graph.
     pub fn start(threads: usize) -> Result<Self, StoreError> {
         let failed = |error: &dyn std::error::Error| StoreError::Failed(error.to_string());
         let threads = ThreadPoolBuilder::new()
@@ -37,20 +37,21 @@ impl Indexer {
         Ok(Self { threads, wake })
     }
 
-    /// Brings a map up to date that nobody else has got hold of yet. Blocks.
+    /// Brings the graph of a map up to date and blocks until that is done. The map must not be known to
+    /// the background thread yet.
     pub fn finish(&self, map: &LiveMap) {
         while map.index.has_work() {
             step(map, &self.threads);
         }
     }
 
-    /// Asks for a map to be brought up to date.
-    pub fn look_at(&self, map: &Arc<LiveMap>) {
+    /// Asks the background thread to bring the graph of a map up to date.
+    pub fn notify(&self, map: &Arc<LiveMap>) {
         if !map.index.has_work() {
             return;
         }
         match self.wake.try_send(Arc::downgrade(map)) {
-            // So many notices wait that this map's next image will bring another.
+            // When the queue is full, the map's next change notifies again.
             Ok(()) | Err(TrySendError::Full(_)) => {}
             Err(TrySendError::Disconnected(_)) => tracing::error!("the indexer has stopped"),
         }
@@ -65,7 +66,7 @@ fn run(wake: &Receiver<Weak<LiveMap>>, threads: &ThreadPool) {
             behind.push(map);
         }
         for map in wake.try_iter() {
-            if !behind.iter().any(|known| known.ptr_eq(&map)) {
+            if !behind.iter().any(|other| other.ptr_eq(&map)) {
                 behind.push(map);
             }
         }
@@ -79,7 +80,7 @@ fn run(wake: &Receiver<Weak<LiveMap>>, threads: &ThreadPool) {
 }
 
 fn step(map: &LiveMap, threads: &ThreadPool) {
-    if let Some(sealed) = map.index.catch_up(map.vectors.as_ref(), TURN, threads) {
-        map.keep(&sealed);
+    if let Some(sealed) = map.index.catch_up(map.vectors.as_ref(), SLOTS_PER_TURN, threads) {
+        map.store_graph(&sealed);
     }
 }

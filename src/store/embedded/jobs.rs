@@ -1,7 +1,7 @@
 //! Jobs and their queue.
 //!
-//! A job that has not ended has an entry in the `queue` tree, whose value says until when nobody may
-//! take it. Ids are UUIDs of version 7, so that key order is the order of submission.
+//! A job that has not ended has an entry in the `queue` tree, whose value is the moment before which
+//! the job cannot be claimed. Ids are version 7 UUIDs, so key order is the order of submission.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -12,8 +12,8 @@ use sled::Transactional;
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
-use super::super::changes::{ended_at, no_job, place, submitted_at};
-use super::super::listing::SEARCHED;
+use super::super::changes::{ended_at, no_job, queue_rank, submitted_at};
+use super::super::listing::MAX_EXAMINED;
 use super::super::{
     Claim, IdempotencyRecord, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
 };
@@ -22,11 +22,11 @@ use super::trees::{
     queued_job, transaction_failed,
 };
 use super::webhooks::WebhookTrees;
-use super::{EmbeddedStore, answers, blocking};
+use super::{EmbeddedStore, blocking, idempotency};
 use whereabouts_core::{Job, Priority};
 
 impl EmbeddedStore {
-    /// Applies a change to one job and tells the listeners.
+    /// Applies a change to one job and publishes it.
     async fn change<F>(&self, id: Uuid, change: F) -> Result<Job, StoreError>
     where
         F: FnOnce(&Trees, JobRecord) -> Result<JobRecord, StoreError> + Send + 'static,
@@ -62,7 +62,7 @@ impl EmbeddedStore {
 }
 
 impl EmbeddedStore {
-    /// Queues a job, unless one was queued for the same request.
+    /// Queues a job, unless one is already queued for the same request; then returns that one.
     async fn insert(
         &self,
         record: JobRecord,
@@ -80,13 +80,13 @@ impl EmbeddedStore {
                     {
                         return Ok(Some(known));
                     }
-                    // Counted here, on the writer thread, so that no two submissions share the
-                    // last place.
+                    // Counted on the writer thread, so that two submissions cannot both take the last
+                    // place.
                     if counting.queued.fetch_add(1, Ordering::Relaxed) >= limit {
                         counting.queued.fetch_sub(1, Ordering::Relaxed);
                         return Err(StoreError::QueueFull { limit });
                     }
-                    let noted = request.map_or(Ok(()), |request| note(trees, &request, id));
+                    let noted = request.map_or(Ok(()), |request| set_job(trees, &request, id));
                     noted.and_then(|()| insert_job(trees, &record)).inspect_err(|_| {
                         counting.queued.fetch_sub(1, Ordering::Relaxed);
                     })?;
@@ -102,19 +102,20 @@ impl EmbeddedStore {
     }
 }
 
-/// The job that was queued for a request.
+/// Returns the job that was queued for a request.
 fn queued_for(trees: &Trees, request: &str) -> Result<Option<Job>, StoreError> {
     let known: Option<IdempotencyRecord> = get(&trees.answers, request.as_bytes())?;
     let job = known.and_then(|known| known.job()).map(|id| trees.job(id)).transpose()?;
     Ok(job.flatten().map(|record| record.job))
 }
 
-/// Notes that a job is queued for a request. It is there only if the job is: whoever reads it looks.
-fn note(trees: &Trees, request: &str, job: Uuid) -> Result<(), StoreError> {
+/// Records the job that is about to be queued for a request. If the job is never written, the reference
+/// dangles, and [`queued_for`] ignores it.
+fn set_job(trees: &Trees, request: &str, job: Uuid) -> Result<(), StoreError> {
     let known: Option<IdempotencyRecord> = get(&trees.answers, request.as_bytes())?;
     let Some(mut known) = known else { return Ok(()) };
-    known.queued(job);
-    answers::write(trees, request.as_bytes(), &known)
+    known.set_job(job);
+    idempotency::write(trees, request.as_bytes(), &known)
 }
 
 #[async_trait]
@@ -136,9 +137,9 @@ impl JobStore for EmbeddedStore {
         Ok(self.inner.queued.load(Ordering::Relaxed))
     }
 
-    async fn oldest_open(&self) -> Result<Option<Timestamp>, StoreError> {
+    async fn oldest_unfinished(&self) -> Result<Option<Timestamp>, StoreError> {
         let inner = Arc::clone(&self.inner);
-        blocking(move || oldest_open(&inner.trees)).await
+        blocking(move || oldest_unfinished(&inner.trees)).await
     }
 
     async fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {
@@ -154,8 +155,8 @@ impl JobStore for EmbeddedStore {
     ) -> Result<JobList, StoreError> {
         let (inner, filter) = (Arc::clone(&self.inner), filter.clone());
         blocking(move || {
-            let most = filter.text.as_ref().map_or(usize::MAX, |_| SEARCHED);
-            list(&inner.trees, &filter, before.unwrap_or(Uuid::max()), limit, most)
+            let max_examined = filter.text.as_ref().map_or(usize::MAX, |_| MAX_EXAMINED);
+            list(&inner.trees, &filter, before.unwrap_or(Uuid::max()), limit, max_examined)
         })
         .await
     }
@@ -166,18 +167,18 @@ impl JobStore for EmbeddedStore {
         lease_until: Timestamp,
     ) -> Result<Option<JobRecord>, StoreError> {
         let inner = Arc::clone(&self.inner);
-        // Looking costs no commit, and workers look every second.
-        let looking = Arc::clone(&inner);
-        if !blocking(move || some_may_be_taken(&looking.trees, now)).await? {
+        // Workers poll every second; a read costs no commit.
+        let polling = Arc::clone(&inner);
+        if !blocking(move || is_any_claimable(&polling.trees, now)).await? {
             return Ok(None);
         }
         self.inner
             .writer
             .commit(
                 move |trees, _| {
-                    let Some(mut record) = next_waiting(trees, now)? else { return Ok(None) };
-                    record.take(now);
-                    write_job(trees, &record, Place::Queue(Some(lease_until)))?;
+                    let Some(mut record) = next_claimable(trees, now)? else { return Ok(None) };
+                    record.start_attempt(now);
+                    write_job(trees, &record, Listing::Queue(Some(lease_until)))?;
                     Ok(Some(record))
                 },
                 move |claimed: &Option<JobRecord>| {
@@ -204,8 +205,8 @@ impl JobStore for EmbeddedStore {
     async fn release(&self, claim: Claim, release: Release) -> Result<(), StoreError> {
         self.change(claim.job, move |trees, mut record| {
             if record.is_held_by(claim) {
-                record.give_back(&release);
-                write_job(trees, &record, Place::Queue(release.not_before))?;
+                record.requeue(&release);
+                write_job(trees, &record, Listing::Queue(release.not_before))?;
             }
             Ok(record)
         })
@@ -217,7 +218,7 @@ impl JobStore for EmbeddedStore {
         self.change(claim.job, move |trees, mut record| {
             if record.is_held_by(claim) {
                 record.job = job;
-                write_job(trees, &record, Place::Ended(ended_at(&record.job)))?;
+                write_job(trees, &record, Listing::Ended(ended_at(&record.job)))?;
             }
             Ok(record)
         })
@@ -228,7 +229,7 @@ impl JobStore for EmbeddedStore {
     async fn cancel(&self, id: Uuid) -> Result<Job, StoreError> {
         self.change(id, move |trees, mut record| {
             if record.cancel(Timestamp::now()) {
-                write_job(trees, &record, Place::Ended(ended_at(&record.job)))?;
+                write_job(trees, &record, Listing::Ended(ended_at(&record.job)))?;
             }
             Ok(record)
         })
@@ -238,8 +239,8 @@ impl JobStore for EmbeddedStore {
     async fn retry(&self, id: Uuid) -> Result<Job, StoreError> {
         self.change(id, move |trees, mut record| {
             let ended = ended_at(&record.job);
-            record.queue_again()?;
-            write_job(trees, &record, Place::Again { ended })?;
+            record.retry()?;
+            write_job(trees, &record, Listing::Requeued { ended })?;
             Ok(record)
         })
         .await
@@ -250,20 +251,20 @@ impl JobStore for EmbeddedStore {
     }
 }
 
-/// Jobs older than `before`, at most `limit` of them, among the `most` youngest of those.
+/// Returns up to `limit` matching jobs older than `before`, after examining at most `max_examined`.
 fn list(
     trees: &Trees,
     filter: &JobFilter,
     before: Uuid,
     limit: usize,
-    most: usize,
+    max_examined: usize,
 ) -> Result<JobList, StoreError> {
     let (mut found, mut last) = (JobList::default(), None);
-    for (looked, entry) in trees.jobs.range(..before.as_bytes().to_vec()).rev().enumerate() {
+    for (examined, entry) in trees.jobs.range(..before.as_bytes().to_vec()).rev().enumerate() {
         if found.jobs.len() == limit {
             break;
         }
-        if looked == most {
+        if examined == max_examined {
             found.searched_to = last;
             break;
         }
@@ -276,17 +277,17 @@ fn list(
     Ok(found)
 }
 
-/// No job is held or kept waiting longer than this, budgets of a day included. An entry that says so
-/// was written before the clock was set back.
+/// The longest possible lease or delay, waiting for a daily budget included. A longer one was written
+/// before the clock was set back, and does not count.
 const LONGEST_LEASE: SignedDuration = SignedDuration::from_hours(25);
 
-/// Whether an entry of the queue keeps its job from being taken.
+/// Whether the lease of a queue entry keeps its job from being claimed.
 fn is_held(lease: &[u8], now: Timestamp) -> Result<bool, StoreError> {
     let longest = now.saturating_add(LONGEST_LEASE).unwrap_or(Timestamp::MAX);
     Ok(decode::<Lease>(lease)?.is_some_and(|until| until > now && until <= longest))
 }
 
-fn some_may_be_taken(trees: &Trees, now: Timestamp) -> Result<bool, StoreError> {
+fn is_any_claimable(trees: &Trees, now: Timestamp) -> Result<bool, StoreError> {
     for lease in trees.queue.iter().values() {
         if !is_held(&lease.map_err(failed)?, now)? {
             return Ok(true);
@@ -295,8 +296,8 @@ fn some_may_be_taken(trees: &Trees, now: Timestamp) -> Result<bool, StoreError> 
     Ok(false)
 }
 
-/// The first job in the queue that may be taken.
-fn next_waiting(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, StoreError> {
+/// Returns the first job in the queue that can be claimed.
+fn next_claimable(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, StoreError> {
     for entry in trees.queue.iter() {
         let (key, lease) = entry.map_err(failed)?;
         if is_held(&lease, now)? {
@@ -312,11 +313,11 @@ fn next_waiting(trees: &Trees, now: Timestamp) -> Result<Option<JobRecord>, Stor
     Ok(None)
 }
 
-/// When the oldest job in the queue was submitted: the first of one of the priorities.
-fn oldest_open(trees: &Trees) -> Result<Option<Timestamp>, StoreError> {
+/// Returns when the oldest job in the queue was submitted, which is the first of some priority.
+fn oldest_unfinished(trees: &Trees) -> Result<Option<Timestamp>, StoreError> {
     let mut oldest: Option<Uuid> = None;
     for priority in [Priority::High, Priority::Normal, Priority::Low] {
-        if let Some(key) = trees.queue.scan_prefix([place(priority)]).keys().next() {
+        if let Some(key) = trees.queue.scan_prefix([queue_rank(priority)]).keys().next() {
             let id = queued_job(&key.map_err(failed)?);
             oldest = oldest.into_iter().chain(id).min();
         }
@@ -327,29 +328,30 @@ fn oldest_open(trees: &Trees) -> Result<Option<Timestamp>, StoreError> {
 fn insert_job(trees: &Trees, record: &JobRecord) -> Result<(), StoreError> {
     let reference = blob_ref_key(&record.query.digest, &BlobOwner::Query(record.query.id));
     put(&trees.blob_refs, &reference, &())?;
-    write_job(trees, record, Place::Queue(None))
+    write_job(trees, record, Listing::Queue(None))
 }
 
-/// Where a job is listed.
-enum Place {
-    /// In the queue.
+/// The tree that lists a job.
+enum Listing {
+    /// The queue.
     Queue(Lease),
-    /// In the queue again, after it had ended.
-    Again { ended: Timestamp },
-    /// Among those that have ended, by when that was.
+    /// The queue, after the job had ended.
+    Requeued { ended: Timestamp },
+    /// The ended jobs, by their end time.
     Ended(Timestamp),
 }
 
-/// Writes a job and its place; and with its end, what webhooks are told of that.
-fn write_job(trees: &Trees, record: &JobRecord, place: Place) -> Result<(), StoreError> {
+/// Writes a job and its listing, and the deliveries about its end if it has ended.
+fn write_job(trees: &Trees, record: &JobRecord, listing: Listing) -> Result<(), StoreError> {
     let (key, in_queue) = (record.job.id.as_bytes(), queue_key(&record.job));
     let value = encode(record)?;
-    let (lease, gone, end) = match place {
-        Place::Queue(lease) => (Some(encode(&lease)?), None, None),
-        Place::Again { ended } => (Some(encode(&Lease::None)?), Some(ended), None),
-        Place::Ended(at) => (None, None, Some(at)),
+    let (lease, delisted, end) = match listing {
+        Listing::Queue(lease) => (Some(encode(&lease)?), None, None),
+        Listing::Requeued { ended } => (Some(encode(&Lease::None)?), Some(ended), None),
+        Listing::Ended(at) => (None, None, Some(at)),
     };
-    let news = end.map(|_| trees.webhooks.news_of(&record.job)).transpose()?.unwrap_or_default();
+    let outbox = end.map(|_| trees.webhooks.deliveries_for(&record.job)).transpose()?;
+    let outbox = outbox.unwrap_or_default();
     let WebhookTrees { deliveries, bodies, due, .. } = &trees.webhooks;
     (&trees.jobs, &trees.queue, &trees.ended, deliveries, bodies, due)
         .transaction(|(jobs, queue, ended, deliveries, bodies, due)| {
@@ -358,78 +360,16 @@ fn write_job(trees: &Trees, record: &JobRecord, place: Place) -> Result<(), Stor
                 Some(lease) => queue.insert(&in_queue, lease.as_slice())?,
                 None => queue.remove(&in_queue)?,
             };
-            if let Some(at) = gone {
+            if let Some(at) = delisted {
                 ended.remove(&ended_key(at, record.job.id))?;
             }
             if let Some(at) = end {
                 ended.insert(&ended_key(at, record.job.id), &[] as &[u8])?;
             }
-            news.iter().try_for_each(|news| news.write(deliveries, bodies, due))
+            outbox.iter().try_for_each(|delivery| delivery.write(deliveries, bodies, due))
         })
         .map_err(transaction_failed)
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::drafts::tests::settings;
-    use super::*;
-    use crate::Query;
-    use whereabouts_core::{Digest, MapName, MediaType, RefinerKind};
-
-    /// A job that waits in a map.
-    async fn submitted(store: &EmbeddedStore, map: &str) -> Uuid {
-        let (now, id) = (Timestamp::now(), Uuid::now_v7());
-        let digest = Digest::of(id.as_bytes());
-        let query =
-            Query { id, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
-        let map: MapName = map.parse().unwrap();
-        let job = Job::queued(map, id, RefinerKind::Local, now);
-        let id = job.id;
-        let (map_uid, candidates) = (Uuid::nil(), vec![]);
-        let record = JobRecord {
-            job,
-            map_uid,
-            revision: 0,
-            query,
-            candidates,
-            claims: 0,
-            traceparent: None,
-        };
-        store.submit(record, 100).await.unwrap();
-        id
-    }
-
-    #[tokio::test]
-    async fn a_search_ends_after_so_many_jobs_and_goes_on_where_it_ended() {
-        let dir = tempfile::tempdir().unwrap();
-        let store = EmbeddedStore::open(&settings(dir.path())).unwrap();
-        let mut jobs = Vec::new();
-        for map in ["town", "yard", "town", "yard", "yard"] {
-            jobs.push(submitted(&store, map).await);
-        }
-        let filter = JobFilter { text: Some("TOW".into()), ..JobFilter::default() };
-        let search = |before: Uuid, limit: usize| {
-            let found = list(&store.inner.trees, &filter, before, limit, 2).unwrap();
-            (found.jobs.iter().map(|job| job.id).collect::<Vec<_>>(), found.searched_to)
-        };
-        assert_eq!(search(Uuid::max(), 10), (vec![], Some(jobs[3])));
-        assert_eq!(search(jobs[3], 10), (vec![jobs[2]], Some(jobs[1])));
-        assert_eq!(search(jobs[1], 10), (vec![jobs[0]], None));
-        // A list that is full says nothing of where the search ended.
-        assert_eq!(search(jobs[3], 1), (vec![jobs[2]], None));
-        let whole = store.jobs(&filter, None, 10).await.unwrap();
-        assert_eq!((whole.jobs.len(), whole.searched_to), (2, None));
-    }
-
-    #[test]
-    fn a_lease_from_before_the_clock_was_set_back_holds_nothing() {
-        let now: Timestamp = "2026-05-04T12:00:00Z".parse().unwrap();
-        let held = |until: Option<&str>| {
-            let lease: Lease = until.map(|until| until.parse().unwrap());
-            is_held(&encode(&lease).unwrap(), now).unwrap()
-        };
-        assert!(held(Some("2026-05-04T12:00:01Z")) && held(Some("2026-05-05T00:00:00Z")));
-        assert!(!held(None) && !held(Some("2026-05-04T11:59:59Z")));
-        assert!(!held(Some("2027-05-04T12:00:00Z")));
-    }
-}
+mod tests;

@@ -1,4 +1,4 @@
-//! API keys: one small record each. A key that was revoked stays, so that the audit log can be read.
+//! API keys, one record each. A revoked key is kept, so that the audit log can still be resolved.
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! One map in memory: which slot is which image, and its index.
+//! A loaded map: which image is in which slot, and the index over them.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -10,31 +10,31 @@ use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
 use parking_lot::RwLock;
 use whereabouts_core::{Calibration, CalibrationSettings, Candidate, ImageId, Map, Pose};
-use whereabouts_index::{Found, IndexSettings, MapIndex, SealedGraph, SearchMode, Vectors};
+use whereabouts_index::{IndexSettings, MapIndex, ScoredSlot, SealedGraph, SearchMode, Vectors};
 
 pub(super) struct LiveMap {
     /// The map as stored; scene and description may change.
     map: RwLock<Map>,
     pub vectors: Arc<VectorFiles>,
     pub index: MapIndex,
-    pub calibration: KeptCalibration,
-    /// The sealed graph, so that a start need not build it again.
+    pub calibration: StoredCalibration,
+    /// Where the sealed graph is stored, so that a restart need not rebuild it.
     graph_file: PathBuf,
     entries: RwLock<Vec<Option<Entry>>>,
-    /// The slot of the next image. Only the writer thread moves it.
+    /// The slot of the next image. Only the writer thread changes it.
     next_slot: AtomicUsize,
-    /// How often images were added and removed.
+    /// Number of additions and removals since the map was loaded.
     changes: AtomicU64,
 }
 
-/// What an answer says about an image, kept in memory so that a search reads no record.
+/// The fields of an image that a candidate needs, kept in memory so that a search reads no records.
 struct Entry {
     id: ImageId,
     pose: Option<Pose>,
 }
 
 impl LiveMap {
-    /// Loads a map. An image whose descriptor is damaged is left out of answers, and said so.
+    /// Loads a map. An image with a damaged descriptor is logged and excluded from searches.
     pub fn load(
         map: Map,
         descriptors: &Path,
@@ -52,14 +52,15 @@ impl LiveMap {
             } else {
                 tracing::error!(
                     map = %live.map().name, image = %stored.image.id,
-                    "its descriptor is damaged, so it is not found; delete the image and add it again"
+                    "its descriptor is damaged, so searches do not find it; delete the image and add it \
+                     again"
                 );
             }
         }
         Ok(live)
     }
 
-    /// A map of which nothing is known yet but its descriptors.
+    /// Opens a map's descriptors, without any images yet.
     pub fn open(map: Map, descriptors: &Path, index: IndexSettings) -> Result<Self, StoreError> {
         let folder = folder_of(&map, descriptors);
         let vectors = VectorFiles::open(folder.clone(), map.dim)?;
@@ -67,7 +68,7 @@ impl LiveMap {
             map: RwLock::new(map),
             vectors: Arc::new(vectors),
             index: MapIndex::new(index),
-            calibration: KeptCalibration::open(&folder),
+            calibration: StoredCalibration::open(&folder),
             graph_file: folder.join("graph"),
             entries: RwLock::default(),
             next_slot: AtomicUsize::new(0),
@@ -75,39 +76,39 @@ impl LiveMap {
         })
     }
 
-    /// Takes up the graph of an earlier process. One that is damaged or missing is built again in
-    /// the background, while the map is searched exactly.
+    /// Restores the graph sealed by an earlier process. If it is damaged or missing, it is rebuilt in
+    /// the background while the map is searched exactly.
     fn restore_graph(&self, settings: IndexSettings) {
         let bytes = match std::fs::read(&self.graph_file) {
             Ok(bytes) => bytes,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return,
             Err(error) => {
-                tracing::warn!(file = %self.graph_file.display(), %error, "the graph cannot be read");
+                tracing::warn!(file = %self.graph_file.display(), %error, "cannot read the graph");
                 return;
             }
         };
         match SealedGraph::from_bytes(&bytes) {
-            Ok(sealed) if sealed.dim() == self.vectors.dim() && sealed.fits(&settings) => {
-                // Its slots are never given to other images.
+            Ok(sealed) if sealed.dim() == self.vectors.dim() && sealed.is_built_with(&settings) => {
+                // Its slots must not be reused for other images.
                 self.next_slot.fetch_max(sealed.end(), Ordering::Relaxed);
                 self.index.restore(sealed);
             }
             Ok(_) => tracing::info!(
                 file = %self.graph_file.display(),
-                "the graph was made with other settings; it is built again"
+                "the graph was built with other settings; rebuilding it"
             ),
             Err(error) => {
-                tracing::warn!(file = %self.graph_file.display(), %error, "the graph is built again");
+                tracing::warn!(file = %self.graph_file.display(), %error, "rebuilding the graph");
             }
         }
     }
 
-    /// Writes a sealed graph where the next start finds it.
-    pub fn keep(&self, sealed: &SealedGraph) {
-        let beside = self.graph_file.with_extension("tmp");
-        if let Err(error) = replace_durably(&self.graph_file, &beside, &sealed.to_bytes()) {
-            // The next start builds it again.
-            tracing::warn!(file = %self.graph_file.display(), %error, "the graph cannot be kept");
+    /// Writes a sealed graph to disk for the next start.
+    pub fn store_graph(&self, sealed: &SealedGraph) {
+        let temporary = self.graph_file.with_extension("tmp");
+        if let Err(error) = replace_durably(&self.graph_file, &temporary, &sealed.to_bytes()) {
+            // The next start rebuilds it.
+            tracing::warn!(file = %self.graph_file.display(), %error, "cannot write the graph");
         }
     }
 
@@ -119,23 +120,23 @@ impl LiveMap {
         *self.map.write() = map;
     }
 
-    /// The slot for a new image. Call on the writer thread.
-    pub fn take_slot(&self) -> usize {
+    /// Allocates the slot of a new image. Call it on the writer thread.
+    pub fn allocate_slot(&self) -> usize {
         self.next_slot.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// The slot that the next image will have. Only on the writer thread does it mean that every
-    /// image with a lower one is stored.
+    /// Returns the slot of the next image. Only on the writer thread does this mean that all images with
+    /// lower slots are stored.
     pub fn next_slot(&self) -> usize {
         self.next_slot.load(Ordering::Relaxed)
     }
 
-    /// Gives out slots where `other`, which this one replaces, leaves off.
-    pub fn go_on_from(&self, other: &Self) {
+    /// Continues the slot numbers of `other`, which this map replaces.
+    pub fn continue_slots_of(&self, other: &Self) {
         self.next_slot.store(other.next_slot(), Ordering::Relaxed);
     }
 
-    /// Makes a stored image part of every later answer.
+    /// Makes a stored image visible to searches.
     pub fn publish(&self, stored: &StoredImage) {
         let mut entries = self.entries.write();
         if entries.len() <= stored.slot {
@@ -147,7 +148,7 @@ impl LiveMap {
         self.index.add(stored.slot);
     }
 
-    /// Keeps an image out of every later answer.
+    /// Hides an image from searches.
     pub fn withdraw(&self, slot: usize) {
         self.index.remove(slot);
         let mut entries = self.entries.write();
@@ -157,17 +158,17 @@ impl LiveMap {
         self.changes.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Bytes of the descriptors, and of the sealed graph.
+    /// Returns the size of the descriptors and the sealed graph, in bytes.
     pub fn index_bytes(&self) -> u64 {
         self.vectors.bytes_of(self.next_slot()) + self.index.sealed_bytes() as u64
     }
 
-    /// How often images were added and removed since the map was loaded.
+    /// Returns the number of additions and removals since the map was loaded.
     pub fn changes(&self) -> u64 {
         self.changes.load(Ordering::Relaxed)
     }
 
-    /// The images that have a pose, in the order of their addition.
+    /// Returns the images that have a pose, in insertion order.
     pub fn positions(&self) -> Vec<(ImageId, Pose)> {
         let entries = self.entries.read();
         entries.iter().flatten().filter_map(|entry| Some((entry.id.clone(), entry.pose?))).collect()
@@ -177,109 +178,110 @@ impl LiveMap {
         self.candidates(&self.index.search(self.vectors.as_ref(), query, k, mode))
     }
 
-    fn candidates(&self, found: &[Found]) -> Vec<Candidate> {
+    fn candidates(&self, found: &[ScoredSlot]) -> Vec<Candidate> {
         let entries = self.entries.read();
         found
             .iter()
-            // An image that was removed since the search is left out.
+            // Skip images that were removed since the search.
             .filter_map(|found| Some((found, entries.get(found.slot)?.as_ref()?)))
             .enumerate()
             .map(|(position, (found, entry))| Candidate {
                 rank: position + 1,
                 image_id: entry.id.clone(),
-                // Rounding can carry the cosine of equal pictures just past 1.
+                // Rounding can push the cosine of identical pictures slightly above 1.
                 similarity: found.similarity.clamp(-1.0, 1.0),
                 pose: entry.pose,
             })
             .collect()
     }
 
-    /// Images spread over the map, each with the `k` most similar ones of other places.
-    pub fn look_alikes(&self, settings: CalibrationSettings, k: usize) -> Vec<HardNegatives> {
-        let places: Vec<Place> = {
+    /// Samples images evenly across the map and returns the `k` hardest negatives of each.
+    pub fn hard_negatives(&self, settings: CalibrationSettings, k: usize) -> Vec<HardNegatives> {
+        let images: Vec<ImageLocation> = {
             let entries = self.entries.read();
-            let known = entries.iter().enumerate();
-            let known = known.filter_map(|(slot, entry)| Some((slot, entry.as_ref()?)));
-            known.map(|(slot, entry)| Place { slot, pose: entry.pose }).collect()
+            let present = entries.iter().enumerate();
+            let present = present.filter_map(|(slot, entry)| Some((slot, entry.as_ref()?)));
+            present.map(|(slot, entry)| ImageLocation { slot, pose: entry.pose }).collect()
         };
-        let asked = (0..places.len()).step_by(settings.step(places.len()));
-        asked.filter_map(|at| self.look_alikes_of(&places, at, settings, k)).collect()
+        let samples = (0..images.len()).step_by(settings.step(images.len()));
+        samples.filter_map(|at| self.hard_negatives_of(&images, at, settings, k)).collect()
     }
 
-    /// `None` for an image that is no longer there.
-    fn look_alikes_of(
+    /// Returns the hard negatives of one image; `None` if the image was removed meanwhile.
+    fn hard_negatives_of(
         &self,
-        places: &[Place],
+        images: &[ImageLocation],
         at: usize,
         settings: CalibrationSettings,
         k: usize,
     ) -> Option<HardNegatives> {
-        let asked = &places[at];
-        let of_another_place = |found: &Found| {
-            // Where it stands in the order of addition.
-            let position = places.partition_point(|place| place.slot < found.slot);
-            let pose = places.get(position).and_then(|place| place.pose);
-            settings.are_apart(places.len(), (at, asked.pose), (position, pose))
+        let query = &images[at];
+        let of_another_place = |found: &ScoredSlot| {
+            // Its position in insertion order.
+            let position = images.partition_point(|image| image.slot < found.slot);
+            let pose = images.get(position).and_then(|image| image.pose);
+            settings.are_apart(images.len(), (at, query.pose), (position, pose))
         };
         let mut descriptor = Vec::new();
         self.vectors
-            .scan(asked.slot..asked.slot + 1, &mut |_, numbers| descriptor = numbers.to_vec());
-        // Twice as many, until enough of them are of other places.
-        let mut wanted = k + 2 * settings.place_images_of(places.len()) + 1;
-        let others: Vec<Found> = loop {
+            .scan(query.slot..query.slot + 1, &mut |_, numbers| descriptor = numbers.to_vec());
+        // Double the limit until enough results are of other places.
+        let mut limit = k + 2 * settings.place_radius(images.len()) + 1;
+        let others: Vec<ScoredSlot> = loop {
             let found =
-                self.index.search(self.vectors.as_ref(), &descriptor, wanted, SearchMode::Fast);
-            let all = found.len() < wanted;
-            let others: Vec<Found> = found.into_iter().filter(of_another_place).take(k).collect();
-            if others.len() == k || all {
+                self.index.search(self.vectors.as_ref(), &descriptor, limit, SearchMode::Fast);
+            let exhausted = found.len() < limit;
+            let others: Vec<ScoredSlot> =
+                found.into_iter().filter(of_another_place).take(k).collect();
+            if others.len() == k || exhausted {
                 break others;
             }
-            wanted *= 2;
+            limit *= 2;
         };
         let image_id = self.entries.read();
-        let image_id = image_id.get(asked.slot)?.as_ref()?.id.clone();
+        let image_id = image_id.get(query.slot)?.as_ref()?.id.clone();
         Some(HardNegatives { image_id, others: self.candidates(&others) })
     }
 }
 
-/// Where an image is, and where it was taken from.
-struct Place {
+/// The slot of an image and the pose it was taken from.
+struct ImageLocation {
     slot: usize,
     pose: Option<Pose>,
 }
 
-/// What was last measured in the map, beside its descriptors.
-pub(super) struct KeptCalibration {
+/// The latest calibration of a map, cached in memory and stored next to its descriptors.
+pub(super) struct StoredCalibration {
     file: PathBuf,
-    known: RwLock<Option<Arc<Calibration>>>,
+    cached: RwLock<Option<Arc<Calibration>>>,
 }
 
-impl KeptCalibration {
-    /// What an earlier process measured; if it cannot be read it is measured again.
+impl StoredCalibration {
+    /// Reads the calibration of an earlier process. A file that cannot be read counts as missing.
     fn open(folder: &Path) -> Self {
         let file = folder.join("calibration.json");
-        let known = std::fs::read(&file).ok().and_then(|json| serde_json::from_slice(&json).ok());
-        Self { file, known: RwLock::new(known) }
+        let stored = std::fs::read(&file).ok().and_then(|json| serde_json::from_slice(&json).ok());
+        Self { file, cached: RwLock::new(stored) }
     }
 
     pub fn get(&self) -> Option<Arc<Calibration>> {
-        self.known.read().clone()
+        self.cached.read().clone()
     }
 
     pub fn put(&self, measured: Calibration) {
-        let beside = self.file.with_extension("tmp");
-        let kept = serde_json::to_vec(&measured)
+        let temporary = self.file.with_extension("tmp");
+        let written = serde_json::to_vec(&measured)
             .map_err(std::io::Error::from)
-            .and_then(|json| replace_durably(&self.file, &beside, &json));
-        if let Err(error) = kept {
-            // The next start measures again.
-            tracing::warn!(file = %self.file.display(), %error, "a calibration cannot be kept");
+            .and_then(|json| replace_durably(&self.file, &temporary, &json));
+        if let Err(error) = written {
+            // The next start calibrates again.
+            tracing::warn!(file = %self.file.display(), %error, "cannot write a calibration");
         }
-        *self.known.write() = Some(Arc::new(measured));
+        *self.cached.write() = Some(Arc::new(measured));
     }
 }
 
-/// Where the descriptors of a map are: each revision has a folder of its own.
+/// Returns the folder of a map's descriptors; each revision has its own.
 pub(super) fn folder_of(map: &Map, descriptors: &Path) -> PathBuf {
     let uid = map.uid.simple();
     descriptors.join(match map.revision {

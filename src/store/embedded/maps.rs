@@ -1,4 +1,4 @@
-//! Maps and images: every change goes through the writer, every read past it.
+//! Maps and images. Every change goes through the writer thread; reads bypass it.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -23,11 +23,11 @@ use whereabouts_core::{
 };
 use whereabouts_index::SearchMode;
 
-/// Images removed in one transaction when a whole map goes.
-const SWEEP: usize = 256;
+/// Images removed in one transaction when a map is deleted.
+const SWEEP_BATCH: usize = 256;
 
 impl Inner {
-    /// The map as it is now, whatever its revision.
+    /// Returns the loaded map, whatever its revision.
     pub(super) fn live(&self, map: &Map) -> Result<Arc<LiveMap>, StoreError> {
         let maps = self.maps.read();
         match maps.get(&map.name) {
@@ -36,7 +36,7 @@ impl Inner {
         }
     }
 
-    /// The map, if its descriptors are still those that the caller knows.
+    /// Returns the loaded map if it still has the revision that the caller knows.
     pub(super) fn live_revision(&self, map: &Map) -> Result<Arc<LiveMap>, StoreError> {
         let live = self.live(map)?;
         match live.map().revision == map.revision {
@@ -45,11 +45,11 @@ impl Inner {
         }
     }
 
-    /// Keeps an image out of every later answer, also of those of a draft. On the writer thread.
+    /// Removes an image from the map's index and that of its draft. Call it on the writer thread.
     fn withdraw(&self, map: &Map, slot: usize) {
         if let Ok(live) = self.live(map) {
             live.withdraw(slot);
-            self.indexer.look_at(&live);
+            self.indexer.notify(&live);
         }
         let drafts = self.drafts.read();
         if let Some(draft) = drafts.get(&map.uid) {
@@ -57,15 +57,15 @@ impl Inner {
         }
     }
 
-    /// Stores the map's record; on the writer thread.
-    fn apply_put(&self, trees: &Trees, wanted: Map) -> Result<(Map, bool), StoreError> {
-        let stored: Option<Map> = get(&trees.maps, wanted.name.as_str().as_bytes())?;
+    /// Stores the map's record. Call it on the writer thread.
+    fn apply_put(&self, trees: &Trees, requested: Map) -> Result<(Map, bool), StoreError> {
+        let stored: Option<Map> = get(&trees.maps, requested.name.as_str().as_bytes())?;
         let (map, new) = match stored {
-            None => (wanted, true),
+            None => (requested, true),
             Some(stored) => {
                 let uid = stored.uid;
                 let has_images = || trees.images.scan_prefix(uid.as_bytes()).next().is_some();
-                (changed_map(stored, wanted, has_images)?, false)
+                (changed_map(stored, requested, has_images)?, false)
             }
         };
         put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
@@ -128,8 +128,8 @@ impl MapStore for EmbeddedStore {
             )
             .await?;
         let Some(map) = removed else { return Ok(false) };
-        // The map is gone for every caller; what it leaves behind is cleared away in small steps,
-        // and by the next start if this process ends before.
+        // Callers no longer see the map; its images are now removed in small batches. If this process
+        // ends before that is done, the next start finishes it.
         let inner = Arc::clone(&self.inner);
         blocking(move || {
             sweep(map.uid, &inner.trees, &inner.blobs)?;
@@ -168,8 +168,8 @@ impl MapStore for EmbeddedStore {
                         let image = same_bytes(present.image, &image)?;
                         return Ok((StoredImage { image, slot }, false));
                     }
-                    still_there(trees, &map)?;
-                    let slot = writing.take_slot();
+                    check_revision(trees, &map)?;
+                    let slot = writing.allocate_slot();
                     writing.vectors.write(slot, descriptor.as_slice())?;
                     touched.vectors.push(Arc::clone(&writing.vectors));
                     let stored = StoredImage { image, slot };
@@ -179,7 +179,7 @@ impl MapStore for EmbeddedStore {
                 move |(stored, new)| {
                     if *new {
                         publishing.publish(stored);
-                        inner.indexer.look_at(&publishing);
+                        inner.indexer.notify(&publishing);
                     }
                 },
             )
@@ -190,6 +190,19 @@ impl MapStore for EmbeddedStore {
     async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
         let (inner, uid, id) = (Arc::clone(&self.inner), map.uid, id.clone());
         blocking(move || Ok(inner.trees.image(uid, &id)?.map(|stored| stored.image))).await
+    }
+
+    async fn images_by_id(
+        &self,
+        map: &Map,
+        ids: &[ImageId],
+    ) -> Result<Vec<Option<Image>>, StoreError> {
+        let (inner, uid, ids) = (Arc::clone(&self.inner), map.uid, ids.to_vec());
+        blocking(move || {
+            let image = |id| Ok(inner.trees.image(uid, id)?.map(|stored| stored.image));
+            ids.iter().map(image).collect()
+        })
+        .await
     }
 
     async fn images(
@@ -248,18 +261,18 @@ impl MapStore for EmbeddedStore {
         blocking(move || Ok(live.search(query.as_slice(), k, mode))).await
     }
 
-    async fn look_alikes(
+    async fn hard_negatives(
         &self,
         map: &Map,
         settings: CalibrationSettings,
         k: usize,
     ) -> Result<Vec<HardNegatives>, StoreError> {
         let live = self.inner.live_revision(map)?;
-        blocking(move || Ok(live.look_alikes(settings, k))).await
+        blocking(move || Ok(live.hard_negatives(settings, k))).await
     }
 
     async fn calibration(&self, map: &Map) -> Result<Option<Arc<Calibration>>, StoreError> {
-        // What was measured in a map that is gone, or has other descriptors by now, is gone with it.
+        // A calibration is gone with its map or its revision.
         Ok(self.inner.live_revision(map).ok().and_then(|live| live.calibration.get()))
     }
 
@@ -286,8 +299,8 @@ impl BlobStore for EmbeddedStore {
     }
 }
 
-/// Whether the map is stored and has the descriptors that the caller knows.
-pub(super) fn still_there(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
+/// Returns the stored map, if it still has the revision that the caller knows.
+pub(super) fn check_revision(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
     match get::<Map>(&trees.maps, map.name.as_str().as_bytes())? {
         Some(stored) if stored.uid == map.uid && stored.revision == map.revision => Ok(stored),
         Some(stored) if stored.uid == map.uid => Err(StoreError::Superseded(stored.name)),
@@ -322,8 +335,9 @@ fn remove_images(trees: &Trees, uid: Uuid, stored: &[StoredImage]) -> Result<(),
         .map_err(transaction_failed)
 }
 
-/// Clears away what deleted maps left behind when the process ended too soon.
-pub(super) fn sweep_deleted(
+/// Removes orphans: images and descriptor folders of deleted maps, left by a process that ended before
+/// it had removed them.
+pub(super) fn collect_orphans(
     trees: &Trees,
     blobs: &Blobs,
     descriptors: &Path,
@@ -342,8 +356,8 @@ pub(super) fn sweep_deleted(
             None => break,
         }
     }
-    // Left by maps that are gone, by a map whose model changed while it was empty, by a reindex
-    // that did not end.
+    // Folders are left by deleted maps, by a map whose model changed while it was empty, and by a
+    // reindex that did not finish.
     let in_use: Vec<_> = maps.iter().map(|map| folder_of(map, descriptors)).collect();
     for folder in std::fs::read_dir(descriptors).into_iter().flatten().flatten() {
         if !in_use.contains(&folder.path()) {
@@ -353,24 +367,25 @@ pub(super) fn sweep_deleted(
     trees.flush()
 }
 
-/// Clears away the frames, images, references and bytes of a map that is gone.
+/// Removes the frames, images, references and bytes of a deleted map.
 fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs) -> Result<(), StoreError> {
     trees.forget_frames(uid)?;
     loop {
-        let some: Vec<StoredImage> = trees.images_of(uid).take(SWEEP).collect::<Result<_, _>>()?;
-        if some.is_empty() {
+        let batch: Vec<StoredImage> =
+            trees.images_of(uid).take(SWEEP_BATCH).collect::<Result<_, _>>()?;
+        if batch.is_empty() {
             break;
         }
-        remove_images(trees, uid, &some)?;
+        remove_images(trees, uid, &batch)?;
         trees.flush()?;
-        for stored in &some {
+        for stored in &batch {
             blobs.remove_unreferenced(&stored.image.digest, trees);
         }
     }
     Ok(())
 }
 
-/// What cannot be removed stays as rubbish, which harms nobody.
+/// Removes a folder of descriptors. One that cannot be removed is harmless and only takes up space.
 pub(super) fn remove_folder(folder: &Path) {
     if let Err(error) = std::fs::remove_dir_all(folder)
         && error.kind() != std::io::ErrorKind::NotFound

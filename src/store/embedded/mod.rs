@@ -1,36 +1,36 @@
-//! The embedded store: one folder, one process.
+//! The embedded store, for a single process: everything is in one data folder.
 //!
 //! ```text
 //! DATA/lock              held while a process uses the folder
-//! DATA/version           the version of what follows (`schema.rs`)
-//! DATA/commits           the number of the last commit, to notice a database that lost some
+//! DATA/version           the version of the folder's format (`schema.rs`)
+//! DATA/commits           the number of the last commit, to detect a database that lost commits
 //! DATA/db/               sled: records of maps, images, queries and jobs
 //! DATA/descriptors/UID/  append-only segments of one map's descriptors, memory-mapped; UID-N/ from
 //!                        its Nth reindex on
 //! DATA/images/ab/…       image bytes by digest
 //! ```
 //!
-//! One writer thread applies every change and makes those that arrived together durable together.
-//! The graph of a map is derived from its segments and is built in the background.
+//! A single writer thread applies all changes and makes them durable by group commit. The graph of a
+//! map is derived from its segments and is built in the background.
 
-mod answers;
 mod blobs;
 mod compact;
 mod descriptions;
 mod doctor;
 mod drafts;
 mod export;
+mod idempotency;
 mod indexer;
 mod jobs;
 mod keys;
 mod live_map;
 mod maps;
-mod mark;
 mod retention;
 mod schema;
 mod segments;
 mod trees;
 mod usage;
+mod watermark;
 mod webhooks;
 mod writer;
 
@@ -46,31 +46,31 @@ use uuid::Uuid;
 
 use self::blobs::Blobs;
 pub use self::compact::{Compacted, compact};
-use self::descriptions::DescriptionUse;
+use self::descriptions::DescriptionLru;
 pub use self::doctor::{Examination, Finding, MapReport, Report, Sizes, examine};
 use self::indexer::Indexer;
 use self::live_map::LiveMap;
-use self::mark::CommitWatermark;
 use self::trees::Trees;
+use self::watermark::CommitWatermark;
 use self::writer::Writer;
 use super::{DescriptionBounds, StoreError};
 use whereabouts_core::MapName;
 use whereabouts_index::IndexSettings;
 
-/// How the embedded store works.
+/// Settings of the embedded store.
 #[derive(Debug, Clone)]
 pub struct EmbeddedSettings {
-    /// Its folder; made if it is not there.
+    /// The data folder, created if it does not exist.
     pub dir: PathBuf,
     /// How maps are indexed.
     pub index: IndexSettings,
     /// Threads that build graphs.
     pub index_threads: usize,
-    /// Bytes of the disk that stay free.
+    /// Free disk space below which no image bytes are stored.
     pub min_free_bytes: u64,
-    /// Memory for sled's page cache, in bytes.
+    /// Size of sled's page cache, in bytes.
     pub db_cache_bytes: u64,
-    /// The most changes that are made durable together.
+    /// Maximum number of changes in a group commit.
     pub commit_batch: usize,
     /// Bounds of the cache of descriptions.
     pub descriptions: DescriptionBounds,
@@ -87,39 +87,40 @@ struct Inner {
     writer: Writer,
     blobs: Blobs,
     maps: RwLock<BTreeMap<MapName, Arc<LiveMap>>>,
-    /// Descriptors in the making, by the uid of their map.
+    /// Drafts, by the uid of their map.
     drafts: RwLock<BTreeMap<Uuid, Arc<LiveMap>>>,
     indexer: Indexer,
     index: IndexSettings,
     descriptors: PathBuf,
-    /// Jobs that wait or run, and jobs that have ended.
+    /// Number of jobs that are queued or running.
     queued: AtomicUsize,
+    /// Number of jobs that have ended.
     ended: AtomicUsize,
-    descriptions: DescriptionUse,
+    descriptions: DescriptionLru,
     changes: broadcast::Sender<Uuid>,
-    /// Told when deliveries to webhooks were queued.
+    /// Notified when deliveries to webhooks were queued.
     deliveries: watch::Sender<()>,
-    /// Held, never read: the lock ends with the file handle.
+    /// Locks the data folder for as long as the file is open.
     _lock: File,
 }
 
-/// Change notices kept for a slow listener.
-const CHANGES_KEPT: usize = 1024;
+/// Capacity of the channel of job changes; a slower receiver misses the oldest.
+const CHANGES_CAPACITY: usize = 1024;
 
 impl EmbeddedStore {
-    /// Opens the store and loads every map. Blocks; call it before serving.
+    /// Opens the store and loads every map. This blocks, so call it before serving.
     pub fn open(settings: &EmbeddedSettings) -> Result<Self, StoreError> {
         let dir = &settings.dir;
-        make_folder(dir)?;
+        create_folder(dir)?;
         let lock = lock(dir)?;
         schema::bring_up_to_date(dir)?;
-        compact::settle(dir)?;
+        compact::finish_interrupted(dir)?;
         let trees = Trees::open(&dir.join("db"), settings.db_cache_bytes)?;
-        let mark = CommitWatermark::open(dir, &trees)?;
+        let watermark = CommitWatermark::open(dir, &trees)?;
         let descriptors = dir.join("descriptors");
-        make_folder(&descriptors)?;
+        create_folder(&descriptors)?;
         let blobs = Blobs::open(dir.join("images"), settings.min_free_bytes)?;
-        maps::sweep_deleted(&trees, &blobs, &descriptors)?;
+        maps::collect_orphans(&trees, &blobs, &descriptors)?;
         let mut loaded = BTreeMap::new();
         for map in trees.maps()? {
             let name = map.name.clone();
@@ -129,9 +130,9 @@ impl EmbeddedStore {
         let queued = trees.requeue_claimed()?;
         let ended = trees.ended.len();
         let inner = Inner {
-            writer: Writer::start(trees.clone(), mark, settings.commit_batch)?,
+            writer: Writer::start(trees.clone(), watermark, settings.commit_batch)?,
             indexer: Indexer::start(settings.index_threads)?,
-            descriptions: DescriptionUse::load(&trees, settings.descriptions)?,
+            descriptions: DescriptionLru::load(&trees, settings.descriptions)?,
             trees,
             blobs,
             maps: RwLock::new(loaded),
@@ -140,27 +141,27 @@ impl EmbeddedStore {
             descriptors,
             queued: AtomicUsize::new(queued),
             ended: AtomicUsize::new(ended),
-            changes: broadcast::channel(CHANGES_KEPT).0,
+            changes: broadcast::channel(CHANGES_CAPACITY).0,
             deliveries: watch::Sender::new(()),
             _lock: lock,
         };
         for live in inner.maps.read().values() {
-            inner.indexer.look_at(live);
+            inner.indexer.notify(live);
         }
         Ok(Self { inner: Arc::new(inner) })
     }
 }
 
-fn make_folder(path: &Path) -> Result<(), StoreError> {
+fn create_folder(path: &Path) -> Result<(), StoreError> {
     std::fs::create_dir_all(path).map_err(|error| {
         StoreError::Failed(format!(
-            "cannot make the folder {}: {error}; choose another with --data",
+            "cannot create the folder {}: {error}; choose another with --data",
             path.display()
         ))
     })
 }
 
-/// A folder that is to be looked at, not made.
+/// Refuses a data folder that does not exist, without creating it.
 fn check_folder(dir: &Path) -> Result<(), StoreError> {
     if dir.is_dir() {
         return Ok(());
@@ -187,13 +188,13 @@ fn lock(dir: &Path) -> Result<File, StoreError> {
     }
 }
 
-/// Runs a read that may touch the disk away from the async threads.
-async fn blocking<T, F>(work: F) -> Result<T, StoreError>
+/// Runs a read that may touch the disk outside the async threads.
+async fn blocking<T, F>(read: F) -> Result<T, StoreError>
 where
     T: Send + 'static,
     F: FnOnce() -> Result<T, StoreError> + Send + 'static,
 {
-    tokio::task::spawn_blocking(work)
+    tokio::task::spawn_blocking(read)
         .await
-        .unwrap_or_else(|error| Err(StoreError::Failed(format!("a read broke off: {error}"))))
+        .unwrap_or_else(|error| Err(StoreError::Failed(format!("a read did not finish: {error}"))))
 }

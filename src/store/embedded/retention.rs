@@ -1,5 +1,5 @@
-//! Ended jobs go, with their queries and frames: the first to end first, a few in each change, so that
-//! no other change waits long.
+//! Retention: ended jobs are removed with their queries and frames, oldest first and in small batches,
+//! so that other changes do not wait long.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -8,31 +8,35 @@ use async_trait::async_trait;
 use jiff::civil::Date;
 use sled::Transactional;
 
-use super::super::{KeepJobs, RemovedJobs, Retention, StoreError};
+use super::super::{JobRetention, RemovedJobs, Retention, StoreError};
 use super::trees::{BlobOwner, Trees, blob_ref_key, ended_job, failed, transaction_failed};
 use super::{EmbeddedStore, blocking};
 use whereabouts_core::{Digest, MapName};
 
-/// What one change took away.
+/// What one batch removed.
 #[derive(Default)]
-struct Taken {
+struct RemovedBatch {
     removed: RemovedJobs,
     frames: Vec<Digest>,
 }
 
 #[async_trait]
 impl Retention for EmbeddedStore {
-    async fn remove_ended(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError> {
+    async fn remove_ended(
+        &self,
+        keep: JobRetention,
+        batch: usize,
+    ) -> Result<RemovedJobs, StoreError> {
         let counting = Arc::clone(&self.inner);
-        let change = move |trees: &Trees, _: &mut _| take(trees, keep, &counting.ended, batch);
-        let taken = self.inner.writer.commit(change, |_| {}).await?;
-        let Taken { mut removed, frames } = taken;
+        let change =
+            move |trees: &Trees, _: &mut _| remove_batch(trees, keep, &counting.ended, batch);
+        let RemovedBatch { mut removed, frames } = self.inner.writer.commit(change, |_| {}).await?;
         let inner = Arc::clone(&self.inner);
-        // Not on the writer thread: files take their time.
+        // Deleting files is slow, so it does not happen on the writer thread.
         blocking(move || {
-            let gone =
+            let freed =
                 frames.iter().map(|frame| inner.blobs.remove_unreferenced(frame, &inner.trees));
-            removed.bytes = gone.sum();
+            removed.bytes = freed.sum();
             Ok(removed)
         })
         .await
@@ -48,8 +52,8 @@ impl Retention for EmbeddedStore {
         self.inner.writer.commit(forget, |()| {}).await
     }
 
-    async fn clear_left(&self) -> Result<(), StoreError> {
-        // Opening the folder does it, and every description that comes.
+    async fn collect_garbage(&self) -> Result<(), StoreError> {
+        // Opening the folder collects orphans, and adding a description evicts others.
         Ok(())
     }
 
@@ -69,24 +73,24 @@ impl Retention for EmbeddedStore {
     }
 }
 
-/// Removes the records of up to `batch` of the jobs that have ended, and counts down.
-fn take(
+/// Removes the records of up to `batch` ended jobs, and subtracts them from the count of ended jobs.
+fn remove_batch(
     trees: &Trees,
-    keep: KeepJobs,
+    keep: JobRetention,
     ended: &AtomicUsize,
     batch: usize,
-) -> Result<Taken, StoreError> {
-    let mut taken = Taken::default();
-    for place in trees.ended.iter().keys().take(batch) {
-        let place = place.map_err(failed)?;
-        let Some((at, id)) = ended_job(&place) else {
-            return Err(StoreError::Damaged("a job has ended at no time".into()));
+) -> Result<RemovedBatch, StoreError> {
+    let mut removed = RemovedBatch::default();
+    for key in trees.ended.iter().keys().take(batch) {
+        let key = key.map_err(failed)?;
+        let Some((at, id)) = ended_job(&key) else {
+            return Err(StoreError::Damaged("the key of an ended job cannot be read".into()));
         };
-        let left = ended.load(Ordering::Relaxed);
+        let remaining = ended.load(Ordering::Relaxed);
         let count = match (keep.since, keep.most) {
             _ if at > keep.settled => break,
-            (Some(since), _) if at < since => &mut taken.removed.by_age,
-            (_, Some(most)) if left > most => &mut taken.removed.by_count,
+            (Some(since), _) if at < since => &mut removed.removed.by_age,
+            (_, Some(most)) if remaining > most => &mut removed.removed.by_count,
             _ => break,
         };
         *count += 1;
@@ -96,9 +100,9 @@ fn take(
             (record.query.digest, reference)
         });
         (&trees.jobs, &trees.ended, &trees.blob_refs)
-            .transaction(|(jobs, places, refs)| {
+            .transaction(|(jobs, keys, refs)| {
                 jobs.remove(id.as_bytes())?;
-                places.remove(&place)?;
+                keys.remove(&key)?;
                 if let Some((_, reference)) = &frame {
                     refs.remove(reference.as_slice())?;
                 }
@@ -106,7 +110,7 @@ fn take(
             })
             .map_err(transaction_failed)?;
         ended.fetch_sub(1, Ordering::Relaxed);
-        taken.frames.extend(frame.map(|(digest, _)| digest));
+        removed.frames.extend(frame.map(|(digest, _)| digest));
     }
-    Ok(taken)
+    Ok(removed)
 }

@@ -1,13 +1,13 @@
-//! The version of a data folder, and the steps that bring an older one up to date.
+//! The version of a data folder, and the migrations that bring an older folder up to date.
 //!
-//! The version is in a file of its own, `DATA/version`, because it has to be known before the database
-//! is opened: opening it writes to it, and a later version may keep its records elsewhere. A folder
-//! with a database and without that file is of version 1.
+//! The version is in a separate file, `DATA/version`, because it must be known before the database is
+//! opened: opening it writes to it, and a later version may keep its records elsewhere. A folder that
+//! has a database but no such file has version 1.
 //!
-//! | version | what is new |
+//! | version | changes |
 //! |---|---|
 //! | 1 | |
-//! | 2 | a place in the queue begins with the job's priority; ended jobs are listed by when they ended |
+//! | 2 | queue keys begin with the job's priority; ended jobs are listed by end time |
 
 use std::fs::{self, File};
 use std::io;
@@ -24,36 +24,37 @@ use crate::JobRecord;
 
 const FILE: &str = "version";
 
-/// From each version to the next, the first from version 1.
-const STEPS: &[Step] = &[Step { changes: &["db"], apply: list_jobs_by_place }];
+/// The migrations in order, the first from version 1 to version 2.
+const MIGRATIONS: &[Migration] =
+    &[Migration { changes: &["db"], apply: add_priorities_and_end_times }];
 
-/// From one version to the next.
-struct Step {
-    /// What it changes, below the data folder; copied first.
+/// A migration from one version to the next.
+struct Migration {
+    /// The subfolders that it changes, which are copied first.
     changes: &'static [&'static str],
-    /// Does it. A step that broke off is taken again, from wherever it came to.
+    /// Applies the migration. It runs again if it was interrupted, on whatever it left.
     apply: fn(&Path) -> Result<(), StoreError>,
 }
 
 /// The version that this program reads and writes.
 pub(super) fn newest() -> u32 {
-    STEPS.len() as u32 + 1
+    MIGRATIONS.len() as u32 + 1
 }
 
-/// Brings the data folder to this program's version, or refuses it. Call it under the lock.
+/// Brings the data folder to this program's version, or refuses it. Call it while holding the lock.
 pub(super) fn bring_up_to_date(dir: &Path) -> Result<(), StoreError> {
-    migrate(dir, STEPS)
+    migrate(dir, MIGRATIONS)
 }
 
-/// The version of the data folder; `None` if there is nothing in it yet.
+/// Returns the version of the data folder; `None` if the folder is empty.
 pub(super) fn version_of(dir: &Path) -> Result<Option<u32>, StoreError> {
     let path = dir.join(FILE);
     match fs::read_to_string(&path) {
         Ok(text) => match text.trim().parse() {
             Ok(version) if version > 0 => Ok(Some(version)),
             _ => Err(StoreError::Damaged(format!(
-                "{} holds no version; put the data folder back from a copy, or make a new one and \
-                 `whereabouts restore` a backup",
+                "{} does not contain a version; restore the data folder from a copy, or create a new \
+                 one and `whereabouts restore` a backup",
                 path.display()
             ))),
         },
@@ -64,40 +65,40 @@ pub(super) fn version_of(dir: &Path) -> Result<Option<u32>, StoreError> {
     }
 }
 
-/// Where the step to `version` keeps what it found.
+/// Returns where the migration to `version` stores its copy of the folder as it was before.
 pub(super) fn copy_before(dir: &Path, version: u32) -> PathBuf {
     dir.join(format!("before-version-{version}"))
 }
 
-/// Why a folder of a later version is left alone, and what to do.
+/// Explains why a folder of a later version is refused, and what to do.
 pub(super) fn too_new(dir: &Path, version: u32, newest: u32) -> String {
     format!(
-        "the data folder {} is of version {version}, and this program knows versions up to {newest}: \
-         a later whereabouts has used it. Run that one; or back up from it with `whereabouts backup` \
-         and restore into a new folder of this one",
+        "the data folder {} is of version {version}, but this program supports versions up to {newest}: \
+         a later release of whereabouts has used the folder. Run that release, or use its `whereabouts \
+         backup` and restore the backup into a new folder with this one",
         dir.display()
     )
 }
 
-fn migrate(dir: &Path, steps: &[Step]) -> Result<(), StoreError> {
-    let newest = steps.len() as u32 + 1;
+fn migrate(dir: &Path, migrations: &[Migration]) -> Result<(), StoreError> {
+    let newest = migrations.len() as u32 + 1;
     let Some(mut version) = version_of(dir)? else { return write_version(dir, newest) };
     if version > newest {
         return Err(StoreError::Conflict(too_new(dir, version, newest)));
     }
-    for step in &steps[version as usize - 1..] {
+    for migration in &migrations[version as usize - 1..] {
         let copy = copy_before(dir, version + 1);
         tracing::info!(
             folder = %dir.display(), from = version, to = version + 1, copy = %copy.display(),
             "the data folder is brought to a newer version"
         );
-        keep_copy(dir, step.changes, &copy)?;
-        (step.apply)(dir)?;
+        copy_first(dir, migration.changes, &copy)?;
+        (migration.apply)(dir)?;
         version += 1;
         write_version(dir, version)?;
         tracing::info!(
             copy = %copy.display(),
-            "done; the copy may be deleted once the server has been seen to work"
+            "done; the copy may be deleted once the server is known to work"
         );
     }
     if !dir.join(FILE).is_file() {
@@ -113,28 +114,28 @@ fn write_version(dir: &Path, version: u32) -> Result<(), StoreError> {
         .map_err(|error| cannot("write", &path, &error))
 }
 
-/// Copies what a step changes. A copy that is there was made by a step that broke off, before it
-/// changed anything.
-fn keep_copy(dir: &Path, changes: &[&str], copy: &Path) -> Result<(), StoreError> {
+/// Copies what a migration changes. An existing copy is from an interrupted run, before it changed
+/// anything, and is kept.
+fn copy_first(dir: &Path, changes: &[&str], copy: &Path) -> Result<(), StoreError> {
     if copy.is_dir() {
         return Ok(());
     }
-    let growing = copy.with_extension("tmp");
-    let made = || -> io::Result<()> {
-        if growing.exists() {
-            fs::remove_dir_all(&growing)?;
+    let incomplete = copy.with_extension("tmp");
+    let copied = || -> io::Result<()> {
+        if incomplete.exists() {
+            fs::remove_dir_all(&incomplete)?;
         }
-        fs::create_dir_all(&growing)?;
+        fs::create_dir_all(&incomplete)?;
         for change in changes {
-            copy_folder(&dir.join(change), &growing.join(change))?;
+            copy_folder(&dir.join(change), &incomplete.join(change))?;
         }
-        fs::rename(&growing, copy)?;
+        fs::rename(&incomplete, copy)?;
         File::open(dir)?.sync_all()
     };
-    made().map_err(|error| {
+    copied().map_err(|error| {
         StoreError::Failed(format!(
-            "the data folder cannot be brought to a newer version, because what changes cannot be \
-             copied to {}: {error}; make room there and start again, nothing was changed",
+            "the data folder cannot be migrated to a newer version, because its records cannot be \
+             copied to {} first: {error}; free some space and start again, nothing was changed",
             copy.display()
         ))
     })
@@ -154,20 +155,20 @@ fn copy_folder(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-fn cannot(what: &str, path: &Path, error: &io::Error) -> StoreError {
-    StoreError::Failed(format!("cannot {what} {}: {error}", path.display()))
+fn cannot(action: &str, path: &Path, error: &io::Error) -> StoreError {
+    StoreError::Failed(format!("cannot {action} {}: {error}", path.display()))
 }
 
-/// To version 2.
-fn list_jobs_by_place(dir: &Path) -> Result<(), StoreError> {
+/// The migration to version 2.
+fn add_priorities_and_end_times(dir: &Path) -> Result<(), StoreError> {
     const CACHE_BYTES: u64 = 64 << 20;
     let trees = Trees::open(&dir.join("db"), CACHE_BYTES)?;
     for entry in trees.jobs.iter() {
         let (key, value) = entry.map_err(failed)?;
         let record: JobRecord = decode(&value)?;
         if record.job.state.is_final() {
-            let place = ended_key(ended_at(&record.job), record.job.id);
-            trees.ended.insert(place, &[]).map_err(failed)?;
+            let key = ended_key(ended_at(&record.job), record.job.id);
+            trees.ended.insert(key, &[]).map_err(failed)?;
         } else if trees.queue.contains_key(&key).map_err(failed)? {
             put(&trees.queue, &queue_key(&record.job), &Lease::None)?;
         }
@@ -202,8 +203,10 @@ mod tests {
         }
     }
 
-    const TWO: &[Step] =
-        &[Step { changes: &["db"], apply: first }, Step { changes: &["db"], apply: second }];
+    const TWO: &[Migration] = &[
+        Migration { changes: &["db"], apply: first },
+        Migration { changes: &["db"], apply: second },
+    ];
 
     fn folder() -> tempfile::TempDir {
         let dir = tempfile::tempdir().unwrap();
@@ -217,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn an_older_folder_is_brought_up_step_by_step_with_a_copy_before_each() {
+    fn an_older_folder_is_copied_before_each_migration() {
         let dir = folder();
         migrate(dir.path(), TWO).unwrap();
         assert_eq!(read(dir.path(), "db/records"), "two, three");
@@ -229,12 +232,12 @@ mod tests {
     }
 
     #[test]
-    fn a_step_that_broke_off_is_taken_again_and_its_copy_stays_as_it_was() {
+    fn an_interrupted_migration_runs_again_and_keeps_its_copy() {
         let dir = folder();
         fs::write(dir.path().join("db/stop"), "").unwrap();
         assert!(migrate(dir.path(), TWO).is_err());
         assert_eq!(version_of(dir.path()).unwrap(), Some(2));
-        // As if the step had got that far.
+        // Simulates a partly applied migration.
         fs::write(dir.path().join("db/records"), "half").unwrap();
         fs::remove_file(dir.path().join("db/stop")).unwrap();
         migrate(dir.path(), TWO).unwrap();
@@ -243,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn a_newer_folder_is_refused_and_left_alone() {
+    fn a_newer_folder_is_refused_and_not_changed() {
         let dir = folder();
         fs::write(dir.path().join(FILE), "4\n").unwrap();
         let error = migrate(dir.path(), TWO).unwrap_err().to_string();
@@ -262,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn a_job_that_was_queued_before_there_were_priorities_keeps_its_place() {
+    fn a_job_queued_under_version_1_keeps_its_place_in_the_queue() {
         let dir = tempfile::tempdir().unwrap();
         let record = |state| {
             let now = Timestamp::now();
@@ -279,12 +282,12 @@ mod tests {
             let (map_uid, candidates) = (Uuid::nil(), vec![]);
             JobRecord { job, map_uid, revision: 0, query, candidates, claims: 0, traceparent: None }
         };
-        let (waiting, ended) = (record(JobState::Running), record(JobState::Failed));
+        let (unfinished, ended) = (record(JobState::Running), record(JobState::Failed));
         let trees = Trees::open(&dir.path().join("db"), 1 << 20).unwrap();
-        for record in [&waiting, &ended] {
+        for record in [&unfinished, &ended] {
             put(&trees.jobs, record.job.id.as_bytes(), record).unwrap();
         }
-        put(&trees.queue, waiting.job.id.as_bytes(), &Some(Timestamp::now())).unwrap();
+        put(&trees.queue, unfinished.job.id.as_bytes(), &Some(Timestamp::now())).unwrap();
         trees.flush().unwrap();
         drop(trees);
         bring_up_to_date(dir.path()).unwrap();
@@ -292,7 +295,7 @@ mod tests {
         let keys = |tree: &sled::Tree| -> Vec<Vec<u8>> {
             tree.iter().keys().map(|key| key.unwrap().to_vec()).collect()
         };
-        assert_eq!(keys(&trees.queue), [queue_key(&waiting.job)]);
+        assert_eq!(keys(&trees.queue), [queue_key(&unfinished.job)]);
         let at = ended.job.finished_at.unwrap();
         assert_eq!(keys(&trees.ended), [ended_key(at, ended.job.id)]);
         assert!(copy_before(dir.path(), 2).join("db").is_dir());

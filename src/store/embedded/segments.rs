@@ -5,8 +5,8 @@
 //! row                CRC-32, zero, slot (64 bits), dim × f32
 //! ```
 //!
-//! All numbers are little-endian. The CRC-32 of a row covers its slot and its numbers, so that a
-//! row that was never written, was torn, or belongs elsewhere is told from a good one.
+//! All numbers are little-endian. The CRC-32 of a row covers its slot and its numbers, so that it
+//! detects rows that were never written, are torn, or belong to another slot.
 
 use std::fs::{self, File};
 use std::io;
@@ -27,7 +27,7 @@ const MAGIC: &[u8; 8] = b"WHEREVEC";
 const VERSION: u32 = 1;
 const HEADER_BYTES: usize = 64;
 const ROW_HEADER_BYTES: usize = 16;
-/// Rows of a segment. The file is sparse, so that an unused row takes no space.
+/// Rows of a segment. The file is sparse, so unused rows take no space.
 const ROWS: usize = 8192;
 
 #[cfg(target_endian = "big")]
@@ -47,10 +47,10 @@ struct Segment {
 }
 
 impl VectorFiles {
-    /// Opens the segments in `dir`, which is made if it is not there.
+    /// Opens the segments in `dir`, which is created if it does not exist.
     pub fn open(dir: PathBuf, dim: usize) -> Result<Self, StoreError> {
         let files = Self { dir, dim, segments: RwLock::default() };
-        fs::create_dir_all(&files.dir).map_err(|error| files.failed("make", &error))?;
+        fs::create_dir_all(&files.dir).map_err(|error| files.failed("create", &error))?;
         while files.path(files.count()).is_file() {
             files.grow()?;
         }
@@ -86,7 +86,7 @@ impl VectorFiles {
         Ok(())
     }
 
-    /// Makes every descriptor written so far durable.
+    /// Makes all descriptors written so far durable.
     pub fn sync(&self) -> Result<(), StoreError> {
         let segments = self.segments.read().clone();
         for segment in segments {
@@ -97,7 +97,7 @@ impl VectorFiles {
         Ok(())
     }
 
-    /// Whether the row of `slot` holds what was written there.
+    /// Whether the row of `slot` holds a descriptor with a valid checksum.
     pub fn is_intact(&self, slot: usize) -> bool {
         self.segment(slot / ROWS).is_some_and(|segment| {
             let (header, vector) = self.row(&segment, slot);
@@ -106,7 +106,7 @@ impl VectorFiles {
         })
     }
 
-    /// The descriptor of `slot`; `None` unless it is what was written there.
+    /// Returns the descriptor of `slot`; `None` if the row is empty or damaged.
     pub fn read(&self, slot: usize) -> Option<Descriptor> {
         if !self.is_intact(slot) {
             return None;
@@ -143,13 +143,13 @@ impl VectorFiles {
                 "its header is damaged or of another version; restore a backup",
             ));
         }
-        // A segment that was cut short reads as zeros, which no checksum lets through.
+        // The missing end of a truncated segment reads as zeros, which fail the checksum.
         if file.metadata()?.len() < length {
             file.set_len(length)?;
         }
         #[expect(unsafe_code, reason = "memory-mapping is unsafe by signature")]
-        // SAFETY: the data folder is locked, so that no other process changes the file; this one
-        // never shortens it, and writes a row before its slot is known to any reader.
+        // SAFETY: the data folder is locked, so no other process changes the file; this process never
+        // truncates it, and writes a row before any reader knows its slot.
         let map = unsafe { Mmap::map(&file)? };
         Ok(Segment { file, map, dirty: AtomicBool::new(false) })
     }
@@ -174,7 +174,7 @@ impl VectorFiles {
         HEADER_BYTES + (slot % ROWS) * self.stride()
     }
 
-    /// Bytes of so many rows.
+    /// Returns the size of a number of rows, in bytes.
     pub fn bytes_of(&self, rows: usize) -> u64 {
         (rows * self.stride()) as u64
     }
@@ -195,8 +195,8 @@ impl VectorFiles {
         self.dir.join(format!("{index:06}.seg"))
     }
 
-    fn failed(&self, what: &str, error: &io::Error) -> StoreError {
-        StoreError::Failed(format!("cannot {what} {}: {error}", self.dir.display()))
+    fn failed(&self, action: &str, error: &io::Error) -> StoreError {
+        StoreError::Failed(format!("cannot {action} {}: {error}", self.dir.display()))
     }
 }
 
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn descriptors_survive_a_reopening_across_segments() {
+    fn descriptors_in_several_segments_survive_reopening() {
         let dir = tempfile::tempdir().unwrap();
         let slots = [0, 1, ROWS - 1, ROWS, 2 * ROWS + 5];
         let files = VectorFiles::open(dir.path().join("m"), 3).unwrap();
@@ -251,11 +251,11 @@ mod tests {
             assert_eq!(rows(&files, slot..slot + 1), [(slot, vec![slot as f32, 1.0, -1.0])]);
         }
         assert!(!files.is_intact(2), "a row that was never written");
-        assert!(!files.is_intact(9 * ROWS), "a segment that was never made");
+        assert!(!files.is_intact(9 * ROWS), "a segment that was never created");
     }
 
     #[test]
-    fn a_damaged_row_is_noticed() {
+    fn a_damaged_row_is_detected() {
         let dir = tempfile::tempdir().unwrap();
         let files = VectorFiles::open(dir.path().join("m"), 4).unwrap();
         files.write(0, &[1.0; 4]).unwrap();
@@ -275,15 +275,15 @@ mod tests {
     }
 
     #[test]
-    fn a_segment_that_was_cut_short_loses_only_what_was_cut() {
+    fn a_truncated_segment_loses_only_the_missing_rows() {
         let dir = tempfile::tempdir().unwrap();
         let files = VectorFiles::open(dir.path().join("m"), 4).unwrap();
         for slot in 0..3 {
             files.write(slot, &[1.0; 4]).unwrap();
         }
-        let (path, keep) = (files.path(0), files.offset(2) as u64);
+        let (path, length) = (files.path(0), files.offset(2) as u64);
         drop(files);
-        File::options().write(true).open(path).unwrap().set_len(keep).unwrap();
+        File::options().write(true).open(path).unwrap().set_len(length).unwrap();
         let files = VectorFiles::open(dir.path().join("m"), 4).unwrap();
         assert_eq!([0, 1, 2].map(|slot| files.is_intact(slot)), [true, true, false]);
     }

@@ -1,4 +1,4 @@
-//! The records in sled, and how they are keyed.
+//! The records in sled and their keys.
 
 use std::path::Path;
 use std::thread;
@@ -9,12 +9,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use uuid::Uuid;
 
-use super::super::changes::place;
+use super::super::changes::queue_rank;
 use super::super::{JobRecord, StoreError};
 use super::webhooks::WebhookTrees;
 use whereabouts_core::{Digest, Image, ImageId, Job, JobState, Map};
 
-/// The sled trees. Clones share them.
+/// The sled trees. Clones share the same database.
 #[derive(Clone)]
 pub(super) struct Trees {
     db: sled::Db,
@@ -22,48 +22,48 @@ pub(super) struct Trees {
     pub maps: sled::Tree,
     /// Map uid, image id → [`StoredImage`].
     pub images: sled::Tree,
-    /// Digest, owner → nothing: who needs which image bytes.
+    /// Digest, owner → nothing: the references to image bytes.
     pub blob_refs: sled::Tree,
     /// Job id → [`JobRecord`].
     pub jobs: sled::Tree,
-    /// Place in the queue → when its lease ends ([`Lease`]), for jobs that have not ended.
+    /// Priority, job id → when its lease ends ([`Lease`]), for jobs that have not ended.
     pub queue: sled::Tree,
-    /// When a job ended, and its id → nothing, for jobs that have ended.
+    /// End time, job id → nothing, for jobs that have ended.
     pub ended: sled::Tree,
     /// Cache key → description of a pair.
     pub descriptions: sled::Tree,
     /// Map uid, query id → a frame whose pairs were described.
     pub frames: sled::Tree,
-    /// Day, map → what was spent.
+    /// Day, map → usage.
     pub usage: sled::Tree,
     /// Id → API key.
     pub keys: sled::Tree,
-    /// Caller and idempotency key → first answer.
+    /// Caller and idempotency key → idempotency record.
     pub answers: sled::Tree,
-    /// When that was, and the same → nothing.
+    /// Time of that record, the same key → nothing.
     pub answers_by_age: sled::Tree,
     /// Webhooks and their deliveries.
     pub webhooks: WebhookTrees,
 }
 
-/// The key of the number of the last commit, in the default tree.
+/// The key of the commit number in the default tree.
 const COMMITS: &[u8] = b"commits";
 
-/// How long [`open_when_released`] waits.
-const RELEASE: Duration = Duration::from_secs(10);
+/// How long [`open_when_released`] waits for the lock.
+const LOCK_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Opens the database, after waiting for sled's own threads to let go of it.
+/// Opens the database, waiting for sled's own threads to release its lock.
 ///
-/// A database that this process has just closed, after a migration say, stays locked until the
-/// last piece of work in sled's thread pool has ended, and sled has no call that waits for that.
-/// Nobody else can hold it: the data folder has a lock of its own, which is taken first.
+/// A database that this process has just closed, for example after a migration, stays locked until
+/// the last task in sled's thread pool has ended, and sled has no call that waits for that. No other
+/// process can hold the lock, because the lock of the data folder is taken first.
 fn open_when_released(config: &sled::Config) -> sled::Result<sled::Db> {
-    let until = Instant::now() + RELEASE;
+    let deadline = Instant::now() + LOCK_TIMEOUT;
     loop {
         match config.open() {
             Err(sled::Error::Io(error))
                 if error.to_string().contains("could not acquire lock")
-                    && Instant::now() < until =>
+                    && Instant::now() < deadline =>
             {
                 thread::sleep(Duration::from_millis(5));
             }
@@ -72,18 +72,18 @@ fn open_when_released(config: &sled::Config) -> sled::Result<sled::Db> {
     }
 }
 
-/// An image and where its descriptor is.
+/// An image and the slot of its descriptor.
 #[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 pub(super) struct StoredImage {
     pub image: Image,
     pub slot: usize,
 }
 
-/// Until when nobody may take a job: it is held, or is not to be tried before. `None` while it
-/// waits.
+/// The moment before which a job cannot be claimed, because a worker holds it or its retry is delayed.
+/// `None` while it waits.
 pub(super) type Lease = Option<Timestamp>;
 
-/// Who needs the bytes of a blob.
+/// A record that refers to the bytes of a blob.
 pub(super) enum BlobOwner<'a> {
     Image { map_uid: Uuid, id: &'a ImageId },
     Query(Uuid),
@@ -94,7 +94,7 @@ impl Trees {
         let config = sled::Config::new()
             .path(path)
             .cache_capacity(cache_bytes)
-            // The writer flushes; a flush by the clock would only split what belongs together.
+            // The writer flushes; a timed flush would split group commits.
             .flush_every_ms(None);
         let db = open_when_released(&config).map_err(failed)?;
         let tree = |name: &str| db.open_tree(name).map_err(failed);
@@ -116,22 +116,22 @@ impl Trees {
         })
     }
 
-    /// Every tree that has a name.
+    /// Returns every tree, also those that this version does not use.
     pub fn all(&self) -> Result<Vec<sled::Tree>, StoreError> {
         self.db.tree_names().iter().map(|name| self.tree(name)).collect()
     }
 
-    /// The tree of that name; made if it is not there.
+    /// Returns the tree of this name, created if it does not exist.
     pub fn tree(&self, name: &[u8]) -> Result<sled::Tree, StoreError> {
         self.db.open_tree(name).map_err(failed)
     }
 
-    /// Makes every change so far durable.
+    /// Makes all changes so far durable.
     pub fn flush(&self) -> Result<(), StoreError> {
         self.db.flush().map(drop).map_err(failed)
     }
 
-    /// The number of the last commit; 0 in a new database.
+    /// Returns the number of the last commit; 0 in a new database.
     pub fn commit_number(&self) -> Result<u64, StoreError> {
         Ok(get(&self.db, COMMITS)?.unwrap_or(0))
     }
@@ -148,7 +148,7 @@ impl Trees {
         get(&self.images, &image_key(map_uid, id))
     }
 
-    /// The images of a map, by id.
+    /// Iterates over the images of a map, by id.
     pub fn images_of(
         &self,
         map_uid: Uuid,
@@ -159,7 +159,7 @@ impl Trees {
             .map(|value| decode(&value.map_err(failed)?))
     }
 
-    /// Forgets the frames of a map whose pairs were described.
+    /// Deletes the described frames of a map.
     pub fn forget_frames(&self, map_uid: Uuid) -> Result<(), StoreError> {
         for key in self.frames.scan_prefix(map_uid.as_bytes()).keys() {
             self.frames.remove(key.map_err(failed)?).map_err(failed)?;
@@ -167,14 +167,14 @@ impl Trees {
         Ok(())
     }
 
-    /// Images of a map by id: those after `after`.
+    /// Iterates over the images of a map whose ids sort after `after`, by id.
     pub fn images_after(
         &self,
         map_uid: Uuid,
         after: Option<&ImageId>,
     ) -> impl Iterator<Item = Result<StoredImage, StoreError>> + use<> {
         let start = match after {
-            // The smallest key behind the cursor's.
+            // The smallest key after the cursor's.
             Some(id) => [image_key(map_uid, id), vec![0]].concat(),
             None => map_uid.as_bytes().to_vec(),
         };
@@ -190,18 +190,18 @@ impl Trees {
         get(&self.jobs, id.as_bytes())
     }
 
-    /// Whether nobody needs the bytes of `digest` any more.
+    /// Whether no record refers to the bytes of `digest`.
     pub fn is_unreferenced(&self, digest: &Digest) -> bool {
         self.blob_refs.scan_prefix(digest.hex()).next().is_none()
     }
 
-    /// Gives every claimed job back to the queue: whoever held it ended with the last process.
-    /// Returns how many jobs wait.
+    /// Returns every running job to the queue, because the process that ran it has ended. Returns the
+    /// number of queued jobs.
     pub fn requeue_claimed(&self) -> Result<usize, StoreError> {
-        let mut waiting = 0;
+        let mut queued = 0;
         for key in self.queue.iter().keys() {
             let key = key.map_err(failed)?;
-            waiting += 1;
+            queued += 1;
             let job = queued_job(&key).map(|id| self.job(id)).transpose()?.flatten();
             let Some(mut record) = job else { continue };
             if record.job.state == JobState::Running {
@@ -211,29 +211,29 @@ impl Trees {
             }
         }
         self.flush()?;
-        Ok(waiting)
+        Ok(queued)
     }
 
-    /// Bytes of the database's files.
+    /// Returns the size of the database's files, in bytes.
     pub fn bytes(&self) -> Result<u64, StoreError> {
         self.db.size_on_disk().map_err(failed)
     }
 }
 
-/// A job's place in the queue: sorted by priority, then by age.
+/// The key of a job in the queue, which sorts by priority, then by age.
 pub(super) fn queue_key(job: &Job) -> [u8; 17] {
     let mut key = [0; 17];
-    key[0] = place(job.priority);
+    key[0] = queue_rank(job.priority);
     key[1..].copy_from_slice(job.id.as_bytes());
     key
 }
 
-/// The job at a place in the queue.
+/// Returns the job of a key in the queue.
 pub(super) fn queued_job(key: &[u8]) -> Option<Uuid> {
     Uuid::from_slice(key.get(1..)?).ok()
 }
 
-/// A job's place among those that have ended: sorted by when that was, in milliseconds since 1970.
+/// The key of an ended job, which sorts by when it ended, in milliseconds since 1970.
 pub(super) fn ended_key(at: Timestamp, job: Uuid) -> [u8; 24] {
     let mut key = [0; 24];
     key[..8].copy_from_slice(&at.as_millisecond().max(0).to_be_bytes());
@@ -241,7 +241,7 @@ pub(super) fn ended_key(at: Timestamp, job: Uuid) -> [u8; 24] {
     key
 }
 
-/// When a job ended, and which, from its place.
+/// Returns the end time and the id of the job of a key in `ended`.
 pub(super) fn ended_job(key: &[u8]) -> Option<(Timestamp, Uuid)> {
     let (at, job) = key.split_first_chunk::<8>()?;
     Some((Timestamp::from_millisecond(i64::from_be_bytes(*at)).ok()?, Uuid::from_slice(job).ok()?))
@@ -294,19 +294,18 @@ pub(super) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, StoreError>
 pub(super) fn failed(error: sled::Error) -> StoreError {
     match error {
         sled::Error::Corruption { .. } => StoreError::Damaged(
-            "the files of the record database do not fit together; restore a backup into another \
-             folder"
+            "the files of the record database are inconsistent; restore a backup into another folder"
                 .into(),
         ),
         error => StoreError::Failed(error.to_string()),
     }
 }
 
-/// What a transaction that never aborts on its own account returns when it fails.
+/// Converts the error of a transaction whose closure never aborts it.
 pub(super) fn transaction_failed(error: sled::transaction::TransactionError<()>) -> StoreError {
     match error {
         sled::transaction::TransactionError::Abort(()) => {
-            StoreError::Failed("a transaction was given up".into())
+            StoreError::Failed("a transaction was aborted".into())
         }
         sled::transaction::TransactionError::Storage(error) => failed(error),
     }
@@ -317,14 +316,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_database_that_is_being_let_go_of_is_waited_for() {
+    fn opening_waits_for_the_lock_of_a_database_that_was_just_closed() {
         let dir = tempfile::tempdir().unwrap();
         let first = Trees::open(dir.path(), 1 << 20).unwrap();
-        let holding = thread::spawn(move || {
+        let closing = thread::spawn(move || {
             thread::sleep(Duration::from_millis(100));
             drop(first);
         });
         Trees::open(dir.path(), 1 << 20).unwrap();
-        holding.join().unwrap();
+        closing.join().unwrap();
     }
 }

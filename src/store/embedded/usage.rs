@@ -1,4 +1,4 @@
-//! What was spent, by day and map: one small record each, kept for a configured number of days.
+//! Usage of external models: one record for each day and map, kept for a configured number of days.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use super::trees::{decode, failed, get, put};
 use super::{EmbeddedStore, blocking};
 use whereabouts_core::DayUsage;
 
-/// Sorted by day: dates are written with four, two and two digits.
+/// The key sorts by day, because a date has a fixed number of digits.
 fn key(of: &DayUsage) -> Vec<u8> {
     format!("{}/{}", of.date, of.map.as_str()).into_bytes()
 }
@@ -24,9 +24,9 @@ impl UsageStore for EmbeddedStore {
                 move |trees, _| {
                     let key = key(&spent);
                     let sum = match get::<DayUsage>(&trees.usage, &key)? {
-                        Some(known) => DayUsage {
-                            usage: known.usage + spent.usage,
-                            money: known.money + spent.money,
+                        Some(total) => DayUsage {
+                            usage: total.usage + spent.usage,
+                            money: total.money + spent.money,
                             ..spent
                         },
                         None => spent,

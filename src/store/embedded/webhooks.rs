@@ -1,7 +1,8 @@
 //! Webhooks and their deliveries.
 //!
-//! A delivery that waits has a place in `due`, one that does not in `ended`; both change with it in one
-//! transaction. The body of its message is a record of its own, which no attempt writes again.
+//! A waiting delivery has a key in `due`, any other one in `ended`; both change together with the
+//! delivery in one transaction. The body of the message is a separate record, so that attempts do not
+//! rewrite it.
 
 mod trees;
 
@@ -15,16 +16,18 @@ use uuid::Uuid;
 use super::super::changes::{
     attempted, check_ended, disable, no_delivery, no_webhook, too_many_webhooks,
 };
-use super::super::{ForgottenDeliveries, KeepDeliveries, StoreError, StoredDelivery, WebhookStore};
+use super::super::{
+    DeliveryRetention, RemovedDeliveries, StoreError, StoredDelivery, WebhookStore,
+};
 use super::trees::{Trees, decode, failed, put};
 use super::{EmbeddedStore, blocking};
 use whereabouts_core::{Attempt, Delivery, DeliveryState, StoredWebhook};
 
 pub(super) use self::trees::WebhookTrees;
-use self::trees::{News, key};
+use self::trees::{DeliveryRecord, key};
 
-/// Deliveries removed in one change when their webhook is.
-const REMOVED_AT_ONCE: usize = 256;
+/// Deliveries removed in one change when their webhook is deleted.
+const REMOVAL_BATCH: usize = 256;
 
 impl EmbeddedStore {
     /// Applies a change to webhooks.
@@ -37,23 +40,23 @@ impl EmbeddedStore {
         self.inner.writer.commit(change, |_| {}).await
     }
 
-    /// Looks at webhooks.
-    async fn look_at_webhooks<T, F>(&self, look: F) -> Result<T, StoreError>
+    /// Reads webhooks.
+    async fn read_webhooks<T, F>(&self, read: F) -> Result<T, StoreError>
     where
         T: Send + 'static,
         F: FnOnce(&WebhookTrees) -> Result<T, StoreError> + Send + 'static,
     {
         let inner = Arc::clone(&self.inner);
-        blocking(move || look(&inner.trees.webhooks)).await
+        blocking(move || read(&inner.trees.webhooks)).await
     }
 }
 
 #[async_trait]
 impl WebhookStore for EmbeddedStore {
-    async fn add_webhook(&self, webhook: StoredWebhook, most: usize) -> Result<(), StoreError> {
+    async fn add_webhook(&self, webhook: StoredWebhook, max: usize) -> Result<(), StoreError> {
         self.change_webhooks(move |trees| {
-            if trees.webhooks.len() >= most {
-                return Err(too_many_webhooks(most));
+            if trees.webhooks.len() >= max {
+                return Err(too_many_webhooks(max));
             }
             put(&trees.webhooks, webhook.webhook.id.as_bytes(), &webhook)
         })
@@ -61,7 +64,7 @@ impl WebhookStore for EmbeddedStore {
     }
 
     async fn webhooks(&self) -> Result<Vec<StoredWebhook>, StoreError> {
-        self.look_at_webhooks(|trees| {
+        self.read_webhooks(|trees| {
             let values = trees.webhooks.iter().values();
             values.map(|value| decode(&value.map_err(failed)?)).collect()
         })
@@ -69,7 +72,7 @@ impl WebhookStore for EmbeddedStore {
     }
 
     async fn webhook(&self, id: Uuid) -> Result<Option<StoredWebhook>, StoreError> {
-        self.look_at_webhooks(move |trees| trees.webhook(id)).await
+        self.read_webhooks(move |trees| trees.webhook(id)).await
     }
 
     async fn disable_webhook(&self, id: Uuid, at: Timestamp, why: &str) -> Result<(), StoreError> {
@@ -86,19 +89,18 @@ impl WebhookStore for EmbeddedStore {
 
     async fn delete_webhook(&self, id: Uuid) -> Result<bool, StoreError> {
         loop {
-            // The webhook goes last, so that a process that ends meanwhile leaves nothing that belongs to
-            // none.
-            let removing = move |trees: &WebhookTrees| {
-                let some = trees.some_of(id, REMOVED_AT_ONCE)?;
-                some.iter().try_for_each(|delivery| trees.remove(delivery))?;
-                if some.len() == REMOVED_AT_ONCE {
+            // The webhook is deleted last, so that an interruption leaves no orphaned deliveries.
+            let remove_batch = move |trees: &WebhookTrees| {
+                let batch = trees.some_of(id, REMOVAL_BATCH)?;
+                batch.iter().try_for_each(|delivery| trees.remove(delivery))?;
+                if batch.len() == REMOVAL_BATCH {
                     return Ok(None);
                 }
                 let removed = trees.webhooks.remove(id.as_bytes()).map_err(failed)?;
                 Ok(Some(removed.is_some()))
             };
-            if let Some(there) = self.change_webhooks(removing).await? {
-                return Ok(there);
+            if let Some(existed) = self.change_webhooks(remove_batch).await? {
+                return Ok(existed);
             }
         }
     }
@@ -106,7 +108,7 @@ impl WebhookStore for EmbeddedStore {
     async fn queue_delivery(&self, new: StoredDelivery) -> Result<(), StoreError> {
         self.change_webhooks(move |trees| {
             trees.enabled(new.delivery.webhook)?;
-            trees.queue(&News::of(&new.delivery, new.body)?)
+            trees.queue(&DeliveryRecord::new(&new.delivery, new.body)?)
         })
         .await?;
         self.inner.deliveries.send_replace(());
@@ -120,14 +122,14 @@ impl WebhookStore for EmbeddedStore {
         now: Timestamp,
     ) -> Result<Delivery, StoreError> {
         let queued = self.change_webhooks(move |trees| {
-            let Some(known) = trees.delivery(&key(webhook, id))? else {
+            let Some(ended) = trees.delivery(&key(webhook, id))? else {
                 trees.webhook(webhook)?.ok_or_else(|| no_webhook(webhook))?;
                 return Err(no_delivery(id));
             };
             trees.enabled(webhook)?;
-            check_ended(&known)?;
-            let again = known.clone().again(now);
-            trees.replace(&known, &again)?;
+            check_ended(&ended)?;
+            let again = ended.clone().requeued(now);
+            trees.replace(&ended, &again)?;
             Ok(again)
         });
         let queued = queued.await?;
@@ -142,7 +144,7 @@ impl WebhookStore for EmbeddedStore {
         before: Option<Uuid>,
         limit: usize,
     ) -> Result<Vec<Delivery>, StoreError> {
-        self.look_at_webhooks(move |trees| {
+        self.read_webhooks(move |trees| {
             let end = key(webhook, before.unwrap_or(Uuid::max()));
             let older = trees.deliveries.range(webhook.as_bytes().to_vec()..end.to_vec()).rev();
             older
@@ -163,11 +165,11 @@ impl WebhookStore for EmbeddedStore {
         now: Timestamp,
         limit: usize,
     ) -> Result<Vec<StoredDelivery>, StoreError> {
-        self.look_at_webhooks(move |trees| {
+        self.read_webhooks(move |trees| {
             let mut due = Vec::new();
             for key in trees.due_until(webhook, now, limit)? {
                 let body = trees.bodies.get(key).map_err(failed)?;
-                // One without the other was removed between the two looks.
+                // If one of them is missing, the delivery was removed between the reads.
                 if let (Some(delivery), Some(body)) = (trees.delivery(&key)?, body) {
                     due.push(StoredDelivery { delivery, body: body.to_vec() });
                 }
@@ -184,9 +186,9 @@ impl WebhookStore for EmbeddedStore {
         attempt: Attempt,
     ) -> Result<Option<Delivery>, StoreError> {
         self.change_webhooks(move |trees| {
-            let Some(known) = trees.delivery(&key(webhook, id))? else { return Ok(None) };
-            let Some(after) = attempted(known.clone(), attempt) else { return Ok(None) };
-            trees.replace(&known, &after)?;
+            let Some(before) = trees.delivery(&key(webhook, id))? else { return Ok(None) };
+            let Some(after) = attempted(before.clone(), attempt) else { return Ok(None) };
+            trees.replace(&before, &after)?;
             Ok(Some(after))
         })
         .await
@@ -199,17 +201,17 @@ impl WebhookStore for EmbeddedStore {
         why: &str,
         limit: usize,
     ) -> Result<usize, StoreError> {
-        // Looking costs no commit.
-        let some = move |trees: &WebhookTrees| trees.due_until(webhook, Timestamp::MAX, 1);
-        if self.look_at_webhooks(some).await?.is_empty() {
+        // A read costs no commit.
+        let first = move |trees: &WebhookTrees| trees.due_until(webhook, Timestamp::MAX, 1);
+        if self.read_webhooks(first).await?.is_empty() {
             return Ok(0);
         }
         let why = why.to_owned();
         self.change_webhooks(move |trees| {
             let keys = trees.due_until(webhook, Timestamp::MAX, limit)?;
             for key in &keys {
-                if let Some(known) = trees.delivery(key)? {
-                    trees.replace(&known, &known.clone().given_up(at, &why))?;
+                if let Some(waiting) = trees.delivery(key)? {
+                    trees.replace(&waiting, &waiting.clone().dead_lettered(at, &why))?;
                 }
             }
             Ok(keys.len())
@@ -219,30 +221,30 @@ impl WebhookStore for EmbeddedStore {
 
     async fn forget_deliveries(
         &self,
-        keep: KeepDeliveries,
+        keep: DeliveryRetention,
         batch: usize,
-    ) -> Result<ForgottenDeliveries, StoreError> {
-        // Looking costs no commit.
-        if self.look_at_webhooks(move |trees| trees.surplus(keep, 1)).await?.is_empty() {
-            return Ok(ForgottenDeliveries::default());
+    ) -> Result<RemovedDeliveries, StoreError> {
+        // A read costs no commit.
+        if self.read_webhooks(move |trees| trees.surplus(keep, 1)).await?.is_empty() {
+            return Ok(RemovedDeliveries::default());
         }
         self.change_webhooks(move |trees| {
-            let mut forgotten = ForgottenDeliveries::default();
+            let mut removed = RemovedDeliveries::default();
             for key in trees.surplus(keep, batch)? {
                 let Some(delivery) = trees.delivery(&key)? else { continue };
                 match delivery.state {
-                    DeliveryState::Waiting => forgotten.waiting += 1,
-                    _ => forgotten.ended += 1,
+                    DeliveryState::Waiting => removed.waiting += 1,
+                    _ => removed.ended += 1,
                 }
                 trees.remove(&delivery)?;
             }
-            Ok(forgotten)
+            Ok(removed)
         })
         .await
     }
 
     async fn waiting_deliveries(&self) -> Result<usize, StoreError> {
-        self.look_at_webhooks(|trees| Ok(trees.due.len())).await
+        self.read_webhooks(|trees| Ok(trees.due.len())).await
     }
 
     fn queued_deliveries(&self) -> watch::Receiver<()> {

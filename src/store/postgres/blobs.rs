@@ -1,8 +1,8 @@
-//! Image bytes: in the object store, with a row each that counts who needs them.
+//! Image bytes: an object in the object store, and a row that counts the references to it.
 //!
-//! Bytes are put like this: the row first, pinned for a while; then the object, if it is not there. They are
-//! removed like this: the row is locked and the object removed while it is, so that whoever puts the same
-//! bytes at that moment waits, and then finds them gone.
+//! Storing writes the row first, pinned for a while, and then the object if it is missing. Removal locks
+//! the row and deletes the object before it commits, so that a concurrent upload of the same bytes waits
+//! and then finds the object missing.
 
 use async_trait::async_trait;
 use bytes::Bytes;
@@ -11,8 +11,8 @@ use super::super::{BlobPin, BlobStore, StoreError};
 use super::{Inner, PostgresStore, count};
 use whereabouts_core::Digest;
 
-/// Bytes of so many pictures are removed in one transaction.
-const REMOVED_AT_ONCE: i64 = 64;
+/// Objects removed in one transaction.
+const REMOVAL_BATCH: i64 = 64;
 
 #[async_trait]
 impl BlobStore for PostgresStore {
@@ -29,7 +29,7 @@ impl BlobStore for PostgresStore {
         .bind(inner.settings.pin.as_secs_f64());
         inner.run(pinned).await?;
         inner.objects.put(&digest, bytes).await?;
-        // The row says how long they are kept: longer than anybody takes to refer to them.
+        // The row holds the pin: `pinned_until` leaves enough time to refer to the bytes.
         Ok(Box::new(()))
     }
 
@@ -39,31 +39,31 @@ impl BlobStore for PostgresStore {
 }
 
 impl Inner {
-    /// Removes bytes that nobody needs; returns how many.
-    pub(super) async fn remove_unneeded(&self) -> Result<u64, StoreError> {
+    /// Removes bytes without a reference or a pin; returns their size.
+    pub(super) async fn remove_unreferenced(&self) -> Result<u64, StoreError> {
         let mut removed = 0;
         loop {
-            let some = self.call(self.remove_some()).await?;
-            removed += some.iter().sum::<u64>();
-            if some.len() < REMOVED_AT_ONCE as usize {
+            let sizes = self.call(self.remove_batch()).await?;
+            removed += sizes.iter().sum::<u64>();
+            if sizes.len() < REMOVAL_BATCH as usize {
                 return Ok(removed);
             }
         }
     }
 
-    async fn remove_some(&self) -> Result<Vec<u64>, StoreError> {
+    async fn remove_batch(&self) -> Result<Vec<u64>, StoreError> {
         let mut tx = self.begin().await?;
-        let unneeded: Vec<(Vec<u8>, i64)> = sqlx::query_as(
+        let unreferenced: Vec<(Vec<u8>, i64)> = sqlx::query_as(
             "DELETE FROM blobs WHERE digest IN (
                  SELECT digest FROM blobs WHERE needed <= 0 AND pinned_until <= now()
                  ORDER BY pinned_until LIMIT $1 FOR UPDATE SKIP LOCKED)
              RETURNING digest, size",
         )
-        .bind(REMOVED_AT_ONCE)
+        .bind(REMOVAL_BATCH)
         .fetch_all(&mut *tx)
         .await?;
         let mut sizes = Vec::new();
-        for (digest, size) in unneeded {
+        for (digest, size) in unreferenced {
             self.objects.remove(&digest_of(&digest)?).await?;
             sizes.push(size.unsigned_abs());
         }
@@ -72,15 +72,15 @@ impl Inner {
     }
 }
 
-/// A digest as it is stored.
+/// Decodes a stored digest.
 pub(super) fn digest_of(bytes: &[u8]) -> Result<Digest, StoreError> {
     let bytes: Result<[u8; 32], _> = bytes.try_into();
     bytes.map(Digest::from).map_err(|_| {
-        StoreError::Damaged("a digest of the database is not of 32 bytes; restore a backup".into())
+        StoreError::Damaged("a stored digest does not have 32 bytes; restore a backup".into())
     })
 }
 
-/// Bytes that a record refers to were not put, or too long ago.
+/// The error of a record whose bytes were never stored, or whose pin has expired.
 pub(super) fn not_stored(digest: &Digest) -> StoreError {
     StoreError::Failed(format!("the bytes of {digest} are not stored; send them again"))
 }

@@ -1,7 +1,7 @@
-//! The cache of descriptions that were paid for, and the frames they are of.
+//! The description cache, and the frames whose pairs were described.
 //!
-//! Bounded in bytes and in age. The least recently used go first; when one was used is noted now and then, not
-//! at every use.
+//! The cache is bounded in bytes and in age. The least recently used descriptions are evicted first;
+//! uses are recorded at most once per [`USE_RESOLUTION_S`].
 
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -15,16 +15,16 @@ use crate::DescriptionCache;
 use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, SimilarFrame};
 use whereabouts_core::{Descriptor, Digest, StandIn};
 
-/// As many similar frames are looked at, at the most: a pair that none of them has is bought.
-const SIMILAR_FRAMES: i64 = 4;
+/// Maximum number of similar frames returned. A pair that none of them has is bought.
+const MAX_SIMILAR_FRAMES: i64 = 4;
 
-/// A use is noted if the last one that was is so long ago, in seconds.
-const USES_NOTED_S: f64 = 3600.0;
+/// A use is recorded only if the last recorded one is older than this, in seconds.
+const USE_RESOLUTION_S: f64 = 3600.0;
 
-/// The most descriptions removed in one statement.
-const REMOVED_AT_ONCE: i64 = 1000;
+/// Maximum number of descriptions removed in one statement.
+const REMOVAL_BATCH: i64 = 1000;
 
-/// How full the cache was when it was last looked at.
+/// The size of the cache when it was last measured.
 #[derive(Default)]
 pub(super) struct KnownLevels(Mutex<CacheLevels>);
 
@@ -51,7 +51,7 @@ impl DescriptionCache for PostgresStore {
         )
         .bind(key.as_bytes().as_slice())
         .bind(inner.settings.descriptions.max_age.as_secs_f64())
-        .bind(USES_NOTED_S);
+        .bind(USE_RESOLUTION_S);
         inner.one(query).await
     }
 
@@ -75,7 +75,7 @@ impl DescriptionCache for PostgresStore {
         inner.run(query).await.map(drop)
     }
 
-    async fn begin_purchase(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
+    async fn acquire_lease(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
         let inner = &self.inner;
         let for_s = until.duration_since(Timestamp::now()).as_secs_f64().max(0.0);
         let query = sqlx::query(
@@ -92,7 +92,7 @@ impl DescriptionCache for PostgresStore {
         Ok(inner.run(query).await? > 0)
     }
 
-    async fn end_purchase(&self, key: &Digest) -> Result<(), StoreError> {
+    async fn release_lease(&self, key: &Digest) -> Result<(), StoreError> {
         let inner = &self.inner;
         let query = sqlx::query("DELETE FROM purchases WHERE key = $1 AND holder = $2")
             .bind(key.as_bytes().as_slice())
@@ -107,7 +107,7 @@ impl DescriptionCache for PostgresStore {
         at_least: f32,
     ) -> Result<Vec<SimilarFrame>, StoreError> {
         let inner = &self.inner;
-        // A map that changed its model while it was empty keeps frames of the old one.
+        // A map whose model changed while it was empty still has frames of the old model.
         let query = sqlx::query_as(
             "SELECT query_id, digest, similarity FROM (
                  SELECT query_id, digest, 1 - (descriptor <=> $2::real[]::vector) AS similarity
@@ -119,7 +119,7 @@ impl DescriptionCache for PostgresStore {
         .bind(to.as_slice())
         .bind(i32::try_from(to.dim()).unwrap_or(0))
         .bind(f64::from(at_least))
-        .bind(SIMILAR_FRAMES);
+        .bind(MAX_SIMILAR_FRAMES);
         inner
             .call(async {
                 let found: Vec<(Uuid, Vec<u8>, f64)> = query.fetch_all(&inner.pool).await?;
@@ -136,7 +136,7 @@ impl DescriptionCache for PostgresStore {
         &self,
         map: Uuid,
         frame: DescribedFrame,
-        most: usize,
+        max_frames: usize,
     ) -> Result<(), StoreError> {
         let inner = &self.inner;
         let keep = sqlx::query(
@@ -154,7 +154,7 @@ impl DescriptionCache for PostgresStore {
                  ORDER BY query_id DESC OFFSET $2 LIMIT 1)",
         )
         .bind(map)
-        .bind(count(most));
+        .bind(count(max_frames));
         inner
             .call(async {
                 let mut tx = inner.begin().await?;
@@ -171,33 +171,34 @@ impl DescriptionCache for PostgresStore {
 }
 
 impl Inner {
-    /// Removes descriptions that are too old or too many, and notes how full the cache is.
-    pub(super) async fn tidy_descriptions(&self) -> Result<(), StoreError> {
+    /// Removes expired leases and descriptions, evicts descriptions beyond the bound, and measures the
+    /// cache.
+    pub(super) async fn evict_descriptions(&self) -> Result<(), StoreError> {
         let bounds = self.settings.descriptions;
-        let broken_off = sqlx::query("DELETE FROM purchases WHERE until <= now()");
-        self.run(broken_off).await?;
+        let expired_leases = sqlx::query("DELETE FROM purchases WHERE until <= now()");
+        self.run(expired_leases).await?;
         loop {
-            let gone = sqlx::query(
+            let expired = sqlx::query(
                 "DELETE FROM descriptions WHERE key IN (
                      SELECT key FROM descriptions
                      WHERE created_at <= now() - make_interval(secs => $1) LIMIT $2)",
             )
             .bind(bounds.max_age.as_secs_f64())
-            .bind(REMOVED_AT_ONCE);
-            let gone = self.run(gone).await?;
-            if gone < REMOVED_AT_ONCE.unsigned_abs() {
+            .bind(REMOVAL_BATCH);
+            let removed = self.run(expired).await?;
+            if removed < REMOVAL_BATCH.unsigned_abs() {
                 break;
             }
         }
         loop {
             let levels = self.call(self.cache_levels()).await?;
             self.levels.set(levels);
-            let over = levels.bytes.saturating_sub(bounds.max_bytes);
-            if over == 0 {
+            let excess = levels.bytes.saturating_sub(bounds.max_bytes);
+            if excess == 0 {
                 return Ok(());
             }
-            // The least recently used, as long as they are needed to make room.
-            let gone = sqlx::query(
+            // The least recently used ones, until the excess is freed.
+            let least_used = sqlx::query(
                 "DELETE FROM descriptions WHERE key IN (
                      SELECT key FROM (
                          SELECT key, sum(size) OVER (ORDER BY used_at, key) - size AS before
@@ -205,10 +206,10 @@ impl Inner {
                                ORDER BY used_at, key LIMIT $2) oldest) summed
                      WHERE before < $1)",
             )
-            .bind(i64::try_from(over).unwrap_or(i64::MAX))
-            .bind(REMOVED_AT_ONCE);
-            let gone = self.run(gone).await?;
-            if gone == 0 {
+            .bind(i64::try_from(excess).unwrap_or(i64::MAX))
+            .bind(REMOVAL_BATCH);
+            let evicted = self.run(least_used).await?;
+            if evicted == 0 {
                 return Ok(());
             }
         }

@@ -1,8 +1,8 @@
-//! The descriptors of maps, each map's in a table of its own, and the search in them.
+//! The descriptors of maps, one table for each map, and the search in them.
 //!
-//! A table holds the descriptors as they were given, in 32-bit floats. Its HNSW index is over the same
-//! numbers in 16 bits (`halfvec`), which takes half the memory: the index proposes a few more images than are
-//! wanted, and those are compared again with all their bits. `tests/store/search.rs` holds its recall.
+//! A table stores the descriptors at full precision, as 32-bit floats. Its HNSW index is over the same
+//! numbers in 16 bits (`halfvec`), which halves its memory: the index returns a few more images than
+//! requested, and these are ranked again at full precision. `tests/store/search.rs` checks the recall.
 
 use std::collections::HashSet;
 
@@ -17,17 +17,17 @@ use super::{Inner, count, is_locked, is_missing_table};
 use whereabouts_core::{CalibrationSettings, Candidate, Descriptor, ImageId, Map, Pose};
 use whereabouts_index::SearchMode;
 
-/// The most numbers that pgvector indexes in 16 bits.
-pub(super) const MOST_INDEXED: usize = 4000;
+/// The maximum number of dimensions that pgvector indexes in 16 bits.
+pub(super) const MAX_INDEXED_DIM: usize = 4000;
 
-/// So many images more than are wanted come from the index, to be compared again.
-const SPARE: usize = 8;
+/// Number of images requested from the index in addition to `k`, to be ranked again.
+const OVERFETCH: usize = 8;
 
-/// Longer descriptors do not fit into a page of a table, and are kept beside it.
-const MOST_IN_PAGE: usize = 1900;
+/// Descriptors with more dimensions do not fit into a table's page, and are stored out of line.
+const MAX_INLINE_DIM: usize = 1900;
 
-/// Tables of descriptors that no map and no draft has, by how their names begin.
-const UNNEEDED: &str = "
+/// Selects the descriptor tables that belong to no map or draft, by the prefix of their names.
+const UNUSED_TABLES: &str = "
     SELECT relname::text FROM pg_class
     WHERE relkind = 'r' AND pg_table_is_visible(oid) AND starts_with(relname::text, $1)
         AND relname::text NOT IN (
@@ -35,16 +35,18 @@ const UNNEEDED: &str = "
             UNION ALL
             SELECT 'descriptors_' || replace(map_uid::text, '-', '') || '_' || revision FROM drafts)";
 
-/// The bytes of each map's descriptors and their index. A table that is replaced at this moment counts nothing.
+/// Selects the size of each map's descriptors and their index. A table that is being replaced counts as
+/// empty.
 pub(super) const SIZES: &str = "
     SELECT name, coalesce(pg_total_relation_size(to_regclass(
         'descriptors_' || replace(uid::text, '-', '') || '_' || revision)), 0)
     FROM maps ORDER BY name";
 
-/// So long a table is waited for that is to be dropped, in milliseconds. Nobody can search it meanwhile.
-const DROP_PATIENCE_MS: u32 = 200;
+/// How long to wait for the lock of a table to drop, in milliseconds. Searches of it wait meanwhile.
+const DROP_LOCK_TIMEOUT_MS: u32 = 200;
 
-/// Maps whose index is known to be there, by uid and revision. None ever loses it.
+/// Maps that are known to have an index, by uid and revision. An index is never dropped alone, so entries
+/// stay valid.
 #[derive(Default)]
 pub(super) struct KnownGraphs(RwLock<HashSet<(Uuid, u32)>>);
 
@@ -66,7 +68,7 @@ impl KnownGraphs {
     }
 }
 
-/// The table of a map's descriptors.
+/// Returns the name of the table of a map's descriptors.
 pub(super) fn table(uid: Uuid, revision: u32) -> String {
     format!("{}{revision}", table_prefix(uid))
 }
@@ -75,25 +77,28 @@ fn table_prefix(uid: Uuid) -> String {
     format!("descriptors_{}_", uid.simple())
 }
 
-/// The name of its index.
+/// Returns the name of the index of that table.
 pub(super) fn graph(uid: Uuid, revision: u32) -> String {
     format!("graph_{}_{revision}", uid.simple())
 }
 
-/// Makes the table of a map's descriptors.
-pub(super) async fn make_table(connection: &mut PgConnection, map: &Map) -> Result<(), StoreError> {
+/// Creates the table of a map's descriptors.
+pub(super) async fn create_table(
+    connection: &mut PgConnection,
+    map: &Map,
+) -> Result<(), StoreError> {
     let (table, dim) = (table(map.uid, map.revision), map.dim);
-    let storage = if dim <= MOST_IN_PAGE { "PLAIN" } else { "EXTERNAL" };
-    let make = format!(
+    let storage = if dim <= MAX_INLINE_DIM { "PLAIN" } else { "EXTERNAL" };
+    let create = format!(
         "CREATE TABLE {table} (
              slot bigint PRIMARY KEY,
              descriptor vector({dim}) STORAGE {storage} NOT NULL)"
     );
-    sqlx::query(AssertSqlSafe(make)).execute(connection).await?;
+    sqlx::query(AssertSqlSafe(create)).execute(connection).await?;
     Ok(())
 }
 
-/// Drops it, once nobody reads it.
+/// Drops the table of a map's descriptors, after waiting for its readers.
 pub(super) async fn drop_table(
     connection: &mut PgConnection,
     uid: Uuid,
@@ -104,7 +109,7 @@ pub(super) async fn drop_table(
     Ok(())
 }
 
-/// The numbers of a descriptor that the database gives.
+/// Converts the numbers of a stored descriptor.
 pub(super) fn descriptor_of(numbers: Vec<f32>) -> Option<Descriptor> {
     Descriptor::stored(numbers).ok()
 }
@@ -118,7 +123,7 @@ struct Found {
 }
 
 impl Inner {
-    /// Refuses a map whose descriptors are not those that the caller knows.
+    /// Refuses a map that was deleted, or reindexed after the caller read it.
     pub(super) async fn check_revision(&self, map: &Map) -> Result<(), StoreError> {
         let stored = sqlx::query_scalar("SELECT revision FROM maps WHERE uid = $1").bind(map.uid);
         let stored: Option<i64> = stored.fetch_optional(&self.pool).await?;
@@ -129,15 +134,15 @@ impl Inner {
         }
     }
 
-    /// Refuses a map that is gone.
-    pub(super) async fn check_there(&self, map: &Map) -> Result<(), StoreError> {
+    /// Refuses a map that was deleted.
+    pub(super) async fn check_exists(&self, map: &Map) -> Result<(), StoreError> {
         match self.check_revision(map).await {
             Err(StoreError::Superseded(_)) => Ok(()),
             checked => checked,
         }
     }
 
-    /// What to say of a statement that failed because of the map's table.
+    /// Converts the error of a statement that uses the map's table.
     pub(super) async fn explain(&self, map: &Map, error: sqlx::Error) -> StoreError {
         if !is_missing_table(&error) {
             return error.into();
@@ -151,33 +156,34 @@ impl Inner {
         }
     }
 
-    /// Drops the tables of descriptors that no map and no draft has any more, of one uid or of all. One that is
-    /// in use, or whose index is being built, is left to a later look.
+    /// Drops the descriptor tables that belong to no map or draft, of one uid or of all. A table that is in
+    /// use, or whose index is being built, is skipped and dropped by a later call.
     ///
-    /// Never in the transaction that made them so: whoever adds an image locks the table and then the map's
-    /// row, and a transaction that locked the two in the other order would wait for it, and it for that.
-    pub(super) async fn drop_unneeded(&self, uid: Option<Uuid>) -> Result<(), StoreError> {
+    /// This must not run in the transaction that made a table unused: adding an image locks the table and
+    /// then the map's row, so locking them in the opposite order would deadlock.
+    pub(super) async fn drop_unused_tables(&self, uid: Option<Uuid>) -> Result<(), StoreError> {
         let prefix = uid.map_or_else(|| "descriptors_".to_owned(), table_prefix);
-        let unneeded = sqlx::query_scalar(UNNEEDED).bind(prefix);
-        let unneeded: Vec<String> =
-            self.call(async { Ok(unneeded.fetch_all(&self.pool).await?) }).await?;
-        for table in unneeded {
-            self.call(self.drop_if_unneeded(&table)).await?;
+        let unused = sqlx::query_scalar(UNUSED_TABLES).bind(prefix);
+        let unused: Vec<String> =
+            self.call(async { Ok(unused.fetch_all(&self.pool).await?) }).await?;
+        for table in unused {
+            self.call(self.drop_if_unused(&table)).await?;
         }
         Ok(())
     }
 
-    /// The same after a change that is done: what cannot be dropped is left to the janitor.
-    pub(super) async fn drop_left(&self, uid: Uuid) {
-        if let Err(error) = self.drop_unneeded(Some(uid)).await {
-            tracing::warn!(%error, "old descriptors are left to a later look");
+    /// Drops the unused tables of one uid. A failure is only logged, because garbage collection tries
+    /// again.
+    pub(super) async fn drop_unused_tables_of(&self, uid: Uuid) {
+        if let Err(error) = self.drop_unused_tables(Some(uid)).await {
+            tracing::warn!(%error, "cannot drop old descriptors yet");
         }
     }
 
-    async fn drop_if_unneeded(&self, table: &str) -> Result<(), StoreError> {
+    async fn drop_if_unused(&self, table: &str) -> Result<(), StoreError> {
         let mut tx = self.begin().await?;
         for statement in [
-            format!("SET LOCAL lock_timeout = {DROP_PATIENCE_MS}"),
+            format!("SET LOCAL lock_timeout = {DROP_LOCK_TIMEOUT_MS}"),
             format!("LOCK TABLE {table} IN ACCESS EXCLUSIVE MODE"),
         ] {
             match sqlx::raw_sql(AssertSqlSafe(statement)).execute(&mut *tx).await {
@@ -185,29 +191,29 @@ impl Inner {
                 done => done?,
             };
         }
-        // Another draft of the same revision may have begun meanwhile.
-        let still = sqlx::query_scalar(UNNEEDED).bind(table);
-        let still: Vec<String> = still.fetch_all(&mut *tx).await?;
-        if still.iter().any(|still| still == table) {
+        // Check again, because another draft of the same revision may have begun meanwhile.
+        let unused = sqlx::query_scalar(UNUSED_TABLES).bind(table);
+        let unused: Vec<String> = unused.fetch_all(&mut *tx).await?;
+        if unused.iter().any(|unused| unused == table) {
             let drop = format!("DROP TABLE {table}");
             sqlx::raw_sql(AssertSqlSafe(drop)).execute(&mut *tx).await?;
         }
         Ok(tx.commit().await?)
     }
 
-    /// Whether the map's index is there.
+    /// Whether the map has an index.
     async fn has_graph(&self, map: &Map) -> Result<bool, StoreError> {
         if self.graphs.has(map) {
             return Ok(true);
         }
-        let there = sqlx::query_scalar("SELECT graph FROM maps WHERE uid = $1 AND revision = $2")
+        let graph = sqlx::query_scalar("SELECT graph FROM maps WHERE uid = $1 AND revision = $2")
             .bind(map.uid)
             .bind(i64::from(map.revision));
-        let there: Option<bool> = there.fetch_optional(&self.pool).await?;
-        if there == Some(true) {
+        let graph: Option<bool> = graph.fetch_optional(&self.pool).await?;
+        if graph == Some(true) {
             self.graphs.add(map);
         }
-        Ok(there == Some(true))
+        Ok(graph == Some(true))
     }
 
     pub(super) async fn candidates(
@@ -229,8 +235,8 @@ impl Inner {
     ) -> Result<Vec<Found>, StoreError> {
         if mode == SearchMode::Fast && self.has_graph(map).await? {
             let found = self.nearest(map, query, k, true).await?;
-            // Among many removed images an index can lose its way to the rest, and it is not looked through
-            // to its end.
+            // If many images were removed, an index scan may end before it has found enough. Disposition search
+            // exactly.
             if found.len() == k {
                 return Ok(found);
             }
@@ -253,7 +259,7 @@ impl Inner {
             ),
             false => format!("SELECT slot, descriptor FROM {table}"),
         };
-        // OFFSET 0 has images looked up one by one. A plan made for any LIMIT would read the whole map's.
+        // OFFSET 0 makes the planner look up images one by one; a generic plan would read all of the map's.
         let sql = format!(
             "SELECT n.slot, i.id, i.pose, 1 - n.distance AS similarity
              FROM (SELECT slot, descriptor <=> $1::real[]::vector AS distance
@@ -263,18 +269,18 @@ impl Inner {
              JOIN maps m ON m.uid = $4 AND m.revision = $5
              ORDER BY n.distance, n.slot"
         );
-        let wanted = k + SPARE;
+        let fetched = k + OVERFETCH;
         let search = sqlx::query(AssertSqlSafe(sql))
             .bind(query.as_slice())
             .bind(count(k))
-            .bind(count(wanted))
+            .bind(count(fetched))
             .bind(map.uid)
             .bind(i64::from(map.revision));
-        let rows = if by_graph && wanted > self.settings.index.ef_search {
+        let rows = if by_graph && fetched > self.settings.index.ef_search {
             let mut tx = self.begin().await?;
-            // For this search alone: as many points are looked at as it takes to find so many.
+            // Raise ef_search for this search only, so that it can return enough images.
             sqlx::query("SELECT set_config('hnsw.ef_search', $1, true)")
-                .bind(wanted.min(1000).to_string())
+                .bind(fetched.min(1000).to_string())
                 .execute(&mut *tx)
                 .await?;
             search.fetch_all(&mut *tx).await
@@ -301,43 +307,43 @@ impl Inner {
             .collect()
     }
 
-    /// Images spread over the map, each with the `k` most similar ones of other places.
-    pub(super) async fn similar_places(
+    /// Samples images evenly across the map and returns the `k` hardest negatives of each.
+    pub(super) async fn find_hard_negatives(
         &self,
         map: &Map,
         settings: CalibrationSettings,
         k: usize,
     ) -> Result<Vec<HardNegatives>, StoreError> {
-        let places: Vec<(i64, String, Option<Json<Pose>>)> =
+        let images: Vec<(i64, String, Option<Json<Pose>>)> =
             sqlx::query_as("SELECT slot, id, pose FROM images WHERE map_uid = $1 ORDER BY slot")
                 .bind(map.uid)
                 .fetch_all(&self.pool)
                 .await?;
-        let mut asked = Vec::new();
-        for at in (0..places.len()).step_by(settings.step(places.len())) {
-            let (slot, id, pose) = &places[at];
+        let mut samples = Vec::new();
+        for at in (0..images.len()).step_by(settings.step(images.len())) {
+            let (slot, id, pose) = &images[at];
             let Some(descriptor) = self.descriptor(map, *slot).await? else { continue };
             let pose = pose.as_ref().map(|Json(pose)| *pose);
             let of_another_place = |found: &Found| {
-                let position = places.partition_point(|(slot, ..)| *slot < found.slot);
-                settings.are_apart(places.len(), (at, pose), (position, found.pose))
+                let position = images.partition_point(|(slot, ..)| *slot < found.slot);
+                settings.are_apart(images.len(), (at, pose), (position, found.pose))
             };
-            // Twice as many, until enough of them are of other places.
-            let mut wanted = k + 2 * settings.place_images_of(places.len()) + 1;
+            // Double the limit until enough results are of other places.
+            let mut limit = k + 2 * settings.place_radius(images.len()) + 1;
             let others = loop {
-                let found = self.find(map, &descriptor, wanted, SearchMode::Fast).await?;
-                let all = found.len() < wanted;
+                let found = self.find(map, &descriptor, limit, SearchMode::Fast).await?;
+                let exhausted = found.len() < limit;
                 let others: Vec<Found> =
                     found.into_iter().filter(of_another_place).take(k).collect();
-                if others.len() == k || all {
+                if others.len() == k || exhausted {
                     break others;
                 }
-                wanted *= 2;
+                limit *= 2;
             };
             let image_id = image_id(id.clone())?;
-            asked.push(HardNegatives { image_id, others: candidates(others) });
+            samples.push(HardNegatives { image_id, others: candidates(others) });
         }
-        Ok(asked)
+        Ok(samples)
     }
 
     async fn descriptor(&self, map: &Map, slot: i64) -> Result<Option<Descriptor>, StoreError> {
@@ -353,7 +359,7 @@ impl Inner {
 
 pub(super) fn image_id(id: String) -> Result<ImageId, StoreError> {
     id.parse().map_err(|_| {
-        StoreError::Damaged("an image of the database has no valid id; restore a backup".into())
+        StoreError::Damaged("a stored image has an invalid id; restore a backup".into())
     })
 }
 
@@ -361,7 +367,7 @@ fn candidates(found: Vec<Found>) -> Vec<Candidate> {
     let candidate = |(position, found): (usize, Found)| Candidate {
         rank: position + 1,
         image_id: found.id,
-        // Rounding can carry the cosine of equal pictures just past 1.
+        // Rounding can push the cosine of identical pictures slightly above 1.
         similarity: (found.similarity as f32).clamp(-1.0, 1.0),
         pose: found.pose,
     };

@@ -1,4 +1,4 @@
-//! Descriptors made anew, in a table beside the one that serves, and the step that puts it in its place.
+//! Drafts: new descriptors in a separate table, and their atomic replacement of the current one.
 
 use async_trait::async_trait;
 use sqlx::types::Json;
@@ -6,19 +6,19 @@ use sqlx::{AssertSqlSafe, PgConnection};
 
 use super::super::changes::{being_reindexed, removed};
 use super::super::{Draft, DraftStore, StoreError};
-use super::descriptors::{MOST_INDEXED, drop_table, make_table, table};
+use super::descriptors::{MAX_INDEXED_DIM, create_table, drop_table, table};
 use super::{Inner, PostgresStore, count, record};
 use whereabouts_core::{Descriptor, Image, Map};
 
 struct PostgresDraft {
     store: PostgresStore,
-    /// The map that serves.
+    /// The map as it is.
     old: Map,
     /// The map as it will be.
     next: Map,
-    /// Images up to this place have been looked at.
+    /// The last slot examined by the current pass over the images.
     seen: i64,
-    /// Whether the index was built.
+    /// Whether the draft's index was built.
     indexed: bool,
 }
 
@@ -31,7 +31,7 @@ impl DraftStore for PostgresStore {
             .call(async {
                 inner.check_revision(&old).await?;
                 let mut tx = inner.begin().await?;
-                let taken = sqlx::query(
+                let acquired = sqlx::query(
                     "INSERT INTO drafts (map_uid, revision, holder) VALUES ($1, $2, $3)
                      ON CONFLICT (map_uid) DO UPDATE
                      SET revision = EXCLUDED.revision, holder = EXCLUDED.holder
@@ -44,12 +44,12 @@ impl DraftStore for PostgresStore {
                 .bind(inner.lifetime())
                 .execute(&mut *tx)
                 .await?;
-                if taken.rows_affected() == 0 {
+                if acquired.rows_affected() == 0 {
                     return Err(being_reindexed(&next));
                 }
-                // What a process that is dead may have left.
+                // A dead process may have left its table.
                 drop_table(&mut tx, next.uid, next.revision).await?;
-                make_table(&mut tx, &next).await?;
+                create_table(&mut tx, &next).await?;
                 Ok(tx.commit().await?)
             })
             .await?;
@@ -67,15 +67,15 @@ impl Draft for PostgresDraft {
                 self.check_held(&inner.pool).await?;
                 loop {
                     let from = self.seen;
-                    let some = self.missing_after(&inner, from, limit).await?;
-                    if let Some((last, _)) = some.last() {
+                    let page = self.missing_after(&inner, from, limit).await?;
+                    if let Some((last, _)) = page.last() {
                         self.seen = *last;
-                        return Ok(some.into_iter().map(|(_, Json(image))| image).collect());
+                        return Ok(page.into_iter().map(|(_, Json(image))| image).collect());
                     }
                     if from == 0 {
                         return Ok(Vec::new());
                     }
-                    // Once more from the beginning: places are given before images are stored.
+                    // Start another pass, because slots are assigned before images become visible.
                     self.seen = 0;
                 }
             })
@@ -85,7 +85,7 @@ impl Draft for PostgresDraft {
     async fn write(&mut self, image: &Image, descriptor: Descriptor) -> Result<(), StoreError> {
         let inner = &self.store.inner;
         let table = table(self.next.uid, self.next.revision);
-        // Its id may have gone to another image, which a later look finds.
+        // If the id now belongs to another image, a later pass finds that one.
         let sql = format!(
             "INSERT INTO {table} (slot, descriptor)
              SELECT slot, $4::real[]::vector FROM images
@@ -111,15 +111,15 @@ impl Draft for PostgresDraft {
             })
             .await?;
         if !self.indexed {
-            // Before it serves: a large map should not be searched exactly until its index is there.
-            self.indexed = self.build(&inner).await?;
+            // Build the index first, so that a large map is never searched exactly.
+            self.indexed = self.build_index(&inner).await?;
         }
-        let replaced = inner.call(self.put_in_place(&inner)).await?;
+        let replaced = inner.call(self.swap(&inner)).await?;
         if replaced {
             if self.indexed {
                 inner.graphs.add(&self.next);
             }
-            inner.drop_left(self.next.uid).await;
+            inner.drop_unused_tables_of(self.next.uid).await;
         }
         Ok(replaced)
     }
@@ -131,9 +131,9 @@ impl Draft for PostgresDraft {
             .bind(uid)
             .bind(inner.process);
         if let Err(error) = inner.run(own).await {
-            tracing::warn!(%error, "a draft is left to the next one of the map");
+            tracing::warn!(%error, "cannot delete a draft; the next draft of the map replaces it");
         }
-        inner.drop_left(uid).await;
+        inner.drop_unused_tables_of(uid).await;
     }
 }
 
@@ -155,8 +155,8 @@ impl PostgresDraft {
         Ok(query.bind(count(limit)).fetch_all(&inner.pool).await?)
     }
 
-    /// Builds the index, if the map is large enough for one.
-    async fn build(&self, inner: &Inner) -> Result<bool, StoreError> {
+    /// Builds the index if the map is large enough. Returns whether there is one.
+    async fn build_index(&self, inner: &Inner) -> Result<bool, StoreError> {
         let table = table(self.next.uid, self.next.revision);
         let large = format!("SELECT count(*) FROM (SELECT FROM {table} LIMIT $1) counted");
         let exact = inner.settings.index.exact_up_to;
@@ -166,18 +166,19 @@ impl PostgresDraft {
                 Ok(counting.fetch_one(&inner.pool).await?)
             })
             .await?;
-        if images <= count(exact) || self.next.dim > MOST_INDEXED {
+        if images <= count(exact) || self.next.dim > MAX_INDEXED_DIM {
             return Ok(false);
         }
         let mut connection = inner.pool.acquire().await?.detach();
-        inner.index(&mut connection, &self.next).await?;
+        inner.create_index(&mut connection, &self.next).await?;
         Ok(true)
     }
 
-    async fn put_in_place(&self, inner: &Inner) -> Result<bool, StoreError> {
+    /// Replaces the current descriptors. Returns `false` if the draft is incomplete.
+    async fn swap(&self, inner: &Inner) -> Result<bool, StoreError> {
         let (uid, table) = (self.next.uid, table(self.next.uid, self.next.revision));
         let mut tx = inner.begin().await?;
-        // Whoever adds or removes an image waits from here on.
+        // From here on, additions and removals of images wait.
         let stored = sqlx::query_scalar("SELECT record FROM maps WHERE uid = $1 FOR UPDATE");
         let stored: Option<Json<Map>> = stored.bind(uid).fetch_optional(&mut *tx).await?;
         let Json(stored) = stored.ok_or_else(|| removed(&self.old))?;
@@ -185,7 +186,7 @@ impl PostgresDraft {
             return Err(StoreError::Superseded(stored.name));
         }
         self.check_held(&mut *tx).await?;
-        if self.lacks_some(&mut tx).await? {
+        if self.is_incomplete(&mut tx).await? {
             return Ok(false);
         }
         let removed = format!(
@@ -193,7 +194,7 @@ impl PostgresDraft {
                  SELECT FROM images WHERE map_uid = $1 AND slot = d.slot)"
         );
         sqlx::query(AssertSqlSafe(removed)).bind(uid).execute(&mut *tx).await?;
-        // Scene and description may have changed.
+        // Scene and description may have changed meanwhile.
         let map = Map { scene: stored.scene, description: stored.description, ..self.next.clone() };
         sqlx::query(
             "UPDATE maps SET revision = $2, record = $3::json, graph = $4, calibration = NULL,
@@ -205,17 +206,17 @@ impl PostgresDraft {
         .bind(self.indexed)
         .execute(&mut *tx)
         .await?;
-        // Their descriptors are not like those that come now.
-        for gone in
+        // The descriptors of described frames belong to the old revision.
+        for obsolete in
             ["DELETE FROM frames WHERE map_uid = $1", "DELETE FROM drafts WHERE map_uid = $1"]
         {
-            sqlx::query(gone).bind(uid).execute(&mut *tx).await?;
+            sqlx::query(obsolete).bind(uid).execute(&mut *tx).await?;
         }
         tx.commit().await?;
         Ok(true)
     }
 
-    /// Refuses a draft that was taken from this process, because it had not been heard of.
+    /// Refuses a draft that another process took over because the heartbeats of this one had stopped.
     async fn check_held(&self, executor: impl sqlx::PgExecutor<'_>) -> Result<(), StoreError> {
         let held = sqlx::query("SELECT FROM drafts WHERE map_uid = $1 AND holder = $2 FOR SHARE")
             .bind(self.next.uid)
@@ -223,20 +224,21 @@ impl PostgresDraft {
         match held.fetch_optional(executor).await? {
             Some(_) => Ok(()),
             None => Err(StoreError::Conflict(format!(
-                "the reindexing of the map {} was given up, because this process had not been heard of \
-                 for too long; begin it again",
+                "the reindexing of the map {} was abandoned, because the heartbeats of this process had \
+                 stopped; start it again",
                 self.next.name
             ))),
         }
     }
 
-    async fn lacks_some(&self, connection: &mut PgConnection) -> Result<bool, StoreError> {
+    /// Whether some image has no descriptor in the draft.
+    async fn is_incomplete(&self, connection: &mut PgConnection) -> Result<bool, StoreError> {
         let table = table(self.next.uid, self.next.revision);
         let sql = format!(
             "SELECT EXISTS (SELECT FROM images i WHERE i.map_uid = $1
                  AND NOT EXISTS (SELECT FROM {table} d WHERE d.slot = i.slot))"
         );
-        let lacking = sqlx::query_scalar(AssertSqlSafe(sql)).bind(self.next.uid);
-        Ok(lacking.fetch_one(connection).await?)
+        let incomplete = sqlx::query_scalar(AssertSqlSafe(sql)).bind(self.next.uid);
+        Ok(incomplete.fetch_one(connection).await?)
     }
 }

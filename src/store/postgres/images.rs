@@ -1,5 +1,7 @@
-//! The images of maps. One statement adds an image with its descriptor, its count and its claim to the
-//! bytes, and one removes it with all of that.
+//! The images of maps. A single statement adds an image together with its descriptor, the count of
+//! images and the reference to its bytes, and another removes all of them.
+
+use std::collections::HashMap;
 
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -15,11 +17,11 @@ use super::{Inner, PostgresStore, blobs, count, is_missing_table, record};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Descriptor, Image, ImageId, Map, Pose};
 
-/// Counts of a map are kept in so many parts.
-const PARTS: i16 = 16;
+/// Number of rows that a map's counts are spread over, to reduce contention.
+const COUNT_PARTS: i16 = 16;
 
-/// How often something is tried again that another process was quicker with.
-const TRIES: usize = 3;
+/// Maximum number of attempts when concurrent changes interfere.
+const MAX_ATTEMPTS: usize = 3;
 
 impl Inner {
     pub(super) async fn add_image(
@@ -48,8 +50,8 @@ impl Inner {
              SELECT (SELECT count(*) FROM added) AS added, (SELECT count(*) FROM needed) AS needed"
         );
         let (text, pose) = (record(&image)?, image.pose.as_ref().map(record).transpose()?);
-        for _ in 0..TRIES {
-            // One transaction, so that nothing stays of an image without bytes.
+        for _ in 0..MAX_ATTEMPTS {
+            // A transaction, so that an image whose bytes are missing is rolled back.
             let mut tx = self.begin().await?;
             let added = sqlx::query(AssertSqlSafe(sql.clone()))
                 .bind(map.uid)
@@ -82,9 +84,9 @@ impl Inner {
             if let Some(present) = self.image(map.uid, &image.id).await? {
                 return Ok(Added::Present(same_bytes(present, &image)?));
             }
-            // The image was there and has just been removed.
+            // The image existed and was removed just now, so try again.
         }
-        Err(super::unavailable("others change the same image"))
+        Err(super::unavailable("other processes are changing the same image"))
     }
 
     pub(super) async fn image(
@@ -96,6 +98,23 @@ impl Inner {
         let found: Option<Json<Image>> =
             found.bind(map_uid).bind(id.as_str()).fetch_optional(&self.pool).await?;
         Ok(found.map(|Json(image)| image))
+    }
+
+    pub(super) async fn images_by_id(
+        &self,
+        map_uid: Uuid,
+        ids: &[ImageId],
+    ) -> Result<Vec<Option<Image>>, StoreError> {
+        let keys: Vec<&str> = ids.iter().map(ImageId::as_str).collect();
+        let found: Vec<Json<Image>> =
+            sqlx::query_scalar("SELECT record FROM images WHERE map_uid = $1 AND id = ANY($2)")
+                .bind(map_uid)
+                .bind(keys)
+                .fetch_all(&self.pool)
+                .await?;
+        let found: HashMap<ImageId, Image> =
+            found.into_iter().map(|Json(image)| (image.id.clone(), image)).collect();
+        Ok(ids.iter().map(|id| found.get(id).cloned()).collect())
     }
 
     pub(super) async fn images(
@@ -124,13 +143,13 @@ impl Inner {
         .fetch_all(&self.pool)
         .await?;
         if positions.is_empty() {
-            self.check_there(map).await?;
+            self.check_exists(map).await?;
         }
         positions.into_iter().map(|(id, Json(pose))| Ok((image_id(id)?, pose))).collect()
     }
 
     pub(super) async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {
-        for _ in 0..TRIES {
+        for _ in 0..MAX_ATTEMPTS {
             let revision = sqlx::query_scalar("SELECT revision FROM maps WHERE uid = $1");
             let revision: Option<i64> = revision.bind(map.uid).fetch_optional(&self.pool).await?;
             let revision = revision.ok_or_else(|| removed(map))?;
@@ -161,7 +180,7 @@ impl Inner {
                 Ok(row) if row.try_get::<i64, _>("map")? > 0 => {
                     return Ok(row.try_get::<i64, _>("gone")? > 0);
                 }
-                // It was reindexed meanwhile.
+                // The map was reindexed meanwhile, so try again.
                 Ok(_) => {}
                 Err(error) if is_missing_table(&error) => {}
                 Err(error) => return Err(error.into()),
@@ -211,7 +230,7 @@ impl ExportStore for PostgresStore {
     }
 }
 
-/// Any part of a map's counts.
+/// Chooses an arbitrary row of a map's counts.
 fn part() -> i16 {
-    (Timestamp::now().subsec_nanosecond() / 1000 % i32::from(PARTS)) as i16
+    (Timestamp::now().subsec_nanosecond() / 1000 % i32::from(COUNT_PARTS)) as i16
 }

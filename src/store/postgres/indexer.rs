@@ -1,7 +1,8 @@
 //! Builds the HNSW indexes of maps that have outgrown exact search, in the background.
 //!
-//! PostgreSQL builds an index while images are added and removed, and puts every later image into it. An
-//! advisory lock of the connection keeps two processes from building the same one; nobody waits for it.
+//! PostgreSQL builds an index while images are added and removed, and adds later images to it. An
+//! advisory lock of the connection keeps two processes from building the same index; nothing waits for
+//! it.
 
 use std::sync::Weak;
 use std::time::Duration;
@@ -12,14 +13,14 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::super::StoreError;
-use super::descriptors::{MOST_INDEXED, graph, table};
+use super::descriptors::{MAX_INDEXED_DIM, graph, table};
 use super::{Inner, count};
 use whereabouts_core::Map;
 
-/// The pause between two looks for maps without an index.
-const PAUSE: Duration = Duration::from_secs(1);
+/// The interval between checks for maps without an index.
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Looks until the store is closed.
+/// Builds missing indexes until the store is closed.
 pub(super) async fn keep_indexed(store: Weak<Inner>, closed: CancellationToken) {
     while let Some(inner) = store.upgrade() {
         let building = async {
@@ -38,13 +39,13 @@ pub(super) async fn keep_indexed(store: Weak<Inner>, closed: CancellationToken) 
         drop(inner);
         tokio::select! {
             () = closed.cancelled() => return,
-            () = tokio::time::sleep(PAUSE) => {}
+            () = tokio::time::sleep(CHECK_INTERVAL) => {}
         }
     }
 }
 
 impl Inner {
-    /// Maps that have too many images to be searched exactly, and no index.
+    /// Returns the maps that have too many images for exact search, but no index.
     async fn outgrown(&self) -> Result<Vec<Map>, StoreError> {
         let maps: Vec<Json<Map>> = sqlx::query_scalar(
             "SELECT record FROM maps WHERE NOT graph AND (
@@ -53,10 +54,10 @@ impl Inner {
         .bind(count(self.settings.index.exact_up_to))
         .fetch_all(&self.pool)
         .await?;
-        Ok(maps.into_iter().map(|Json(map)| map).filter(|map| map.dim <= MOST_INDEXED).collect())
+        Ok(maps.into_iter().map(|Json(map)| map).filter(|map| map.dim <= MAX_INDEXED_DIM).collect())
     }
 
-    /// Builds the index of a map, unless another process is at it.
+    /// Builds the index of a map, unless another process is building it.
     async fn build_graph(&self, map: &Map) -> Result<(), StoreError> {
         let lock = lock_of(map.uid);
         let mut connection = self.pool.acquire().await?;
@@ -64,10 +65,10 @@ impl Inner {
         if !locked.fetch_one(&mut *connection).await? {
             return Ok(());
         }
-        // Whatever becomes of it, the connection is closed, and the lock goes with it.
+        // A detached connection is closed when it is dropped, which releases the lock.
         let mut connection = connection.detach();
         let began = std::time::Instant::now();
-        self.index(&mut connection, map).await?;
+        self.create_index(&mut connection, map).await?;
         sqlx::query("UPDATE maps SET graph = true WHERE uid = $1 AND revision = $2")
             .bind(map.uid)
             .bind(i64::from(map.revision))
@@ -77,8 +78,8 @@ impl Inner {
         Ok(())
     }
 
-    /// Makes the index of a map's descriptors. The map need not serve yet.
-    pub(super) async fn index(
+    /// Creates the index of a map's descriptors, which may be those of a draft.
+    pub(super) async fn create_index(
         &self,
         connection: &mut PgConnection,
         map: &Map,
@@ -86,17 +87,17 @@ impl Inner {
         let (index, memory) = (self.settings.index, self.settings.index_memory_mib);
         let (table, graph) = (table(map.uid, map.revision), graph(map.uid, map.revision));
         let (dim, m, construction) = (map.dim, index.m, index.ef_construction);
-        let there = "SELECT indisvalid FROM pg_index WHERE indexrelid = to_regclass($1)";
-        let there: Option<bool> =
-            sqlx::query_scalar(there).bind(&graph).fetch_optional(&mut *connection).await?;
-        if there == Some(true) {
-            // Built for a process that ended before it could say so.
+        let valid = "SELECT indisvalid FROM pg_index WHERE indexrelid = to_regclass($1)";
+        let valid: Option<bool> =
+            sqlx::query_scalar(valid).bind(&graph).fetch_optional(&mut *connection).await?;
+        if valid == Some(true) {
+            // Built by a process that ended before it could record that.
             return Ok(());
         }
         for statement in [
             "SET statement_timeout = 0".to_owned(),
             format!("SET maintenance_work_mem = '{memory}MB'"),
-            // Half of one, from a build that broke off.
+            // An invalid index is left by an interrupted build.
             format!("DROP INDEX CONCURRENTLY IF EXISTS {graph}"),
             format!(
                 "CREATE INDEX CONCURRENTLY {graph} ON {table}
@@ -110,7 +111,7 @@ impl Inner {
     }
 }
 
-/// The advisory lock of whoever builds the index of a map.
+/// Returns the advisory lock for building the index of a map.
 fn lock_of(uid: Uuid) -> i64 {
     let (high, low) = uid.as_u64_pair();
     (high ^ low).cast_signed()

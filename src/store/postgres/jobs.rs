@@ -1,8 +1,8 @@
 //! Jobs and their queue.
 //!
-//! A worker takes a job in a transaction of its own, which passes over jobs that others are taking
-//! (`SKIP LOCKED`), and holds it by a mark: its process, the number of the claim, and until when. A job
-//! whose holder is dead is free at once.
+//! A worker claims a job in a transaction that skips jobs being claimed by others (`SKIP LOCKED`). The
+//! row then holds the claim: the process, the number of the claim, and when it expires. A job whose
+//! process is dead can be claimed at once.
 
 use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
@@ -12,43 +12,43 @@ use sqlx::{Postgres, Transaction};
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
-use super::super::changes::{ended_at, news_of, no_job, place, submitted_at};
-use super::super::listing::SEARCHED;
+use super::super::changes::{deliveries_for, ended_at, no_job, queue_rank, submitted_at};
+use super::super::listing::MAX_EXAMINED;
 use super::super::{
     Claim, IdempotencyRecord, JobFilter, JobList, JobRecord, JobStore, Release, Step, StoreError,
 };
 use super::listener::{DELIVERIES, JOBS};
-use super::statements::alone;
+use super::statements::advisory_lock;
 use super::{Inner, PostgresStore, count, counted, record, seconds};
 use whereabouts_core::{Job, JobState, StoredWebhook};
 
-/// So close to its bound the length of the queue is counted by one submission after another; before that,
-/// as many submissions at once may do no harm.
-const SUBMITTED_AT_ONCE: usize = 256;
+/// Within this distance of the queue's bound, submissions count the queue one at a time. Farther away,
+/// this many concurrent submissions cannot exceed the bound.
+const SERIAL_MARGIN: usize = 256;
 
-/// The advisory lock of those who count.
+/// The advisory lock of submissions that count the queue.
 const QUEUE_LOCK: i64 = 0x7768_6572_6561_0001;
 
-/// Jobs read at a time while a text is looked for.
-const PAGE: usize = 250;
+/// Jobs read at a time by a text search.
+const SEARCH_PAGE: usize = 250;
 
-/// What a change does to a job's row, beside its record.
-enum Place {
-    /// It stays as it is.
-    Same,
-    /// In the queue; nobody takes it for so many seconds.
+/// How a change affects the columns of a job's row next to its record.
+enum RowUpdate {
+    /// Only the record changes.
+    Keep,
+    /// The job is queued, and cannot be claimed for a number of seconds.
     Queue { for_s: f64 },
-    /// Held by this process for so many seconds.
-    Held { for_s: f64 },
-    /// It has ended.
-    Ended,
+    /// This process holds the job for a number of seconds.
+    Hold { for_s: f64 },
+    /// The job has ended.
+    End,
 }
 
 impl PostgresStore {
-    /// Applies a change to one job, unless the change says `None`.
+    /// Applies a change to one job; a change that returns `None` writes nothing.
     async fn change<F>(&self, id: Uuid, change: F) -> Result<Job, StoreError>
     where
-        F: FnOnce(&mut JobRecord) -> Result<Option<Place>, StoreError> + Send,
+        F: FnOnce(&mut JobRecord) -> Result<Option<RowUpdate>, StoreError> + Send,
     {
         let inner = &self.inner;
         inner
@@ -57,22 +57,22 @@ impl PostgresStore {
                 let found = sqlx::query_scalar("SELECT record FROM jobs WHERE id = $1 FOR UPDATE");
                 let found = found.bind(id).fetch_optional(&mut *tx).await?;
                 let Json(mut known): Json<JobRecord> = found.ok_or_else(|| no_job(id))?;
-                let mut lets_go = false;
+                let mut releases = false;
                 let changed = match change(&mut known) {
-                    Ok(Some(place)) => {
-                        lets_go = !matches!(place, Place::Same);
-                        inner.write_job(&mut tx, &known, place).await
+                    Ok(Some(update)) => {
+                        releases = !matches!(update, RowUpdate::Keep);
+                        inner.write_job(&mut tx, &known, update).await
                     }
                     Ok(None) => Ok(()),
                     Err(refused) => Err(refused),
                 };
-                // Also where nothing has changed: whoever claims passes over a job that is locked.
+                // End the transaction even if nothing has changed, because claims skip a locked job.
                 match changed {
                     Ok(()) => tx.commit().await?,
                     Err(_) => tx.rollback().await?,
                 }
-                if lets_go && changed.is_ok() {
-                    inner.held.let_go(known.claim());
+                if releases && changed.is_ok() {
+                    inner.claims.release(known.claim());
                 }
                 changed.map(|()| known.job)
             })
@@ -81,19 +81,20 @@ impl PostgresStore {
 }
 
 impl Inner {
-    /// Writes a job that is there and tells of it; and with its end, what webhooks are told of that.
+    /// Updates a job and notifies other processes; if the job has ended, also queues the deliveries
+    /// about its end.
     async fn write_job(
         &self,
         tx: &mut Transaction<'_, Postgres>,
         changed: &JobRecord,
-        place: Place,
+        update: RowUpdate,
     ) -> Result<(), StoreError> {
         let job = &changed.job;
-        let (same, for_s, held, end) = match place {
-            Place::Same => (true, 0.0, false, None),
-            Place::Queue { for_s } => (false, for_s, false, None),
-            Place::Held { for_s } => (false, for_s, true, None),
-            Place::Ended => (false, 0.0, false, Some(ended_at(job))),
+        let (keep, for_s, held, end) = match update {
+            RowUpdate::Keep => (true, 0.0, false, None),
+            RowUpdate::Queue { for_s } => (false, for_s, false, None),
+            RowUpdate::Hold { for_s } => (false, for_s, true, None),
+            RowUpdate::End => (false, 0.0, false, Some(ended_at(job))),
         };
         sqlx::query(
             "WITH changed AS (
@@ -108,7 +109,7 @@ impl Inner {
         .bind(job.id)
         .bind(record(changed)?)
         .bind(job.state.as_str())
-        .bind(same)
+        .bind(keep)
         .bind(for_s)
         .bind(held)
         .bind(self.process)
@@ -117,12 +118,12 @@ impl Inner {
         .execute(&mut **tx)
         .await?;
         if end.is_some() {
-            self.queue_news(tx, job).await?;
+            self.queue_deliveries(tx, job).await?;
         }
         Ok(())
     }
 
-    async fn queue_news(
+    async fn queue_deliveries(
         &self,
         tx: &mut Transaction<'_, Postgres>,
         job: &Job,
@@ -131,11 +132,11 @@ impl Inner {
             sqlx::query_scalar("SELECT record FROM webhooks ORDER BY id FOR KEY SHARE")
                 .fetch_all(&mut **tx)
                 .await?;
-        let news = news_of(job, webhooks.into_iter().map(|Json(stored)| stored))?;
-        for delivery in &news {
+        let outbox = deliveries_for(job, webhooks.into_iter().map(|Json(stored)| stored))?;
+        for delivery in &outbox {
             self.insert_delivery(tx, delivery).await?;
         }
-        if !news.is_empty() {
+        if !outbox.is_empty() {
             sqlx::query("SELECT pg_notify($1, '')").bind(DELIVERIES).execute(&mut **tx).await?;
         }
         Ok(())
@@ -148,9 +149,9 @@ impl Inner {
         new: &JobRecord,
         limit: usize,
     ) -> Result<(), StoreError> {
-        if self.waiting(&mut **tx, limit).await? + SUBMITTED_AT_ONCE > limit {
-            alone(tx, QUEUE_LOCK).await?;
-            if self.waiting(&mut **tx, limit).await? >= limit {
+        if self.unfinished(&mut **tx, limit).await? + SERIAL_MARGIN > limit {
+            advisory_lock(tx, QUEUE_LOCK).await?;
+            if self.unfinished(&mut **tx, limit).await? >= limit {
                 return Err(StoreError::QueueFull { limit });
             }
         }
@@ -165,7 +166,7 @@ impl Inner {
         .bind(job.id)
         .bind(job.map.as_str())
         .bind(job.state.as_str())
-        .bind(i16::from(place(job.priority)))
+        .bind(i16::from(queue_rank(job.priority)))
         .bind(new.query.digest.as_bytes().as_slice())
         .bind(record(new)?)
         .bind(JOBS)
@@ -177,7 +178,7 @@ impl Inner {
         }
     }
 
-    /// Jobs of a map and state that are older than another, newest first.
+    /// Returns up to `limit` jobs of a map and state that are older than `before`, newest first.
     async fn older(
         &self,
         filter: &JobFilter,
@@ -196,15 +197,15 @@ impl Inner {
         self.all(query).await
     }
 
-    /// Jobs that wait or run.
-    async fn waiting<'a>(
+    /// Counts the jobs that are queued or running, up to `limit`.
+    async fn unfinished<'a>(
         &self,
         executor: impl sqlx::PgExecutor<'a>,
         limit: usize,
     ) -> Result<usize, StoreError> {
-        let waiting =
+        let unfinished =
             "SELECT count(*) FROM (SELECT FROM jobs WHERE ended_at IS NULL LIMIT $1) open";
-        Ok(counted(sqlx::query_scalar(waiting).bind(count(limit)).fetch_one(executor).await?))
+        Ok(counted(sqlx::query_scalar(unfinished).bind(count(limit)).fetch_one(executor).await?))
     }
 }
 
@@ -242,9 +243,9 @@ impl JobStore for PostgresStore {
                     if let Some(Json(queued)) = job {
                         return Ok(Some(queued.job));
                     }
-                    known.queued(new.job.id);
-                    let note = sqlx::query("UPDATE answers SET record = $2::json WHERE id = $1");
-                    note.bind(request).bind(record(&known)?).execute(&mut *tx).await?;
+                    known.set_job(new.job.id);
+                    let update = sqlx::query("UPDATE answers SET record = $2::json WHERE id = $1");
+                    update.bind(request).bind(record(&known)?).execute(&mut *tx).await?;
                 }
                 inner.insert_job(&mut tx, &new, limit).await?;
                 tx.commit().await?;
@@ -255,12 +256,12 @@ impl JobStore for PostgresStore {
 
     async fn queued(&self) -> Result<usize, StoreError> {
         let inner = &self.inner;
-        inner.call(inner.waiting(&inner.pool, usize::MAX)).await
+        inner.call(inner.unfinished(&inner.pool, usize::MAX)).await
     }
 
-    async fn oldest_open(&self) -> Result<Option<Timestamp>, StoreError> {
+    async fn oldest_unfinished(&self) -> Result<Option<Timestamp>, StoreError> {
         let inner = &self.inner;
-        // Those that are open first, which are few: by the order of ids alone one would pass all that have ended.
+        // Selects the few unfinished jobs first: a scan in order of id would pass over all ended jobs.
         let oldest = sqlx::query_scalar(
             "WITH open AS MATERIALIZED (SELECT id FROM jobs WHERE ended_at IS NULL)
              SELECT id FROM open ORDER BY id LIMIT 1",
@@ -286,25 +287,25 @@ impl JobStore for PostgresStore {
             let jobs = page.into_iter().map(|known| known.job).collect();
             return Ok(JobList { jobs, searched_to: None });
         }
-        // The text is looked for here, so that both stores find the same.
-        let (mut found, mut before, mut looked) = (JobList::default(), before, 0);
+        // The search runs here rather than in SQL, so that both stores match the same texts.
+        let (mut found, mut before, mut examined) = (JobList::default(), before, 0);
         while found.jobs.len() < limit {
-            if looked >= SEARCHED {
+            if examined >= MAX_EXAMINED {
                 found.searched_to = before;
                 break;
             }
-            let page = inner.older(filter, before, PAGE).await?;
-            let whole = page.len() == PAGE;
+            let page = inner.older(filter, before, SEARCH_PAGE).await?;
+            let is_full = page.len() == SEARCH_PAGE;
             for known in page {
                 if found.jobs.len() == limit {
                     break;
                 }
-                (before, looked) = (Some(known.job.id), looked + 1);
+                (before, examined) = (Some(known.job.id), examined + 1);
                 if filter.matches(&known) {
                     found.jobs.push(known.job);
                 }
             }
-            if !whole {
+            if !is_full {
                 break;
             }
         }
@@ -332,22 +333,22 @@ impl JobStore for PostgresStore {
                     )
                     .bind(inner.process)
                     .bind(inner.lifetime())
-                    .bind(inner.held.all());
+                    .bind(inner.claims.all());
                     let found: Option<(Json<JobRecord>, bool)> =
                         found.fetch_optional(&mut *tx).await?;
                     let Some((Json(known), ours)) = found else { return Ok(None) };
-                    // Another worker of this process may have taken it since the list was made.
-                    if !(ours && inner.held.has(known.job.id)) {
+                    // Another worker of this process may have claimed it since the list was made.
+                    if !(ours && inner.claims.has(known.job.id)) {
                         break (tx, known);
                     }
                     tx.rollback().await?;
                 };
-                known.take(now);
-                inner.write_job(&mut tx, &known, Place::Held { for_s }).await?;
-                // If the answer to the commit is lost, nobody knows of the claim, and the job is free.
-                let holding = inner.held.hold(known.claim(), for_s);
+                known.start_attempt(now);
+                inner.write_job(&mut tx, &known, RowUpdate::Hold { for_s }).await?;
+                // If the result of the commit is lost, the guard drops the claim and the job is free.
+                let guard = inner.claims.hold(known.claim(), for_s);
                 tx.commit().await?;
-                holding.keep();
+                guard.keep();
                 Ok(Some(known))
             })
             .await
@@ -357,7 +358,7 @@ impl JobStore for PostgresStore {
         self.change(claim.job, move |known| {
             Ok(known.is_held_by(claim).then(|| {
                 known.add(step);
-                Place::Same
+                RowUpdate::Keep
             }))
         })
         .await
@@ -369,8 +370,8 @@ impl JobStore for PostgresStore {
         let for_s = wait.map_or(0.0, seconds).max(0.0);
         self.change(claim.job, move |known| {
             Ok(known.is_held_by(claim).then(|| {
-                known.give_back(&release);
-                Place::Queue { for_s }
+                known.requeue(&release);
+                RowUpdate::Queue { for_s }
             }))
         })
         .await
@@ -381,7 +382,7 @@ impl JobStore for PostgresStore {
         self.change(claim.job, move |known| {
             Ok(known.is_held_by(claim).then(|| {
                 known.job = job;
-                Place::Ended
+                RowUpdate::End
             }))
         })
         .await
@@ -389,13 +390,13 @@ impl JobStore for PostgresStore {
     }
 
     async fn cancel(&self, id: Uuid) -> Result<Job, StoreError> {
-        self.change(id, |known| Ok(known.cancel(Timestamp::now()).then_some(Place::Ended))).await
+        self.change(id, |known| Ok(known.cancel(Timestamp::now()).then_some(RowUpdate::End))).await
     }
 
     async fn retry(&self, id: Uuid) -> Result<Job, StoreError> {
         self.change(id, |known| {
-            known.queue_again()?;
-            Ok(Some(Place::Queue { for_s: 0.0 }))
+            known.retry()?;
+            Ok(Some(RowUpdate::Queue { for_s: 0.0 }))
         })
         .await
     }

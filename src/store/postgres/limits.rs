@@ -1,7 +1,7 @@
-//! Limits that all processes keep together.
+//! Limits that all processes share.
 //!
-//! Buckets are in a table that is not logged: it costs no wait for the disk, and after a crash of the database
-//! the buckets are full.
+//! Token buckets are in an unlogged table, which does not wait for the disk. After a crash of the
+//! database, all buckets are full.
 
 use async_trait::async_trait;
 use jiff::civil::Date;
@@ -9,15 +9,19 @@ use jiff_sqlx::ToSqlx;
 
 use super::super::{SharedLimits, StoreError, TokenGrant, TokenRequest};
 use super::PostgresStore;
-use super::statements::alone;
+use super::statements::advisory_lock;
 use whereabouts_core::Spent;
 
-/// The advisory lock of those who set something aside.
+/// The advisory lock of calls that reserve a part of the budget.
 const BUDGET_LOCK: i64 = 0x7768_6572_6561_0003;
 
 #[async_trait]
 impl SharedLimits for PostgresStore {
-    async fn draw(&self, name: &str, draws: [TokenRequest; 2]) -> Result<TokenGrant, StoreError> {
+    async fn take_tokens(
+        &self,
+        name: &str,
+        draws: [TokenRequest; 2],
+    ) -> Result<TokenGrant, StoreError> {
         let inner = &self.inner;
         let [first, second] = draws;
         let query = sqlx::query_as(
@@ -36,20 +40,21 @@ impl SharedLimits for PostgresStore {
         )
         .bind(name)
         .bind(first.per_minute)
-        .bind(first.needed)
-        .bind(first.taken)
+        .bind(first.required)
+        .bind(first.amount)
         .bind(second.per_minute)
-        .bind(second.needed)
-        .bind(second.taken);
+        .bind(second.required)
+        .bind(second.amount);
         inner
             .call(async {
-                let (taken, first, second): (bool, f64, f64) = query.fetch_one(&inner.pool).await?;
-                Ok(TokenGrant { taken, left: [first, second] })
+                let (granted, first, second): (bool, f64, f64) =
+                    query.fetch_one(&inner.pool).await?;
+                Ok(TokenGrant { granted, remaining: [first, second] })
             })
             .await
     }
 
-    async fn set_aside(&self, day: Date, most: Spent, limit: Spent) -> Result<bool, StoreError> {
+    async fn reserve(&self, day: Date, most: Spent, limit: Spent) -> Result<bool, StoreError> {
         let inner = &self.inner;
         let set = sqlx::query(
             "INSERT INTO set_aside AS a (day, holder, tokens, money)
@@ -75,8 +80,8 @@ impl SharedLimits for PostgresStore {
         inner
             .call(async {
                 let mut tx = inner.begin().await?;
-                // One after another, so that no two take the same rest.
-                alone(&mut tx, BUDGET_LOCK).await?;
+                // One at a time, so that no two reservations use the same remainder.
+                advisory_lock(&mut tx, BUDGET_LOCK).await?;
                 let set = set.execute(&mut *tx).await?.rows_affected() > 0;
                 tx.commit().await?;
                 Ok(set)
@@ -84,7 +89,7 @@ impl SharedLimits for PostgresStore {
             .await
     }
 
-    async fn give_back(&self, day: Date, unneeded: Spent) -> Result<(), StoreError> {
+    async fn release(&self, day: Date, unneeded: Spent) -> Result<(), StoreError> {
         let inner = &self.inner;
         let query = sqlx::query(
             "UPDATE set_aside SET tokens = greatest(tokens - $3, 0), money = greatest(money - $4, 0)

@@ -1,6 +1,7 @@
-//! Hears from the database what other processes have changed.
+//! Receives notifications of changes by other processes (`LISTEN`).
 //!
-//! Notices are lost while the connection is. After that, the jobs that changed meanwhile are told of again.
+//! Notifications are lost while the connection is down. After a reconnect, the jobs that changed
+//! meanwhile are published again.
 
 use std::sync::Weak;
 use std::time::{Duration, Instant};
@@ -13,21 +14,21 @@ use uuid::Uuid;
 use super::super::StoreError;
 use super::Inner;
 
-/// A job changed: its id.
+/// Channel: a job changed; the payload is its id.
 pub(super) const JOBS: &str = "whereabouts_jobs";
-/// Deliveries to webhooks were queued.
+/// Channel: deliveries to webhooks were queued.
 pub(super) const DELIVERIES: &str = "whereabouts_deliveries";
-/// A key was made or revoked.
+/// Channel: an API key was created or revoked.
 pub(super) const KEYS: &str = "whereabouts_keys";
 
-/// The pause before a lost connection is made again.
-const PAUSE: Duration = Duration::from_millis(250);
+/// The pause before reconnecting.
+const RECONNECT_PAUSE: Duration = Duration::from_millis(250);
 
-/// The most jobs that are told of again.
-const TOLD_AGAIN: i64 = 1000;
+/// Maximum number of jobs published again after a reconnect.
+const MAX_REPUBLISHED: i64 = 1000;
 
-/// A connection that hears from now on. It is in no pool: one that has died in silence would keep its place
-/// there for long.
+/// Opens a connection that listens. It has a pool of its own, because a dead connection would occupy a
+/// place in the shared pool for a long time.
 pub(super) async fn connect(pool: &PgPool) -> Result<PgListener, StoreError> {
     let own = PgPoolOptions::new()
         .max_connections(1)
@@ -41,30 +42,30 @@ pub(super) async fn connect(pool: &PgPool) -> Result<PgListener, StoreError> {
 
 /// Listens until the store is closed.
 pub(super) async fn listen(first: PgListener, store: Weak<Inner>, closed: CancellationToken) {
-    let (mut first, mut heard_at) = (Some(first), Instant::now());
+    let (mut first, mut connected_at) = (Some(first), Instant::now());
     loop {
-        let heard = tokio::select! {
+        let lost = tokio::select! {
             () = closed.cancelled() => return,
-            heard = hear(first.take(), &store, &mut heard_at) => heard,
+            lost = receive(first.take(), &store, &mut connected_at) => lost,
         };
         if store.strong_count() == 0 {
             return;
         }
-        if let Err(error) = heard {
-            tracing::warn!(%error, "what other processes change is not heard; trying again");
+        if let Err(error) = lost {
+            tracing::warn!(%error, "notifications of other processes' changes are lost; reconnecting");
         }
         tokio::select! {
             () = closed.cancelled() => return,
-            () = tokio::time::sleep(PAUSE) => {}
+            () = tokio::time::sleep(RECONNECT_PAUSE) => {}
         }
     }
 }
 
-/// Listens until the connection is lost; notes when it was last there.
-async fn hear(
+/// Receives notifications until the connection is lost, and records when it was last known to work.
+async fn receive(
     connected: Option<PgListener>,
     store: &Weak<Inner>,
-    heard_at: &mut Instant,
+    connected_at: &mut Instant,
 ) -> Result<(), StoreError> {
     let Some(inner) = store.upgrade() else { return Ok(()) };
     let timeout = inner.settings.timeout;
@@ -72,34 +73,35 @@ async fn hear(
         Some(listener) => listener,
         None => {
             let listener = inner.call(connect(&inner.pool)).await?;
-            inner.call(inner.tell_again(heard_at.elapsed())).await?;
+            inner.call(inner.republish(connected_at.elapsed())).await?;
             listener
         }
     };
     drop(inner);
     loop {
-        *heard_at = Instant::now();
-        let notice = tokio::time::timeout(timeout, listener.try_recv()).await;
+        *connected_at = Instant::now();
+        let notification = tokio::time::timeout(timeout, listener.try_recv()).await;
         let Some(inner) = store.upgrade() else { return Ok(()) };
-        match notice {
-            Ok(notice) => {
+        match notification {
+            Ok(notification) => {
                 let lost = || super::unavailable("the connection was lost");
-                inner.tell(&notice?.ok_or_else(lost)?);
+                inner.publish(&notification?.ok_or_else(lost)?);
             }
-            // Nothing has happened, or the connection is dead.
+            // Nothing has changed, or the connection is dead.
             Err(_) => {
-                let ask = sqlx::query("SELECT 1").execute(&mut listener);
-                inner.call(async { Ok(ask.await?) }).await?;
+                let ping = sqlx::query("SELECT 1").execute(&mut listener);
+                inner.call(async { Ok(ping.await?) }).await?;
             }
         }
     }
 }
 
 impl Inner {
-    fn tell(&self, notice: &PgNotification) {
-        match notice.channel() {
+    /// Passes a notification on to the receivers in this process.
+    fn publish(&self, notification: &PgNotification) {
+        match notification.channel() {
             JOBS => {
-                if let Ok(id) = notice.payload().parse::<Uuid>() {
+                if let Ok(id) = notification.payload().parse::<Uuid>() {
                     let _ = self.changes.send(id);
                 }
             }
@@ -113,18 +115,18 @@ impl Inner {
         }
     }
 
-    /// Tells of what may have changed while nothing was heard.
-    async fn tell_again(&self, silence: Duration) -> Result<(), StoreError> {
+    /// Publishes whatever may have changed while the connection was down.
+    async fn republish(&self, outage: Duration) -> Result<(), StoreError> {
         self.deliveries.send_replace(());
         self.keys.send_replace(());
-        // The database may have been away for part of the time; a generous margin costs little.
-        let since = silence.as_secs_f64() + 2.0 * self.settings.timeout.as_secs_f64();
+        // A generous margin costs little; the database itself may have been down for part of the time.
+        let since = outage.as_secs_f64() + 2.0 * self.settings.timeout.as_secs_f64();
         let changed: Vec<Uuid> = sqlx::query_scalar(
             "SELECT id FROM jobs WHERE changed_at > now() - make_interval(secs => $1)
              ORDER BY changed_at DESC LIMIT $2",
         )
         .bind(since)
-        .bind(TOLD_AGAIN)
+        .bind(MAX_REPUBLISHED)
         .fetch_all(&self.pool)
         .await?;
         for id in changed {

@@ -9,7 +9,7 @@ use uuid::Uuid;
 
 use super::super::changes::{changed_map, check_dim, removed};
 use super::super::{Added, HardNegatives, IndexState, MapStore, StoreError};
-use super::descriptors::make_table;
+use super::descriptors::create_table;
 use super::{Inner, PostgresStore, counted, record};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Image, ImageId, Map, MapName, Pose,
@@ -35,9 +35,9 @@ impl MapStore for PostgresStore {
         let inner = &self.inner;
         let Some(uid) = inner.call(inner.delete_map(name)).await? else { return Ok(false) };
         inner.graphs.forget(uid);
-        inner.drop_left(uid).await;
-        // The map is gone for every caller; what it leaves behind is cleared away in small steps, and by
-        // whoever removes what has had its time, if this process ends before.
+        inner.drop_unused_tables_of(uid).await;
+        // Callers no longer see the map; its images are now removed in small batches. If this process
+        // ends before that is done, garbage collection finishes it.
         while inner.call(inner.sweep(uid)).await? {}
         Ok(true)
     }
@@ -57,7 +57,7 @@ impl MapStore for PostgresStore {
                 Ok(IndexState {
                     images: counted(row.try_get("images")?),
                     graph: row.try_get("graph")?,
-                    // PostgreSQL's index holds every image from the moment that it is stored.
+                    // PostgreSQL's index contains every image as soon as it is stored.
                     behind: false,
                     changes: row.try_get::<i64, _>("changes")?.unsigned_abs(),
                 })
@@ -76,6 +76,14 @@ impl MapStore for PostgresStore {
 
     async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
         self.inner.call(self.inner.image(map.uid, id)).await
+    }
+
+    async fn images_by_id(
+        &self,
+        map: &Map,
+        ids: &[ImageId],
+    ) -> Result<Vec<Option<Image>>, StoreError> {
+        self.inner.call(self.inner.images_by_id(map.uid, ids)).await
     }
 
     async fn images(
@@ -106,16 +114,16 @@ impl MapStore for PostgresStore {
         self.inner.call(self.inner.candidates(map, &query, k, mode)).await
     }
 
-    async fn look_alikes(
+    async fn hard_negatives(
         &self,
         map: &Map,
         settings: CalibrationSettings,
         k: usize,
     ) -> Result<Vec<HardNegatives>, StoreError> {
         let inner = &self.inner;
-        inner.call(inner.measure(map)).await?;
-        // Many searches, and nobody waits for them.
-        inner.similar_places(map, settings, k).await
+        inner.call(inner.acquire_calibration(map)).await?;
+        // Not subject to the time limit of a call: these are many searches.
+        inner.find_hard_negatives(map, settings, k).await
     }
 
     async fn calibration(&self, map: &Map) -> Result<Option<Arc<Calibration>>, StoreError> {
@@ -150,45 +158,45 @@ impl MapStore for PostgresStore {
 }
 
 impl Inner {
-    async fn put_map(&self, wanted: Map) -> Result<(Map, bool), StoreError> {
+    async fn put_map(&self, requested: Map) -> Result<(Map, bool), StoreError> {
         loop {
-            if let Some(put) = self.try_to_put_map(wanted.clone()).await? {
+            if let Some(put) = self.try_to_put_map(requested.clone()).await? {
                 return Ok(put);
             }
         }
     }
 
-    /// `None` if somebody else has just made the map, so that it is there now.
-    async fn try_to_put_map(&self, wanted: Map) -> Result<Option<(Map, bool)>, StoreError> {
+    /// Returns `None` if a concurrent call has just created the map, so that it must be read again.
+    async fn try_to_put_map(&self, requested: Map) -> Result<Option<(Map, bool)>, StoreError> {
         let mut tx = self.begin().await?;
         let stored = sqlx::query_scalar("SELECT record FROM maps WHERE name = $1 FOR UPDATE");
-        let stored = stored.bind(wanted.name.as_str()).fetch_optional(&mut *tx).await?;
+        let stored = stored.bind(requested.name.as_str()).fetch_optional(&mut *tx).await?;
         let (map, new) = match stored {
             None => {
                 let inserted = sqlx::query(
                     "INSERT INTO maps (uid, name, revision, record) VALUES ($1, $2, $3, $4::json)
                      ON CONFLICT (name) DO NOTHING",
                 )
-                .bind(wanted.uid)
-                .bind(wanted.name.as_str())
-                .bind(i64::from(wanted.revision))
-                .bind(record(&wanted)?)
+                .bind(requested.uid)
+                .bind(requested.name.as_str())
+                .bind(i64::from(requested.revision))
+                .bind(record(&requested)?)
                 .execute(&mut *tx)
                 .await?;
                 if inserted.rows_affected() == 0 {
                     return Ok(None);
                 }
-                make_table(&mut tx, &wanted).await?;
-                (wanted, true)
+                create_table(&mut tx, &requested).await?;
+                (requested, true)
             }
             Some(Json(stored)) => {
                 let stored: Map = stored;
                 let before = stored.uid;
                 let has_images = has_images(&mut tx, before).await?;
-                let map = changed_map(stored, wanted, || has_images)?;
+                let map = changed_map(stored, requested, || has_images)?;
                 if map.uid != before {
-                    leave(&mut tx, before).await?;
-                    make_table(&mut tx, &map).await?;
+                    add_tombstone(&mut tx, before).await?;
+                    create_table(&mut tx, &map).await?;
                 }
                 let changed = sqlx::query(
                     "UPDATE maps SET uid = $2, record = $3::json,
@@ -206,17 +214,17 @@ impl Inner {
 
     async fn delete_map(&self, name: &MapName) -> Result<Option<Uuid>, StoreError> {
         let mut tx = self.begin().await?;
-        let gone = sqlx::query_scalar("DELETE FROM maps WHERE name = $1 RETURNING uid");
-        let gone: Option<Uuid> = gone.bind(name.as_str()).fetch_optional(&mut *tx).await?;
-        let Some(uid) = gone else { return Ok(None) };
-        leave(&mut tx, uid).await?;
+        let deleted = sqlx::query_scalar("DELETE FROM maps WHERE name = $1 RETURNING uid");
+        let deleted: Option<Uuid> = deleted.bind(name.as_str()).fetch_optional(&mut *tx).await?;
+        let Some(uid) = deleted else { return Ok(None) };
+        add_tombstone(&mut tx, uid).await?;
         tx.commit().await?;
         Ok(Some(uid))
     }
 
-    /// Takes upon this process to measure the map.
-    async fn measure(&self, map: &Map) -> Result<(), StoreError> {
-        let taken = sqlx::query(
+    /// Acquires the right of this process to calibrate the map.
+    async fn acquire_calibration(&self, map: &Map) -> Result<(), StoreError> {
+        let acquired = sqlx::query(
             "UPDATE maps SET measured_by = $3 WHERE uid = $1 AND revision = $2
                  AND (measured_by IS NULL OR measured_by = $3
                      OR NOT is_alive(measured_by, make_interval(secs => $4)))",
@@ -227,18 +235,21 @@ impl Inner {
         .bind(self.lifetime())
         .execute(&self.pool)
         .await?;
-        if taken.rows_affected() == 0 {
+        if acquired.rows_affected() == 0 {
             self.check_revision(map).await?;
             let name = &map.name;
-            return Err(StoreError::Conflict(format!("another process measures the map {name}")));
+            return Err(StoreError::Conflict(format!(
+                "another process is calibrating the map {name}"
+            )));
         }
         Ok(())
     }
 
-    /// Clears away some of what a deleted map has left; `false` once nothing is left.
+    /// Removes a batch of the images of a deleted map; once there are none, the rest of its rows and its
+    /// tombstone. Returns `false` when nothing is left.
     async fn sweep(&self, uid: Uuid) -> Result<bool, StoreError> {
         let mut tx = self.begin().await?;
-        let gone: i64 = sqlx::query_scalar(
+        let removed: i64 = sqlx::query_scalar(
             "WITH gone AS (
                  DELETE FROM images WHERE map_uid = $1 AND id IN (
                      SELECT id FROM images WHERE map_uid = $1 ORDER BY id LIMIT 256
@@ -253,7 +264,7 @@ impl Inner {
         .bind(uid)
         .fetch_one(&mut *tx)
         .await?;
-        if gone == 0 {
+        if removed == 0 {
             for rest in [
                 "DELETE FROM frames WHERE map_uid = $1",
                 "DELETE FROM image_counts WHERE map_uid = $1",
@@ -263,36 +274,37 @@ impl Inner {
             }
         }
         tx.commit().await?;
-        Ok(gone > 0)
+        Ok(removed > 0)
     }
 
-    /// Clears away what processes that ended too soon have left of deleted maps, and of drafts.
-    pub(super) async fn sweep_left(&self) -> Result<(), StoreError> {
-        let broken_off = sqlx::query(
+    /// Removes orphans: drafts of dead processes, unused tables, and the rows of deleted maps.
+    pub(super) async fn collect_orphans(&self) -> Result<(), StoreError> {
+        let abandoned_drafts = sqlx::query(
             "DELETE FROM drafts
              WHERE holder <> $1 AND NOT is_alive(holder, make_interval(secs => $2))",
         )
         .bind(self.process)
         .bind(self.lifetime());
-        self.run(broken_off).await?;
-        self.drop_unneeded(None).await?;
-        let left = sqlx::query_scalar("SELECT uid FROM deleted_maps");
-        let left: Vec<Uuid> = self.call(async { Ok(left.fetch_all(&self.pool).await?) }).await?;
-        for uid in left {
+        self.run(abandoned_drafts).await?;
+        self.drop_unused_tables(None).await?;
+        let deleted = sqlx::query_scalar("SELECT uid FROM deleted_maps");
+        let deleted: Vec<Uuid> =
+            self.call(async { Ok(deleted.fetch_all(&self.pool).await?) }).await?;
+        for uid in deleted {
             while self.call(self.sweep(uid)).await? {}
         }
         Ok(())
     }
 }
 
-/// Notes that a map is gone and that what belonged to it is to be cleared away.
-async fn leave(connection: &mut PgConnection, uid: Uuid) -> Result<(), StoreError> {
-    let note = sqlx::query("INSERT INTO deleted_maps (uid) VALUES ($1) ON CONFLICT DO NOTHING");
-    note.bind(uid).execute(connection).await?;
+/// Adds the tombstone of a deleted map, so that its remaining rows are removed.
+async fn add_tombstone(connection: &mut PgConnection, uid: Uuid) -> Result<(), StoreError> {
+    let insert = sqlx::query("INSERT INTO deleted_maps (uid) VALUES ($1) ON CONFLICT DO NOTHING");
+    insert.bind(uid).execute(connection).await?;
     Ok(())
 }
 
 async fn has_images(connection: &mut PgConnection, uid: Uuid) -> Result<bool, StoreError> {
-    let some = sqlx::query_scalar("SELECT EXISTS (SELECT FROM images WHERE map_uid = $1)");
-    Ok(some.bind(uid).fetch_one(connection).await?)
+    let exists = sqlx::query_scalar("SELECT EXISTS (SELECT FROM images WHERE map_uid = $1)");
+    Ok(exists.bind(uid).fetch_one(connection).await?)
 }

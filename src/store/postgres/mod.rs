@@ -1,20 +1,20 @@
-//! The store of many processes: records and descriptors in PostgreSQL with pgvector, pictures in an object
-//! store.
+//! The scale-out store, for many processes: records and descriptors are in PostgreSQL with pgvector,
+//! pictures in an object store.
 //!
-//! Nothing is kept in a process that another would need. What a process holds for a while, a job, a draft, a
-//! request that is to be done once, is marked with the process's id, and free again when the process has
-//! not said for a while that it is alive ([`processes`]). No lock outlives its statement or its short
-//! transaction; building an index, which may take minutes, holds an advisory lock that nobody waits for.
+//! Processes share no state except through the database. A job, draft or idempotent request that a
+//! process holds is marked with the process's id, and becomes free when the heartbeats of that process
+//! stop (`processes.rs`). No lock is held longer than a statement or a short transaction. The exception
+//! is building an index, which may take minutes and holds an advisory lock that nothing waits for.
 //!
-//! Every call has a time limit. A database that is away, too slow or too busy is
-//! [`StoreError::Unavailable`], and nothing of the call has happened, or all of it.
+//! Every call has a time limit. If the database is down, too slow or too busy, the call fails with
+//! [`StoreError::Unavailable`], having taken effect completely or not at all.
 
-mod answers;
 mod blobs;
+mod claims;
 mod descriptions;
 mod descriptors;
 mod drafts;
-mod held;
+mod idempotency;
 mod images;
 mod indexer;
 mod jobs;
@@ -49,18 +49,18 @@ use self::schema::{schema_state, too_new};
 use super::{DescriptionBounds, Objects, StoreError};
 use whereabouts_index::IndexSettings;
 
-/// How the store in PostgreSQL works.
+/// Settings of the store in PostgreSQL.
 #[derive(Debug, Clone)]
 pub struct PostgresSettings {
     /// `postgres://user:password@host:port/database`.
     pub url: String,
-    /// The most connections of this process.
+    /// Maximum number of connections of this process.
     pub max_connections: u32,
-    /// The longest a call may take.
+    /// Time limit of a call.
     pub timeout: Duration,
-    /// After so long without a sign of life a process counts as dead.
+    /// A process without a heartbeat for this long is considered dead.
     pub lifetime: Duration,
-    /// Image bytes that nothing refers to stay at least so long after they came.
+    /// New image bytes are kept for at least this long, even without a reference.
     pub pin: Duration,
     /// How maps are indexed.
     pub index: IndexSettings,
@@ -78,57 +78,57 @@ pub struct PostgresStore {
 
 struct Inner {
     pool: PgPool,
-    doubts: RecentTimeout,
+    recent_timeout: RecentTimeout,
     objects: Objects,
     settings: PostgresSettings,
-    /// This process among all.
+    /// The id of this process.
     process: Uuid,
     changes: broadcast::Sender<Uuid>,
     deliveries: watch::Sender<()>,
     keys: watch::Sender<()>,
     levels: KnownLevels,
     graphs: descriptors::KnownGraphs,
-    held: held::HeldJobs,
-    /// Ends what works in the background.
+    claims: claims::LocalClaims,
+    /// Cancels the background tasks when it is dropped.
     _background: DropGuard,
 }
 
-/// Change notices kept for a slow listener.
-const CHANGES_KEPT: usize = 1024;
+/// Capacity of the channel of job changes; a slower receiver misses the oldest.
+const CHANGES_CAPACITY: usize = 1024;
 
-/// Statements prepared on each connection. Those that search a map name its table.
-const STATEMENTS_KEPT: usize = 256;
+/// Prepared statements cached on each connection. Each map has its own, because they name its table.
+const STATEMENT_CACHE: usize = 256;
 
 impl PostgresStore {
-    /// Opens the store for a process of that id; the schema must be up to date ([`migrate`]).
+    /// Opens the store for the process with this id. The schema must be up to date ([`migrate`]).
     pub async fn open(
         settings: PostgresSettings,
         objects: Objects,
         process: Uuid,
     ) -> Result<Self, StoreError> {
-        let doubts = RecentTimeout::default();
-        let pool = connect(&settings, &doubts)?;
+        let recent_timeout = RecentTimeout::default();
+        let pool = connect(&settings, &recent_timeout)?;
         check_schema(&pool, &settings).await?;
         let background = CancellationToken::new();
         let inner = Arc::new(Inner {
             objects,
             process,
-            changes: broadcast::channel(CHANGES_KEPT).0,
+            changes: broadcast::channel(CHANGES_CAPACITY).0,
             deliveries: watch::Sender::new(()),
             keys: watch::Sender::new(()),
             levels: KnownLevels::default(),
             graphs: descriptors::KnownGraphs::default(),
-            held: held::HeldJobs::default(),
+            claims: claims::LocalClaims::default(),
             _background: background.clone().drop_guard(),
             pool,
-            doubts,
+            recent_timeout,
             settings,
         });
-        inner.sign_of_life().await?;
-        // Whoever has the store hears of every change.
+        inner.heartbeat().await?;
+        // Listen before the store is handed out, so that no change is missed.
         let listener = inner.call(listener::connect(&inner.pool)).await?;
         let weak = Arc::downgrade(&inner);
-        tokio::spawn(processes::keep_alive(weak.clone(), background.clone()));
+        tokio::spawn(processes::send_heartbeats(weak.clone(), background.clone()));
         tokio::spawn(listener::listen(listener, weak.clone(), background.clone()));
         tokio::spawn(indexer::keep_indexed(weak, background));
         Ok(Self { inner })
@@ -136,7 +136,7 @@ impl PostgresStore {
 }
 
 impl Inner {
-    /// Does something within the time that a call has.
+    /// Runs a call within its time limit.
     async fn call<T>(
         &self,
         work: impl Future<Output = Result<T, StoreError>>,
@@ -144,8 +144,8 @@ impl Inner {
         let limit = self.settings.timeout;
         let mut work = std::pin::pin!(work);
         tokio::time::timeout(limit, work.as_mut()).await.unwrap_or_else(|_| {
-            // Before the work is dropped, and gives its connection back.
-            self.doubts.arise();
+            // Recorded before `work` is dropped, which returns its connection to the pool.
+            self.recent_timeout.record();
             let limit = limit.as_millis();
             Err(unavailable(format!("it did not answer within {limit} ms (database.timeout_ms)")))
         })
@@ -155,35 +155,38 @@ impl Inner {
         Ok(self.pool.begin().await?)
     }
 
-    /// How long a silent process counts as alive, in seconds.
+    /// How long a process is considered alive after a heartbeat, in seconds.
     fn lifetime(&self) -> f64 {
         self.settings.lifetime.as_secs_f64()
     }
 }
 
-/// When a call last ran out of time. The pool asks every connection that it is given back whether it is alive,
-/// and would wait for the answer of a dead one for ever; after such a call it does not.
+/// Time of the last call timeout. After a timeout, connections are pinged with a time limit before they
+/// return to the pool, because the pool's own ping would wait on a dead socket forever.
 #[derive(Clone, Default)]
 struct RecentTimeout(Arc<Mutex<Option<Instant>>>);
 
 impl RecentTimeout {
-    fn arise(&self) {
+    fn record(&self) {
         *self.0.lock() = Some(Instant::now());
     }
 
-    /// Whether a call ran out of time so short a while ago that its connection is still to come.
-    fn are_fresh(&self, within: Duration) -> bool {
-        let arose = *self.0.lock();
-        arose.is_some_and(|arose| arose.elapsed() < within)
+    /// Whether a call timed out within this duration, so that its connection may be returned now.
+    fn is_within(&self, duration: Duration) -> bool {
+        let timed_out_at = *self.0.lock();
+        timed_out_at.is_some_and(|at| at.elapsed() < duration)
     }
 }
 
-/// No connection yet: they are made when they are needed.
-fn connect(settings: &PostgresSettings, doubts: &RecentTimeout) -> Result<PgPool, StoreError> {
+/// Creates a pool that connects lazily.
+fn connect(
+    settings: &PostgresSettings,
+    recent_timeout: &RecentTimeout,
+) -> Result<PgPool, StoreError> {
     let options = PgConnectOptions::from_str(&settings.url).map_err(|error| {
-        // The error may show the address, and that may hold a password.
+        // The error text may contain the URL, and with it a password.
         let what = match error {
-            sqlx::Error::Configuration(_) => "it is no address",
+            sqlx::Error::Configuration(_) => "not a valid URL",
             _ => "it cannot be used",
         };
         StoreError::Failed(format!(
@@ -191,32 +194,32 @@ fn connect(settings: &PostgresSettings, doubts: &RecentTimeout) -> Result<PgPool
         ))
     })?;
     let ef_search = settings.index.ef_search.to_string();
-    // The server gives up what nobody waits for any more.
-    let patience = settings.timeout.as_millis().to_string();
+    // The server aborts statements whose caller has timed out.
+    let timeout_ms = settings.timeout.as_millis().to_string();
     let options = options
         .application_name("whereabouts")
-        .statement_cache_capacity(STATEMENTS_KEPT)
+        .statement_cache_capacity(STATEMENT_CACHE)
         .options([
             ("hnsw.ef_search", ef_search.as_str()),
-            // Dead images are in the index until the next vacuum: look on until there are enough. Their order
-            // is made anew, and the strict one leaves out what comes late.
+            // Removed images stay in the index until the next vacuum, so scans continue until there are
+            // enough results. Results are sorted again afterwards, and strict order would drop late ones.
             ("hnsw.iterative_scan", "relaxed_order"),
-            // Compiling a search takes longer than searching.
+            // JIT compilation takes longer than a search.
             ("jit", "off"),
-            ("statement_timeout", patience.as_str()),
-            ("idle_in_transaction_session_timeout", patience.as_str()),
+            ("statement_timeout", timeout_ms.as_str()),
+            ("idle_in_transaction_session_timeout", timeout_ms.as_str()),
         ]);
-    let (doubts, timeout) = (doubts.clone(), settings.timeout);
+    let (recent_timeout, timeout) = (recent_timeout.clone(), settings.timeout);
     Ok(PgPoolOptions::new()
         .max_connections(settings.max_connections)
         .acquire_timeout(settings.timeout)
         .acquire_slow_threshold(settings.timeout)
         .after_release(move |connection, _| {
-            let doubtful = doubts.are_fresh(2 * timeout);
+            let suspect = recent_timeout.is_within(2 * timeout);
             Box::pin(async move {
-                if doubtful {
-                    let answer = tokio::time::timeout(timeout, connection.ping()).await;
-                    answer.map_err(|_| sqlx::Error::PoolTimedOut)??;
+                if suspect {
+                    let pong = tokio::time::timeout(timeout, connection.ping()).await;
+                    pong.map_err(|_| sqlx::Error::PoolTimedOut)??;
                 }
                 Ok(true)
             })
@@ -225,25 +228,25 @@ fn connect(settings: &PostgresSettings, doubts: &RecentTimeout) -> Result<PgPool
 }
 
 async fn check_schema(pool: &PgPool, settings: &PostgresSettings) -> Result<(), StoreError> {
-    let looking = tokio::time::timeout(settings.timeout, schema_state(pool));
-    match looking.await.map_err(|_| unavailable("it did not answer".to_owned()))?? {
+    let state = tokio::time::timeout(settings.timeout, schema_state(pool));
+    match state.await.map_err(|_| unavailable("it did not answer".to_owned()))?? {
         SchemaState::UpToDate => Ok(()),
         SchemaState::Behind { steps } => Err(StoreError::Conflict(format!(
-            "the tables of the database are not up to date (steps missing: {steps}); run `whereabouts \
+            "the database schema is not up to date (missing migrations: {steps}); run `whereabouts \
              migrate` with the same settings first"
         ))),
         SchemaState::Ahead { version } => Err(too_new(version)),
     }
 }
 
-/// The database was not there for a call, which may be made again.
+/// The database was unavailable; the call may be retried.
 fn unavailable(why: impl std::fmt::Display) -> StoreError {
     StoreError::Unavailable(format!("the database is not available: {why}; try again in a moment"))
 }
 
-/// What PostgreSQL reports, by the first two characters of its code, when it could do the same another
-/// time: connections, lack of resources, operators, transactions that were in each other's way.
-const PASSING: [&str; 5] = ["08", "40", "53", "57", "58"];
+/// Classes of SQLSTATE codes (their first two characters) that are transient: connection failures,
+/// serialization failures, insufficient resources, operator intervention, system errors.
+const TRANSIENT_CLASSES: [&str; 5] = ["08", "40", "53", "57", "58"];
 
 impl From<sqlx::Error> for StoreError {
     fn from(error: sqlx::Error) -> Self {
@@ -251,8 +254,10 @@ impl From<sqlx::Error> for StoreError {
             sqlx::Error::Database(reported) => {
                 let code = reported.code().unwrap_or_default();
                 let class = code.get(..2).unwrap_or_default();
-                // 25P02 and the like follow from what was reported before; 55P03 is a lock.
-                if PASSING.contains(&class) || matches!(&*code, "55P03" | "25P02" | "25P03") {
+                // 55P03: a lock was not available; 25P02 and 25P03: the transaction is aborted or idle.
+                if TRANSIENT_CLASSES.contains(&class)
+                    || matches!(&*code, "55P03" | "25P02" | "25P03")
+                {
                     return unavailable(reported.message());
                 }
                 Self::Failed(format!("the database: {} ({code})", reported.message()))
@@ -271,33 +276,33 @@ impl From<sqlx::Error> for StoreError {
     }
 }
 
-/// Whether a table is missing: that of the descriptors of a map that was removed or reindexed.
+/// Whether a table does not exist, such as that of the descriptors of a deleted or reindexed map.
 fn is_missing_table(error: &sqlx::Error) -> bool {
     error.as_database_error().and_then(|error| error.code()).as_deref() == Some("42P01")
 }
 
-/// Whether a lock was not to be had in time.
+/// Whether a lock could not be acquired in time.
 fn is_locked(error: &sqlx::Error) -> bool {
     error.as_database_error().and_then(|error| error.code()).as_deref() == Some("55P03")
 }
 
-/// A record as it is stored.
+/// Encodes a record for storage.
 fn record<T: Serialize>(value: &T) -> Result<String, StoreError> {
     serde_json::to_string(value).map_err(|error| StoreError::Failed(error.to_string()))
 }
 
-/// So long, in seconds. The clocks of processes differ, so that the database's counts: what is meant is how
-/// long lies between two moments of the caller.
+/// Converts a duration to seconds. Only durations are sent to the database, not times, because the
+/// clocks of processes differ and the database's clock is the one that counts.
 fn seconds(duration: SignedDuration) -> f64 {
     duration.as_secs_f64()
 }
 
-/// A count as PostgreSQL has it.
+/// Converts a count to a `bigint`.
 fn count(number: usize) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }
 
-/// A count that PostgreSQL gives.
+/// Converts a `bigint` to a count.
 fn counted(number: i64) -> usize {
     usize::try_from(number).unwrap_or(0)
 }

@@ -1,4 +1,4 @@
-//! Which processes are alive.
+//! Heartbeats of processes.
 
 use std::sync::Weak;
 
@@ -7,15 +7,18 @@ use tokio_util::sync::CancellationToken;
 use super::super::StoreError;
 use super::Inner;
 
-/// Signs of life in the time after whose silence a process counts as dead.
-const SIGNS: u32 = 5;
+/// Heartbeats per lifetime: a process is considered dead after missing this many.
+const HEARTBEATS_PER_LIFETIME: u32 = 5;
 
-/// Processes that have been dead for so long are forgotten, in seconds.
-const FORGOTTEN_S: i64 = 24 * 3600;
+/// Heartbeats between two removals of dead processes.
+const REMOVAL_INTERVAL: u32 = 1000;
+
+/// How long dead processes stay in the table, in seconds.
+const DEAD_RETENTION_S: i64 = 24 * 3600;
 
 impl Inner {
-    /// Says that this process is alive.
-    pub(super) async fn sign_of_life(&self) -> Result<(), StoreError> {
+    /// Records that this process is alive.
+    pub(super) async fn heartbeat(&self) -> Result<(), StoreError> {
         let alive = sqlx::query(
             "INSERT INTO processes (id, alive_until) VALUES ($1, now() + make_interval(secs => $2))
              ON CONFLICT (id) DO UPDATE SET alive_until = EXCLUDED.alive_until",
@@ -25,29 +28,29 @@ impl Inner {
         self.run(alive).await.map(drop)
     }
 
-    async fn forget_the_dead(&self) -> Result<(), StoreError> {
+    async fn remove_dead_processes(&self) -> Result<(), StoreError> {
         let dead = sqlx::query(
             "DELETE FROM processes WHERE alive_until < now() - make_interval(secs => $1::bigint)",
         )
-        .bind(FORGOTTEN_S);
+        .bind(DEAD_RETENTION_S);
         self.run(dead).await.map(drop)
     }
 }
 
-/// Says so until the store is closed.
-pub(super) async fn keep_alive(store: Weak<Inner>, closed: CancellationToken) {
-    let mut signs = 0;
+/// Sends heartbeats until the store is closed.
+pub(super) async fn send_heartbeats(store: Weak<Inner>, closed: CancellationToken) {
+    let mut sent: u32 = 0;
     while let Some(inner) = store.upgrade() {
-        let pause = inner.settings.lifetime / SIGNS;
-        let told = match signs % 1000 {
-            0 => inner.forget_the_dead().await,
+        let pause = inner.settings.lifetime / HEARTBEATS_PER_LIFETIME;
+        let removed = match sent % REMOVAL_INTERVAL {
+            0 => inner.remove_dead_processes().await,
             _ => Ok(()),
         };
-        let told = told.and(inner.sign_of_life().await);
-        if let Err(error) = told {
-            tracing::warn!(%error, "the other processes cannot be told that this one is alive");
+        let heartbeat = removed.and(inner.heartbeat().await);
+        if let Err(error) = heartbeat {
+            tracing::warn!(%error, "cannot send a heartbeat; other processes may consider this one dead");
         }
-        signs += 1;
+        sent = sent.wrapping_add(1);
         drop(inner);
         tokio::select! {
             () = closed.cancelled() => return,

@@ -1,34 +1,38 @@
-//! Forgetting what has had its time. Every server does it; what one is removing the others pass over.
+//! Retention. Every server removes expired records and skips rows that another one is removing.
 
 use async_trait::async_trait;
 use jiff::civil::Date;
 use jiff_sqlx::ToSqlx;
 
-use super::super::{KeepJobs, RemovedJobs, Retention, StoreError};
+use super::super::{JobRetention, RemovedJobs, Retention, StoreError};
 use super::descriptors::SIZES;
 use super::{Inner, PostgresStore, count, counted};
 use whereabouts_core::MapName;
 
 #[async_trait]
 impl Retention for PostgresStore {
-    async fn remove_ended(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError> {
+    async fn remove_ended(
+        &self,
+        keep: JobRetention,
+        batch: usize,
+    ) -> Result<RemovedJobs, StoreError> {
         let inner = &self.inner;
         let removed = inner.call(inner.remove_jobs(keep, batch)).await?;
-        let bytes = inner.remove_unneeded().await?;
+        let bytes = inner.remove_unreferenced().await?;
         Ok(RemovedJobs { bytes, ..removed })
     }
 
     async fn forget_usage(&self, before: Date) -> Result<(), StoreError> {
         let inner = &self.inner;
         let usage = sqlx::query("DELETE FROM usage WHERE day < $1").bind(before.to_sqlx());
-        let set_aside = sqlx::query("DELETE FROM set_aside WHERE day < current_date - 2");
+        let reservations = sqlx::query("DELETE FROM set_aside WHERE day < current_date - 2");
         inner.run(usage).await?;
-        inner.run(set_aside).await.map(drop)
+        inner.run(reservations).await.map(drop)
     }
 
-    async fn clear_left(&self) -> Result<(), StoreError> {
-        self.inner.sweep_left().await?;
-        self.inner.tidy_descriptions().await
+    async fn collect_garbage(&self) -> Result<(), StoreError> {
+        self.inner.collect_orphans().await?;
+        self.inner.evict_descriptions().await
     }
 
     async fn db_bytes(&self) -> Result<u64, StoreError> {
@@ -48,21 +52,25 @@ impl Retention for PostgresStore {
         let sizes: Vec<(String, i64)> =
             inner.call(async { Ok(sizes.fetch_all(&inner.pool).await?) }).await?;
         let sizes = sizes.into_iter();
-        // Each name was one when it was stored.
+        // Every name was valid when it was stored.
         Ok(sizes
             .filter_map(|(map, bytes)| Some((map.parse().ok()?, bytes.unsigned_abs())))
             .collect())
     }
 
     async fn free_bytes(&self) -> Option<u64> {
-        // An object store does not say.
+        // An object store does not report its free space.
         None
     }
 }
 
 impl Inner {
-    /// Removes the rows of jobs that are not to be kept, and their claim to the bytes of their frames.
-    async fn remove_jobs(&self, keep: KeepJobs, batch: usize) -> Result<RemovedJobs, StoreError> {
+    /// Removes the rows of jobs that need not be kept, and their references to the bytes of their frames.
+    async fn remove_jobs(
+        &self,
+        keep: JobRetention,
+        batch: usize,
+    ) -> Result<RemovedJobs, StoreError> {
         let ended = "SELECT count(*) FROM jobs WHERE ended_at IS NOT NULL";
         let ended: i64 = sqlx::query_scalar(ended).fetch_one(&self.pool).await?;
         let surplus = keep.most.map_or(0, |most| (ended - count(most)).max(0));

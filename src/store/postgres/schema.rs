@@ -1,4 +1,4 @@
-//! The schema's steps, which are in `migrations/`.
+//! The schema, whose migrations are in `migrations/`. `migrations/README.md` has the rules for adding one.
 
 use std::borrow::Cow;
 
@@ -8,35 +8,35 @@ use sqlx::{PgPool, SqlSafeStr};
 use super::super::StoreError;
 use super::{PostgresSettings, RecentTimeout, connect};
 
-/// How far the schema of a database is.
+/// The state of a database's schema.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SchemaState {
-    /// It is what this program needs.
+    /// The schema is the one that this program needs.
     UpToDate,
-    /// Steps are missing.
+    /// Migrations are missing.
     Behind {
-        /// How many.
+        /// Number of missing migrations.
         steps: usize,
     },
-    /// A program has been there that is later by more than one version.
+    /// A program that is newer by more than one version has migrated the database.
     Ahead {
-        /// Its steps go up to this one.
+        /// The version of its last migration.
         version: i64,
     },
 }
 
-fn steps() -> Vec<Migration> {
-    let step = |version, name: &'static str, sql: &'static str| {
+fn migrations() -> Vec<Migration> {
+    let migration = |version, name: &'static str, sql: &'static str| {
         let sql = sql.into_sql_str();
         Migration::new(version, Cow::Borrowed(name), MigrationType::Simple, sql, false)
     };
-    vec![step(1, "first", include_str!("../../../migrations/0001_first.sql"))]
+    vec![migration(1, "first", include_str!("../../../migrations/0001_first.sql"))]
 }
 
-/// Applies the missing steps; returns how many there were. Processes that do so at once wait for each other.
+/// Applies the missing migrations and returns their number. Concurrent calls wait for each other.
 pub async fn migrate(settings: &PostgresSettings) -> Result<usize, StoreError> {
-    let unhurried = PostgresSettings { max_connections: 1, ..settings.clone() };
-    let pool = connect(&unhurried, &RecentTimeout::default())?;
+    let single = PostgresSettings { max_connections: 1, ..settings.clone() };
+    let pool = connect(&single, &RecentTimeout::default())?;
     let missing = match schema_state(&pool).await? {
         SchemaState::UpToDate => 0,
         SchemaState::Behind { steps } => steps,
@@ -44,36 +44,39 @@ pub async fn migrate(settings: &PostgresSettings) -> Result<usize, StoreError> {
     };
     if missing > 0 {
         let mut connection = pool.acquire().await?;
-        // A step may take as long as it needs.
+        // Migrations have no time limit.
         sqlx::query("SET statement_timeout = 0").execute(&mut *connection).await?;
-        Migrator::with_migrations(steps()).run(&mut *connection).await.map_err(failed)?;
+        Migrator::with_migrations(migrations()).run(&mut *connection).await.map_err(failed)?;
     }
     pool.close().await;
     Ok(missing)
 }
 
-/// How far the schema of the database of these settings is.
+/// Returns the state of the schema of the database with these settings.
 pub async fn schema_of(settings: &PostgresSettings) -> Result<SchemaState, StoreError> {
     schema_state(&connect(settings, &RecentTimeout::default())?).await
 }
 
-/// How far the schema is.
+/// Returns the state of the schema.
 pub(super) async fn schema_state(pool: &PgPool) -> Result<SchemaState, StoreError> {
-    let known = steps();
+    let known = migrations();
     let mut connection = pool.acquire().await?;
-    let there = "SELECT to_regclass('_sqlx_migrations') IS NOT NULL";
-    if !sqlx::query_scalar::<_, bool>(there).fetch_one(&mut *connection).await? {
+    let exists = "SELECT to_regclass('_sqlx_migrations') IS NOT NULL";
+    if !sqlx::query_scalar::<_, bool>(exists).fetch_one(&mut *connection).await? {
         return Ok(SchemaState::Behind { steps: known.len() });
     }
     let applied = connection.list_applied_migrations("_sqlx_migrations").await.map_err(failed)?;
     let is_known =
-        |applied: &AppliedMigration| known.iter().any(|step| step.version == applied.version);
+        |applied: &AppliedMigration| known.iter().any(|known| known.version == applied.version);
     let later: Vec<_> = applied.iter().filter(|applied| !is_known(applied)).collect();
     match (known.len() - (applied.len() - later.len()), later.as_slice()) {
         (0, []) => Ok(SchemaState::UpToDate),
-        // Each step keeps the schema readable to the program before it.
-        (0, [step]) => {
-            tracing::warn!(step = step.version, "a later whereabouts has migrated the database");
+        // Every migration keeps the schema compatible with the previous version of the program.
+        (0, [next]) => {
+            tracing::warn!(
+                step = next.version,
+                "a later release of whereabouts has migrated the database"
+            );
             Ok(SchemaState::UpToDate)
         }
         (_, [.., last]) => Ok(SchemaState::Ahead { version: last.version }),
@@ -81,11 +84,11 @@ pub(super) async fn schema_state(pool: &PgPool) -> Result<SchemaState, StoreErro
     }
 }
 
-/// Why a database is left alone that a later program has migrated, and what to do.
+/// Explains why a database that a later release has migrated is refused, and what to do.
 pub(super) fn too_new(version: i64) -> StoreError {
     StoreError::Conflict(format!(
-        "the database has version {version} of the schema, and this program does not know it: a later \
-         whereabouts has migrated it. Run that one"
+        "the database schema has version {version}, which this program does not support: a later \
+         release of whereabouts has migrated it. Run that release"
     ))
 }
 
@@ -93,7 +96,7 @@ fn failed(error: MigrateError) -> StoreError {
     match error {
         MigrateError::Execute(error) => error.into(),
         error => StoreError::Failed(format!(
-            "the schema cannot be brought up to date: {error}; nothing of the step was kept"
+            "the schema cannot be migrated: {error}; the failed migration was rolled back"
         )),
     }
 }

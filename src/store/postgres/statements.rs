@@ -1,4 +1,4 @@
-//! What most calls come down to: one statement, within the time that a call has.
+//! Calls that consist of a single statement.
 
 use serde::de::DeserializeOwned;
 use sqlx::postgres::{PgArguments, PgConnection};
@@ -9,11 +9,11 @@ use sqlx::{Postgres, Transaction};
 use super::super::StoreError;
 use super::Inner;
 
-/// A statement that gives records.
+/// A statement that returns records.
 type Records<'q, T> = QueryScalar<'q, Postgres, Json<T>, PgArguments>;
 
 impl Inner {
-    /// Changes something; returns how many rows.
+    /// Runs a statement and returns the number of affected rows.
     pub(super) async fn run(
         &self,
         statement: Query<'_, Postgres, PgArguments>,
@@ -21,7 +21,7 @@ impl Inner {
         self.call(async { Ok(statement.execute(&self.pool).await?.rows_affected()) }).await
     }
 
-    /// The record that a statement gives, if there is one.
+    /// Returns the record that a statement selects, if there is one.
     pub(super) async fn one<T>(&self, statement: Records<'_, T>) -> Result<Option<T>, StoreError>
     where
         T: DeserializeOwned + Send + Unpin + 'static,
@@ -30,7 +30,7 @@ impl Inner {
         Ok(found.map(|Json(record)| record))
     }
 
-    /// All records that a statement gives.
+    /// Returns all records that a statement selects.
     pub(super) async fn all<T>(&self, statement: Records<'_, T>) -> Result<Vec<T>, StoreError>
     where
         T: DeserializeOwned + Send + Unpin + 'static,
@@ -40,8 +40,11 @@ impl Inner {
     }
 }
 
-/// Waits until no other transaction holds this advisory lock; this one holds it until its end.
-pub(super) async fn alone(tx: &mut Transaction<'_, Postgres>, lock: i64) -> Result<(), StoreError> {
+/// Acquires an advisory lock, which is held until the end of the transaction.
+pub(super) async fn advisory_lock(
+    tx: &mut Transaction<'_, Postgres>,
+    lock: i64,
+) -> Result<(), StoreError> {
     let connection: &mut PgConnection = tx;
     sqlx::query("SELECT pg_advisory_xact_lock($1)").bind(lock).execute(connection).await?;
     Ok(())

@@ -1,4 +1,4 @@
-//! What was spent, by day and map.
+//! Usage of external models, by day and map.
 
 use async_trait::async_trait;
 use jiff::civil::Date;
@@ -15,7 +15,7 @@ impl UsageStore for PostgresStore {
     async fn add_usage(&self, spent: DayUsage) -> Result<(), StoreError> {
         let inner = &self.inner;
         let DayUsage { date, map, usage, money } = spent;
-        // What was set aside for it is set aside no more.
+        // Spending is subtracted from this process's reservations.
         let query = sqlx::query(
             "WITH settled AS (
                  UPDATE set_aside SET tokens = greatest(tokens - $5 - $6, 0),
@@ -57,7 +57,7 @@ fn day(row: &PgRow) -> Result<DayUsage, StoreError> {
     let small = |column: &str| number(column).map(|n| u32::try_from(n).unwrap_or(u32::MAX));
     let map: String = row.try_get("map")?;
     let map = map.parse().map_err(|_| {
-        StoreError::Damaged("a map of the accounts has no valid name; restore a backup".into())
+        StoreError::Damaged("a usage record has an invalid map name; restore a backup".into())
     })?;
     Ok(DayUsage {
         date: row.try_get::<jiff_sqlx::Date, _>("day")?.to_jiff(),

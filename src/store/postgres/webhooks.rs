@@ -1,5 +1,5 @@
-//! Webhooks and their deliveries. A delivery that a process has taken up is passed over by the others while
-//! that process is alive.
+//! Webhooks and their deliveries. Other processes skip a delivery that a process is sending, while that
+//! process is alive.
 
 use async_trait::async_trait;
 use jiff::Timestamp;
@@ -12,13 +12,15 @@ use uuid::Uuid;
 use super::super::changes::{
     attempted, check_enabled, check_ended, disable, no_delivery, no_webhook, too_many_webhooks,
 };
-use super::super::{ForgottenDeliveries, KeepDeliveries, StoreError, StoredDelivery, WebhookStore};
+use super::super::{
+    DeliveryRetention, RemovedDeliveries, StoreError, StoredDelivery, WebhookStore,
+};
 use super::listener::DELIVERIES;
-use super::statements::alone;
+use super::statements::advisory_lock;
 use super::{Inner, PostgresStore, count, counted, record};
 use whereabouts_core::{Attempt, Delivery, DeliveryState, StoredWebhook};
 
-/// The advisory lock of those who add webhooks.
+/// The advisory lock of calls that add webhooks.
 const WEBHOOKS_LOCK: i64 = 0x7768_6572_6561_0002;
 
 impl Inner {
@@ -77,7 +79,7 @@ impl Inner {
         Ok(found.map(|Json(delivery)| delivery))
     }
 
-    async fn tell_of_deliveries(
+    async fn notify_deliveries(
         &self,
         tx: &mut Transaction<'_, Postgres>,
     ) -> Result<(), StoreError> {
@@ -86,8 +88,11 @@ impl Inner {
     }
 }
 
-/// The webhook, which nobody changes until the transaction has ended.
-async fn held(connection: &mut PgConnection, id: Uuid) -> Result<StoredWebhook, StoreError> {
+/// Reads a webhook and locks it against changes until the end of the transaction.
+async fn lock_webhook(
+    connection: &mut PgConnection,
+    id: Uuid,
+) -> Result<StoredWebhook, StoreError> {
     let sql = "SELECT record FROM webhooks WHERE id = $1 FOR SHARE";
     let found: Option<Json<StoredWebhook>> =
         sqlx::query_scalar(sql).bind(id).fetch_optional(connection).await?;
@@ -96,17 +101,17 @@ async fn held(connection: &mut PgConnection, id: Uuid) -> Result<StoredWebhook, 
 
 #[async_trait]
 impl WebhookStore for PostgresStore {
-    async fn add_webhook(&self, webhook: StoredWebhook, most: usize) -> Result<(), StoreError> {
+    async fn add_webhook(&self, webhook: StoredWebhook, max: usize) -> Result<(), StoreError> {
         let inner = &self.inner;
         let text = record(&webhook)?;
         inner
             .call(async {
                 let mut tx = inner.begin().await?;
-                alone(&mut tx, WEBHOOKS_LOCK).await?;
-                let there: i64 =
+                advisory_lock(&mut tx, WEBHOOKS_LOCK).await?;
+                let existing: i64 =
                     sqlx::query_scalar("SELECT count(*) FROM webhooks").fetch_one(&mut *tx).await?;
-                if counted(there) >= most {
-                    return Err(too_many_webhooks(most));
+                if counted(existing) >= max {
+                    return Err(too_many_webhooks(max));
                 }
                 let add = sqlx::query("INSERT INTO webhooks (id, record) VALUES ($1, $2::json)");
                 add.bind(webhook.webhook.id).bind(&text).execute(&mut *tx).await?;
@@ -145,7 +150,7 @@ impl WebhookStore for PostgresStore {
 
     async fn delete_webhook(&self, id: Uuid) -> Result<bool, StoreError> {
         let inner = &self.inner;
-        // Its deliveries go with it.
+        // The foreign key deletes its deliveries as well.
         let query = sqlx::query("DELETE FROM webhooks WHERE id = $1").bind(id);
         Ok(inner.run(query).await? > 0)
     }
@@ -155,9 +160,9 @@ impl WebhookStore for PostgresStore {
         inner
             .call(async {
                 let mut tx = inner.begin().await?;
-                check_enabled(&held(&mut tx, new.delivery.webhook).await?)?;
+                check_enabled(&lock_webhook(&mut tx, new.delivery.webhook).await?)?;
                 inner.insert_delivery(&mut tx, &new).await?;
-                inner.tell_of_deliveries(&mut tx).await?;
+                inner.notify_deliveries(&mut tx).await?;
                 Ok(tx.commit().await?)
             })
             .await
@@ -173,18 +178,18 @@ impl WebhookStore for PostgresStore {
         inner
             .call(async {
                 let mut tx = inner.begin().await?;
-                let stored = held(&mut tx, webhook).await?;
-                let known = inner.lock_delivery(&mut tx, webhook, id).await?;
-                let known = known.ok_or_else(|| no_delivery(id))?;
-                let checked = check_enabled(&stored).and_then(|()| check_ended(&known));
+                let stored = lock_webhook(&mut tx, webhook).await?;
+                let ended = inner.lock_delivery(&mut tx, webhook, id).await?;
+                let ended = ended.ok_or_else(|| no_delivery(id))?;
+                let checked = check_enabled(&stored).and_then(|()| check_ended(&ended));
                 if checked.is_err() {
-                    // At once: whoever asks what is due passes over a delivery that is locked.
+                    // Unlock at once, because queries for due deliveries skip a locked one.
                     tx.rollback().await?;
-                    return checked.map(|()| known);
+                    return checked.map(|()| ended);
                 }
-                let again = known.again(now);
+                let again = ended.requeued(now);
                 inner.update_delivery(&mut tx, &again).await?;
-                inner.tell_of_deliveries(&mut tx).await?;
+                inner.notify_deliveries(&mut tx).await?;
                 tx.commit().await?;
                 Ok(again)
             })
@@ -254,10 +259,10 @@ impl WebhookStore for PostgresStore {
         inner
             .call(async {
                 let mut tx = inner.begin().await?;
-                let Some(known) = inner.lock_delivery(&mut tx, webhook, id).await? else {
+                let Some(before) = inner.lock_delivery(&mut tx, webhook, id).await? else {
                     return Ok(None);
                 };
-                let Some(after) = attempted(known, attempt) else { return Ok(None) };
+                let Some(after) = attempted(before, attempt) else { return Ok(None) };
                 inner.update_delivery(&mut tx, &after).await?;
                 tx.commit().await?;
                 Ok(Some(after))
@@ -286,7 +291,7 @@ impl WebhookStore for PostgresStore {
                 .await?;
                 let given_up = waiting.len();
                 for Json(delivery) in waiting {
-                    inner.update_delivery(&mut tx, &delivery.given_up(at, why)).await?;
+                    inner.update_delivery(&mut tx, &delivery.dead_lettered(at, why)).await?;
                 }
                 tx.commit().await?;
                 Ok(given_up)
@@ -296,9 +301,9 @@ impl WebhookStore for PostgresStore {
 
     async fn forget_deliveries(
         &self,
-        keep: KeepDeliveries,
+        keep: DeliveryRetention,
         batch: usize,
-    ) -> Result<ForgottenDeliveries, StoreError> {
+    ) -> Result<RemovedDeliveries, StoreError> {
         let inner = &self.inner;
         inner
             .call(async {
@@ -306,7 +311,7 @@ impl WebhookStore for PostgresStore {
                     .fetch_one(&inner.pool)
                     .await?;
                 let surplus = (all - count(keep.most)).max(0);
-                // The first to end, and if that is not enough the oldest that wait.
+                // Those that ended first, then the oldest waiting ones.
                 let (ended, waiting): (i64, i64) = sqlx::query_as(
                     "WITH ended AS (
                          SELECT webhook, id, ended_at, row_number() OVER () AS number
@@ -330,7 +335,7 @@ impl WebhookStore for PostgresStore {
                 .bind(count(batch))
                 .fetch_one(&inner.pool)
                 .await?;
-                Ok(ForgottenDeliveries { ended: counted(ended), waiting: counted(waiting) })
+                Ok(RemovedDeliveries { ended: counted(ended), waiting: counted(waiting) })
             })
             .await
     }

@@ -1,4 +1,4 @@
-//! Sends spans to a collector over OTLP, and carries trace contexts between processes (W3C Trace Context).
+//! Export of spans over OTLP, and propagation of trace contexts between processes (W3C Trace Context).
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -15,14 +15,14 @@ use tracing_opentelemetry::OpenTelemetrySpanExt;
 use tracing_subscriber::Layer;
 use tracing_subscriber::registry::LookupSpan;
 
-use super::{TRACEPARENT, TRACESTATE, TraceSettings, is_ours};
+use super::{TRACEPARENT, TRACESTATE, TraceSettings, is_trace_span};
 
-/// What sends traces. Its end sends the last of them.
+/// The trace exporter. Dropping it flushes the remaining spans.
 #[derive(Debug, Default)]
 pub struct Traces(Option<SdkTracerProvider>);
 
 impl Traces {
-    /// Nothing is sent until [`Traces::layer`] is in use.
+    /// Starts the exporter. Spans reach it through [`Traces::layer`].
     pub fn start(settings: &TraceSettings) -> Result<Self, String> {
         if settings.url.is_empty() {
             return Ok(Self::default());
@@ -41,28 +41,29 @@ impl Traces {
             .with_service_name("whereabouts")
             .with_attributes([process, version])
             .build();
-        let by_share = Sampler::TraceIdRatioBased(settings.share);
+        let by_rate = Sampler::TraceIdRatioBased(settings.share);
         let provider = SdkTracerProvider::builder()
             .with_batch_exporter(exporter)
-            .with_sampler(Sampler::ParentBased(Box::new(by_share)))
+            .with_sampler(Sampler::ParentBased(Box::new(by_rate)))
             .with_resource(resource)
             .build();
         Ok(Self(Some(provider)))
     }
 
-    /// Takes spans from those who make them.
+    /// Creates the layer that collects spans; `None` if tracing is disabled.
     pub fn layer<S>(&self) -> Option<impl Layer<S> + use<S>>
     where
         S: Subscriber + for<'a> LookupSpan<'a>,
     {
         let tracer = self.0.as_ref()?.tracer("whereabouts");
-        let ours = tracing_subscriber::filter::filter_fn(|about| about.is_span() && is_ours(about));
+        let trace_spans =
+            tracing_subscriber::filter::filter_fn(|span| span.is_span() && is_trace_span(span));
         let layer = tracing_opentelemetry::layer()
             .with_tracer(tracer)
             .with_location(false)
             .with_threads(false)
             .with_target(false);
-        Some(layer.with_filter(ours))
+        Some(layer.with_filter(trace_spans))
     }
 }
 
@@ -71,18 +72,18 @@ impl Drop for Traces {
         if let Some(provider) = self.0.take()
             && let Err(error) = provider.shutdown()
         {
-            tracing::warn!(%error, "the last traces were not sent");
+            tracing::warn!(%error, "cannot flush the remaining traces");
         }
     }
 }
 
-/// Makes a span part of the trace that a `traceparent` names.
+/// Makes a span a child of the given trace context.
 pub(super) fn set_parent(span: &Span, traceparent: Option<&str>, tracestate: Option<&str>) {
     if span.is_disabled() {
         return;
     }
-    let named = [(TRACEPARENT, traceparent), (TRACESTATE, tracestate)];
-    let carrier: HashMap<String, String> = named
+    let headers = [(TRACEPARENT, traceparent), (TRACESTATE, tracestate)];
+    let carrier: HashMap<String, String> = headers
         .into_iter()
         .filter_map(|(name, value)| Some((name.to_owned(), value?.to_owned())))
         .collect();
@@ -91,7 +92,7 @@ pub(super) fn set_parent(span: &Span, traceparent: Option<&str>, tracestate: Opt
     }
 }
 
-/// The trace that is going on: its `traceparent` for other processes, and its id; `None` where nothing is traced.
+/// The `traceparent` and the trace id of the current span; `None` if it is not traced.
 pub fn current() -> Option<(String, String)> {
     let context = Span::current().context();
     let id = {
@@ -103,7 +104,7 @@ pub fn current() -> Option<(String, String)> {
 }
 
 fn traceparent(context: &Context) -> Option<String> {
-    let mut written = HashMap::new();
-    TraceContextPropagator::new().inject_context(context, &mut written);
-    written.remove(TRACEPARENT)
+    let mut carrier = HashMap::new();
+    TraceContextPropagator::new().inject_context(context, &mut carrier);
+    carrier.remove(TRACEPARENT)
 }

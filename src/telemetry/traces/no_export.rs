@@ -1,4 +1,4 @@
-//! Stands in for the exporter in a build without the Cargo feature `otel`: nothing is sent.
+//! A stand-in for the exporter in builds without the Cargo feature `otel`.
 
 use tracing::{Span, Subscriber};
 use tracing_subscriber::Layer;
@@ -7,7 +7,7 @@ use tracing_subscriber::registry::LookupSpan;
 
 use super::TraceSettings;
 
-/// Sends no traces.
+/// A trace exporter that does nothing.
 #[derive(Debug, Default)]
 pub struct Traces;
 
@@ -22,7 +22,7 @@ impl Traces {
             .into())
     }
 
-    /// No layer.
+    /// Always `None`.
     pub fn layer<S>(&self) -> Option<impl Layer<S> + use<S>>
     where
         S: Subscriber + for<'a> LookupSpan<'a>,
@@ -33,7 +33,7 @@ impl Traces {
 
 pub(super) fn set_parent(_: &Span, _: Option<&str>, _: Option<&str>) {}
 
-/// `None`: nothing is traced.
+/// Always `None`.
 pub fn current() -> Option<(String, String)> {
     None
 }

@@ -1,4 +1,4 @@
-//! Who waits, who goes first, who is refused.
+//! Queueing, priorities and rejection.
 
 use std::pin::Pin;
 
@@ -17,42 +17,42 @@ fn admission(permits: usize, queue: usize) -> Admission {
     })
 }
 
-fn demand(class: WorkClass) -> AdmissionRequest {
+fn request(class: WorkClass) -> AdmissionRequest {
     AdmissionRequest { class, deadline: None }
 }
 
-/// Joins the line; whoever is refused at once fails the test.
+/// Joins the queue; panics if the request is not queued.
 async fn waiting(admission: &Admission, class: WorkClass) -> Entering {
     let admission = admission.clone();
-    let mut entering: Entering = Box::pin(async move { admission.enter(demand(class)).await });
+    let mut entering: Entering = Box::pin(async move { admission.acquire(request(class)).await });
     assert!(poll!(&mut entering).is_pending());
     entering
 }
 
-async fn reason(admission: &Admission, demand: AdmissionRequest) -> RejectReason {
-    admission.enter(demand).await.unwrap_err().reason
+async fn reason(admission: &Admission, request: AdmissionRequest) -> RejectReason {
+    admission.acquire(request).await.unwrap_err().reason
 }
 
 #[tokio::test]
-async fn one_more_than_may_wait_is_refused_at_once() {
+async fn a_full_queue_rejects_at_once() {
     let admission = admission(1, 2);
-    let _inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
+    let _held = admission.acquire(request(WorkClass::Localize)).await.unwrap();
     let _a = waiting(&admission, WorkClass::Localize).await;
     let _b = waiting(&admission, WorkClass::Localize).await;
-    assert_eq!(reason(&admission, demand(WorkClass::Localize)).await, RejectReason::QueueFull);
-    assert_eq!(reason(&admission, demand(WorkClass::Index)).await, RejectReason::QueueFull);
-    assert!(admission.check(demand(WorkClass::Localize)).is_err());
+    assert_eq!(reason(&admission, request(WorkClass::Localize)).await, RejectReason::QueueFull);
+    assert_eq!(reason(&admission, request(WorkClass::Index)).await, RejectReason::QueueFull);
+    assert!(admission.check(request(WorkClass::Localize)).is_err());
     assert_eq!(admission.pressure(), 1.0);
 }
 
 #[tokio::test]
-async fn frames_go_first_then_images_then_what_nobody_waits_for() {
+async fn frames_go_before_images_and_images_before_background_work() {
     let admission = admission(1, 9);
-    let inside = admission.enter(demand(WorkClass::Index)).await.unwrap();
+    let held = admission.acquire(request(WorkClass::Index)).await.unwrap();
     let mut background = waiting(&admission, WorkClass::Background).await;
     let mut index = waiting(&admission, WorkClass::Index).await;
     let mut localize = waiting(&admission, WorkClass::Localize).await;
-    drop(inside);
+    drop(held);
     assert!(poll!(&mut index).is_pending() && poll!(&mut background).is_pending());
     drop(localize.as_mut().await.unwrap());
     assert!(poll!(&mut background).is_pending());
@@ -62,9 +62,9 @@ async fn frames_go_first_then_images_then_what_nobody_waits_for() {
 }
 
 #[tokio::test]
-async fn the_last_image_makes_room_for_a_frame() {
+async fn the_newest_waiting_image_is_evicted_for_a_frame() {
     let admission = admission(1, 2);
-    let _inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
+    let _held = admission.acquire(request(WorkClass::Localize)).await.unwrap();
     let mut first = waiting(&admission, WorkClass::Index).await;
     let last = waiting(&admission, WorkClass::Index).await;
     let _frame = waiting(&admission, WorkClass::Localize).await;
@@ -73,50 +73,50 @@ async fn the_last_image_makes_room_for_a_frame() {
 }
 
 #[tokio::test]
-async fn the_place_of_who_has_gone_is_free() {
+async fn a_request_that_left_frees_its_slot() {
     let admission = admission(1, 1);
-    let inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
+    let held = admission.acquire(request(WorkClass::Localize)).await.unwrap();
     drop(waiting(&admission, WorkClass::Localize).await);
     let mut next = waiting(&admission, WorkClass::Localize).await;
-    drop(inside);
+    drop(held);
     drop(next.as_mut().await.unwrap());
     assert_eq!(admission.levels().in_use, 0);
 }
 
 #[tokio::test(start_paused = true)]
-async fn nobody_waits_longer_than_the_bound_but_in_the_background() {
+async fn only_background_work_waits_longer_than_the_maximum() {
     let admission = admission(1, 2);
-    let inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
+    let held = admission.acquire(request(WorkClass::Localize)).await.unwrap();
     let mut background = waiting(&admission, WorkClass::Background).await;
     let frame = waiting(&admission, WorkClass::Localize).await;
     assert_eq!(frame.await.unwrap_err().reason, RejectReason::WaitTooLong);
     assert!(poll!(&mut background).is_pending());
-    drop(inside);
+    drop(held);
     assert!(background.await.is_ok());
 }
 
 #[tokio::test]
-async fn what_cannot_be_in_time_is_refused_at_once_and_told_when_to_come_back() {
+async fn an_unreachable_deadline_is_rejected_at_once_with_a_retry_after() {
     let admission = admission(1, 100);
-    let mut inside = admission.enter(demand(WorkClass::Localize)).await.unwrap();
-    inside.since = Instant::now() - Duration::from_secs(4);
-    inside.served();
+    let mut held = admission.acquire(request(WorkClass::Localize)).await.unwrap();
+    held.acquired = Instant::now() - Duration::from_secs(4);
+    held.complete();
     let soon = AdmissionRequest {
         class: WorkClass::Localize,
         deadline: Some(Instant::now() + Duration::from_secs(5)),
     };
-    let refused = admission.enter(soon).await.unwrap_err();
-    assert_eq!(refused.reason, RejectReason::DeadlineTooSoon);
-    assert_eq!(refused.retry_after.as_secs(), 4);
-    let mut in_line = Vec::new();
+    let rejected = admission.acquire(soon).await.unwrap_err();
+    assert_eq!(rejected.reason, RejectReason::DeadlineTooSoon);
+    assert_eq!(rejected.retry_after.as_secs(), 4);
+    let mut queued = Vec::new();
     for _ in 0..14 {
-        in_line.push(waiting(&admission, WorkClass::Localize).await);
+        queued.push(waiting(&admission, WorkClass::Localize).await);
     }
-    let refused = admission.enter(demand(WorkClass::Localize)).await.unwrap_err();
-    assert_eq!(refused.reason, RejectReason::WaitTooLong);
-    assert_eq!(refused.retry_after.as_secs(), 30);
-    // Who is alone is tried, whatever took long before.
-    in_line.clear();
-    drop(inside);
-    assert!(admission.enter(soon).await.is_ok());
+    let rejected = admission.acquire(request(WorkClass::Localize)).await.unwrap_err();
+    assert_eq!(rejected.reason, RejectReason::WaitTooLong);
+    assert_eq!(rejected.retry_after.as_secs(), 30);
+    // With a free permit nothing is rejected, however slow earlier work was.
+    queued.clear();
+    drop(held);
+    assert!(admission.acquire(soon).await.is_ok());
 }

@@ -2,108 +2,124 @@
 
 use super::*;
 
-fn queue(narrow_sessions: usize, max_batch: usize) -> Queue {
-    let layout = Layout { threads: 4, sessions: narrow_sessions.max(1), max_batch };
-    let state = State { narrow_sessions, ..State::default() };
-    Queue { state: state.into(), work: Condvar::new(), room: Condvar::new(), layout }
+fn manifest() -> Arc<Manifest> {
+    let text = include_str!("../../../deploy/models/xfeat.toml");
+    Arc::new(Manifest::parse(text, std::path::Path::new("xfeat.toml")).unwrap())
+}
+
+fn queue(throughput_sessions: usize, max_batch: usize) -> Queue {
+    let layout = Layout { threads: 4, sessions: throughput_sessions.max(1), max_batch };
+    let state = State { throughput_sessions, ..State::default() };
+    Queue {
+        state: state.into(),
+        work_available: Condvar::new(),
+        room_available: Condvar::new(),
+        layout,
+        manifest: manifest(),
+    }
 }
 
 fn submit(queue: &Queue) -> PendingInference {
-    let (answer, inferring) = oneshot::channel();
+    let (reply, result) = oneshot::channel();
     let mut state = queue.lock();
     state.overlapped |= state.in_progress();
-    state.waiting.push_back(Request { tensor: Tensor::grey(1, 1), answer });
-    PendingInference(inferring)
+    let (kind, features) = (DescriptorKind::Gem, FeatureSet::DescriptorOnly);
+    state.waiting.push_back(Request { tensor: Tensor::grey(1, 1), kind, features, reply });
+    PendingInference(result)
 }
 
 fn may_take(queue: &Queue) -> (bool, bool) {
     let state = queue.lock();
-    (state.may_take(Kind::Wide), state.may_take(Kind::Narrow))
+    (state.may_take(SessionKind::Latency), state.may_take(SessionKind::Throughput))
 }
 
-/// What a session does, less inference.
-fn run(queue: &Queue, kind: Kind) -> (Vec<Request>, Run<'_>) {
+/// What a session thread does, without inference.
+fn run(queue: &Queue, kind: SessionKind) -> (Vec<Request>, Running<'_>) {
     assert!(queue.lock().may_take(kind));
-    (queue.take(kind).unwrap(), Run { queue, kind })
+    (queue.take(kind).unwrap(), Running { queue, kind })
 }
 
 #[test]
-fn a_picture_that_comes_alone_has_all_threads() {
+fn a_picture_that_arrives_alone_gets_the_latency_session() {
     let queue = queue(2, 1);
     for _ in 0..3 {
-        let _inferring = submit(&queue);
+        let _pending = submit(&queue);
         assert_eq!(may_take(&queue), (true, false));
-        drop(run(&queue, Kind::Wide));
+        drop(run(&queue, SessionKind::Latency));
     }
 }
 
 #[test]
-fn pictures_that_overlap_are_run_side_by_side_until_none_does() {
+fn overlapping_pictures_use_throughput_sessions_until_the_queue_is_idle() {
     let queue = queue(2, 1);
     let _a = submit(&queue);
-    let wide = run(&queue, Kind::Wide);
+    let latency = run(&queue, SessionKind::Latency);
     let (_b, _c) = (submit(&queue), submit(&queue));
     assert_eq!(may_take(&queue), (false, false));
-    drop(wide);
-    let (first, second) = (run(&queue, Kind::Narrow), run(&queue, Kind::Narrow));
+    drop(latency);
+    let (first, second) =
+        (run(&queue, SessionKind::Throughput), run(&queue, SessionKind::Throughput));
     drop((first, second));
     let _d = submit(&queue);
-    drop(run(&queue, Kind::Narrow));
+    drop(run(&queue, SessionKind::Throughput));
     let _e = submit(&queue);
     assert_eq!(may_take(&queue), (true, false));
 }
 
 #[test]
-fn the_wide_session_goes_on_where_there_is_no_other() {
+fn the_latency_session_serves_alone_without_throughput_sessions() {
     let queue = queue(0, 8);
     let _a = submit(&queue);
-    let wide = run(&queue, Kind::Wide);
+    let latency = run(&queue, SessionKind::Latency);
     let _more: Vec<_> = (0..9).map(|_| submit(&queue)).collect();
-    drop(wide);
-    assert_eq!(run(&queue, Kind::Wide).0.len(), 8);
+    drop(latency);
+    assert_eq!(run(&queue, SessionKind::Latency).0.len(), 8);
 }
 
 #[test]
-fn what_waits_is_shared_among_the_narrow_sessions() {
+fn throughput_sessions_share_the_queue_evenly() {
     let queue = queue(2, 8);
-    let _inferring: Vec<_> = (0..6).map(|_| submit(&queue)).collect();
-    drop(run(&queue, Kind::Wide));
-    let _inferring: Vec<_> = (0..6).map(|_| submit(&queue)).collect();
-    queue.lock().crowded = true;
-    let first = run(&queue, Kind::Narrow);
+    let _pending: Vec<_> = (0..6).map(|_| submit(&queue)).collect();
+    drop(run(&queue, SessionKind::Latency));
+    let _pending: Vec<_> = (0..6).map(|_| submit(&queue)).collect();
+    queue.lock().throughput_mode = true;
+    let first = run(&queue, SessionKind::Throughput);
     assert_eq!((first.0.len(), queue.lock().waiting.len()), (3, 3));
 }
 
 #[test]
-fn what_nobody_waits_for_any_more_is_not_run() {
+fn abandoned_pictures_are_not_run() {
     let queue = queue(0, 8);
-    let mut inferring: Vec<_> = (0..5).map(|_| submit(&queue)).collect();
-    inferring.truncate(2);
-    assert_eq!(run(&queue, Kind::Wide).0.len(), 2);
+    let mut pending: Vec<_> = (0..5).map(|_| submit(&queue)).collect();
+    pending.truncate(2);
+    assert_eq!(run(&queue, SessionKind::Latency).0.len(), 2);
 }
 
 #[test]
-fn the_room_of_those_who_have_gone_is_given_away() {
+fn abandoned_pictures_make_room_in_the_queue() {
     let queue = Arc::new(queue(0, 1));
-    let gone: Vec<_> = (0..queue.layout.capacity()).map(|_| submit(&queue)).collect();
+    let abandoned: Vec<_> = (0..queue.layout.capacity()).map(|_| submit(&queue)).collect();
     let batcher = Batcher { queue: Arc::clone(&queue), threads: Vec::new() };
-    let waits = thread::spawn(move || {
-        let inferring = batcher.submit(Tensor::grey(2, 2));
-        (batcher, inferring)
+    let waiting = thread::spawn(move || {
+        let pending =
+            batcher.submit(Tensor::grey(2, 2), DescriptorKind::Gem, FeatureSet::DescriptorOnly);
+        (batcher, pending)
     });
-    drop(gone);
-    let taken = queue.take(Kind::Wide).unwrap();
-    assert_eq!((taken.len(), taken[0].tensor.width), (1, 2));
-    assert!(waits.join().unwrap().1.is_ok());
+    drop(abandoned);
+    let batch = queue.take(SessionKind::Latency).unwrap();
+    assert_eq!((batch.len(), batch[0].tensor.width), (1, 2));
+    assert!(waiting.join().unwrap().1.is_ok());
 }
 
 #[test]
-fn who_waits_hears_of_the_end() {
+fn waiting_callers_fail_when_the_batcher_is_dropped() {
     let queue = Arc::new(queue(0, 1));
     let batcher = Batcher { queue: Arc::clone(&queue), threads: Vec::new() };
-    let waits = batcher.submit(Tensor::grey(1, 1)).unwrap();
+    let waiting = batcher
+        .submit(Tensor::grey(1, 1), DescriptorKind::Gem, FeatureSet::DescriptorOnly)
+        .unwrap();
     drop(batcher);
-    assert!(queue.take(Kind::Wide).is_none());
+    assert!(queue.take(SessionKind::Latency).is_none());
     drop(queue);
-    assert!(matches!(waits.wait(), Err(InferenceError::Stopped)));
+    assert!(matches!(waiting.wait(), Err(InferenceError::Stopped)));
 }

@@ -1,9 +1,9 @@
-//! What goes wrong on the way to a server and back.
+//! Faults of the server and of the connection.
 
 use super::shelf::KEY;
 use super::*;
 
-/// Answers the first describe calls with a fault each.
+/// Answers the first describe calls with these faults.
 fn after(faults: Vec<Reply>) -> Script {
     Script {
         describe: Box::new(move |call| match faults.get(call.number - 1) {
@@ -19,7 +19,7 @@ fn status(code: u16) -> Reply {
 }
 
 #[tokio::test]
-async fn what_may_pass_is_tried_again() {
+async fn transient_faults_are_retried() {
     let faults = [
         Reply::Busy("0".into()),
         status(500),
@@ -38,7 +38,7 @@ async fn what_may_pass_is_tried_again() {
 }
 
 #[tokio::test]
-async fn a_call_that_hangs_is_given_up_at_its_deadline() {
+async fn a_hanging_call_times_out_and_is_retried() {
     let bench = Bench::with(after(vec![Reply::Hang]), |settings| settings.timeout_s = 1).await;
     let refinement = bench.refine(1).await.unwrap();
     assert_eq!(refinement.degraded, None);
@@ -46,7 +46,7 @@ async fn a_call_that_hangs_is_given_up_at_its_deadline() {
 }
 
 #[tokio::test]
-async fn dropping_a_job_hangs_up() {
+async fn dropping_a_job_closes_its_connections() {
     let bench = Bench::new(after(vec![Reply::Hang; 3])).await;
     {
         let mut job = Box::pin(bench.refine(3));
@@ -61,7 +61,7 @@ async fn dropping_a_job_hangs_up() {
 }
 
 #[tokio::test]
-async fn an_answer_of_ten_megabytes_is_refused() {
+async fn an_answer_above_the_size_limit_is_rejected() {
     let bench = Bench::new(after(vec![Reply::Huge(10_000_000)])).await;
     let error = bench.refine(1).await.unwrap_err();
     assert!(matches!(&error, RefineError::Permanent(why) if why.contains("answer_max_bytes")));
@@ -69,7 +69,7 @@ async fn an_answer_of_ten_megabytes_is_refused() {
 }
 
 #[tokio::test]
-async fn a_pair_that_fails_for_good_is_ranked_behind_the_others() {
+async fn a_pair_that_fails_permanently_is_ranked_last() {
     let script = Script {
         describe: Box::new(|call| match call.number {
             2 => status(413),
@@ -88,7 +88,7 @@ async fn a_pair_that_fails_for_good_is_ranked_behind_the_others() {
 }
 
 #[tokio::test]
-async fn when_no_pair_can_be_described_the_job_has_no_ranking() {
+async fn without_any_description_the_job_has_no_ranking() {
     let always =
         |reply: Reply| Script { describe: Box::new(move |_| reply.clone()), ..Script::default() };
     let bench = Bench::new(always(status(404))).await;
@@ -103,7 +103,7 @@ async fn when_no_pair_can_be_described_the_job_has_no_ranking() {
 }
 
 #[tokio::test]
-async fn when_the_reasoning_call_fails_for_good_the_order_is_the_coarse_one() {
+async fn after_a_failed_reasoning_call_the_order_is_the_coarse_one() {
     let script = Script { reason: Box::new(|_| status(500)), ..Script::default() };
     let bench = Bench::new(script).await;
     let refinement = bench.refine(3).await.unwrap();
@@ -113,7 +113,7 @@ async fn when_the_reasoning_call_fails_for_good_the_order_is_the_coarse_one() {
 }
 
 #[tokio::test]
-async fn a_server_that_takes_no_schema_is_asked_only_once() {
+async fn a_schema_is_not_sent_again_after_the_server_rejected_it() {
     let script = Script { structured: false, ..Script::default() };
     let bench = Bench::new(script).await;
     for _ in 0..3 {
@@ -123,10 +123,10 @@ async fn a_server_that_takes_no_schema_is_asked_only_once() {
 }
 
 #[tokio::test]
-async fn the_key_is_never_repeated() {
-    let said = format!("Incorrect API key provided: {KEY}");
+async fn the_key_is_hidden_in_error_messages() {
+    let message = format!("Incorrect API key provided: {KEY}");
     let script = Script {
-        describe: Box::new(move |_| Reply::Status(401, said.clone())),
+        describe: Box::new(move |_| Reply::Status(401, message.clone())),
         ..Script::default()
     };
     let bench = Bench::new(script).await;
@@ -137,9 +137,9 @@ async fn the_key_is_never_repeated() {
 }
 
 #[tokio::test]
-async fn a_server_that_is_not_there_may_come_back() {
+async fn an_unreachable_server_is_a_transient_error() {
     let mut bench = Bench::new(Script::default()).await;
     bench.rebuild(|settings| settings.base_url = "http://127.0.0.1:1/v1".into());
     let error = bench.refine(1).await.unwrap_err();
-    assert!(matches!(&error, RefineError::Transient(why) if why.contains("cannot be talked to")));
+    assert!(matches!(&error, RefineError::Transient(why) if why.contains("cannot be reached")));
 }

@@ -1,11 +1,11 @@
-//! Breaker and budget: what a job does while no call may be made.
+//! Circuit breaker and budget: what becomes of a job while no call may be made.
 
 use async_trait::async_trait;
 
 use super::*;
 use whereabouts_core::{Ranking, RefinerKind, Usage};
 
-/// Stands in for the local refiner: turns the coarse order round.
+/// Stands in for the local refiner: reverses the coarse order.
 struct Reverse;
 
 #[async_trait]
@@ -16,13 +16,13 @@ impl Refiner for Reverse {
 
     async fn refine(
         &self,
-        record: &JobRecord,
+        input: &RefineInput,
         _: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        let order: Vec<usize> = (0..record.candidates.len()).rev().collect();
+        let order: Vec<usize> = (0..input.candidates.len()).rev().collect();
         Ok(Refinement {
             descriptions: vec![],
-            ranking: Ranking::new(&record.candidates, &order).unwrap(),
+            ranking: Ranking::new(&input.candidates, &order).unwrap(),
             evidence: None,
             reasoning: None,
             reasoning_took_ms: None,
@@ -43,7 +43,7 @@ fn failing(first: usize) -> Script {
     }
 }
 
-/// One call at a time, each tried once; three failures open the breaker.
+/// One call at a time and without retries; three failures open the breaker.
 fn brittle(settings: &mut MllmSettings) {
     settings.concurrency = 1;
     settings.attempts = 1;
@@ -51,7 +51,7 @@ fn brittle(settings: &mut MllmSettings) {
 }
 
 #[tokio::test]
-async fn an_open_breaker_hands_the_job_to_the_other_refiner() {
+async fn an_open_breaker_hands_the_job_to_the_fallback() {
     let mut bench = Bench::with(failing(1000), brittle).await;
     bench.fallback = Some(Arc::new(Reverse));
     bench.rebuild(|settings| settings.breaker_open_s = 3600);
@@ -62,18 +62,18 @@ async fn an_open_breaker_hands_the_job_to_the_other_refiner() {
         assert!(why.contains("`local` instead of `mllm`") && why.contains("suspended"), "{why}");
     }
     assert_eq!(bench.mock.describe_calls(), 3);
-    assert!(bench.refiner.levels().unwrap().suspended);
+    assert!(bench.refiner.levels().suspended);
 }
 
 #[tokio::test]
-async fn without_another_refiner_the_job_is_tried_again_later() {
+async fn without_a_fallback_an_open_breaker_is_a_transient_error() {
     let bench = Bench::with(failing(1000), brittle).await;
     let error = bench.refine(5).await.unwrap_err();
     assert!(matches!(error, RefineError::Transient(_)), "{error}");
 }
 
 #[tokio::test]
-async fn a_job_that_waits_goes_on_when_the_breaker_lets_it() {
+async fn a_job_continues_when_the_breaker_closes() {
     let bench = Bench::with(failing(3), |settings| {
         brittle(settings);
         settings.breaker_open_s = 0;
@@ -83,11 +83,11 @@ async fn a_job_that_waits_goes_on_when_the_breaker_lets_it() {
     let refinement = bench.refine(6).await.unwrap();
     assert_eq!(bench.mock.describe_calls(), 6);
     assert!(refinement.degraded.unwrap().starts_with("3 of 6 pairs"));
-    assert!(!bench.refiner.levels().unwrap().suspended);
+    assert!(!bench.refiner.levels().suspended);
 }
 
 #[tokio::test]
-async fn a_job_that_waits_says_for_how_long() {
+async fn a_deferred_job_states_how_long_to_wait() {
     let bench = Bench::with(failing(1000), |settings| {
         brittle(settings);
         settings.breaker_open_s = 3600;
@@ -101,17 +101,17 @@ async fn a_job_that_waits_says_for_how_long() {
 }
 
 #[tokio::test]
-async fn what_earlier_attempts_spent_counts_against_the_budget_of_the_job() {
+async fn spend_of_earlier_attempts_counts_against_the_budget_of_the_job() {
     let bench = Bench::with(Script::default(), |settings| settings.tokens_per_job = 20_000).await;
-    let mut record = bench.record(2);
-    record.job.usage.prompt_tokens = 19_990;
-    let error = bench.refiner.refine(&record, &Steps::default()).await.unwrap_err();
+    let mut input = bench.input(2);
+    input.spent.prompt_tokens = 19_990;
+    let error = bench.refiner.refine(&input, &Steps::default()).await.unwrap_err();
     assert!(matches!(&error, RefineError::Permanent(why) if why.contains("tokens_per_job")));
     assert_eq!(bench.mock.describe_calls(), 0);
 }
 
 #[tokio::test]
-async fn a_job_never_passes_its_budget() {
+async fn a_job_never_exceeds_its_budget() {
     let mut bench = Bench::with(Script::default(), |settings| {
         settings.concurrency = 1;
         settings.tokens_per_job = 6000;
@@ -129,7 +129,7 @@ async fn a_job_never_passes_its_budget() {
 }
 
 #[tokio::test]
-async fn a_day_never_passes_its_budget() {
+async fn a_day_never_exceeds_its_budget() {
     let bench = Bench::with(Script::default(), |settings| {
         settings.price_prompt = 1.0;
         settings.price_completion = 2.0;
@@ -147,7 +147,7 @@ async fn a_day_never_passes_its_budget() {
     assert_eq!(bench.mock.describe_calls(), 0);
     bench.refiner.seed_spent_today(&spent(0.5));
     assert_eq!(bench.refine(2).await.unwrap().degraded, None);
-    assert!(bench.refiner.levels().unwrap().spent_today.money > 0.5);
+    assert!(bench.refiner.levels().spent_today.money > 0.5);
     let spent: f64 = bench.cache.spent.lock().iter().map(|spent| spent.money).sum();
-    assert!((bench.refiner.levels().unwrap().spent_today.money - 0.5 - spent).abs() < 1e-9);
+    assert!((bench.refiner.levels().spent_today.money - 0.5 - spent).abs() < 1e-9);
 }

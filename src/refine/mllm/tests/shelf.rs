@@ -1,4 +1,4 @@
-//! A map of a few plain pictures in memory, and a refiner that looks at them through the mock.
+//! A map of a few plain pictures in memory, and a refiner that calls the mock server.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -13,30 +13,31 @@ use uuid::Uuid;
 
 use super::super::settings::tests::defaults;
 use super::*;
-use whereabouts_core::{CachedDescription, DescribedFrame, Secret, SimilarFrame};
+use crate::QueryFrame;
+use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, Secret, SimilarFrame};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, CoordinateFrame, DayUsage, Descriptor,
-    DescriptorKind, Digest, Image, ImageId, Job, Map, MapName, MediaType, Pose, Precision,
-    RefinerKind, StandIn,
+    DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose, Precision, StandIn,
+    Usage,
 };
 use whereabouts_index::SearchMode;
-use whereabouts_store::{Added, BlobPin, HardNegatives, IndexState, Query, Step, StoreError};
+use whereabouts_store::{Added, BlobPin, HardNegatives, IndexState, Step, StoreError};
 use whereabouts_telemetry::metrics::registry;
 use whereabouts_testkit::mock_mllm::{MockMllm, Script};
 use whereabouts_vision::decode::encode_jpeg;
 
-/// The key that every call must carry.
+/// The API key that the mock demands.
 pub const KEY: &str = "sk-test-5c1f";
 
 /// A map with the images `image-0`, `image-1`, …
 #[derive(Clone)]
 pub struct Shelf {
     pub map: Map,
-    /// Their bytes; the last is the frame.
+    /// Their bytes; the last picture is the frame.
     pictures: Arc<Vec<Bytes>>,
 }
 
-/// The mock, and a refiner that is set up to call it.
+/// The mock server, and a refiner that calls it.
 pub struct Bench {
     pub mock: MockMllm,
     pub shelf: Shelf,
@@ -65,18 +66,18 @@ impl Bench {
         Self { mock, shelf, cache, fallback: None, settings, refiner }
     }
 
-    /// The refiner as after a restart with other settings; the cache stays.
+    /// Replaces the refiner, as a restart with other settings does. The cache is kept.
     pub fn rebuild(&mut self, change: impl FnOnce(&mut MllmSettings)) {
         change(&mut self.settings);
         self.refiner = refiner(&self.shelf, &self.cache, self.fallback.clone(), &self.settings);
     }
 
-    pub fn record(&self, candidates: usize) -> JobRecord {
-        self.shelf.record(candidates)
+    pub fn input(&self, candidates: usize) -> RefineInput {
+        self.shelf.input(candidates)
     }
 
     pub async fn refine(&self, candidates: usize) -> Result<Refinement, RefineError> {
-        self.refiner.refine(&self.record(candidates), &Steps::default()).await
+        self.refiner.refine(&self.input(candidates), &Steps::default()).await
     }
 }
 
@@ -99,14 +100,14 @@ fn refiner(
     MllmRefiner::new(parts, settings.clone()).unwrap()
 }
 
-/// The picture of a number: so many white columns, as no compression mistakes for others.
+/// Encodes a number as a picture: twice as many white columns, which survive compression.
 fn picture(number: u32) -> Bytes {
     let column = |x| Rgb([if x < 2 * number { 255 } else { 0 }; 3]);
     encode_jpeg(&RgbImage::from_fn(64, 48, |x, _| column(x))).unwrap().into()
 }
 
 impl Shelf {
-    fn new() -> Self {
+    pub fn new() -> Self {
         let map = Map {
             uid: Uuid::from_u128(1),
             name: "m".parse().unwrap(),
@@ -124,40 +125,34 @@ impl Shelf {
         Self { map, pictures: Arc::new((0..24).map(picture).collect()) }
     }
 
-    /// The digest of a picture.
+    /// Returns the digest of a picture.
     pub fn digest(&self, number: usize) -> Digest {
         Digest::of(&self.pictures[number])
     }
 
-    fn record(&self, candidates: usize) -> JobRecord {
-        let now = Timestamp::now();
-        let query = Query {
-            id: Uuid::now_v7(),
-            digest: Digest::of(&self.pictures[self.pictures.len() - 1]),
-            media_type: MediaType::Jpeg,
-            created_at: now,
-            descriptor: None,
-        };
+    fn input(&self, candidates: usize) -> RefineInput {
         let candidate = |index: usize| Candidate {
             rank: index + 1,
             image_id: format!("image-{index}").parse().unwrap(),
             similarity: 0.9,
             pose: None,
         };
-        JobRecord {
-            job: Job::queued(self.map.name.clone(), query.id, RefinerKind::Mllm, now),
-            map_uid: self.map.uid,
-            revision: self.map.revision,
-            query,
+        RefineInput {
+            id: Uuid::now_v7(),
+            map: self.map.clone(),
+            frame: QueryFrame {
+                query_id: Uuid::now_v7(),
+                digest: self.digest(self.pictures.len() - 1),
+                descriptor: None,
+            },
             candidates: (0..candidates).map(candidate).collect(),
-            claims: 0,
-            traceparent: None,
+            spent: Usage::default(),
         }
     }
 }
 
-fn not_here<T>() -> Result<T, StoreError> {
-    Err(StoreError::Failed("the refiner has no business here".into()))
+fn unused<T>() -> Result<T, StoreError> {
+    Err(StoreError::Failed("the refiner should not call this".into()))
 }
 
 #[async_trait]
@@ -182,23 +177,23 @@ impl MapStore for Shelf {
     }
 
     async fn put_map(&self, _: Map) -> Result<(Map, bool), StoreError> {
-        not_here()
+        unused()
     }
 
     async fn maps(&self) -> Result<Vec<Map>, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn delete_map(&self, _: &MapName) -> Result<bool, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn index_state(&self, _: &Map) -> Result<IndexState, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn add_image(&self, _: &Map, _: Image, _: Descriptor) -> Result<Added, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn images(
@@ -207,15 +202,15 @@ impl MapStore for Shelf {
         _: Option<&ImageId>,
         _: usize,
     ) -> Result<Vec<Image>, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn positions(&self, _: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn delete_image(&self, _: &Map, _: &ImageId) -> Result<bool, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn search(
@@ -225,31 +220,31 @@ impl MapStore for Shelf {
         _: usize,
         _: SearchMode,
     ) -> Result<Vec<Candidate>, StoreError> {
-        not_here()
+        unused()
     }
 
-    async fn look_alikes(
+    async fn hard_negatives(
         &self,
         _: &Map,
         _: CalibrationSettings,
         _: usize,
     ) -> Result<Vec<HardNegatives>, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn calibration(&self, _: &Map) -> Result<Option<Arc<Calibration>>, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn put_calibration(&self, _: &Map, _: Calibration) -> Result<(), StoreError> {
-        not_here()
+        unused()
     }
 }
 
 #[async_trait]
 impl BlobStore for Shelf {
     async fn put_blob(&self, _: Digest, _: Bytes) -> Result<BlobPin, StoreError> {
-        not_here()
+        unused()
     }
 
     async fn blob(&self, digest: &Digest) -> Result<Option<Bytes>, StoreError> {
@@ -257,7 +252,7 @@ impl BlobStore for Shelf {
     }
 }
 
-/// Remembers the steps of a refinement.
+/// Records the steps of a refinement.
 #[derive(Default)]
 pub struct Steps(pub Mutex<Vec<Step>>);
 
@@ -284,7 +279,7 @@ impl UsageStore for MemoryCache {
     }
 
     async fn usage(&self, _: Date) -> Result<Vec<DayUsage>, StoreError> {
-        not_here()
+        unused()
     }
 }
 

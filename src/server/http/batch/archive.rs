@@ -1,4 +1,4 @@
-//! Many images in a tar archive, as it comes in.
+//! Reads the images of a tar archive while it arrives.
 
 use std::io::Read;
 use std::sync::Arc;
@@ -11,46 +11,46 @@ use tokio::sync::{OwnedSemaphorePermit, mpsc};
 use tokio_util::io::{StreamReader, SyncIoBridge};
 
 use super::{LARGEST_META, Room, described, unreadable};
-use crate::http::problem::Problem;
+use crate::gate::Problem;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::{BulkImage, ServiceError};
 
-/// What the name of a picture is followed by in the name of what is said about it.
+/// Suffix of the file that describes a picture, after the name of the picture.
 const META: &str = ".json";
 
 type Next = Result<Result<BulkImage, ServiceError>, Problem>;
 
-/// The images of an archive. It is read by a thread of its own, no faster than the images are taken.
+/// The images of an archive. A blocking thread reads it, no faster than the images are consumed.
 pub(super) fn images(body: Body, room: Room) -> impl Stream<Item = Next> + Send {
-    let (images, taken) = mpsc::channel(1);
+    let (images, received) = mpsc::channel(1);
     let body = body.into_data_stream().map_err(std::io::Error::other);
     let reader = SyncIoBridge::new(StreamReader::new(body));
     tokio::task::spawn_blocking(move || {
         let mut entries =
-            Entries { room, runtime: Handle::current(), images, before: Before::Nothing };
+            Entries { room, runtime: Handle::current(), images, pending: Pending::Nothing };
         if let Err(problem) = entries.read(reader) {
             let _ = entries.images.blocking_send(Err(problem));
         }
     });
-    stream::unfold(taken, |mut taken| async { Some((taken.recv().await?, taken)) })
+    stream::unfold(received, |mut received| async { Some((received.recv().await?, received)) })
 }
 
 struct Entries {
     room: Room,
     runtime: Handle,
     images: mpsc::Sender<Next>,
-    before: Before,
+    pending: Pending,
 }
 
-/// The entry before, whose other half may follow.
-enum Before {
+/// The previous entry, whose counterpart may follow.
+enum Pending {
     Nothing,
     Picture { name: Arc<str>, bytes: Bytes, memory: OwnedSemaphorePermit },
     Meta { of: Arc<str>, text: Vec<u8> },
 }
 
 impl Entries {
-    /// Reads all entries; `Ok` also when nobody takes them any more.
+    /// Reads all entries, or until the images are no longer consumed.
     fn read(&mut self, reader: impl Read) -> Result<(), Problem> {
         let broken = |error: std::io::Error| unreadable(&error, &error.to_string());
         let mut archive = tar::Archive::new(reader);
@@ -70,7 +70,7 @@ impl Entries {
                 Problem::new(ErrorKind::Malformed, detail)
             })?;
             let name: Arc<str> = name.strip_prefix("./").unwrap_or(name).into();
-            let go_on = match name.strip_suffix(META) {
+            let continues = match name.strip_suffix(META) {
                 Some(of) => {
                     if size > LARGEST_META {
                         let detail = format!("{name:?} exceeds {LARGEST_META} bytes");
@@ -81,65 +81,65 @@ impl Entries {
                     self.meta(of.into(), text)
                 }
                 None => {
-                    if !self.makes_way_for(&name) {
+                    if !self.flush_unless_about(&name) {
                         return Ok(());
                     }
                     if self.room.is_too_small(size) {
                         self.images.blocking_send(Ok(Err(self.room.too_large()))).is_ok()
                     } else {
-                        let memory = self.runtime.block_on(self.room.take(size))?;
+                        let memory = self.runtime.block_on(self.room.reserve(size))?;
                         let mut bytes = Vec::with_capacity(size);
                         entry.read_to_end(&mut bytes).map_err(broken)?;
                         self.picture(name, bytes.into(), memory)
                     }
                 }
             };
-            if !go_on {
+            if !continues {
                 return Ok(());
             }
         }
-        self.pass_on();
+        self.flush();
         Ok(())
     }
 
     fn meta(&mut self, of: Arc<str>, text: Vec<u8>) -> bool {
-        match std::mem::replace(&mut self.before, Before::Nothing) {
-            Before::Picture { name, bytes, memory } if name == of => {
+        match std::mem::replace(&mut self.pending, Pending::Nothing) {
+            Pending::Picture { name, bytes, memory } if name == of => {
                 self.send(&name, Some(&text), bytes, memory)
             }
-            before => {
-                self.before = before;
-                let go_on = self.pass_on();
-                self.before = Before::Meta { of, text };
-                go_on
+            other => {
+                self.pending = other;
+                let continues = self.flush();
+                self.pending = Pending::Meta { of, text };
+                continues
             }
         }
     }
 
-    /// Passes the entry before on, unless it is about the picture that comes now: of two pictures one would
-    /// wait for the memory of the other.
-    fn makes_way_for(&mut self, picture: &str) -> bool {
-        matches!(&self.before, Before::Meta { of, .. } if **of == *picture) || self.pass_on()
+    /// Flushes the previous entry, unless it describes the next picture. Holding two pictures at a time could
+    /// deadlock, the second waiting for the memory of the first.
+    fn flush_unless_about(&mut self, picture: &str) -> bool {
+        matches!(&self.pending, Pending::Meta { of, .. } if **of == *picture) || self.flush()
     }
 
     fn picture(&mut self, name: Arc<str>, bytes: Bytes, memory: OwnedSemaphorePermit) -> bool {
-        match std::mem::replace(&mut self.before, Before::Nothing) {
-            Before::Meta { text, .. } => self.send(&name, Some(&text), bytes, memory),
+        match std::mem::replace(&mut self.pending, Pending::Nothing) {
+            Pending::Meta { text, .. } => self.send(&name, Some(&text), bytes, memory),
             _ => {
-                self.before = Before::Picture { name, bytes, memory };
+                self.pending = Pending::Picture { name, bytes, memory };
                 true
             }
         }
     }
 
-    /// Passes the entry before on, as its other half is not there.
-    fn pass_on(&mut self) -> bool {
-        match std::mem::replace(&mut self.before, Before::Nothing) {
-            Before::Nothing => true,
-            Before::Picture { name, bytes, memory } => self.send(&name, None, bytes, memory),
-            Before::Meta { of, .. } => {
+    /// Sends the previous entry on without its counterpart.
+    fn flush(&mut self) -> bool {
+        match std::mem::replace(&mut self.pending, Pending::Nothing) {
+            Pending::Nothing => true,
+            Pending::Picture { name, bytes, memory } => self.send(&name, None, bytes, memory),
+            Pending::Meta { of, .. } => {
                 let error = ServiceError::malformed(format!(
-                    "{of}{META} is about {of}, which is neither right before nor right after it in the archive"
+                    "{of}{META} describes {of}, which is neither directly before nor directly after it in the archive"
                 ));
                 self.images.blocking_send(Ok(Err(error))).is_ok()
             }

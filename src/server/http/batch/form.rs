@@ -1,4 +1,4 @@
-//! Many images in a form, part by part.
+//! Reads the images of a form, part by part.
 
 use axum::extract::multipart::{Field, MultipartError};
 use axum::extract::{FromRequest, Multipart, Request};
@@ -6,12 +6,12 @@ use bytes::{Bytes, BytesMut};
 use futures_util::{Stream, stream};
 use tokio::sync::OwnedSemaphorePermit;
 
-use super::{LARGEST_META, Room, STEP, described, unreadable};
-use crate::http::problem::Problem;
+use super::{FIRST_RESERVATION, LARGEST_META, Room, described, unreadable};
+use crate::gate::Problem;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::{BulkImage, ServiceError};
 
-/// The images of a form, as its parts come in.
+/// The images of a form, as its parts arrive.
 pub(super) async fn images(
     request: Request,
     room: Room,
@@ -42,7 +42,7 @@ impl Parts {
                 }
                 "meta" => {
                     return Err(malformed(
-                        "two parts \"meta\" follow one another; each is about the part \"image\" after it"
+                        "there are two parts \"meta\" in a row; each describes the part \"image\" that follows"
                             .into(),
                     ));
                 }
@@ -71,36 +71,36 @@ impl Parts {
     }
 }
 
-/// The bytes of a picture, and the memory that they take. Of one that is too large the rest is left out.
+/// Reads a picture, and reserves memory for it. A picture that is too large is read to its end and dropped.
 async fn picture(
     room: &Room,
     mut part: Field<'_>,
 ) -> Result<Result<(Bytes, OwnedSemaphorePermit), ServiceError>, Problem> {
     let limit = room.settings.body_limit_bytes;
-    let mut held = room.take(STEP.min(limit)).await?;
+    let mut reserved = room.reserve(FIRST_RESERVATION.min(limit)).await?;
     let (mut bytes, mut too_large) = (BytesMut::new(), false);
     while let Some(chunk) = part.chunk().await.map_err(broken)? {
         room.allow(0);
-        let so_far = bytes.len() + chunk.len();
-        too_large |= room.is_too_small(so_far);
+        let length = bytes.len() + chunk.len();
+        too_large |= room.is_too_small(length);
         if too_large {
             continue;
         }
-        if held.num_permits() < so_far {
-            held.merge(room.take(limit - held.num_permits()).await?);
+        if reserved.num_permits() < length {
+            reserved.merge(room.reserve(limit - reserved.num_permits()).await?);
         }
         bytes.extend_from_slice(&chunk);
     }
-    drop(held.split(held.num_permits().saturating_sub(bytes.len())));
-    Ok(if too_large { Err(room.too_large()) } else { Ok((bytes.freeze(), held)) })
+    drop(reserved.split(reserved.num_permits().saturating_sub(bytes.len())));
+    Ok(if too_large { Err(room.too_large()) } else { Ok((bytes.freeze(), reserved)) })
 }
 
-/// A whole part of at most so many bytes.
-async fn whole(mut part: Field<'_>, most: usize, what: &str) -> Result<Vec<u8>, Problem> {
+/// Reads a part of at most `limit` bytes.
+async fn whole(mut part: Field<'_>, limit: usize, what: &str) -> Result<Vec<u8>, Problem> {
     let mut bytes = Vec::new();
     while let Some(chunk) = part.chunk().await.map_err(broken)? {
-        if bytes.len() + chunk.len() > most {
-            let detail = format!("{what} exceeds {most} bytes");
+        if bytes.len() + chunk.len() > limit {
+            let detail = format!("{what} exceeds {limit} bytes");
             return Err(Problem::new(ErrorKind::TooLarge, detail));
         }
         bytes.extend_from_slice(&chunk);

@@ -1,11 +1,11 @@
-//! Jobs: each is where its state says, and has its frame.
+//! Checks jobs: each is listed as its state requires, and has its frame.
 
 use super::super::super::changes::ended_at;
 use super::super::trees::{
     BlobOwner, Lease, blob_ref_key, decode, ended_job, ended_key, failed, put, queue_key,
     queued_job,
 };
-use super::{Doctor, some};
+use super::{Doctor, list};
 use crate::{JobRecord, StoreError};
 
 impl Doctor<'_> {
@@ -16,9 +16,9 @@ impl Doctor<'_> {
                 Ok(record) => record,
                 Err(error) => {
                     self.report.problem(
-                        format!("the record of a job is lost: {error}"),
-                        "nothing else depends on it; restore a backup into a new folder to be rid of \
-                         it",
+                        format!("the record of a job cannot be read: {error}"),
+                        "nothing else depends on it; to get rid of it, restore a backup into a new \
+                         folder",
                     );
                     continue;
                 }
@@ -31,8 +31,8 @@ impl Doctor<'_> {
             };
             if !listed.map_err(failed)? {
                 unlisted.push(job.id);
-                if self.how.repair {
-                    self.list(&record)?;
+                if self.options.repair {
+                    self.relist(&record)?;
                 }
             }
             let query = &record.query;
@@ -40,35 +40,35 @@ impl Doctor<'_> {
                 frameless.push(job.id);
             }
             let reference = blob_ref_key(&query.digest, &BlobOwner::Query(query.id));
-            self.needed.references.insert(reference);
-            self.needed.frames.insert(query.digest, job.id);
+            self.required.references.insert(reference);
+            self.required.frames.insert(query.digest, job.id);
         }
         if !unlisted.is_empty() {
             self.report.found(
                 true,
                 format!(
-                    "{} jobs are not listed where their state says: {}",
+                    "{} jobs are not listed as their state requires: {}",
                     unlisted.len(),
-                    some(&unlisted)
+                    list(&unlisted)
                 ),
                 "--repair lists them",
-                self.how.repair,
+                self.options.repair,
             );
         }
         if !frameless.is_empty() {
             self.report.problem(
                 format!(
-                    "the frames of {} jobs that wait are lost: {}",
+                    "the frames of {} unfinished jobs are lost: {}",
                     frameless.len(),
-                    some(&frameless)
+                    list(&frameless)
                 ),
                 "start the server and cancel them: POST /jobs/{id}/cancel",
             );
         }
-        self.places_of_no_job()
+        self.dangling_listings()
     }
 
-    fn list(&self, record: &JobRecord) -> Result<(), StoreError> {
+    fn relist(&self, record: &JobRecord) -> Result<(), StoreError> {
         let (trees, job) = (&self.trees, &record.job);
         match job.state.is_final() {
             true => {
@@ -78,25 +78,26 @@ impl Doctor<'_> {
         }
     }
 
-    fn places_of_no_job(&mut self) -> Result<(), StoreError> {
-        let mut empty = 0;
+    fn dangling_listings(&mut self) -> Result<(), StoreError> {
+        let mut dangling = 0;
         for (tree, is_ended) in [(&self.trees.queue, false), (&self.trees.ended, true)] {
             for key in tree.iter().keys() {
                 let key = key.map_err(failed)?;
                 let id =
                     if is_ended { ended_job(&key).map(|(_, id)| id) } else { queued_job(&key) };
-                let there = id.map(|id| self.trees.jobs.contains_key(id.as_bytes()));
-                if there.transpose().map_err(failed)? != Some(true) {
-                    empty += 1;
-                    if self.how.repair {
+                let exists = id.map(|id| self.trees.jobs.contains_key(id.as_bytes()));
+                if exists.transpose().map_err(failed)? != Some(true) {
+                    dangling += 1;
+                    if self.options.repair {
                         tree.remove(&key).map_err(failed)?;
                     }
                 }
             }
         }
-        if empty > 0 {
-            let what = format!("{empty} places are of jobs that are gone");
-            self.report.found(false, what, "harmless; --repair removes them", self.how.repair);
+        if dangling > 0 {
+            let what =
+                format!("{dangling} queue or history entries belong to jobs that no longer exist");
+            self.report.found(false, what, "harmless; --repair removes them", self.options.repair);
         }
         Ok(())
     }

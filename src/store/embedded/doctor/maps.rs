@@ -1,4 +1,4 @@
-//! Maps: every record has its descriptor, and what is derived fits.
+//! Checks maps: every image has its descriptor, and derived files are valid.
 
 use std::collections::HashMap;
 use std::fs;
@@ -11,29 +11,29 @@ use super::super::live_map::folder_of;
 use super::super::maps::remove_folder;
 use super::super::segments::VectorFiles;
 use super::super::trees::{BlobOwner, StoredImage, blob_ref_key, decode, failed};
-use super::{Doctor, some};
+use super::{Doctor, list};
 use crate::StoreError;
 use whereabouts_core::{ImageId, Map, Precision};
 use whereabouts_index::SealedGraph;
 
-/// A map and the room it takes.
+/// A map and its size on disk.
 #[derive(Debug, Clone, Serialize)]
 pub struct MapReport {
-    /// Its name.
+    /// The name of the map.
     pub name: String,
     /// The model of its descriptors.
     pub model: String,
-    /// At which precision.
+    /// The precision of the model.
     pub precision: Precision,
-    /// Numbers in a descriptor.
+    /// Dimensions of a descriptor.
     pub dim: usize,
-    /// Its images.
+    /// Number of images.
     pub images: usize,
-    /// Bytes of its descriptors, of the graph over them, and of its pictures.
+    /// Bytes of the descriptors.
     pub descriptor_bytes: u64,
-    /// See above.
+    /// Bytes of the graph.
     pub graph_bytes: u64,
-    /// See above. Pictures that several images or maps share count for each.
+    /// Bytes of the pictures. A picture that several images or maps share counts for each.
     pub picture_bytes: u64,
 }
 
@@ -46,7 +46,7 @@ impl Doctor<'_> {
                 Ok(map) => map,
                 Err(error) => {
                     self.report.problem(
-                        format!("the record of a map is lost: {error}"),
+                        format!("the record of a map cannot be read: {error}"),
                         "restore a backup into a new folder",
                     );
                     continue;
@@ -60,24 +60,24 @@ impl Doctor<'_> {
         let orphans: Vec<_> =
             found.map(|entry| entry.path()).filter(|path| !folders.contains(path)).collect();
         if !orphans.is_empty() {
-            if self.how.repair {
+            if self.options.repair {
                 orphans.iter().for_each(|orphan| remove_folder(orphan));
             }
             self.report.found(
                 false,
-                format!("{} folders in descriptors/ are of no map", orphans.len()),
-                "the next start of the server removes them, or --repair",
-                self.how.repair,
+                format!("{} folders in descriptors/ belong to no map", orphans.len()),
+                "--repair or the next start of the server removes them",
+                self.options.repair,
             );
         }
-        let mut lost = 0;
+        let mut orphaned_images = 0;
         for key in self.trees.images.iter().keys() {
             let key = key.map_err(failed)?;
-            lost += usize::from(!uids.iter().any(|uid| key.starts_with(uid.as_bytes())));
+            orphaned_images += usize::from(!uids.iter().any(|uid| key.starts_with(uid.as_bytes())));
         }
-        if lost > 0 {
+        if orphaned_images > 0 {
             self.report.note(
-                format!("{lost} images are of maps that were deleted"),
+                format!("{orphaned_images} images belong to deleted maps"),
                 "the next start of the server removes them",
             );
         }
@@ -98,14 +98,14 @@ impl Doctor<'_> {
             None => None,
         };
         let (mut images, mut end, mut picture_bytes) = (0, 0, 0);
-        let (mut damaged, mut twice) = (Vec::new(), Vec::new());
+        let (mut damaged, mut sharing) = (Vec::new(), Vec::new());
         let mut slots: HashMap<usize, ImageId> = HashMap::new();
         for stored in self.trees.images_of(map.uid) {
             let StoredImage { image, slot } = match stored {
                 Ok(stored) => stored,
                 Err(error) => {
                     self.report.problem(
-                        format!("the record of an image of {name} is lost: {error}"),
+                        format!("the record of an image of {name} cannot be read: {error}"),
                         lost_advice,
                     );
                     continue;
@@ -114,42 +114,42 @@ impl Doctor<'_> {
             images += 1;
             end = end.max(slot + 1);
             if let Some(other) = slots.insert(slot, image.id.clone()) {
-                twice.push(other);
+                sharing.push(other);
             }
             if vectors.as_ref().is_none_or(|vectors| !vectors.is_intact(slot)) {
                 damaged.push(image.id.clone());
             }
             let owner = BlobOwner::Image { map_uid: map.uid, id: &image.id };
-            self.needed.references.insert(blob_ref_key(&image.digest, &owner));
+            self.required.references.insert(blob_ref_key(&image.digest, &owner));
             let picture = self.picture(&image.digest);
             picture_bytes += fs::metadata(picture).map_or(0, |found| found.blocks() * 512);
-            self.needed.images.insert(image.digest, (name.to_string(), image.id));
+            self.required.images.insert(image.digest, (name.to_string(), image.id));
         }
         if !damaged.is_empty() {
             self.report.problem(
                 format!(
-                    "{} images of {name} have no descriptor as it was written, so that they are not \
-                     found: {}",
+                    "the descriptors of {} images of {name} are missing or damaged, so searches do not \
+                     find them: {}",
                     damaged.len(),
-                    some(&damaged)
+                    list(&damaged)
                 ),
                 format!(
-                    "start the server and run `whereabouts index --reindex --map {name}`: it makes \
-                     all descriptors anew from the pictures"
+                    "start the server and run `whereabouts index --reindex --map {name}`: it computes \
+                     all descriptors again from the pictures"
                 ),
             );
         }
-        if !twice.is_empty() {
+        if !sharing.is_empty() {
             self.report.problem(
-                format!("images of {name} share a descriptor with others: {}", some(&twice)),
+                format!("images of {name} share a descriptor with others: {}", list(&sharing)),
                 format!("start the server and run `whereabouts index --reindex --map {name}`"),
             );
         }
         self.graph(map, folder);
-        let bytes = |part: &str| {
-            let found = fs::read_dir(folder).into_iter().flatten().flatten();
-            let found = found.filter(|entry| entry.file_name().to_string_lossy().ends_with(part));
-            found.filter_map(|entry| entry.metadata().ok()).map(|found| found.blocks() * 512).sum()
+        let bytes = |suffix: &str| {
+            let files = fs::read_dir(folder).into_iter().flatten().flatten();
+            let files = files.filter(|entry| entry.file_name().to_string_lossy().ends_with(suffix));
+            files.filter_map(|entry| entry.metadata().ok()).map(|found| found.blocks() * 512).sum()
         };
         self.report.maps.push(MapReport {
             name: name.to_string(),
@@ -167,14 +167,15 @@ impl Doctor<'_> {
     fn graph(&mut self, map: &Map, folder: &Path) {
         let file = folder.join("graph");
         let Ok(bytes) = fs::read(&file) else { return };
-        if SealedGraph::from_bytes(&bytes).is_ok_and(|graph| graph.dim() == map.dim) {
+        let sound = |graph: SealedGraph| graph.dim() == map.dim && graph.unreachable() == 0;
+        if SealedGraph::from_bytes(&bytes).is_ok_and(sound) {
             return;
         }
-        let repaired = self.how.repair && fs::remove_file(&file).is_ok();
+        let repaired = self.options.repair && fs::remove_file(&file).is_ok();
         self.report.found(
             false,
-            format!("the graph of {} is damaged; it is derived, nothing is lost", map.name),
-            "the server builds it again and searches exactly until then; --repair removes it",
+            format!("the graph of {} is damaged; it is derived data, so nothing is lost", map.name),
+            "the server rebuilds it and searches exactly until then; --repair removes it",
             repaired,
         );
     }

@@ -1,4 +1,4 @@
-//! What is in a data folder that no server uses, and whether it is in order.
+//! Checks the consistency of a data folder that no server uses.
 
 mod jobs;
 mod maps;
@@ -15,54 +15,54 @@ pub use self::maps::MapReport;
 pub use self::sizes::Sizes;
 use super::super::StoreError;
 use super::trees::Trees;
-use super::{check_folder, compact, lock, mark, schema};
+use super::{check_folder, compact, lock, schema, watermark};
 use whereabouts_core::{Digest, ImageId};
 
 const CACHE_BYTES: u64 = 64 << 20;
-/// As many of a kind are named in a finding.
-const NAMED: usize = 5;
+/// Number of affected items that a finding lists by name.
+const MAX_LISTED: usize = 5;
 
-/// How to look at a folder.
+/// Options of an examination.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Examination {
-    /// Read every picture and compare its digest.
+    /// Reads every picture and compares its digest.
     pub deep: bool,
-    /// Put right what can be without losing anything.
+    /// Repairs what can be repaired without losing data.
     pub repair: bool,
 }
 
-/// What was found.
+/// The result of an examination.
 #[derive(Debug, Serialize)]
 pub struct Report {
-    /// The folder.
+    /// The data folder.
     pub folder: PathBuf,
-    /// Its version; null if it is empty.
+    /// The version of the folder; null if it is empty.
     pub version: Option<u32>,
-    /// What is wrong, or worth knowing.
+    /// Problems and notes.
     pub findings: Vec<Finding>,
-    /// Bytes by part.
+    /// Sizes of its parts.
     pub sizes: Sizes,
-    /// The maps, by name.
+    /// The maps, sorted by name.
     pub maps: Vec<MapReport>,
-    /// Jobs by state.
+    /// Number of jobs by state.
     pub jobs: BTreeMap<String, usize>,
 }
 
-/// Something that was found.
+/// A problem or a note.
 #[derive(Debug, Clone, Serialize)]
 pub struct Finding {
-    /// Whether something is lost or will fail.
+    /// Whether data is lost or something will fail.
     pub is_problem: bool,
-    /// What it is.
+    /// What was found.
     pub what: String,
     /// What to do about it.
     pub advice: String,
-    /// Whether it was put right.
+    /// Whether it was repaired.
     pub repaired: bool,
 }
 
 impl Report {
-    /// What is wrong and was not put right.
+    /// Returns the number of problems that were not repaired.
     pub fn problems(&self) -> usize {
         self.findings.iter().filter(|finding| finding.is_problem && !finding.repaired).count()
     }
@@ -87,28 +87,31 @@ impl Report {
     }
 }
 
-/// Who needs which bytes, as the records of images and jobs say.
+/// The blobs and references that the records of images and jobs require.
 #[derive(Default)]
-struct Needed {
-    /// Bytes of images, each with one that has them.
+struct Required {
+    /// Blobs of images, each with the map and id of one such image.
     images: HashMap<Digest, (String, ImageId)>,
-    /// Bytes of frames.
+    /// Blobs of frames, each with the id of one such job.
     frames: HashMap<Digest, Uuid>,
-    /// The references that there should be.
+    /// Keys in `blob_refs`.
     references: HashSet<Vec<u8>>,
 }
 
-/// The folder, its database, and what is found in them.
+/// An examination in progress.
 struct Doctor<'a> {
     dir: &'a Path,
     trees: Trees,
-    how: Examination,
+    options: Examination,
     report: Report,
-    needed: Needed,
+    required: Required,
 }
 
-/// Looks at a data folder; [`StoreError::Conflict`] while a server uses it.
-pub fn examine(dir: &Path, how: Examination) -> Result<Report, StoreError> {
+/// Examines a data folder.
+///
+/// # Errors
+/// [`StoreError::Conflict`] while a server uses the folder.
+pub fn examine(dir: &Path, options: Examination) -> Result<Report, StoreError> {
     check_folder(dir)?;
     let _lock = lock(dir)?;
     let mut report = Report {
@@ -120,10 +123,10 @@ pub fn examine(dir: &Path, how: Examination) -> Result<Report, StoreError> {
         jobs: BTreeMap::new(),
     };
     report.sizes = Sizes::of(dir)?;
-    sizes::look(&mut report);
+    sizes::check(&mut report);
     match report.version {
         None => {
-            report.note("the folder is empty", "`whereabouts serve` fills it");
+            report.note("the folder is empty", "`whereabouts serve` initializes it");
             return Ok(report);
         }
         Some(version) if version > schema::newest() => {
@@ -131,41 +134,41 @@ pub fn examine(dir: &Path, how: Examination) -> Result<Report, StoreError> {
                 (schema::too_new(dir, version, schema::newest()), schema::newest());
             report.problem(
                 what,
-                format!("a whereabouts that knows version {newest} cannot look into it"),
+                format!("this program supports versions up to {newest} and cannot examine it"),
             );
             return Ok(report);
         }
         Some(version) if version < schema::newest() => {
             report.note(
                 format!(
-                    "the folder is of version {version}, and the newest is {}",
+                    "the folder is of version {version}, but the newest version is {}",
                     schema::newest()
                 ),
-                "the next start of the server copies its records and brings them up to date; then \
-                 look again",
+                "the next start of the server copies its records and migrates them; run this command \
+                 again afterwards",
             );
             return Ok(report);
         }
         Some(_) => {}
     }
-    compact::settle(dir)?;
+    compact::finish_interrupted(dir)?;
     let trees = match Trees::open(&dir.join("db"), CACHE_BYTES) {
         Ok(trees) => trees,
         Err(error) => {
             report.problem(
                 format!("the database cannot be opened: {error}"),
-                "make a new folder and `whereabouts restore` a backup into it; keep this one until \
-                 that is done, its pictures are in images/",
+                "`whereabouts restore` a backup into a new folder; keep this one until that is done, \
+                 because its pictures are in images/",
             );
             return Ok(report);
         }
     };
-    if let Some(lost) = mark::lost(dir, &trees)? {
-        // Nothing is repaired: pictures that no record needs may be those whose records are lost.
-        report.problem(lost, "look at the disk, too: files do not change by themselves");
+    if let Some(loss) = watermark::detect_loss(dir, &trees)? {
+        // Repair nothing: pictures without a record may belong to the lost records.
+        report.problem(loss, "check the disk as well: files do not change by themselves");
         return Ok(report);
     }
-    let mut doctor = Doctor { dir, trees, how, report, needed: Needed::default() };
+    let mut doctor = Doctor { dir, trees, options, report, required: Required::default() };
     doctor.maps()?;
     doctor.jobs()?;
     doctor.pictures()?;
@@ -173,11 +176,11 @@ pub fn examine(dir: &Path, how: Examination) -> Result<Report, StoreError> {
     Ok(doctor.report)
 }
 
-/// Names some of many.
-fn some<T: std::fmt::Display>(all: &[T]) -> String {
-    let named: Vec<String> = all.iter().take(NAMED).map(T::to_string).collect();
-    match all.len().saturating_sub(NAMED) {
-        0 => named.join(", "),
-        more => format!("{} and {more} more", named.join(", ")),
+/// Lists the first few items and counts the others.
+fn list<T: std::fmt::Display>(items: &[T]) -> String {
+    let listed: Vec<String> = items.iter().take(MAX_LISTED).map(T::to_string).collect();
+    match items.len().saturating_sub(MAX_LISTED) {
+        0 => listed.join(", "),
+        more => format!("{} and {more} more", listed.join(", ")),
     }
 }

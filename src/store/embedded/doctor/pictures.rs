@@ -1,4 +1,4 @@
-//! Bytes of images and frames: whatever is needed is there, and whatever is there is needed.
+//! Checks the bytes of images and frames: all that are required exist, and no others do.
 
 use std::collections::HashSet;
 use std::fs;
@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 use walkdir::WalkDir;
 
 use super::super::trees::failed;
-use super::{Doctor, some};
+use super::{Doctor, list};
 use crate::StoreError;
 use whereabouts_core::Digest;
 
 impl Doctor<'_> {
-    /// Where the bytes of a digest are.
+    /// Returns the path of a picture.
     pub(super) fn picture(&self, digest: &Digest) -> PathBuf {
         super::super::blobs::path_of(&self.dir.join("images"), digest)
     }
@@ -20,7 +20,7 @@ impl Doctor<'_> {
     pub(super) fn pictures(&mut self) -> Result<(), StoreError> {
         self.references()?;
         let missing: Vec<String> = self
-            .needed
+            .required
             .images
             .iter()
             .filter(|(digest, _)| !self.picture(digest).is_file())
@@ -28,9 +28,9 @@ impl Doctor<'_> {
             .collect();
         if !missing.is_empty() {
             self.report.problem(
-                format!("the pictures of {} images are lost: {}", missing.len(), some(&missing)),
-                "they are still found, but cannot be compared or shown: start the server and \
-                 `whereabouts restore` a backup after deleting them, or delete them and add them again",
+                format!("the pictures of {} images are lost: {}", missing.len(), list(&missing)),
+                "searches still find these images, but they cannot be compared or shown: start the \
+                 server, delete them, and `whereabouts restore` a backup or add them again",
             );
         }
         let (mut orphans, mut damaged) = (Vec::new(), Vec::new());
@@ -40,8 +40,8 @@ impl Doctor<'_> {
                 continue;
             }
             match digest_of(&images, entry.path()) {
-                Some(digest) if self.is_needed(&digest) => {
-                    if self.how.deep && !is_intact(entry.path(), &digest) {
+                Some(digest) if self.is_required(&digest) => {
+                    if self.options.deep && !is_intact(entry.path(), &digest) {
                         damaged.push(self.owner(&digest));
                     }
                 }
@@ -50,21 +50,21 @@ impl Doctor<'_> {
         }
         if !damaged.is_empty() {
             self.report.problem(
-                format!("{} pictures are not what was sent: {}", damaged.len(), some(&damaged)),
-                "start the server, delete these images and `whereabouts restore` a backup, or add \
-                 them again; look after the disk",
+                format!("{} pictures are damaged: {}", damaged.len(), list(&damaged)),
+                "start the server, delete these images, and `whereabouts restore` a backup or add \
+                 them again; check the disk as well",
             );
         }
         self.orphans(&orphans);
         Ok(())
     }
 
-    fn is_needed(&self, digest: &Digest) -> bool {
-        self.needed.images.contains_key(digest) || self.needed.frames.contains_key(digest)
+    fn is_required(&self, digest: &Digest) -> bool {
+        self.required.images.contains_key(digest) || self.required.frames.contains_key(digest)
     }
 
     fn owner(&self, digest: &Digest) -> String {
-        match (self.needed.images.get(digest), self.needed.frames.get(digest)) {
+        match (self.required.images.get(digest), self.required.frames.get(digest)) {
             (Some((map, id)), _) => format!("{map}/{id}"),
             (None, Some(job)) => format!("the frame of the job {job}"),
             (None, None) => digest.to_string(),
@@ -81,24 +81,24 @@ impl Doctor<'_> {
             .map(|found| found.len())
             .sum();
         let repaired =
-            self.how.repair && orphans.iter().all(|orphan| fs::remove_file(orphan).is_ok());
+            self.options.repair && orphans.iter().all(|orphan| fs::remove_file(orphan).is_ok());
         self.report.found(
             false,
-            format!("{} files in images/ ({bytes} bytes) are needed by nothing", orphans.len()),
-            "a process that was killed left them; --repair removes them",
+            format!("{} files in images/ ({bytes} bytes) are not referenced", orphans.len()),
+            "a killed process left them; --repair removes them",
             repaired,
         );
     }
 
-    /// Who needs which bytes is written down twice; the records of images and jobs are right.
+    /// Compares the references with the records of images and jobs, which are authoritative.
     fn references(&mut self) -> Result<(), StoreError> {
-        let mut there = HashSet::new();
+        let mut stored = HashSet::new();
         for key in self.trees.blob_refs.iter().keys() {
-            there.insert(key.map_err(failed)?.to_vec());
+            stored.insert(key.map_err(failed)?.to_vec());
         }
-        let missing: Vec<_> = self.needed.references.difference(&there).collect();
-        let stale: Vec<_> = there.difference(&self.needed.references).collect();
-        let repair = self.how.repair;
+        let missing: Vec<_> = self.required.references.difference(&stored).collect();
+        let stale: Vec<_> = stored.difference(&self.required.references).collect();
+        let repair = self.options.repair;
         if repair {
             for key in &missing {
                 self.trees.blob_refs.insert(key.as_slice(), &[]).map_err(failed)?;
@@ -112,7 +112,7 @@ impl Doctor<'_> {
             self.report.found(
                 true,
                 format!(
-                    "{missing} pictures would be removed too soon: references to them are missing"
+                    "{missing} references to pictures are missing: these may be deleted too early"
                 ),
                 "--repair writes them",
                 repair,
@@ -121,8 +121,8 @@ impl Doctor<'_> {
         if stale > 0 {
             self.report.found(
                 false,
-                format!("{stale} references to pictures are of nothing that is there"),
-                "--repair removes them; look again afterwards for pictures that nothing needs",
+                format!("{stale} references to pictures are stale: their image or job is gone"),
+                "--repair removes them; run this command again afterwards to find unreferenced pictures",
                 repair,
             );
         }

@@ -1,4 +1,4 @@
-//! How large the parts of a data folder are.
+//! The sizes of the parts of a data folder.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
@@ -9,25 +9,25 @@ use walkdir::WalkDir;
 use super::Report;
 use crate::StoreError;
 
-/// Less room than this is worth a word: a start may need to copy the database.
-const LITTLE_ROOM: u64 = 1 << 30;
+/// Free space below which a problem is reported, because a start may need to copy the database.
+const LOW_FREE_BYTES: u64 = 1 << 30;
 
-/// Bytes on disk by part. Files may be sparse: what counts is the room they take.
+/// Bytes on disk by part. Sparse files count as the space they occupy.
 #[derive(Debug, Default, Clone, Copy, Serialize)]
 pub struct Sizes {
     /// Records: maps, images, jobs, descriptions.
     pub db: u64,
     /// Descriptors.
     pub descriptors: u64,
-    /// Graphs, which are derived from descriptors.
+    /// Graphs over the descriptors.
     pub graphs: u64,
     /// Pictures of maps and frames of jobs.
     pub images: u64,
-    /// Copies from before the folder was brought to a newer version.
+    /// Copies made before a migration to a newer version.
     pub copies: u64,
-    /// All the rest.
+    /// Everything else.
     pub other: u64,
-    /// Room that is left on the disk.
+    /// Free space on the disk.
     pub free: u64,
 }
 
@@ -55,27 +55,27 @@ impl Sizes {
         Ok(sizes)
     }
 
-    /// All parts together.
+    /// Returns the sum of all parts.
     pub fn total(&self) -> u64 {
         self.db + self.descriptors + self.graphs + self.images + self.copies + self.other
     }
 }
 
-pub(super) fn look(report: &mut Report) {
+pub(super) fn check(report: &mut Report) {
     let Sizes { copies, free, .. } = report.sizes;
     if copies > 0 {
         report.note(
             format!(
-                "before-version-N holds {:.1} MB from before a newer version",
+                "before-version-N holds {:.1} MB of copies made before a migration",
                 copies as f64 / 1e6
             ),
-            "delete it once the server has been seen to work",
+            "delete it once the server is known to work",
         );
     }
-    if free < LITTLE_ROOM {
+    if free < LOW_FREE_BYTES {
         report.problem(
             format!("only {:.0} MB are free on the disk", free as f64 / 1e6),
-            "make room: what cannot be written is refused with 507",
+            "free some space: requests that need more are refused with 507",
         );
     }
 }

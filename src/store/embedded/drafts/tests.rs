@@ -1,4 +1,5 @@
-//! What drafts leave in the folder. What they mean is in `tests/store/drafts.rs`, for every store.
+//! The files that drafts leave in the data folder. `tests/store/drafts.rs` tests their behaviour, for
+//! every store.
 
 use std::path::Path;
 use std::time::Duration;
@@ -21,7 +22,9 @@ pub fn settings(dir: &Path) -> EmbeddedSettings {
             m: 8,
             ef_construction: 50,
             ef_search: 50,
+            threads: 0,
             max_dead_share: 0.5,
+            check_s: 0,
         },
         index_threads: 1,
         min_free_bytes: 0,
@@ -31,7 +34,7 @@ pub fn settings(dir: &Path) -> EmbeddedSettings {
     }
 }
 
-/// The old model gives three numbers, the new one five.
+/// A map whose model gives three dimensions.
 fn map() -> Map {
     Map {
         uid: Uuid::now_v7(),
@@ -49,6 +52,7 @@ fn map() -> Map {
     }
 }
 
+/// The same map reindexed with a model that gives five dimensions.
 fn next(map: &Map) -> Map {
     Map {
         model: "new".into(),
@@ -73,7 +77,7 @@ fn image(id: &str, bytes: &[u8]) -> Image {
     }
 }
 
-/// Another direction for each picture.
+/// A descriptor that differs for each picture.
 fn descriptor(image: &Image, dim: usize) -> Descriptor {
     let hex = image.digest.hex();
     let numbers = hex.bytes().take(dim).map(|byte| f32::from(byte) - 77.0);
@@ -86,7 +90,7 @@ async fn add(store: &EmbeddedStore, map: &Map, id: &str, bytes: &[u8]) {
     store.add_image(map, image, descriptor).await.unwrap();
 }
 
-/// Gives all that is missing its descriptor.
+/// Writes the descriptors of all missing images.
 async fn fill(draft: &mut dyn Draft) {
     for image in draft.missing(9).await.unwrap() {
         draft.write(&image, descriptor(&image, 5)).await.unwrap();
@@ -95,7 +99,7 @@ async fn fill(draft: &mut dyn Draft) {
 }
 
 #[tokio::test]
-async fn a_map_has_one_folder_of_descriptors_whatever_becomes_of_its_drafts() {
+async fn discarded_and_finished_drafts_leave_one_descriptor_folder_per_map() {
     let dir = tempfile::tempdir().unwrap();
     let folders = || std::fs::read_dir(dir.path().join("descriptors")).unwrap().count();
     let store = EmbeddedStore::open(&settings(dir.path())).unwrap();

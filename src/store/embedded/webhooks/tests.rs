@@ -1,13 +1,14 @@
-//! What deliveries leave in the database. What they mean is in `tests/store/webhooks.rs`, for every store.
+//! The records that deliveries leave in the database. `tests/store/webhooks.rs` tests their behaviour,
+//! for every store.
 
 use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::super::drafts::tests::settings;
 use super::*;
-use whereabouts_core::{Then, Webhook, WebhookEvent, WebhookSecret};
+use whereabouts_core::{Disposition, Webhook, WebhookEvent, WebhookSecret};
 
-/// A webhook of which so many pings wait.
+/// Adds a webhook with a number of waiting pings.
 async fn pinged(store: &EmbeddedStore, pings: usize) -> (Uuid, Vec<Uuid>) {
     let webhook = Webhook {
         id: Uuid::now_v7(),
@@ -30,23 +31,23 @@ async fn pinged(store: &EmbeddedStore, pings: usize) -> (Uuid, Vec<Uuid>) {
 }
 
 #[tokio::test]
-async fn nothing_is_left_of_deliveries_that_are_gone() {
+async fn a_removed_delivery_leaves_no_records() {
     let dir = tempfile::tempdir().unwrap();
     let store = EmbeddedStore::open(&settings(dir.path())).unwrap();
-    let (gone, pings) = pinged(&store, REMOVED_AT_ONCE + 3).await;
+    let (deleted, pings) = pinged(&store, REMOVAL_BATCH + 3).await;
     pinged(&store, 3).await;
     let at = Timestamp::now();
-    let dead = Attempt { at, status: None, error: None, then: Then::Dead };
-    store.note_attempt(gone, pings[0], dead).await.unwrap();
-    assert!(store.delete_webhook(gone).await.unwrap());
-    let left = |count: usize| {
+    let dead = Attempt { at, status: None, error: None, disposition: Disposition::Dead };
+    store.note_attempt(deleted, pings[0], dead).await.unwrap();
+    assert!(store.delete_webhook(deleted).await.unwrap());
+    let assert_remaining = |count: usize| {
         let trees = &store.inner.trees.webhooks;
         for tree in [&trees.deliveries, &trees.bodies, &trees.due] {
             assert_eq!(tree.len(), count);
         }
         assert_eq!(trees.ended.len(), 0);
     };
-    left(3);
-    store.forget_deliveries(KeepDeliveries { since: None, most: 1 }, 9).await.unwrap();
-    left(1);
+    assert_remaining(3);
+    store.forget_deliveries(DeliveryRetention { since: None, most: 1 }, 9).await.unwrap();
+    assert_remaining(1);
 }

@@ -1,12 +1,12 @@
-//! The records of webhooks in sled, and how they are keyed.
+//! The records of webhooks in sled and their keys.
 
 use jiff::Timestamp;
 use sled::Transactional;
 use sled::transaction::{ConflictableTransactionResult, TransactionalTree};
 use uuid::Uuid;
 
-use super::super::super::changes::{check_enabled, news_of, no_webhook};
-use super::super::super::{KeepDeliveries, StoreError};
+use super::super::super::changes::{check_enabled, deliveries_for, no_webhook};
+use super::super::super::{DeliveryRetention, StoreError};
 use super::super::trees::{decode, encode, failed, get, transaction_failed};
 use whereabouts_core::{Delivery, DeliveryState, Job, StoredWebhook};
 
@@ -17,11 +17,11 @@ pub(in super::super) struct WebhookTrees {
     pub webhooks: sled::Tree,
     /// Webhook, id → delivery.
     pub deliveries: sled::Tree,
-    /// The same → the body of its message.
+    /// Webhook, id → the body of the message.
     pub bodies: sled::Tree,
-    /// Webhook, when it is due, id → nothing, for deliveries that wait.
+    /// Webhook, due time, id → nothing, for waiting deliveries.
     pub due: sled::Tree,
-    /// When it ended, webhook, id → nothing, for all others.
+    /// End time, webhook, id → nothing, for all other deliveries.
     pub ended: sled::Tree,
 }
 
@@ -45,28 +45,28 @@ impl WebhookTrees {
         get(&self.deliveries, key)
     }
 
-    /// Refuses a webhook that is not there or is to be told nothing.
+    /// Refuses a webhook that does not exist or is disabled.
     pub fn enabled(&self, id: Uuid) -> Result<(), StoreError> {
         check_enabled(&self.webhook(id)?.ok_or_else(|| no_webhook(id))?)
     }
 
-    /// What is to be written because a job has ended.
-    pub fn news_of(&self, job: &Job) -> Result<Vec<News>, StoreError> {
+    /// Returns the deliveries to write because a job has ended.
+    pub fn deliveries_for(&self, job: &Job) -> Result<Vec<DeliveryRecord>, StoreError> {
         if self.webhooks.is_empty() {
             return Ok(Vec::new());
         }
         let webhooks = self.webhooks.iter().values().map(|value| decode(&value.map_err(failed)?));
-        let news = news_of(job, webhooks.collect::<Result<Vec<_>, _>>()?)?;
-        news.into_iter().map(|new| News::of(&new.delivery, new.body)).collect()
+        let outbox = deliveries_for(job, webhooks.collect::<Result<Vec<_>, _>>()?)?;
+        outbox.into_iter().map(|new| DeliveryRecord::new(&new.delivery, new.body)).collect()
     }
 
-    pub fn queue(&self, news: &News) -> Result<(), StoreError> {
+    pub fn queue(&self, new: &DeliveryRecord) -> Result<(), StoreError> {
         (&self.deliveries, &self.bodies, &self.due)
-            .transaction(|(deliveries, bodies, due)| news.write(deliveries, bodies, due))
+            .transaction(|(deliveries, bodies, due)| new.write(deliveries, bodies, due))
             .map_err(transaction_failed)
     }
 
-    /// Puts a delivery in the place of what it was.
+    /// Replaces a delivery with its new state.
     pub fn replace(&self, before: &Delivery, after: &Delivery) -> Result<(), StoreError> {
         let (key, value) = (key(after.webhook, after.id), encode(after)?);
         (&self.deliveries, &self.due, &self.ended)
@@ -96,13 +96,13 @@ impl WebhookTrees {
             .map_err(transaction_failed)
     }
 
-    /// Some deliveries of a webhook.
+    /// Returns up to `limit` deliveries of a webhook.
     pub fn some_of(&self, webhook: Uuid, limit: usize) -> Result<Vec<Delivery>, StoreError> {
         let values = self.deliveries.scan_prefix(webhook.as_bytes()).values();
         values.take(limit).map(|value| decode(&value.map_err(failed)?)).collect()
     }
 
-    /// Keys of deliveries that wait and are due, by when that was.
+    /// Returns the keys of waiting deliveries that are due by `until`, in order of due time.
     pub fn due_until(
         &self,
         webhook: Uuid,
@@ -110,50 +110,54 @@ impl WebhookTrees {
         limit: usize,
     ) -> Result<Vec<[u8; 32]>, StoreError> {
         let end = [&webhook.as_bytes()[..], &millis(until), &[u8::MAX; 16]].concat();
-        let places = self.due.range(webhook.as_bytes().to_vec()..=end).keys();
+        let due_keys = self.due.range(webhook.as_bytes().to_vec()..=end).keys();
         let mut keys = Vec::new();
-        for place in places.take(limit) {
-            keys.extend(delivery_at(&place.map_err(failed)?, 0, 24));
+        for due_key in due_keys.take(limit) {
+            keys.extend(key_within(&due_key.map_err(failed)?, 0, 24));
         }
         Ok(keys)
     }
 
-    /// Keys of deliveries that are not to be kept.
-    pub fn surplus(&self, keep: KeepDeliveries, batch: usize) -> Result<Vec<[u8; 32]>, StoreError> {
-        let too_many = self.deliveries.len().saturating_sub(keep.most);
+    /// Returns the keys of up to `batch` deliveries that need not be kept.
+    pub fn surplus(
+        &self,
+        keep: DeliveryRetention,
+        batch: usize,
+    ) -> Result<Vec<[u8; 32]>, StoreError> {
+        let excess = self.deliveries.len().saturating_sub(keep.most);
         let since = millis(keep.since.unwrap_or(Timestamp::UNIX_EPOCH));
         let mut keys = Vec::new();
-        for place in self.ended.iter().keys() {
-            let place = place.map_err(failed)?;
-            if keys.len() >= batch || (keys.len() >= too_many && place[..] >= since[..]) {
+        for ended_key in self.ended.iter().keys() {
+            let ended_key = ended_key.map_err(failed)?;
+            if keys.len() >= batch || (keys.len() >= excess && ended_key[..] >= since[..]) {
                 return Ok(keys);
             }
-            keys.extend(delivery_at(&place, 8, 24));
+            keys.extend(key_within(&ended_key, 8, 24));
         }
-        if keys.len() < too_many {
+        if keys.len() < excess {
             let mut waiting = Vec::new();
-            for place in self.due.iter().keys() {
-                waiting.extend(delivery_at(&place.map_err(failed)?, 0, 24));
+            for due_key in self.due.iter().keys() {
+                waiting.extend(key_within(&due_key.map_err(failed)?, 0, 24));
             }
             // Ids sort by age.
             waiting.sort_by(|a, b| a[16..].cmp(&b[16..]));
-            let room = too_many.min(batch) - keys.len();
-            keys.extend(waiting.into_iter().take(room));
+            let remaining = excess.min(batch) - keys.len();
+            keys.extend(waiting.into_iter().take(remaining));
         }
         Ok(keys)
     }
 }
 
-/// A delivery that is to be written.
-pub(in super::super) struct News {
+/// A new delivery, encoded for writing.
+pub(in super::super) struct DeliveryRecord {
     key: [u8; 32],
     due: Vec<u8>,
     delivery: Vec<u8>,
     body: Vec<u8>,
 }
 
-impl News {
-    pub fn of(delivery: &Delivery, body: Vec<u8>) -> Result<Self, StoreError> {
+impl DeliveryRecord {
+    pub fn new(delivery: &Delivery, body: Vec<u8>) -> Result<Self, StoreError> {
         let key = key(delivery.webhook, delivery.id);
         Ok(Self { key, due: due_key(delivery), delivery: encode(delivery)?, body })
     }
@@ -178,15 +182,15 @@ pub(super) fn key(webhook: Uuid, id: Uuid) -> [u8; 32] {
     key
 }
 
-/// The key of the delivery whose place has its webhook and its id here.
-fn delivery_at(place: &[u8], webhook: usize, id: usize) -> Option<[u8; 32]> {
+/// Extracts a delivery's key from a longer key that has the webhook and the id at these offsets.
+fn key_within(longer: &[u8], webhook: usize, id: usize) -> Option<[u8; 32]> {
     let mut key = [0; 32];
-    key[..16].copy_from_slice(place.get(webhook..webhook + 16)?);
-    key[16..].copy_from_slice(place.get(id..id + 16)?);
+    key[..16].copy_from_slice(longer.get(webhook..webhook + 16)?);
+    key[16..].copy_from_slice(longer.get(id..id + 16)?);
     Some(key)
 }
 
-/// Sorts by time. Times before 1970 do not occur.
+/// Encodes a time so that bytes sort like times. Times before 1970 do not occur.
 fn millis(at: Timestamp) -> [u8; 8] {
     at.as_millisecond().max(0).to_be_bytes()
 }

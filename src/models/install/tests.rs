@@ -1,0 +1,79 @@
+//! Adding, verifying and locking models in a temporary folder.
+
+use super::*;
+use whereabouts_vision::Assets;
+
+fn fixture(file: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/fixtures/models/tiny-tokens").join(file)
+}
+
+#[test]
+fn an_added_file_is_pinned_and_found() {
+    let assets = tempfile::tempdir().unwrap();
+    let folder = ModelsFolder::open(assets.path()).unwrap();
+    let add = |name| folder.add(&fixture("model.onnx"), &fixture(MANIFEST), name);
+    let Added::Installed { folder: placed, digests, .. } = add(Some("mine")).unwrap() else {
+        panic!("it was not there before");
+    };
+    let verified = verify(&placed).unwrap();
+    assert_eq!(verified.digests, digests);
+    assert_eq!(verified.manifest.sha256, digests.first().copied());
+    assert_eq!(verified.manifest.name, "mine");
+    assert_eq!(Assets::locate(Some(assets.path())).model("mine").unwrap(), placed);
+    assert!(matches!(add(Some("mine")).unwrap(), Added::Present(_)));
+    assert!(matches!(add(Some("../mine")), Err(InstallError::Name(_))));
+    assert!(matches!(add(Some("auto")), Err(InstallError::Name(_))));
+}
+
+#[test]
+fn a_taken_name_and_a_wrong_file_are_rejected() {
+    let assets = tempfile::tempdir().unwrap();
+    let folder = ModelsFolder::open(assets.path()).unwrap();
+    folder.add(&fixture("model.onnx"), &fixture(MANIFEST), None).unwrap();
+    let other = assets.path().join("other.onnx");
+    fs::write(&other, "other").unwrap();
+    let wrong = folder.add(&other, &fixture(MANIFEST), None).unwrap_err().to_string();
+    assert!(wrong.contains("pins"), "{wrong}");
+    let manifest = assets.path().join("other.toml");
+    let text = fs::read_to_string(fixture(MANIFEST)).unwrap();
+    let unpinned: Vec<_> = text.lines().filter(|line| !line.starts_with("sha256")).collect();
+    fs::write(&manifest, unpinned.join("\n")).unwrap();
+    assert!(matches!(folder.add(&other, &manifest, None), Err(InstallError::Taken(_))));
+}
+
+#[test]
+fn external_weights_are_installed_and_verified() {
+    let (assets, given) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let folder = ModelsFolder::open(assets.path()).unwrap();
+    let (file, manifest) = (given.path().join("model.onnx"), given.path().join("given.toml"));
+    fs::copy(fixture("model.onnx"), &file).unwrap();
+    let text = fs::read_to_string(fixture(MANIFEST)).unwrap();
+    let data = "[data]\nfile = \"model.onnx.data\"\n[input]";
+    fs::write(&manifest, text.replace("[input]", data)).unwrap();
+    let missing = folder.add(&file, &manifest, None).unwrap_err().to_string();
+    assert!(missing.contains("model.onnx.data"), "{missing}");
+
+    fs::write(given.path().join("model.onnx.data"), "weights").unwrap();
+    let Added::Installed { folder: placed, digests, .. } =
+        folder.add(&file, &manifest, None).unwrap()
+    else {
+        panic!("it was not there before");
+    };
+    assert_eq!(digests[1], Digest::of(b"weights"));
+    assert_eq!(verify(&placed).unwrap().digests, digests);
+    fs::write(placed.join("model.onnx.data"), "weight5").unwrap();
+    assert!(matches!(verify(&placed), Err(InstallError::Damaged { .. })));
+    fs::write(given.path().join("model.onnx.data"), "others").unwrap();
+    assert!(matches!(folder.add(&file, &manifest, None), Err(InstallError::Taken(_))));
+}
+
+#[test]
+fn a_model_is_installed_by_one_process_at_a_time() {
+    let assets = tempfile::tempdir().unwrap();
+    let folder = ModelsFolder::open(assets.path()).unwrap();
+    let held = folder.lock("m").unwrap();
+    assert!(matches!(folder.lock("m"), Err(InstallError::Locked { .. })));
+    assert!(folder.lock("n").is_ok());
+    drop(held);
+    assert!(folder.lock("m").is_ok());
+}

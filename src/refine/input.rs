@@ -1,0 +1,107 @@
+//! What a refiner works on.
+
+use uuid::Uuid;
+use whereabouts_core::{Candidate, Descriptor, Digest, Map, Usage};
+use whereabouts_store::{JobRecord, MapStore};
+
+use super::RefineError;
+
+/// A camera frame, and the images that the search found for it.
+#[derive(Debug, Clone)]
+pub struct RefineInput {
+    /// Identifies this refinement in logs and prompts: the id of its job.
+    pub id: Uuid,
+    /// The map that was searched.
+    pub map: Map,
+    /// The camera frame.
+    pub frame: QueryFrame,
+    /// The images to compare with the frame, in coarse order.
+    pub candidates: Vec<Candidate>,
+    /// The cost of earlier attempts at the same job. It counts against the job's budget.
+    pub spent: Usage,
+}
+
+/// The camera frame of a query.
+#[derive(Debug, Clone)]
+pub struct QueryFrame {
+    /// The id of the query.
+    pub query_id: Uuid,
+    /// The digest of the picture, whose bytes are in the blob store.
+    pub digest: Digest,
+    /// The frame's descriptor, if it is known and comparable with the map's current descriptors.
+    pub descriptor: Option<Descriptor>,
+}
+
+impl RefineInput {
+    /// Returns the input of a job. Fails with [`RefineError::Permanent`] if the job's map was removed.
+    pub async fn of_job(record: &JobRecord, maps: &dyn MapStore) -> Result<Self, RefineError> {
+        let map = match maps.map(&record.job.map).await? {
+            Some(map) if map.uid == record.map_uid => map,
+            _ => return Err(RefineError::Permanent("the map was removed".into())),
+        };
+        // A reindexed map has other descriptors, which this one cannot be compared with.
+        let descriptor = record.query.descriptor.clone();
+        let descriptor = descriptor.filter(|_| record.revision == map.revision);
+        Ok(Self {
+            id: record.job.id,
+            map,
+            frame: QueryFrame {
+                query_id: record.query.id,
+                digest: record.query.digest,
+                descriptor,
+            },
+            candidates: record.candidates.clone(),
+            spent: record.job.usage,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mllm::tests::shelf::Shelf;
+    use jiff::Timestamp;
+    use whereabouts_core::{Job, MediaType, RefinerKind};
+    use whereabouts_store::Query;
+
+    fn record(map: &Map) -> JobRecord {
+        let now = Timestamp::UNIX_EPOCH;
+        let query = Query {
+            id: Uuid::from_u128(7),
+            digest: Digest::of(b"frame"),
+            media_type: MediaType::Jpeg,
+            created_at: now,
+            descriptor: Descriptor::normalised(vec![1.0]).ok(),
+        };
+        JobRecord {
+            job: Job::queued(map.name.clone(), query.id, RefinerKind::Mllm, now),
+            map_uid: map.uid,
+            revision: map.revision,
+            query,
+            candidates: Vec::new(),
+            claims: 1,
+            traceparent: None,
+        }
+    }
+
+    #[tokio::test]
+    async fn a_descriptor_of_another_revision_of_the_map_is_left_out() {
+        let shelf = Shelf::new();
+        let current = record(&shelf.map);
+        let input = RefineInput::of_job(&current, &shelf).await.unwrap();
+        assert_eq!((input.id, input.frame.query_id), (current.job.id, current.query.id));
+        assert_eq!(input.frame.descriptor, current.query.descriptor);
+        let old = JobRecord { revision: current.revision + 1, ..current };
+        let input = RefineInput::of_job(&old, &shelf).await.unwrap();
+        assert_eq!(input.frame.descriptor, None);
+    }
+
+    #[tokio::test]
+    async fn a_job_whose_map_was_removed_fails_for_good() {
+        let shelf = Shelf::new();
+        // A later map of the same name is another map.
+        let job = JobRecord { map_uid: Uuid::from_u128(99), ..record(&shelf.map) };
+        let error = RefineInput::of_job(&job, &shelf).await.unwrap_err();
+        assert!(matches!(error, RefineError::Permanent(_)), "{error}");
+    }
+}

@@ -1,0 +1,311 @@
+//! The refiner `local`: fetches dense features, has them matched, and turns the matches into a ranking.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use futures_util::{StreamExt, TryStreamExt, stream};
+use whereabouts_core::{
+    Candidate, DenseFeatures, Description, DescriptorKind, Digest, Evidence, ImageId, Map,
+    PairRegion, Ranking, RefinerKind, Usage,
+};
+use whereabouts_store::{BlobStore, HardNegatives, MapStore};
+use whereabouts_vision::{CpuPool, ExtractError, Extractor, FeatureSet, LoadedModels, ModelError};
+
+use super::{LocalMatcher, LocalSettings, Match, PairMatch, describe, rank};
+use crate::{
+    BuildError, DenseCache, DenseKey, NegativeEvidence, Progress, RefineError, RefineInput,
+    Refinement, Refiner, RefinerContext, RefinerSettings, RegionMatcher, milliseconds,
+};
+
+/// Pictures of one job that are fetched from the blob store at a time.
+const CONCURRENT_FETCHES: usize = 8;
+
+/// Geometric matching of dense features, on this machine.
+pub struct LocalRefiner {
+    maps: Arc<dyn MapStore>,
+    blobs: Arc<dyn BlobStore>,
+    /// Extracts dense features that the cache does not hold.
+    models: LoadedModels,
+    dense: Arc<DenseCache>,
+    /// The threads that extract and match.
+    pool: CpuPool,
+    matcher: LocalMatcher,
+}
+
+/// Builds the refiner `local`.
+pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, BuildError> {
+    Ok(Arc::new(LocalRefiner {
+        maps: context.store.clone(),
+        blobs: context.store.clone(),
+        models: context.models.clone(),
+        dense: Arc::clone(&context.dense),
+        pool: context.pool.clone(),
+        matcher: LocalMatcher::new(LocalSettings::default()),
+    }))
+}
+
+/// Returns a text that changes with everything that decides what the refiner finds.
+pub(crate) fn fingerprint(_: &RefinerSettings) -> Result<String, BuildError> {
+    Ok(serde_json::to_string(&LocalSettings::default())?)
+}
+
+/// A picture's dense features, or the bytes to extract them from.
+enum FeatureSource {
+    Cached(Arc<DenseFeatures>),
+    Picture(DenseKey, Bytes),
+}
+
+#[async_trait]
+impl Refiner for LocalRefiner {
+    fn kind(&self) -> RefinerKind {
+        RefinerKind::Local
+    }
+
+    async fn refine(
+        &self,
+        input: &RefineInput,
+        _: &dyn Progress,
+    ) -> Result<Refinement, RefineError> {
+        let comparison = self.compare_input(input).await?;
+        conclude(&input.candidates, &comparison)
+    }
+
+    fn region_matcher(&self) -> Option<&dyn RegionMatcher> {
+        Some(self)
+    }
+
+    fn negative_evidence(&self) -> Option<&dyn NegativeEvidence> {
+        Some(self)
+    }
+}
+
+#[async_trait]
+impl RegionMatcher for LocalRefiner {
+    async fn regions(
+        &self,
+        input: &RefineInput,
+        image: &ImageId,
+    ) -> Result<Option<Vec<PairRegion>>, RefineError> {
+        // Matches depend on the other candidates, so all are compared, as they were in the job.
+        let Comparison { present, pairs, .. } = self.compare_input(input).await?;
+        let of = present.iter().position(|&index| input.candidates[index].image_id == *image);
+        let matches = of.and_then(|of| pairs.into_iter().nth(of)).map(|pair| pair.matches);
+        let region = |found: Match| PairRegion {
+            frame: found.query,
+            image: found.candidate,
+            similarity: found.similarity,
+        };
+        Ok(matches.map(|matches| matches.into_iter().map(region).collect()))
+    }
+}
+
+#[async_trait]
+impl NegativeEvidence for LocalRefiner {
+    async fn best_negative(
+        &self,
+        map: &Map,
+        negatives: &HardNegatives,
+    ) -> Result<Option<Evidence>, RefineError> {
+        let extractor = self.models.of(map).await.map_err(no_model)?;
+        let query = match self.maps.image(map, &negatives.image_id).await? {
+            Some(image) => {
+                self.source(DenseKey { model: extractor.identity(), picture: image.digest }).await?
+            }
+            None => None,
+        };
+        let Some(query) = query else { return Ok(None) };
+        let Comparison { pairs, .. } =
+            self.compare(map, extractor, query, &negatives.others).await?;
+        Ok(rank(&pairs).first().and_then(|&first| agreement(&pairs, first)))
+    }
+}
+
+/// The outcome of matching a query with those of its candidates that are still in the map.
+struct Comparison {
+    /// The indices of these candidates.
+    present: Vec<usize>,
+    /// How each of them agrees with the query.
+    pairs: Vec<PairMatch>,
+    /// Duration of the matching, without fetching and extraction.
+    took: Duration,
+}
+
+impl LocalRefiner {
+    async fn compare_input(&self, input: &RefineInput) -> Result<Comparison, RefineError> {
+        let extractor = self.models.of(&input.map).await.map_err(no_model)?;
+        let frame = DenseKey { model: extractor.identity(), picture: input.frame.digest };
+        let query = self
+            .source(frame)
+            .await?
+            .ok_or_else(|| RefineError::Permanent("the frame is missing from the store".into()))?;
+        self.compare(&input.map, extractor, query, &input.candidates).await
+    }
+
+    async fn compare(
+        &self,
+        map: &Map,
+        extractor: Arc<Extractor>,
+        query: FeatureSource,
+        candidates: &[Candidate],
+    ) -> Result<Comparison, RefineError> {
+        let found = self.candidate_sources(map, extractor.identity(), candidates).await?;
+        let mut present = Vec::new();
+        let mut sources = Vec::new();
+        for (index, source) in found.into_iter().enumerate() {
+            if let Some(source) = source {
+                present.push(index);
+                sources.push(source);
+            }
+        }
+        let (dense, matcher) = (Arc::clone(&self.dense), self.matcher.clone());
+        let (pairs, took) = self
+            .pool
+            .run(move || match_all(&extractor, &dense, &matcher, query, sources))
+            .await
+            .map_err(|error| RefineError::Transient(error.to_string()))??;
+        Ok(Comparison { present, pairs, took })
+    }
+
+    /// Returns the feature source of each candidate, in order; `None` for one that was removed.
+    async fn candidate_sources(
+        &self,
+        map: &Map,
+        model: Digest,
+        candidates: &[Candidate],
+    ) -> Result<Vec<Option<FeatureSource>>, RefineError> {
+        let ids: Vec<ImageId> =
+            candidates.iter().map(|candidate| candidate.image_id.clone()).collect();
+        let images = self.maps.images_by_id(map, &ids).await?;
+        let fetches = images.into_iter().map(|image| async move {
+            match image {
+                Some(image) => self.source(DenseKey { model, picture: image.digest }).await,
+                None => Ok(None),
+            }
+        });
+        // Collected first: the compiler cannot prove the lazy iterator `Send`.
+        let fetches: Vec<_> = fetches.collect();
+        stream::iter(fetches).buffered(CONCURRENT_FETCHES).try_collect().await
+    }
+
+    /// Returns a picture's cached features or else its bytes; `None` if the store has no such picture.
+    async fn source(&self, key: DenseKey) -> Result<Option<FeatureSource>, RefineError> {
+        if let Some(features) = self.dense.get(&key) {
+            return Ok(Some(FeatureSource::Cached(features)));
+        }
+        let bytes = self.blobs.blob(&key.picture).await?;
+        Ok(bytes.map(|bytes| FeatureSource::Picture(key, bytes)))
+    }
+}
+
+/// Converts the error of a missing model. Any version of the map's model would do, because both pictures go
+/// through the same one.
+fn no_model(error: ModelError) -> RefineError {
+    match error {
+        ModelError::NotInstalled(_) | ModelError::Broken { .. } => {
+            RefineError::Permanent(error.to_string())
+        }
+        ModelError::AllInUse(_) => RefineError::Transient(error.to_string()),
+    }
+}
+
+/// Extracts missing features, matches, and returns the duration of the matching. Blocks.
+fn match_all(
+    extractor: &Extractor,
+    dense: &DenseCache,
+    matcher: &LocalMatcher,
+    query: FeatureSource,
+    candidates: Vec<FeatureSource>,
+) -> Result<(Vec<PairMatch>, Duration), RefineError> {
+    let features = |source: FeatureSource| match source {
+        FeatureSource::Cached(features) => Ok(features),
+        FeatureSource::Picture(key, bytes) => {
+            let extraction = extractor
+                .extract(&bytes, DescriptorKind::Gem, FeatureSet::DescriptorAndDense)
+                .map_err(|error: ExtractError| RefineError::Transient(error.to_string()))?;
+            let features = extraction.dense.map(Arc::new).ok_or_else(|| {
+                RefineError::Permanent("the model computed no dense features".into())
+            })?;
+            dense.insert(key, Arc::clone(&features));
+            Ok(features)
+        }
+    };
+    let query = features(query)?;
+    let candidates =
+        candidates.into_iter().map(features).collect::<Result<Vec<_>, RefineError>>()?;
+    let candidates: Vec<&DenseFeatures> = candidates.iter().map(AsRef::as_ref).collect();
+    let began = Instant::now();
+    let pairs = matcher
+        .compare_all(&query, &candidates)
+        .map_err(|error| RefineError::Permanent(error.to_string()))?;
+    Ok((pairs, began.elapsed()))
+}
+
+/// Ranks the compared candidates, and puts removed ones behind them in coarse order.
+fn conclude(candidates: &[Candidate], comparison: &Comparison) -> Result<Refinement, RefineError> {
+    let Comparison { present, pairs, took } = comparison;
+    let per_pair = u32::try_from(pairs.len()).ok().and_then(|pairs| took.checked_div(pairs));
+    let ranked = rank(pairs);
+    let ordered: Vec<usize> = ranked.iter().map(|&pair| present[pair]).collect();
+    let gone = (0..candidates.len()).filter(|index| !present.contains(index));
+    let order: Vec<usize> = ordered.iter().copied().chain(gone).collect();
+    let ranking = Ranking::new(candidates, &order)
+        .map_err(|error| RefineError::Permanent(error.to_string()))?;
+    let missing = candidates.len() - present.len();
+    Ok(Refinement {
+        descriptions: present
+            .iter()
+            .zip(pairs)
+            .map(|(&index, pair)| Description {
+                image_id: candidates[index].image_id.clone(),
+                text: describe(pair),
+                cached: false,
+                stands_in: None,
+                took_ms: per_pair.map(milliseconds),
+                usage: Usage::default(),
+            })
+            .collect(),
+        reasoning: reasoning(candidates, present, pairs, &ordered),
+        reasoning_took_ms: None,
+        evidence: ranked.first().and_then(|&first| agreement(pairs, first)),
+        ranking,
+        usage: Usage::default(),
+        degraded: (missing > 0).then(|| {
+            format!("{missing} of {} candidates were removed from the map", candidates.len())
+        }),
+    })
+}
+
+/// Returns the evidence for one of the compared candidates.
+fn agreement(pairs: &[PairMatch], of: usize) -> Option<Evidence> {
+    let agreeing: Vec<usize> = pairs.iter().map(|pair| pair.matches.len()).collect();
+    Evidence::agreement(&agreeing, of)
+}
+
+/// Explains in one sentence why the first candidate is first.
+fn reasoning(
+    candidates: &[Candidate],
+    present: &[usize],
+    pairs: &[PairMatch],
+    order: &[usize],
+) -> Option<String> {
+    let score = |index: usize| {
+        let pair = present.iter().position(|&known| known == index)?;
+        pairs.get(pair).map(|pair| pair.score * 100.0)
+    };
+    let first = *order.first()?;
+    let best = format!(
+        "{} shares the most with the frame: {:.1} % of the frame's regions speak for it",
+        candidates[first].image_id,
+        score(first)?
+    );
+    Some(match order.get(1) {
+        Some(&second) => format!(
+            "{best}, against {:.1} % for {}, the next best.",
+            score(second)?,
+            candidates[second].image_id
+        ),
+        None => format!("{best}."),
+    })
+}

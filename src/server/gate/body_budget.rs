@@ -1,0 +1,61 @@
+//! The share of the body memory that one request holds.
+
+use std::sync::Arc;
+
+use parking_lot::Mutex;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+/// The share of the body memory held by one request. Released when the request is answered, or when ownership
+/// moves to a decoded message. Clones share it.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct BodyBudget(Arc<Mutex<State>>);
+
+#[derive(Debug, Default)]
+struct State {
+    held: Option<OwnedSemaphorePermit>,
+    /// The request has been answered: what still arrives is discarded and takes no memory.
+    closed: bool,
+}
+
+impl BodyBudget {
+    /// Reserves `bytes` of `memory`; false if there is not as much.
+    pub fn try_add(&self, memory: &Arc<Semaphore>, bytes: usize) -> bool {
+        if self.is_closed() {
+            return true;
+        }
+        let count = u32::try_from(bytes).unwrap_or(u32::MAX);
+        match Arc::clone(memory).try_acquire_many_owned(count) {
+            Ok(permit) => self.add(permit),
+            Err(_) => return false,
+        }
+        true
+    }
+
+    /// Adds memory that was reserved elsewhere.
+    pub fn add(&self, permit: OwnedSemaphorePermit) {
+        let mut state = self.0.lock();
+        if state.closed {
+            return;
+        }
+        match state.held.as_mut() {
+            Some(held) => held.merge(permit),
+            None => state.held = Some(permit),
+        }
+    }
+
+    /// Moves the memory of all messages so far to the caller, who has decoded the last of them.
+    #[cfg(feature = "grpc")]
+    pub fn take(&self) -> Option<OwnedSemaphorePermit> {
+        self.0.lock().held.take()
+    }
+
+    /// Releases everything, because the request has been answered.
+    pub fn close(&self) {
+        *self.0.lock() = State { held: None, closed: true };
+    }
+
+    /// Whether the request has been answered.
+    pub fn is_closed(&self) -> bool {
+        self.0.lock().closed
+    }
+}
