@@ -4,12 +4,13 @@ use std::path::PathBuf;
 
 use whereabouts_server::config::{Config, DEFAULTS, Overrides};
 
+/// Print the effective settings, or every setting with its default
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The configuration file to read
+    /// Configuration file to read
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Print the commented defaults instead: a file to start from
+    /// Print the commented defaults instead, as a file to start from
     #[arg(long)]
     defaults: bool,
 }

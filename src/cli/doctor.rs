@@ -1,4 +1,4 @@
-//! `whereabouts doctor`: looks into a data folder that no server uses.
+//! `whereabouts doctor`: examines the data folder of a stopped server.
 
 use std::path::PathBuf;
 
@@ -8,23 +8,25 @@ use serde::Serialize;
 use whereabouts_server::config::{Config, Overrides};
 use whereabouts_store::embedded::{Compacted, Examination, MapReport, Report, compact, examine};
 
-/// Stop the server first. Exit code 0: nothing is wrong; 1: something is, and each line says what to do.
+/// Check a data folder for problems
+///
+/// Stop the server first. The exit code is 0 if nothing is wrong and 1 otherwise; each finding says what to
+/// do about it.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// A configuration file, for the folder that it names
+    /// Configuration file that names the data folder
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// The data folder
+    /// Data folder
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Read every picture too, and compare its SHA-256
+    /// Also read every image file and verify its SHA-256
     #[arg(long)]
     deep: bool,
-    /// Put right what can be without losing anything: files that nothing needs, derived files,
-    /// references
+    /// Repair what can be repaired without losing anything: unused files, derived files and references
     #[arg(long)]
     repair: bool,
-    /// Write the database anew, which makes its files as small as can be; needs room for both
+    /// Rewrite the database to make its files as small as possible; needs disk space for both copies
     #[arg(long)]
     compact: bool,
     /// Print the report as JSON
@@ -33,9 +35,9 @@ pub struct Args {
 }
 
 #[derive(Serialize)]
-struct Outcome {
+struct DoctorReport {
     #[serde(flatten)]
-    report: Report,
+    examination: Report,
     compacted: Option<Compacted>,
 }
 
@@ -43,27 +45,35 @@ pub fn run(args: Args) -> anyhow::Result<()> {
     let flags = Overrides::default().data(args.data);
     let dir = Config::load(args.config.as_deref(), &flags)?.data.dir;
     let compacted = if args.compact { Some(compact(&dir)?) } else { None };
-    let how = Examination { deep: args.deep, repair: args.repair };
-    let outcome = Outcome { report: examine(&dir, how)?, compacted };
+    let options = Examination { deep: args.deep, repair: args.repair };
+    let report = DoctorReport { examination: examine(&dir, options)?, compacted };
     match args.json {
-        true => println!("{}", serde_json::to_string(&outcome)?),
-        false => print(&outcome),
+        true => println!("{}", serde_json::to_string(&report)?),
+        false => print(&report),
     }
-    match outcome.report.problems() {
+    match report.examination.problems() {
         0 => Ok(()),
-        1 => bail!("something is wrong with {}", dir.display()),
-        problems => bail!("{problems} things are wrong with {}", dir.display()),
+        1 => bail!("found 1 problem in {}; the report above says what to do", dir.display()),
+        problems => {
+            bail!(
+                "found {problems} problems in {}; the report above says what to do",
+                dir.display()
+            )
+        }
     }
 }
 
-fn print(outcome: &Outcome) {
-    let Outcome { report, compacted } = outcome;
-    let version = report.version.map_or("none".to_owned(), |version| version.to_string());
-    println!("folder       {}, version {version}", report.folder.display());
+fn print(DoctorReport { examination, compacted }: &DoctorReport) {
+    let version = examination.version.map_or("none".to_owned(), |version| version.to_string());
+    println!("folder       {}, version {version}", examination.folder.display());
     if let Some(Compacted { bytes_before, bytes_after }) = compacted {
-        println!("compacted    database from {} to {}", size(*bytes_before), size(*bytes_after));
+        println!(
+            "compacted    database from {} to {}",
+            format_bytes(*bytes_before),
+            format_bytes(*bytes_after)
+        );
     }
-    let sizes = &report.sizes;
+    let sizes = &examination.sizes;
     let parts = [
         ("database", sizes.db),
         ("descriptors", sizes.descriptors),
@@ -71,18 +81,19 @@ fn print(outcome: &Outcome) {
         ("images", sizes.images),
         ("copies", sizes.copies),
         ("other", sizes.other),
-        ("all", sizes.total()),
+        ("total", sizes.total()),
         ("free", sizes.free),
     ];
     for (part, bytes) in parts {
-        println!("{part:12} {:>10}", size(bytes));
+        println!("{part:12} {:>10}", format_bytes(bytes));
     }
-    report.maps.iter().for_each(print_map);
-    if !report.jobs.is_empty() {
-        let jobs: Vec<_> = report.jobs.iter().map(|(state, n)| format!("{n} {state}")).collect();
+    examination.maps.iter().for_each(print_map);
+    if !examination.jobs.is_empty() {
+        let jobs: Vec<_> =
+            examination.jobs.iter().map(|(state, count)| format!("{count} {state}")).collect();
         println!("jobs         {}", jobs.join(", "));
     }
-    for finding in &report.findings {
+    for finding in &examination.findings {
         let kind = match (finding.repaired, finding.is_problem) {
             (true, _) => "repaired",
             (false, true) => "problem",
@@ -90,30 +101,30 @@ fn print(outcome: &Outcome) {
         };
         println!("\n{kind}: {}\n  {}", finding.what, finding.advice);
     }
-    if report.findings.is_empty() {
-        println!("\nall is in order");
+    if examination.findings.is_empty() {
+        println!("\nno problems found");
     }
 }
 
 fn print_map(map: &MapReport) {
-    let each = |bytes: u64| size(bytes / map.images.max(1) as u64);
+    let per_image = |bytes: u64| format_bytes(bytes / map.images.max(1) as u64);
     println!(
-        "map          {}: {} images by {} ({} numbers); each: descriptor {}, graph {}, picture {}",
+        "map          {}: {} images, model {} ({} dimensions); per image: descriptor {}, graph {}, file {}",
         map.name,
         map.images,
         map.model,
         map.dim,
-        each(map.descriptor_bytes),
-        each(map.graph_bytes),
-        each(map.picture_bytes),
+        per_image(map.descriptor_bytes),
+        per_image(map.graph_bytes),
+        per_image(map.picture_bytes),
     );
 }
 
-fn size(bytes: u64) -> String {
+fn format_bytes(bytes: u64) -> String {
     match bytes as f64 {
-        few if few < 1e3 => format!("{few} B"),
-        kilo if kilo < 1e6 => format!("{:.1} kB", kilo / 1e3),
-        mega if mega < 1e9 => format!("{:.1} MB", mega / 1e6),
-        giga => format!("{:.1} GB", giga / 1e9),
+        bytes if bytes < 1e3 => format!("{bytes} B"),
+        bytes if bytes < 1e6 => format!("{:.1} kB", bytes / 1e3),
+        bytes if bytes < 1e9 => format!("{:.1} MB", bytes / 1e6),
+        bytes => format!("{:.1} GB", bytes / 1e9),
     }
 }

@@ -2,6 +2,7 @@
 
 use super::client::ServerArg;
 
+/// Check whether a server is ready; the exit code is 0 if it is and 1 if not
 #[derive(Debug, clap::Args)]
 pub struct Args {
     #[command(flatten)]

@@ -8,23 +8,24 @@ use super::client::{Client, ServerArg};
 use super::localize::print_job;
 use whereabouts_core::{Job, JobState, MapName};
 
+/// List refinement jobs on a server, or show one
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Show this job instead of the list
     id: Option<Uuid>,
-    /// Wait until the job has ended, but no longer than so many seconds
+    /// Wait up to this many seconds for the job to end
     #[arg(long, value_name = "SECONDS", requires = "id")]
     wait: Option<u64>,
-    /// Only jobs of this map
+    /// List only jobs of this map
     #[arg(long, conflicts_with = "id")]
     map: Option<MapName>,
-    /// Only jobs in this state
+    /// List only jobs in this state
     #[arg(long, conflicts_with = "id")]
     state: Option<JobState>,
-    /// Only jobs that contain this text, such as the id of an image, or words of an error or of a description
+    /// List only jobs that contain this text, for example in an image id, an error or a description
     #[arg(long, value_name = "TEXT", conflicts_with = "id")]
     search: Option<String>,
-    /// How many to list
+    /// Maximum number of jobs to list
     #[arg(long, default_value_t = 20, conflicts_with = "id")]
     limit: usize,
     /// Print the server's answer as JSON
@@ -43,7 +44,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
             let job: Value = client.json(request).await?;
             match args.json {
                 true => println!("{job}"),
-                false => print_one(&serde_json::from_value(job)?),
+                false => print_with_descriptions(&serde_json::from_value(job)?),
             }
         }
         None => {
@@ -63,7 +64,8 @@ struct Page {
     next_cursor: Option<Uuid>,
 }
 
-/// As many jobs as are wanted. A search comes in pages that may be short, before the last one too.
+/// Fetches pages until the limit or the last page is reached. A page of a search may be short although more
+/// follow.
 async fn list(client: &Client, args: &Args) -> anyhow::Result<Page> {
     let mut page = Page { jobs: Vec::new(), next_cursor: None };
     loop {
@@ -84,11 +86,12 @@ async fn list(client: &Client, args: &Args) -> anyhow::Result<Page> {
     }
 }
 
-fn print_list(page: Page, searched: bool) -> anyhow::Result<()> {
-    match (page.jobs.is_empty(), searched) {
-        (true, true) => println!("no job contains that"),
-        (true, false) => println!("no jobs; POST /localize makes one"),
-        (false, _) => {}
+fn print_list(page: Page, is_search: bool) -> anyhow::Result<()> {
+    if page.jobs.is_empty() {
+        match is_search {
+            true => println!("no job contains that text"),
+            false => println!("no jobs; POST /localize queues one"),
+        }
     }
     for job in page.jobs {
         let job: Job = serde_json::from_value(job)?;
@@ -97,7 +100,7 @@ fn print_list(page: Page, searched: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn print_one(job: &Job) {
+fn print_with_descriptions(job: &Job) {
     print_job(job);
     for description in &job.descriptions {
         println!("\n{}: {}", description.image_id, description.text);

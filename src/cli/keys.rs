@@ -1,4 +1,4 @@
-//! `whereabouts keys`: over HTTP, or in the data folder of a server that does not run.
+//! `whereabouts keys`: over HTTP, or in the data folder of a stopped server.
 
 use std::path::PathBuf;
 
@@ -14,15 +14,15 @@ use whereabouts_server::config::{Config, Overrides};
 use whereabouts_server::startup;
 use whereabouts_service::Keys;
 
-/// Make, list and revoke the keys that a server asks for.
+/// Create, list and revoke API keys
 #[derive(Debug, clap::Args)]
 pub struct Args {
     #[command(subcommand)]
     action: Action,
-    /// Work in this data folder, whose server does not run: the way to the first key
+    /// Work in the data folder of a stopped server instead of over HTTP; this is how to create the first key
     #[arg(long, value_name = "DIR", global = true)]
     data: Option<PathBuf>,
-    /// A configuration file
+    /// Configuration file, for --data
     #[arg(long, value_name = "FILE", global = true)]
     config: Option<PathBuf>,
     /// Print the answer as JSON
@@ -34,32 +34,32 @@ pub struct Args {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Make a key, and show it this once
+    /// Create a key and print it; it is shown only once
     Create {
-        /// What people call it
+        /// Display name of the key
         #[arg(long)]
         name: String,
-        /// robot: localize; operator: jobs and images too; admin: everything
+        /// robot: localize; operator: also jobs and images; admin: everything
         #[arg(long)]
         role: Role,
-        /// Only for this map; repeat it for more
+        /// Restrict the key to this map; repeat the flag for more
         #[arg(long = "map", value_name = "MAP")]
         maps: Vec<MapName>,
-        /// For so many days; without it for ever
+        /// Let the key expire after this many days; without this flag it never expires
         #[arg(long, value_name = "DAYS")]
         expires_days: Option<u32>,
-        /// So many requests a minute at the most
+        /// Limit the key to N requests per minute
         #[arg(long, value_name = "N")]
         requests_per_minute: Option<u32>,
-        /// So many bytes of bodies a minute at the most
+        /// Limit request bodies to N bytes per minute
         #[arg(long, value_name = "N")]
         bytes_per_minute: Option<u64>,
     },
-    /// List the keys, those that were revoked too
+    /// List keys, including revoked ones
     List,
-    /// End a key for good
+    /// Revoke a key permanently
     Revoke {
-        /// Its id, the middle part of the key; or the key
+        /// Id of the key, which is its middle part, or the whole key
         #[arg(value_parser = key_id)]
         id: String,
     },
@@ -70,33 +70,14 @@ struct KeyList {
     keys: Vec<ApiKey>,
 }
 
-/// Where the keys are.
-enum Place {
+/// The keys of a running server, or those in a data folder.
+enum KeyRing {
     Server(Client),
     Folder(Keys),
 }
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
-    let place = match args.data {
-        None => Place::Server(args.server.client()?),
-        Some(data) => {
-            let flags = Overrides::default().data(Some(data));
-            let config = Config::load(args.config.as_deref(), &flags)?;
-            let new = !config.database.is_set() && !config.data.dir.join("version").exists();
-            if new && !matches!(args.action, Action::Create { .. }) {
-                bail!(
-                    "{} is no data folder; only the first key makes one",
-                    config.data.dir.display()
-                );
-            }
-            let opening =
-                tokio::task::spawn_blocking(move || startup::open_store(&config, Uuid::now_v7()));
-            let opened = opening.await.context("the folder could not be opened")?.context(
-                "while its server runs, leave --data out, so that the server is asked over HTTP",
-            )?;
-            Place::Folder(Keys::load(opened.store).await?)
-        }
-    };
+    let keys = KeyRing::open(&args).await?;
     match args.action {
         Action::Create {
             name,
@@ -107,28 +88,28 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
             bytes_per_minute,
         } => {
             let limits = KeyLimits { requests_per_minute, bytes_per_minute };
-            let made = place.create(NewKey { name, role, maps, limits, expires_days }).await?;
+            let made = keys.create(NewKey { name, role, maps, limits, expires_days }).await?;
             match args.json {
                 true => println!("{}", serde_json::to_string(&made)?),
                 false => {
                     println!("{}", made.token);
                     eprintln!(
-                        "the key {} of {:?}, role {}; it is not shown again. Programs send it as \
-                         \"Authorization: Bearer …\", these commands take it from WHEREABOUTS_API_KEY",
+                        "created key {} ({:?}, role {}). Store it now: it is not shown again. Programs send \
+                         it as \"Authorization: Bearer …\"; these commands read it from WHEREABOUTS_API_KEY",
                         made.key.id, made.key.name, made.key.role
                     );
                 }
             }
         }
         Action::List => {
-            let keys = place.list().await?;
+            let keys = keys.list().await?;
             match args.json {
                 true => println!("{}", serde_json::json!({ "keys": keys })),
                 false => print(&keys),
             }
         }
         Action::Revoke { id } => {
-            let key = place.revoke(&id).await?;
+            let key = keys.revoke(&id).await?;
             match args.json {
                 true => println!("{}", serde_json::to_string(&key)?),
                 false => println!("{}: revoked", key.id),
@@ -138,11 +119,31 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     Ok(())
 }
 
-impl Place {
-    async fn create(&self, wanted: NewKey) -> anyhow::Result<MadeKey> {
+impl KeyRing {
+    async fn open(args: &Args) -> anyhow::Result<Self> {
+        let Some(data) = &args.data else { return Ok(Self::Server(args.server.client()?)) };
+        let flags = Overrides::default().data(Some(data.clone()));
+        let config = Config::load(args.config.as_deref(), &flags)?;
+        let is_new = !config.database.is_set() && !config.data.dir.join("version").exists();
+        if is_new && !matches!(args.action, Action::Create { .. }) {
+            bail!(
+                "{} is not a data folder; name another one, or create the first key in it with `whereabouts \
+                 keys create`",
+                config.data.dir.display()
+            );
+        }
+        let opening =
+            tokio::task::spawn_blocking(move || startup::open_store(&config, Uuid::now_v7()));
+        let opened = opening.await.context("cannot open the data folder")?.context(
+            "cannot open the data folder; while its server runs, leave --data out to use the HTTP API",
+        )?;
+        Ok(Self::Folder(Keys::load(opened.store).await?))
+    }
+
+    async fn create(&self, new_key: NewKey) -> anyhow::Result<MadeKey> {
         match self {
-            Self::Folder(keys) => Ok(keys.create(wanted).await?),
-            Self::Server(client) => client.json(client.post("/keys").json(&wanted)).await,
+            Self::Folder(keys) => Ok(keys.create(new_key).await?),
+            Self::Server(client) => client.json(client.post("/keys").json(&new_key)).await,
         }
     }
 
@@ -161,19 +162,16 @@ impl Place {
     }
 }
 
-/// The id of a key, which goes into an address.
+/// Takes the id out of a key or checks that it is one, because it becomes part of a URL.
 fn key_id(text: &str) -> Result<String, String> {
     Token::id_of(text).map(str::to_owned).ok_or_else(|| {
-        format!(
-            "a key's id has {} hexadecimal digits; `whereabouts keys list` shows them",
-            Token::ID
-        )
+        format!("a key id has {} hexadecimal digits; `whereabouts keys list` shows them", Token::ID)
     })
 }
 
 fn print(keys: &[ApiKey]) {
     if keys.is_empty() {
-        println!("no keys; `whereabouts keys create` makes one");
+        println!("no keys; create one with `whereabouts keys create`");
     }
     let now = jiff::Timestamp::now();
     for key in keys {

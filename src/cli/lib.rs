@@ -1,4 +1,4 @@
-//! The command line: one file for each command. Client commands talk to a server.
+//! The command line: one module for each command. Client commands talk to a server.
 
 mod backup;
 mod client;
@@ -7,6 +7,8 @@ mod demo;
 mod doctor;
 mod eval;
 mod healthcheck;
+#[cfg(test)]
+mod help_tests;
 mod index;
 mod jobs;
 mod keys;
@@ -25,56 +27,45 @@ use clap::{Parser, Subcommand};
 
 use whereabouts_server::startup::Role;
 
-/// Tells a robot where it is from one camera frame.
+/// Visual place recognition as a service: localizes a robot from one camera frame
 #[derive(Debug, Parser)]
-#[command(name = "whereabouts", version, about, max_term_width = 100)]
+#[command(name = "whereabouts", version, max_term_width = 100)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
 }
 
+// The help of a command is the doc comment of its `Args`. A doc comment here would replace it, as it does
+// for the two commands that share their arguments.
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Run the server
     Serve(serve::Args),
-    /// Refine the jobs of servers that share a database, and do nothing else
+    /// Run a worker that refines the jobs of servers that share a database
     Worker(serve::Args),
-    /// Make the tables of the database, or bring them up to date
     Migrate(migrate::Args),
-    /// Add a folder of images to a map on a server
     Index(index::Args),
-    /// Localize a picture on a server
     Localize(localize::Args),
-    /// List jobs on a server, or show one
     Jobs(jobs::Args),
-    /// Make, list and revoke API keys
     Keys(keys::Args),
-    /// Install models, check them, and choose the one to use
     Model(model::Args),
-    /// Build a town, index it, localize frames in it, and print what happened
     Demo(demo::Args),
-    /// Say how often the service is right on a folder of references and a folder of queries
     Eval(Box<eval::Args>),
-    /// Save maps of a server to one file, descriptors and pictures included
     Backup(backup::Args),
-    /// Bring the maps of a backup to a server
     Restore(restore::Args),
-    /// Say what is in a data folder, and whether it is in order
     Doctor(doctor::Args),
-    /// Print the settings in force, or every setting with its default
     Config(config::Args),
-    /// Print the OpenAPI description
+    /// Print the OpenAPI description of the HTTP API
     Openapi,
-    /// Ask a server whether it is ready; exit code 0 if so
     Healthcheck(healthcheck::Args),
 }
 
 impl Cli {
-    /// Runs the command: 0 is success, 1 failure; clap itself ends with 2 on wrong usage.
+    /// Runs the command. The exit code is 0 on success and 1 on failure; clap exits with 2 on wrong usage.
     pub fn run(self) -> ExitCode {
-        // Only the first call sets it; a library user may have chosen another.
+        // Fails if a provider is installed already, which is then used instead.
         let _ = rustls::crypto::ring::default_provider().install_default();
-        let outcome = match self.command {
+        let result = match self.command {
             Command::Serve(args) => block_on(serve::run(Role::Serve, args)),
             Command::Worker(args) => block_on(serve::run(Role::Worker, args)),
             Command::Migrate(args) => block_on(migrate::run(args)),
@@ -92,7 +83,7 @@ impl Cli {
             Command::Openapi => openapi::run(),
             Command::Healthcheck(args) => block_on(healthcheck::run(args)),
         };
-        match outcome {
+        match result {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => {
                 eprintln!("whereabouts: {error:#}");
@@ -102,6 +93,6 @@ impl Cli {
     }
 }
 
-fn block_on(work: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
-    tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(work)
+fn block_on(command: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
+    tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(command)
 }

@@ -9,17 +9,18 @@ use super::client::{ServerArg, segment};
 use whereabouts_api::Answer;
 use whereabouts_core::{Job, MapName, MediaType, Pose};
 
+/// Localize an image on a server
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The picture: JPEG, PNG or WebP
+    /// Image file: JPEG, PNG or WebP
     file: PathBuf,
-    /// In which map to look
+    /// Map to search
     #[arg(long)]
     map: MapName,
-    /// How many candidates to show
+    /// Number of candidates to show
     #[arg(short, default_value_t = 5)]
     k: usize,
-    /// Wait for the refinement and show its order
+    /// Wait for the refinement and show its ranking
     #[arg(long)]
     refine: bool,
     /// Print the server's answer as JSON
@@ -34,7 +35,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let frame = std::fs::read(&args.file)
         .with_context(|| format!("cannot read {}", args.file.display()))?;
     let media_type = MediaType::sniff(&frame)
-        .with_context(|| format!("{} is not a JPEG, PNG or WebP picture", args.file.display()))?;
+        .with_context(|| format!("{} is not a JPEG, PNG or WebP image", args.file.display()))?;
     let mode = if args.refine { "wait" } else { "off" };
     let path = format!("/localize?map={}&k={}&refine={mode}", segment(args.map.as_str()), args.k);
     let request = client.post(&path).header("content-type", media_type.as_str()).body(frame);
@@ -47,8 +48,8 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     print_answer(&answer);
     if let Some(link) = &answer.job {
         print_job(&client.json(client.get(&link.href)).await?);
-    } else if let Some(why) = &answer.no_job {
-        println!("no refinement: {}", why.detail);
+    } else if let Some(reason) = &answer.no_job {
+        println!("not refined: {}", reason.detail);
     }
     Ok(())
 }
@@ -61,36 +62,36 @@ fn print_answer(answer: &Answer) {
             candidate.rank,
             candidate.similarity,
             candidate.image_id,
-            pose_text(candidate.pose)
+            format_pose(candidate.pose)
         );
     }
     match &answer.estimate {
         Some(estimate) => println!(
             "estimate: {} {}, confidence {:.3} ({})",
             estimate.image_id,
-            pose_text(estimate.pose),
+            format_pose(estimate.pose),
             estimate.confidence,
-            if estimate.known { "a known place" } else { "perhaps not in the map" }
+            if estimate.known { "a known place" } else { "possibly not in the map" }
         ),
         None => println!("the map has no images yet; add some with `whereabouts index`"),
     }
 }
 
-/// A job for people.
+/// Prints a job for a human reader.
 pub(super) fn print_job(job: &Job) {
-    println!("job {} ({}, {}): {} attempts", job.id, job.map, job.refiner, job.attempts);
     println!(
-        "  {}{}",
-        job.state,
-        job.error.as_ref().map_or(String::new(), |why| format!(": {why}"))
+        "job {} (map {}, refiner {}), attempts: {}",
+        job.id, job.map, job.refiner, job.attempts
     );
-    for place in job.ranking.iter().flat_map(|ranking| ranking.as_slice()) {
+    let error = job.error.as_ref().map_or(String::new(), |error| format!(": {error}"));
+    println!("  {}{error}", job.state);
+    for candidate in job.ranking.iter().flat_map(|ranking| ranking.as_slice()) {
         println!(
             "{:3}  (was {:2})  {}  {}",
-            place.rank,
-            place.coarse_rank,
-            place.image_id,
-            pose_text(place.pose)
+            candidate.rank,
+            candidate.coarse_rank,
+            candidate.image_id,
+            format_pose(candidate.pose)
         );
     }
     if let Some(reasoning) = &job.reasoning {
@@ -98,8 +99,8 @@ pub(super) fn print_job(job: &Job) {
     }
 }
 
-/// A pose in a few characters.
-pub(super) fn pose_text(pose: Option<Pose>) -> String {
+/// Formats a pose in a few characters.
+pub(super) fn format_pose(pose: Option<Pose>) -> String {
     match pose {
         None => "(no pose)".into(),
         Some(Pose::Geographic(pose)) => {

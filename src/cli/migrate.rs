@@ -6,14 +6,16 @@ use anyhow::bail;
 
 use whereabouts_server::config::{Config, Overrides};
 
-/// Makes the tables of the database (database.url, WHEREABOUTS_DATABASE__URL), or brings them up to date. Run it
-/// before a new version is started; it may run several times, and several times at once.
+/// Create or upgrade the database schema
+///
+/// The database is the one of the setting database.url (WHEREABOUTS_DATABASE__URL). Run this before starting
+/// a new version. It is safe to run repeatedly, and on several machines at once.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// A configuration file
+    /// Configuration file
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Only say whether they are up to date: exit code 1 if not
+    /// Only check whether the schema is up to date; the exit code is 1 if it is not
     #[arg(long)]
     check: bool,
 }
@@ -22,8 +24,8 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let config = Config::load(args.config.as_deref(), &Overrides::default())?;
     if !config.database.is_set() {
         bail!(
-            "there is no database: set database.url (WHEREABOUTS_DATABASE__URL). The embedded store needs no \
-             migration: a server brings its data folder up to date when it starts"
+            "no database is configured: set database.url (WHEREABOUTS_DATABASE__URL). The embedded store needs \
+             no migration: the server upgrades its data folder when it starts"
         );
     }
     migrate_database(&config, args.check).await
@@ -31,7 +33,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
 
 #[cfg(not(feature = "postgres"))]
 async fn migrate_database(_: &Config, _: bool) -> anyhow::Result<()> {
-    bail!("this build cannot use PostgreSQL: build with the Cargo feature `postgres`")
+    bail!("this build does not support PostgreSQL: rebuild with the Cargo feature `postgres`")
 }
 
 #[cfg(feature = "postgres")]
@@ -42,22 +44,25 @@ async fn migrate_database(config: &Config, check_only: bool) -> anyhow::Result<(
     let settings = startup::postgres_settings(config);
     if check_only {
         match schema_of(&settings).await? {
-            SchemaState::UpToDate => println!("the tables are up to date"),
+            SchemaState::UpToDate => println!("the schema is up to date"),
             SchemaState::Behind { steps } => {
                 bail!(
-                    "the tables are not up to date (steps missing: {steps}); run `whereabouts migrate`"
+                    "the schema is not up to date (pending migrations: {steps}); run `whereabouts migrate`"
                 )
             }
             SchemaState::Ahead { version } => {
-                bail!("the tables are of version {version}, which this program does not know")
+                bail!(
+                    "the schema has version {version}, which this program does not know; run a program that \
+                     is at least as new as the one that migrated the database"
+                )
             }
         }
         return Ok(());
     }
     match migrate(&settings).await? {
-        0 => println!("the tables are up to date; nothing to do"),
-        1 => println!("one step was taken; the tables are up to date"),
-        steps => println!("{steps} steps were taken; the tables are up to date"),
+        0 => println!("the schema is up to date; nothing to do"),
+        1 => println!("applied 1 migration; the schema is up to date"),
+        migrations => println!("applied {migrations} migrations; the schema is up to date"),
     }
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! `whereabouts restore`: the maps of a backup to a server, over HTTP.
+//! `whereabouts restore`: restores the maps of a backup to a server, over HTTP.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -14,34 +14,37 @@ use reqwest::multipart::{Form, Part};
 use serde::{Deserialize, Serialize};
 
 use super::client::{Client, ServerArg, explained, segment};
-use super::progress::Progress;
+use super::progress::ProgressMeter;
 use whereabouts_api::ImportedImage;
 use whereabouts_archive::{ArchivedMap, End, Item, LeftOut, Reader};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, Image, ImageId, Map, MapName};
 
-/// Images that are listed at a time.
-const PAGE: usize = 1000;
+/// Image records that are listed with one request.
+const PAGE_SIZE: usize = 1000;
 
-/// The whole file is checked before anything is sent. Images get the descriptors that they have in the
-/// file; no model runs. It is safe to run this again: what is there already is left as it is.
+/// Restore maps from a backup to a server
+///
+/// The whole file is verified before anything is sent. Images keep the descriptors that they have in the
+/// file, so no model runs. It is safe to run this again: images that the server already has are skipped.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The file that `whereabouts backup` wrote
+    /// File written by `whereabouts backup`
     file: PathBuf,
-    /// Only this map; can be given several times
+    /// Restore only this map; repeat the flag for more
     #[arg(long = "map", value_name = "NAME")]
     maps: Vec<MapName>,
-    /// Another name for the map, if there is one only
+    /// Restore the map under another name; needs exactly one map
     #[arg(long = "as", value_name = "NAME")]
     name: Option<MapName>,
-    /// Check the file and restore nothing; no server is needed
+    /// Verify the file and restore nothing; needs no server
     #[arg(long)]
     check: bool,
-    /// Images sent side by side
-    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u16).range(1..=64))]
+    /// Number of images to send concurrently
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    #[arg(value_parser = clap::value_parser!(u16).range(1..=64))]
     concurrency: u16,
-    /// Print the outcome as JSON
+    /// Print the result as JSON
     #[arg(long)]
     json: bool,
     #[command(flatten)]
@@ -49,7 +52,7 @@ pub struct Args {
 }
 
 #[derive(Debug, Serialize)]
-struct Outcome {
+struct RestoreReport {
     file: PathBuf,
     maps: Vec<RestoredMap>,
     seconds: f64,
@@ -62,7 +65,7 @@ struct RestoredMap {
     model: String,
     added: usize,
     present: usize,
-    /// Images whose id is taken by others on the server, which were left as they are.
+    /// Images whose id has other bytes on the server, which were left unchanged.
     conflicts: Vec<LeftOut>,
     /// Images that the backup could not save.
     left_out: Vec<LeftOut>,
@@ -70,65 +73,67 @@ struct RestoredMap {
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let start = Instant::now();
-    let end = check(&args.file)?;
-    let maps = chosen(&args, &end)?;
+    let end = verify(&args.file)?;
+    let maps = select_maps(&args, &end)?;
     if args.check {
-        return said_checked(&args, &end);
+        return print_contents(&args, &end);
     }
     let mut restore = Restore {
         client: args.server.client()?,
-        progress: Progress::new("images", maps.iter().map(|map| map.images).sum()),
+        progress: ProgressMeter::new("images", maps.iter().map(|map| map.images).sum()),
         concurrency: usize::from(args.concurrency),
-        done: Vec::new(),
+        maps: Vec::new(),
     };
-    let restored = restore.all(&args, &maps).await;
-    restore.progress.end();
-    let said = |map: &RestoredMap| format!("{} of {}", map.added + map.present, map.name);
-    restored.with_context(|| {
-        let so_far: Vec<_> = restore.done.iter().map(said).collect();
-        let so_far = if so_far.is_empty() { "none".to_owned() } else { so_far.join(", ") };
+    let result = restore.send_all(&args, &maps).await;
+    restore.progress.finish();
+    result.with_context(|| {
+        let count = |map: &RestoredMap| format!("{} of {}", map.added + map.present, map.name);
+        let counts: Vec<_> = restore.maps.iter().map(count).collect();
+        let counts = if counts.is_empty() { "none".to_owned() } else { counts.join(", ") };
         format!(
-            "not all is restored; on the server are these images: {so_far}. The same command adds \
-             the rest"
+            "the restore is incomplete; images on the server so far: {counts}. The same command adds the rest"
         )
     })?;
     let seconds = start.elapsed().as_secs_f64();
-    report(&Outcome { file: args.file, maps: restore.done, seconds }, args.json)
+    print(&RestoreReport { file: args.file, maps: restore.maps, seconds }, args.json)
 }
 
-/// Reads the whole file; whatever is wrong with it is found before anything is sent.
-fn check(file: &Path) -> anyhow::Result<End> {
+/// Reads the whole file, so that damage is found before anything is sent.
+fn verify(file: &Path) -> anyhow::Result<End> {
     const MEGABYTE: u64 = 1 << 20;
     let refused = || format!("{} was not restored, nothing was changed", file.display());
     let total = std::fs::metadata(file).with_context(refused)?.len() / MEGABYTE;
     let mut reader = Reader::open(file).with_context(refused)?;
-    let progress = Progress::new("MB checked", total as usize);
+    let progress = ProgressMeter::new("MB verified", total as usize);
     let mut end = None;
     while let Some(item) = reader.next_item().with_context(refused)? {
-        progress.at((reader.bytes() / MEGABYTE) as usize, total as usize);
+        progress.set((reader.bytes() / MEGABYTE) as usize, total as usize);
         if let Item::End(found) = item {
             end = Some(found);
         }
     }
-    progress.end();
+    progress.finish();
     end.with_context(refused)
 }
 
-/// The maps to restore.
-fn chosen(args: &Args, end: &End) -> anyhow::Result<Vec<ArchivedMap>> {
+/// Returns the maps that the flags select.
+fn select_maps(args: &Args, end: &End) -> anyhow::Result<Vec<ArchivedMap>> {
     if let Some(missing) = args.maps.iter().find(|name| end.maps.iter().all(|m| m.name != **name)) {
-        let there: Vec<_> = end.maps.iter().map(|map| map.name.as_str()).collect();
-        bail!("there is no map {missing} in the backup; it has {}", there.join(", "));
+        let names: Vec<_> = end.maps.iter().map(|map| map.name.as_str()).collect();
+        bail!("the backup has no map {missing}; it has {}", names.join(", "));
     }
-    let wanted = |map: &&ArchivedMap| args.maps.is_empty() || args.maps.contains(&map.name);
-    let maps: Vec<_> = end.maps.iter().filter(wanted).cloned().collect();
+    let is_selected = |map: &&ArchivedMap| args.maps.is_empty() || args.maps.contains(&map.name);
+    let maps: Vec<_> = end.maps.iter().filter(is_selected).cloned().collect();
     if args.name.is_some() && maps.len() != 1 {
-        bail!("--as names one map, but {} would be restored; choose one with --map", maps.len());
+        bail!(
+            "--as needs exactly one map, but {} would be restored; select one with --map",
+            maps.len()
+        );
     }
     Ok(maps)
 }
 
-fn said_checked(args: &Args, end: &End) -> anyhow::Result<()> {
+fn print_contents(args: &Args, end: &End) -> anyhow::Result<()> {
     if args.json {
         println!("{}", serde_json::to_string(end)?);
         return Ok(());
@@ -140,63 +145,62 @@ fn said_checked(args: &Args, end: &End) -> anyhow::Result<()> {
         };
         println!("{}: {} images{left_out}", map.name, map.images);
     }
-    println!("{}: whole, of {}", args.file.display(), end.finished_at);
+    println!("{}: complete, written {}", args.file.display(), end.finished_at);
     Ok(())
 }
 
 struct Restore {
     client: Client,
-    progress: Progress,
+    progress: ProgressMeter,
     concurrency: usize,
-    /// The maps so far; the last one may not be complete.
-    done: Vec<RestoredMap>,
+    /// The maps so far; the last one may be incomplete.
+    maps: Vec<RestoredMap>,
 }
 
-/// What became of one image.
-enum Sent {
+/// How the server answered to one image.
+enum SendOutcome {
     Added,
     Present,
     Conflict(LeftOut),
 }
 
 impl Restore {
-    async fn all(&mut self, args: &Args, maps: &[ArchivedMap]) -> anyhow::Result<()> {
+    async fn send_all(&mut self, args: &Args, maps: &[ArchivedMap]) -> anyhow::Result<()> {
         let mut reader = Reader::open(&args.file)?;
         let mut target: Option<Arc<Target>> = None;
-        let mut sending = FuturesUnordered::new();
+        let mut in_flight = FuturesUnordered::new();
         while let Some(item) = reader.next_item()? {
             match item {
                 Item::Map(map) => {
-                    while let Some(sent) = sending.next().await {
-                        self.count(sent)?;
+                    while let Some(outcome) = in_flight.next().await {
+                        self.count(outcome)?;
                     }
-                    let wanted = maps.iter().find(|wanted| wanted.name == map.name);
-                    target = match wanted {
-                        Some(wanted) => Some(Arc::new(self.begin(args, map, wanted).await?)),
+                    target = match maps.iter().find(|selected| selected.name == map.name) {
+                        Some(archived) => Some(Arc::new(self.open(args, map, archived).await?)),
                         None => None,
                     };
                 }
                 Item::Image(image, bytes) => {
                     let Some(target) = &target else { continue };
-                    if sending.len() >= self.concurrency
-                        && let Some(sent) = sending.next().await
+                    if in_flight.len() >= self.concurrency
+                        && let Some(outcome) = in_flight.next().await
                     {
-                        self.count(sent)?;
+                        self.count(outcome)?;
                     }
                     let (client, target) = (self.client.clone(), Arc::clone(target));
-                    sending.push(async move { send(&client, &target, image, bytes).await });
+                    in_flight.push(async move { send(&client, &target, image, bytes).await });
                 }
                 Item::Manifest(_) | Item::LeftOut(_) | Item::End(_) => {}
             }
         }
-        while let Some(sent) = sending.next().await {
-            self.count(sent)?;
+        while let Some(outcome) = in_flight.next().await {
+            self.count(outcome)?;
         }
         Ok(())
     }
 
-    /// Makes the map, or finds what it has.
-    async fn begin(
+    /// Creates the map unless it exists, and lists the images that it has.
+    async fn open(
         &mut self,
         args: &Args,
         map: Map,
@@ -205,7 +209,7 @@ impl Restore {
         let name = args.name.clone().unwrap_or_else(|| map.name.clone());
         let path = format!("/maps/{}", segment(name.as_str()));
         self.client.send(self.client.put(&format!("{path}/import")).json(&map)).await?;
-        self.done.push(RestoredMap {
+        self.maps.push(RestoredMap {
             name,
             model: map.model.clone(),
             added: 0,
@@ -213,17 +217,17 @@ impl Restore {
             conflicts: Vec::new(),
             left_out: archived.left_out.clone(),
         });
-        let present = present(&self.client, &path).await?;
+        let present = list_images(&self.client, &path).await?;
         Ok(Target { path, map, present })
     }
 
-    fn count(&mut self, sent: anyhow::Result<Sent>) -> anyhow::Result<()> {
-        let (sent, Some(map)) = (sent?, self.done.last_mut()) else { return Ok(()) };
-        match sent {
-            Sent::Added => map.added += 1,
-            Sent::Present => map.present += 1,
-            Sent::Conflict(conflict) => {
-                self.progress.say(&format!("{}: {}: {}", map.name, conflict.id, conflict.why));
+    fn count(&mut self, outcome: anyhow::Result<SendOutcome>) -> anyhow::Result<()> {
+        let (outcome, Some(map)) = (outcome?, self.maps.last_mut()) else { return Ok(()) };
+        match outcome {
+            SendOutcome::Added => map.added += 1,
+            SendOutcome::Present => map.present += 1,
+            SendOutcome::Conflict(conflict) => {
+                self.progress.println(&format!("{}: {}: {}", map.name, conflict.id, conflict.why));
                 map.conflicts.push(conflict);
             }
         }
@@ -232,30 +236,30 @@ impl Restore {
     }
 }
 
-/// Where images go.
+/// The map on the server that images are sent to.
 struct Target {
     path: String,
     map: Map,
-    /// What is there already.
+    /// The images that it had at first.
     present: HashMap<ImageId, Digest>,
 }
 
-async fn present(client: &Client, path: &str) -> anyhow::Result<HashMap<ImageId, Digest>> {
+async fn list_images(client: &Client, path: &str) -> anyhow::Result<HashMap<ImageId, Digest>> {
     #[derive(Deserialize)]
     struct Page {
         images: Vec<Image>,
         next_cursor: Option<String>,
     }
-    let (mut present, mut cursor) = (HashMap::new(), None::<String>);
+    let (mut images, mut cursor) = (HashMap::new(), None::<String>);
     loop {
-        let cursor_of = cursor.iter().map(|cursor| ("cursor", cursor.clone()));
-        let query: Vec<_> = cursor_of.chain([("limit", PAGE.to_string())]).collect();
-        let ask = || Ok(client.get(&format!("{path}/images")).query(&query));
-        let page: Page = client.send_with_retries(ask).await?.json().await?;
-        present.extend(page.images.into_iter().map(|image| (image.id, image.digest)));
+        let cursor_parameter = cursor.iter().map(|cursor| ("cursor", cursor.clone()));
+        let query: Vec<_> = cursor_parameter.chain([("limit", PAGE_SIZE.to_string())]).collect();
+        let request = || Ok(client.get(&format!("{path}/images")).query(&query));
+        let page: Page = client.send_with_retries(request).await?.json().await?;
+        images.extend(page.images.into_iter().map(|image| (image.id, image.digest)));
         cursor = page.next_cursor;
         if cursor.is_none() {
-            return Ok(present);
+            return Ok(images);
         }
     }
 }
@@ -265,50 +269,51 @@ async fn send(
     target: &Target,
     image: ExportedImage,
     bytes: Bytes,
-) -> anyhow::Result<Sent> {
+) -> anyhow::Result<SendOutcome> {
     let (id, digest) = (image.image.id.clone(), image.image.digest);
     if target.present.get(&id) == Some(&digest) {
-        return Ok(Sent::Present);
+        return Ok(SendOutcome::Present);
     }
     let media_type = image.image.media_type.as_str();
     let meta = serde_json::to_string(&ImportedImage { map: target.map.clone(), image })?;
-    let answer = client
+    let response = client
         .response_with_retries(|| {
             let part = Part::stream(bytes.clone()).mime_str(media_type)?;
             let form = Form::new().part("image", part).text("meta", meta.clone());
             Ok(client.post(&format!("{}/import", target.path)).multipart(form))
         })
         .await?;
-    match answer.status() {
-        StatusCode::CREATED => Ok(Sent::Added),
-        StatusCode::OK => Ok(Sent::Present),
+    match response.status() {
+        StatusCode::CREATED => Ok(SendOutcome::Added),
+        StatusCode::OK => Ok(SendOutcome::Present),
         StatusCode::CONFLICT if target.present.contains_key(&id) => {
-            Ok(Sent::Conflict(LeftOut { id, why: explained(answer).await.to_string() }))
+            Ok(SendOutcome::Conflict(LeftOut { id, why: explained(response).await.to_string() }))
         }
-        _ => Err(explained(answer).await.context(format!("the image {:?}", id.as_str()))),
+        _ => Err(explained(response).await.context(format!("the image {:?}", id.as_str()))),
     }
 }
 
-fn report(outcome: &Outcome, json: bool) -> anyhow::Result<()> {
+/// Prints the report. Conflicts are an error.
+fn print(report: &RestoreReport, json: bool) -> anyhow::Result<()> {
     if json {
-        println!("{}", serde_json::to_string(outcome)?);
+        println!("{}", serde_json::to_string(report)?);
     } else {
-        for map in &outcome.maps {
+        for map in &report.maps {
             println!(
-                "{}: {} images added, {} there already; descriptors of {}",
+                "{}: {} images added, {} already present; descriptors of {}",
                 map.name, map.added, map.present, map.model
             );
         }
-        println!("{:.1} s", outcome.seconds);
+        println!("{:.1} s", report.seconds);
     }
-    let left_out: usize = outcome.maps.iter().map(|map| map.left_out.len()).sum();
+    let left_out: usize = report.maps.iter().map(|map| map.left_out.len()).sum();
     if left_out > 0 {
-        eprintln!("{left_out} images were damaged when the backup was made and are not in it");
+        eprintln!("{left_out} images are not in the backup: they were damaged when it was made");
     }
-    match outcome.maps.iter().map(|map| map.conflicts.len()).sum() {
+    match report.maps.iter().map(|map| map.conflicts.len()).sum() {
         0 => Ok(()),
         images => bail!(
-            "{images} images were not restored: their ids are taken by other pictures; remove \
+            "{images} images were not restored: their ids are taken by other images on the server; delete \
              those, or restore under another name with --as"
         ),
     }

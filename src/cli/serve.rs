@@ -13,37 +13,42 @@ use whereabouts_server::config::{Config, Overrides, RefinerChoice};
 use whereabouts_server::startup;
 use whereabouts_server::startup::Role;
 
-/// The settings that a flag can set; all others are in the file and the environment.
+/// The settings that have a flag; all others come from the configuration file and the environment.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// A configuration file; `whereabouts config --defaults` prints one with every key
+    /// Configuration file; `whereabouts config --defaults` prints one with every setting
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// The folder where everything is kept
+    /// Data folder
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Where to listen; port 0 takes any free one
-    #[arg(long, value_name = "HOST:PORT")]
+    /// IP address and port to listen on; port 0 picks a free port
+    #[arg(long, value_name = "IP:PORT", value_parser = listen_address)]
     listen: Option<SocketAddr>,
-    /// Write the address here once the server is ready
+    /// Write the bound address to this file once the server is ready
     #[arg(long, value_name = "FILE")]
     address_file: Option<PathBuf>,
-    /// The model of maps that name none
+    /// Default model, for maps that do not name one
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
-    /// Who refines the candidates
+    /// Refiner of the candidates
     #[arg(long)]
     refiner: Option<RefinerChoice>,
-    /// Ask nobody for a key, whatever the server listens on: whoever reaches it may do everything
+    /// Require no API key, whatever address the server listens on: anyone who can reach it has full access
     #[arg(long)]
     no_keys: bool,
-    /// Refine nothing here; other processes do (`whereabouts worker`). Needs a database (database.url)
+    /// Do not refine in this process but leave it to others (`whereabouts worker`); needs a database
+    /// (database.url)
     #[arg(long)]
     no_workers: bool,
-    /// A server that speaks the OpenAI chat-completions format, for --refiner mllm; its key comes
-    /// from WHEREABOUTS_MLLM__API_KEY
+    /// URL of a server with the OpenAI chat-completions API, for --refiner mllm; its key is read from
+    /// WHEREABOUTS_MLLM__API_KEY
     #[arg(long, value_name = "URL")]
     mllm_base_url: Option<String>,
+}
+
+fn listen_address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| "expected an IP address and a port, such as 127.0.0.1:8080".into())
 }
 
 pub async fn run(role: Role, args: Args) -> anyhow::Result<()> {
@@ -59,34 +64,36 @@ pub async fn run(role: Role, args: Args) -> anyhow::Result<()> {
     if role == Role::Worker {
         check_worker(&config)?;
     }
-    let (troubles, _traces) =
+    let (log_issues, _traces) =
         whereabouts_telemetry::init(&config.log, &config.traces).map_err(anyhow::Error::msg)?;
     let listener = TcpListener::bind(config.server.listen).await.with_context(|| {
-        format!("cannot listen on {}; choose another with --listen", config.server.listen)
+        format!("cannot listen on {}; choose another address with --listen", config.server.listen)
     })?;
     let shutdown = CancellationToken::new();
     tokio::spawn(cancel_on_signal(shutdown.clone()));
-    startup::run(role, config, troubles, listener, shutdown, |address| {
+    startup::run(role, config, log_issues, listener, shutdown, |address| {
         args.address_file.as_deref().map_or(Ok(()), |file| write_address(file, address))
     })
     .await
 }
 
-/// A worker that could not find a job, or would do nothing with one, does not start.
+/// Refuses a configuration under which a worker would never find a job or could not refine it.
 fn check_worker(config: &Config) -> anyhow::Result<()> {
     if !config.database.is_set() {
         bail!(
-            "a worker shares a database with servers: set database.url (WHEREABOUTS_DATABASE__URL); a \
-             server with the embedded store refines by itself"
+            "a worker needs the database of its servers: set database.url (WHEREABOUTS_DATABASE__URL). A \
+             server with the embedded store needs no worker: it refines in its own process"
         );
     }
     if config.jobs.workers == 0 {
-        bail!("a worker refines: leave --no-workers out, and set jobs.workers to 1 or more");
+        bail!(
+            "this worker would refine nothing: remove --no-workers and set jobs.workers to 1 or more"
+        );
     }
     if config.refine.refiner == RefinerChoice::OFF {
         let refiners: Vec<&str> = REFINERS.iter().map(RefinerEntry::name).collect();
         bail!(
-            "a worker refines: set refine.refiner to {}, as the servers have it",
+            "this worker would refine nothing: set refine.refiner to {}, as on the servers",
             refiners.join(" or ")
         );
     }
@@ -97,7 +104,7 @@ async fn cancel_on_signal(shutdown: CancellationToken) {
     let (Ok(mut terminate), Ok(mut interrupt)) =
         (signal(SignalKind::terminate()), signal(SignalKind::interrupt()))
     else {
-        return tracing::error!("signals cannot be caught; stop the server with SIGKILL");
+        return tracing::error!("cannot install signal handlers; stop the server with SIGKILL");
     };
     tokio::select! {
         _ = terminate.recv() => {}
@@ -106,10 +113,10 @@ async fn cancel_on_signal(shutdown: CancellationToken) {
     shutdown.cancel();
 }
 
-/// Writes beside and renames, so that whoever waits for the file never reads half an address.
+/// Writes a temporary file and renames it, so that a reader never sees half an address.
 fn write_address(file: &Path, address: SocketAddr) -> anyhow::Result<()> {
-    let beside = file.with_extension("tmp");
-    std::fs::write(&beside, format!("{address}\n"))
-        .and_then(|()| std::fs::rename(&beside, file))
+    let temporary = file.with_extension("tmp");
+    std::fs::write(&temporary, format!("{address}\n"))
+        .and_then(|()| std::fs::rename(&temporary, file))
         .with_context(|| format!("cannot write the address to {}", file.display()))
 }

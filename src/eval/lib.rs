@@ -1,15 +1,15 @@
-//! How often the service is right, measured on a folder of references and a folder of queries.
+//! Measures Recall@K on a folder of references and a folder of queries, and reports it.
 //!
-//! | file | what it does |
+//! | module | purpose |
 //! |---|---|
-//! | `folder`, `poses`, `truth`, `dataset` | the pictures, and which references are true for which query |
-//! | `map`, `run`, `outcome` | indexes, retrieves and refines with the parts of the service, and keeps what was found |
-//! | `recall`, `resample`, `open_set` | Recall@K, bootstrap intervals, known and unknown places |
-//! | `summary`, `table`, `predictions` | the outcome as JSON, as the field's table, as CSV |
-//! | `report` | the outcome as a page with pictures |
+//! | `folder`, `poses`, `truth`, `dataset` | the images, and the correct references of each query |
+//! | `map`, `run`, `outcome` | index, retrieve and refine with the service, and cache the outcomes |
+//! | `recall`, `resample`, `open_set` | Recall@K, bootstrap intervals, open-set metrics |
+//! | `summary`, `table`, `predictions` | the results as JSON, as a table, as CSV |
+//! | `report` | the results as an HTML page with example images |
 //!
 //! There is no second pipeline: descriptors, search, refiners and the cache of descriptions are those
-//! of the [`whereabouts_service`], in a data folder that a server could serve.
+//! of [`whereabouts_service`], on a data folder that a server could serve.
 
 mod cache_key;
 mod dataset;
@@ -32,9 +32,9 @@ mod tests;
 
 pub use dataset::{Dataset, EvaluatedQuery, Folders, QueryKind, Sampling};
 pub use folder::{PictureFile, pictures};
-pub use outcome::{MethodOutcomes, Outcome, Prediction, Times};
+pub use outcome::{MethodOutcomes, Prediction, QueryOutcome, StageTimes};
 pub use poses::PoseSource;
-pub use run::{Evaluator, Method, RunSettings, Watch};
+pub use run::{Evaluator, Method, Observer, RunSettings};
 pub use summary::{MethodSummary, RunConditions, Summary};
 pub use table::table;
 pub use truth::TruthSource;

@@ -1,4 +1,4 @@
-//! The map of the references, in the work folder: made to hold exactly the pictures of the folder.
+//! Keeps the map of the references in the work folder identical to the folder of references.
 
 use std::collections::{HashMap, HashSet};
 use std::time::Duration;
@@ -16,27 +16,27 @@ use whereabouts_vision::AdmissionRequest;
 /// The map of the references.
 pub(super) struct ReferenceMap {
     pub map: Map,
-    /// Covers every reference, by name and bytes.
+    /// Digest over the names and bytes of all references.
     pub digest: Digest,
 }
 
 impl Evaluator<'_> {
-    /// Adds what is missing, replaces what has changed, removes what is gone, and waits until the
-    /// index has caught up.
+    /// Creates or updates the map: adds missing images, replaces changed ones, deletes those that are gone from the
+    /// folder, and waits until the index is up to date.
     pub(super) async fn reference_map(
         &self,
         references: &[PictureFile],
         descriptor: DescriptorKind,
     ) -> anyhow::Result<ReferenceMap> {
         let service = self.service.as_ref();
-        // A model of its own for each map: descriptors of different models do not mix.
+        // One map per model and execution: descriptors of different models are not comparable.
         let extractor = service
             .maps
             .imaging
             .installed_model(service.maps.imaging.models.default_model())
             .await?;
-        let of = format!("{}\n{}", extractor.digest(), extractor.execution());
-        let name = format!("{descriptor}-{}", &Digest::of(of.as_bytes()).hex()[..12]);
+        let identity = format!("{}\n{}", extractor.digest(), extractor.execution());
+        let name = format!("{descriptor}-{}", &Digest::of(identity.as_bytes()).hex()[..12]);
         let name: MapName = name.parse()?;
         let change = MapChange {
             scene: Some(self.settings.scene),
@@ -45,32 +45,36 @@ impl Evaluator<'_> {
         };
         service.maps.put(name.clone(), change).await?;
 
-        let known = known_images(service, &name).await?;
-        self.watch.begin("references", references.len());
+        let stored = stored_images(service, &name).await?;
+        self.observer.begin("references", references.len());
         let mut added = futures_util::stream::iter(references)
             .map(|picture| {
-                let (name, before) = (&name, known.get(&picture.id).copied());
+                let (name, previous) = (&name, stored.get(&picture.id).copied());
                 async move {
-                    let digest = self.add(name, picture, before).await?;
+                    let digest = self.add(name, picture, previous).await?;
                     Ok::<_, anyhow::Error>((picture, digest))
                 }
             })
-            .buffered(self.settings.side_by_side);
+            .buffered(self.settings.concurrency);
         let mut listing = String::new();
         let mut present = HashSet::with_capacity(references.len());
         while let Some((picture, digest)) = added.try_next().await? {
             listing.push_str(&format!("{} {digest}\n", picture.id));
             present.insert(&picture.id);
-            self.watch.step();
+            self.observer.step();
         }
         drop(added);
-        for gone in known.keys().filter(|id| !present.contains(id)) {
+        for gone in stored.keys().filter(|id| !present.contains(id)) {
             service.images.delete(&name, gone).await?;
         }
         wait_for_index(service, &name).await?;
-        self.watch.end();
-        let map =
-            service.maps.store.map(&name).await?.context("the map of the references is gone")?;
+        self.observer.finish();
+        let map = service
+            .maps
+            .store
+            .map(&name)
+            .await?
+            .context("the map of the references was deleted; run the same command again")?;
         Ok(ReferenceMap { map, digest: Digest::of(listing.as_bytes()) })
     }
 
@@ -78,13 +82,13 @@ impl Evaluator<'_> {
         &self,
         map: &MapName,
         picture: &PictureFile,
-        before: Option<Digest>,
+        previous: Option<Digest>,
     ) -> anyhow::Result<Digest> {
-        let named = || picture.file.display().to_string();
-        let bytes: Bytes = tokio::fs::read(&picture.file).await.with_context(named)?.into();
+        let file = || picture.file.display().to_string();
+        let bytes: Bytes = tokio::fs::read(&picture.file).await.with_context(file)?.into();
         let digest = Digest::of(&bytes);
-        match before {
-            Some(before) if before == digest => return Ok(digest),
+        match previous {
+            Some(previous) if previous == digest => return Ok(digest),
             Some(_) => self.service.images.delete(map, &picture.id).await?,
             None => {}
         }
@@ -94,25 +98,28 @@ impl Evaluator<'_> {
             .add(map, NewImage { bytes, meta, demand: AdmissionRequest::BACKGROUND })
             .await
             .with_context(|| {
-                format!("{} cannot be a reference; repair it or take it out of the folder", named())
+                format!(
+                    "cannot add the reference {}; repair it or remove it from the folder",
+                    file()
+                )
             })?;
         Ok(digest)
     }
 }
 
-async fn known_images(
+async fn stored_images(
     service: &Service,
     map: &MapName,
 ) -> anyhow::Result<HashMap<ImageId, Digest>> {
     const PAGE: usize = 1000;
-    let mut known = HashMap::new();
+    let mut stored = HashMap::new();
     let mut cursor: Option<ImageId> = None;
     loop {
         let page = service.images.list(map, cursor.as_ref(), Some(PAGE)).await?;
-        known.extend(page.images.into_iter().map(|image| (image.id, image.digest)));
+        stored.extend(page.images.into_iter().map(|image| (image.id, image.digest)));
         match page.next_cursor {
             Some(next) => cursor = Some(next.parse()?),
-            None => return Ok(known),
+            None => return Ok(stored),
         }
     }
 }

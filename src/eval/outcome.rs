@@ -1,4 +1,4 @@
-//! What was found for each query, kept on disk so that a run that was killed goes on.
+//! The outcome of each query, cached on disk so that an interrupted run can be resumed.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -12,43 +12,44 @@ use serde::{Deserialize, Serialize};
 use super::Method;
 use whereabouts_core::{Description, Digest, ImageId, Usage};
 
-/// What one method found for one query.
+/// The outcome of one query with one method.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Outcome {
+pub struct QueryOutcome {
     /// The query.
     pub query: ImageId,
-    /// Its bytes.
+    /// SHA-256 of the query's bytes.
     pub digest: Digest,
     /// The references, best first.
-    pub answers: Vec<Prediction>,
-    /// How sure the first of them is, 0 to 1.
+    #[serde(rename = "answers")]
+    pub predictions: Vec<Prediction>,
+    /// Confidence in the first prediction, 0 to 1.
     pub confidence: f32,
-    /// What a refiner said of the pairs.
+    /// The refiner's descriptions of the pairs.
     pub descriptions: Vec<Description>,
-    /// Why the order is as it is.
+    /// The refiner's explanation of its ranking.
     pub reasoning: Option<String>,
-    /// What it cost.
+    /// Calls and tokens spent.
     pub usage: Usage,
-    /// How long it took.
-    pub times: Times,
-    /// Why part of a refined order, or all of it, is the coarse one.
+    /// Duration of the stages.
+    pub times: StageTimes,
+    /// Why the refined ranking is the coarse one, in part or as a whole; `None` if it was refined fully.
     pub degraded: Option<String>,
 }
 
-/// One reference in an answer.
+/// A reference predicted to show the query's place.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Prediction {
     /// The reference.
     pub image_id: ImageId,
-    /// Cosine similarity of its descriptor to the query's, −1 to 1.
+    /// Cosine similarity of its descriptor and the query's, −1 to 1.
     pub similarity: f32,
-    /// Its place in the coarse order, from 1.
+    /// Rank in the coarse order, from 1.
     pub coarse_rank: usize,
 }
 
-/// How long the stages took, in milliseconds.
+/// Duration of the stages of one query, in milliseconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct Times {
+pub struct StageTimes {
     /// Decoding and resizing.
     pub decode: f64,
     /// Inference and pooling.
@@ -57,63 +58,67 @@ pub struct Times {
     pub search: f64,
     /// Refinement of all pairs; 0 for a coarse method.
     pub refine: f64,
-    /// Pairs that were refined.
+    /// Number of pairs refined.
     pub pairs: usize,
 }
 
-/// What one method found for all queries, in their order.
+/// The outcomes of one method, in the order of the queries.
 #[derive(Debug, Clone)]
 pub struct MethodOutcomes {
     /// The method.
     pub method: Method,
-    /// One for each query.
-    pub outcomes: Vec<Outcome>,
+    /// One outcome per query.
+    pub outcomes: Vec<QueryOutcome>,
 }
 
 /// The outcomes of one method in a file of JSON lines.
 ///
-/// Its name covers all that decides an outcome, so that a changed setting begins a new file.
+/// The file name is a digest of everything that determines an outcome, so a changed setting begins a new file.
 pub(super) struct OutcomeCache {
-    known: HashMap<(ImageId, Digest), Outcome>,
+    cached: HashMap<(ImageId, Digest), QueryOutcome>,
     file: Mutex<File>,
 }
 
 impl OutcomeCache {
-    /// Reads what an earlier run left. A line that a kill cut short is passed over.
+    /// Opens a file and reads the outcomes of earlier runs. A truncated line is ignored.
     pub fn open(path: &Path) -> anyhow::Result<Self> {
-        let cannot = || format!("cannot use {}; choose another folder with --work", path.display());
+        let context =
+            || format!("cannot use {}; choose another folder with --work", path.display());
         let text = match std::fs::read(path) {
             Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => String::new(),
-            Err(error) => return Err(error).with_context(cannot),
+            Err(error) => return Err(error).with_context(context),
         };
-        let known = text
+        let cached = text
             .lines()
-            .filter_map(|line| serde_json::from_str::<Outcome>(line).ok())
+            .filter_map(|line| serde_json::from_str::<QueryOutcome>(line).ok())
             .map(|outcome| ((outcome.query.clone(), outcome.digest), outcome))
             .collect();
-        let mut file = File::options().create(true).append(true).open(path).with_context(cannot)?;
+        let mut file =
+            File::options().create(true).append(true).open(path).with_context(context)?;
         if !text.is_empty() && !text.ends_with('\n') {
-            file.write_all(b"\n").with_context(cannot)?;
+            file.write_all(b"\n").with_context(context)?;
         }
-        Ok(Self { known, file: Mutex::new(file) })
+        Ok(Self { cached, file: Mutex::new(file) })
     }
 
-    /// What an earlier run found for these bytes.
-    pub fn get(&self, query: &ImageId, digest: Digest) -> Option<Outcome> {
-        self.known.get(&(query.clone(), digest)).cloned()
+    /// Returns the outcome of an earlier run for the same query with the same bytes.
+    pub fn get(&self, query: &ImageId, digest: Digest) -> Option<QueryOutcome> {
+        self.cached.get(&(query.clone(), digest)).cloned()
     }
 
-    /// Keeps an outcome; it is on disk when this returns. A degraded one is not kept: the next run
-    /// tries again.
-    pub fn keep(&self, outcome: &Outcome) -> anyhow::Result<()> {
+    /// Writes an outcome to disk before it returns. A degraded one is not written, so that the next run tries
+    /// again.
+    pub fn insert(&self, outcome: &QueryOutcome) -> anyhow::Result<()> {
         if outcome.degraded.is_some() {
             return Ok(());
         }
         let mut line = serde_json::to_vec(outcome)?;
         line.push(b'\n');
         let mut file = self.file.lock();
-        file.write_all(&line).and_then(|()| file.sync_data()).context("cannot keep an outcome")
+        file.write_all(&line)
+            .and_then(|()| file.sync_data())
+            .context("cannot write an outcome to the work folder")
     }
 }
 
@@ -121,55 +126,78 @@ impl OutcomeCache {
 mod tests {
     use super::*;
 
-    fn outcome(query: &str) -> Outcome {
-        Outcome {
+    fn outcome(query: &str) -> QueryOutcome {
+        QueryOutcome {
             query: query.parse().unwrap(),
             digest: Digest::of(query.as_bytes()),
-            answers: Vec::new(),
+            predictions: Vec::new(),
             confidence: 0.0,
             descriptions: Vec::new(),
             reasoning: None,
             usage: Usage::default(),
-            times: Times::default(),
+            times: StageTimes::default(),
             degraded: None,
         }
     }
 
     #[test]
-    fn what_was_kept_is_known_after_a_kill_in_the_middle_of_a_line() {
+    fn a_truncated_line_and_degraded_outcomes_are_not_cached() {
         let dir = tempfile::TempDir::new().unwrap();
-        let file = dir.path().join("kept.jsonl");
-        let kept = OutcomeCache::open(&file).unwrap();
-        kept.keep(&outcome("a")).unwrap();
-        kept.keep(&Outcome { degraded: Some("why".into()), ..outcome("b") }).unwrap();
-        kept.keep(&outcome("c")).unwrap();
+        let file = dir.path().join("outcomes.jsonl");
+        let cache = OutcomeCache::open(&file).unwrap();
+        cache.insert(&outcome("a")).unwrap();
+        cache.insert(&QueryOutcome { degraded: Some("why".into()), ..outcome("b") }).unwrap();
+        cache.insert(&outcome("c")).unwrap();
         let bytes = std::fs::read(&file).unwrap();
         std::fs::write(&file, &bytes[..bytes.len() - 9]).unwrap();
-        let kept = OutcomeCache::open(&file).unwrap();
-        kept.keep(&outcome("d")).unwrap();
-        let kept = OutcomeCache::open(&file).unwrap();
-        let known =
-            |name: &str| kept.get(&name.parse().unwrap(), Digest::of(name.as_bytes())).is_some();
-        assert_eq!(["a", "b", "c", "d"].map(known), [true, false, false, true]);
-        assert!(kept.get(&"a".parse().unwrap(), Digest::of(b"other bytes")).is_none());
+        let cache = OutcomeCache::open(&file).unwrap();
+        cache.insert(&outcome("d")).unwrap();
+        let cache = OutcomeCache::open(&file).unwrap();
+        let is_cached =
+            |name: &str| cache.get(&name.parse().unwrap(), Digest::of(name.as_bytes())).is_some();
+        assert_eq!(["a", "b", "c", "d"].map(is_cached), [true, false, false, true]);
+        assert!(cache.get(&"a".parse().unwrap(), Digest::of(b"other bytes")).is_none());
     }
 
     #[test]
-    fn what_is_read_again_is_what_was_measured_to_the_last_bit() {
+    fn a_cached_outcome_equals_the_measured_one_to_the_last_bit() {
         let dir = tempfile::TempDir::new().unwrap();
-        let file = dir.path().join("kept.jsonl");
-        let kept = OutcomeCache::open(&file).unwrap();
+        let file = dir.path().join("outcomes.jsonl");
+        let cache = OutcomeCache::open(&file).unwrap();
         let measured = |i: u32| {
             let ms = f64::from(i) * 1e-6;
-            let times =
-                Times { decode: ms / 3.0, extract: ms / 7.0, refine: ms, ..outcome("a").times };
-            Outcome { times, ..outcome(&i.to_string()) }
+            let times = StageTimes {
+                decode: ms / 3.0,
+                extract: ms / 7.0,
+                refine: ms,
+                ..outcome("a").times
+            };
+            QueryOutcome { times, ..outcome(&i.to_string()) }
         };
-        let all: Vec<Outcome> = (0..200).map(|i| measured(i * 7919 + 1)).collect();
-        all.iter().for_each(|outcome| kept.keep(outcome).unwrap());
-        let kept = OutcomeCache::open(&file).unwrap();
-        assert!(
-            all.iter().all(|known| kept.get(&known.query, known.digest).as_ref() == Some(known))
-        );
+        let all: Vec<QueryOutcome> = (0..200).map(|i| measured(i * 7919 + 1)).collect();
+        all.iter().for_each(|outcome| cache.insert(outcome).unwrap());
+        let cache = OutcomeCache::open(&file).unwrap();
+        assert!(all.iter().all(|one| cache.get(&one.query, one.digest).as_ref() == Some(one)));
+    }
+
+    #[test]
+    fn the_file_of_an_earlier_version_can_be_read() {
+        let line = serde_json::to_value(outcome("a")).unwrap();
+        let keys: Vec<&String> = line.as_object().unwrap().keys().collect();
+        let mut expected = [
+            "query",
+            "digest",
+            "answers",
+            "confidence",
+            "descriptions",
+            "reasoning",
+            "usage",
+            "times",
+            "degraded",
+        ];
+        expected.sort_unstable();
+        let mut keys: Vec<&str> = keys.into_iter().map(String::as_str).collect();
+        keys.sort_unstable();
+        assert_eq!(keys, expected);
     }
 }

@@ -1,4 +1,4 @@
-//! Where the images of a folder were taken: a CSV file, their names, or their EXIF GPS.
+//! Reads the poses of the images in a folder from a CSV file, from their names, or from EXIF GPS.
 
 use std::collections::HashMap;
 use std::io::Cursor;
@@ -11,30 +11,36 @@ use serde::Deserialize;
 use super::PictureFile;
 use whereabouts_core::{CoordinateFrame, GeographicPose, MetricPose, Pose, PoseInput};
 
-/// Where poses come from; one source for a whole folder.
+/// Source of the poses of a whole folder.
 #[derive(Debug)]
 pub enum PoseSource {
     /// A CSV file.
     Csv {
-        /// The frame of all of them.
+        /// Coordinate frame of all poses.
         frame: CoordinateFrame,
-        /// By path below the folder, or by file name.
+        /// Poses by path relative to the folder, or by file name.
         poses: HashMap<String, Pose>,
     },
-    /// `@easting@northing@…` in the file names: metres of a UTM zone.
+    /// File names of the form `@easting@northing@…`, in metres of a UTM zone.
     Names,
-    /// GPS in the EXIF block of each file.
+    /// EXIF GPS of each file.
     Exif,
 }
 
 impl PoseSource {
-    /// The CSV file that was named or lies in the folder; else the names, if they hold positions;
-    /// else EXIF.
+    /// Finds the source: the given CSV file, otherwise `poses.csv` in the folder, otherwise the file names if all of
+    /// them have positions, otherwise EXIF.
+    ///
+    /// # Errors
+    /// The CSV file cannot be read, or a row is not a pose.
     pub fn find(dir: &Path, csv: Option<&Path>, files: &[PictureFile]) -> anyhow::Result<Self> {
-        let beside = dir.join("poses.csv");
-        match csv.or(beside.is_file().then_some(beside.as_path())) {
+        let default = dir.join("poses.csv");
+        match csv.or(default.is_file().then_some(default.as_path())) {
             Some(file) => Self::from_csv(file),
-            None if files.iter().all(|file| in_name(file_name(file.id.as_str())).is_some()) => {
+            None if files
+                .iter()
+                .all(|file| pose_in_name(file_name(file.id.as_str())).is_some()) =>
+            {
                 Ok(Self::Names)
             }
             None => Ok(Self::Exif),
@@ -55,24 +61,28 @@ impl PoseSource {
             let name = row.file.clone();
             let pose = row.pose().with_context(|| format!("{} line {line}", file.display()))?;
             if *frame.get_or_insert(pose.frame()) != pose.frame() {
-                bail!("{} line {line}: lat,lon and x,y in one file", file.display());
+                bail!(
+                    "{} line {line} mixes lat,lon and x,y with other rows; use one frame per file",
+                    file.display()
+                );
             }
             poses.insert(name, pose);
         }
-        let frame = frame.with_context(|| format!("{} has no rows", file.display()))?;
+        let frame =
+            frame.with_context(|| format!("{} has no rows; add one per image", file.display()))?;
         Ok(Self::Csv { frame, poses })
     }
 
-    /// Where it looks, in a few words.
-    pub fn said(&self) -> &'static str {
+    /// Names the source for an error message.
+    pub fn name(&self) -> &'static str {
         match self {
-            Self::Csv { .. } => "the CSV of positions",
-            Self::Names => "their names",
+            Self::Csv { .. } => "the CSV file of poses",
+            Self::Names => "their file names",
             Self::Exif => "their EXIF data",
         }
     }
 
-    /// The frame of the poses, as far as the source decides it.
+    /// Returns the coordinate frame of the poses, unless it differs from file to file.
     pub fn frame(&self) -> Option<CoordinateFrame> {
         match self {
             Self::Csv { frame, .. } => Some(*frame),
@@ -81,14 +91,17 @@ impl PoseSource {
         }
     }
 
-    /// The pose of one image; `None` if the source does not know it.
+    /// Returns the pose of one image; `None` if the source has none. Only EXIF reads `bytes`.
+    ///
+    /// # Errors
+    /// The EXIF position is out of range.
     pub fn pose(&self, id: &str, bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
         match self {
             Self::Csv { poses, .. } => {
                 Ok(poses.get(id).or_else(|| poses.get(file_name(id))).copied())
             }
-            Self::Names => Ok(in_name(file_name(id))),
-            Self::Exif => in_exif(bytes),
+            Self::Names => Ok(pose_in_name(file_name(id))),
+            Self::Exif => pose_in_exif(bytes),
         }
     }
 }
@@ -113,12 +126,12 @@ struct Row {
 impl Row {
     fn pose(self) -> anyhow::Result<Pose> {
         let Self { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw, .. } = self;
-        let given = PoseInput { lat, lon, x, y, ..PoseInput::default() };
-        let frame = given.frame().context("a row needs lat and lon, or x and y")?;
+        let position = PoseInput { lat, lon, x, y, ..PoseInput::default() };
+        let frame = position.frame().context("a row needs either lat and lon, or x and y")?;
         // Columns of the other frame are ignored: tables often have more of them than a pose needs.
         let pose = match frame {
-            CoordinateFrame::Wgs84 => PoseInput { alt, heading, ..given },
-            CoordinateFrame::Metric => PoseInput { z, qx, qy, qz, qw, ..given },
+            CoordinateFrame::Wgs84 => PoseInput { alt, heading, ..position },
+            CoordinateFrame::Metric => PoseInput { z, qx, qy, qz, qw, ..position },
         };
         Ok(pose.check(frame)?)
     }
@@ -128,15 +141,15 @@ fn file_name(id: &str) -> &str {
     id.rsplit('/').next().unwrap_or(id)
 }
 
-/// The first two fields of `@easting@northing@…`, the names that the field's data sets share.
-fn in_name(name: &str) -> Option<Pose> {
+/// Parses the first two fields of `@easting@northing@…`, the naming convention of VPR data sets.
+fn pose_in_name(name: &str) -> Option<Pose> {
     let mut fields = name.strip_prefix('@')?.split('@');
     let (x, y) = (fields.next()?.parse().ok()?, fields.next()?.parse().ok()?);
     let pose = MetricPose { x, y, z: None, qx: None, qy: None, qz: None, qw: None };
     Pose::Metric(pose).checked().ok()
 }
 
-fn in_exif(bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
+fn pose_in_exif(bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
     let Ok(exif) = exif::Reader::new().read_from_container(&mut Cursor::new(bytes)) else {
         return Ok(None);
     };
@@ -144,9 +157,9 @@ fn in_exif(bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
         Some(Value::Rational(values)) => values.iter().map(Rational::to_f64).collect(),
         _ => Vec::new(),
     };
-    let is = |tag: Tag, word: &str| {
+    let starts_with = |tag: Tag, prefix: &str| {
         exif.get_field(tag, In::PRIMARY)
-            .is_some_and(|field| field.display_value().to_string().starts_with(word))
+            .is_some_and(|field| field.display_value().to_string().starts_with(prefix))
     };
     let degrees = |tag: Tag| match rationals(tag)[..] {
         [degrees, minutes, seconds] => Some(degrees + minutes / 60.0 + seconds / 3600.0),
@@ -162,12 +175,12 @@ fn in_exif(bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
     let alt = rationals(Tag::GPSAltitude).first().map(|&alt| if below_sea { -alt } else { alt });
     let heading = rationals(Tag::GPSImgDirection).first().copied();
     let pose = Pose::Geographic(GeographicPose {
-        lat: if is(Tag::GPSLatitudeRef, "S") { -lat } else { lat },
-        lon: if is(Tag::GPSLongitudeRef, "W") { -lon } else { lon },
+        lat: if starts_with(Tag::GPSLatitudeRef, "S") { -lat } else { lat },
+        lon: if starts_with(Tag::GPSLongitudeRef, "W") { -lon } else { lon },
         alt: alt.filter(|alt| alt.is_finite()),
         heading: heading.filter(|heading| heading.is_finite()),
     });
-    Ok(Some(pose.checked().context("its EXIF GPS position is out of range")?))
+    Ok(Some(pose.checked().context("the EXIF GPS position is out of range")?))
 }
 
 #[cfg(test)]
@@ -181,19 +194,19 @@ mod tests {
     }
 
     #[test]
-    fn the_fields_file_names_hold_metres() {
-        let Some(Pose::Metric(pose)) = in_name("@0584522.50@4477231.25@17@T@40.4@-80.0@.jpg")
+    fn easting_and_northing_are_read_from_file_names() {
+        let Some(Pose::Metric(pose)) = pose_in_name("@0584522.50@4477231.25@17@T@40.4@-80.0@.jpg")
         else {
             panic!("no pose");
         };
         assert_eq!((pose.x, pose.y), (584522.5, 4477231.25));
         for name in ["a.jpg", "@.jpg", "@1@.jpg", "@x@y@.jpg", "@nan@1@.jpg", "@1e30@1@.jpg"] {
-            assert!(in_name(name).is_none(), "{name}");
+            assert!(pose_in_name(name).is_none(), "{name}");
         }
     }
 
     #[test]
-    fn a_csv_names_files_by_path_or_by_name() {
+    fn a_csv_refers_to_files_by_path_or_by_name() {
         let source =
             csv("file, lat, lon, heading\na/1.jpg, 35.5, 139.5, 90\n2.jpg,1,2,\n").unwrap();
         assert_eq!(source.frame(), Some(CoordinateFrame::Wgs84));
@@ -203,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_row_is_named_by_its_line() {
+    fn an_invalid_row_is_reported_with_its_line() {
         for text in
             ["file,lat,lon\na,1,2\nb,95,2", "file,x,y\na,1,2\nb,,2", "file,x,y\na,1,2\nb,q,2"]
         {

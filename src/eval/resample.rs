@@ -1,12 +1,12 @@
-//! Repeatable chance: a sample of the queries, and bootstrap intervals.
+//! Reproducible random sampling: a sample of the queries, and bootstrap intervals.
 
 use std::ops::Range;
 
 /// SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014).
 #[derive(Debug, Clone)]
-struct Dice(u64);
+struct SplitMix64(u64);
 
-impl Dice {
+impl SplitMix64 {
     fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
@@ -21,40 +21,40 @@ impl Dice {
     }
 }
 
-/// `size` of `0..count`, each subset as likely as any other, in ascending order; all of them if
-/// there are no more. The same seed gives the same sample.
+/// Draws `size` of `0..count` without replacement, each subset with equal probability, in ascending order. Returns
+/// all of them if there are no more than `size`. The same seed gives the same sample.
 pub fn sample(count: usize, size: usize, seed: u64) -> Vec<usize> {
-    let mut places: Vec<usize> = (0..count).collect();
+    let mut indices: Vec<usize> = (0..count).collect();
     let size = size.min(count);
-    let mut dice = Dice(seed);
+    let mut random = SplitMix64(seed);
     // The first steps of a Fisher-Yates shuffle.
-    for place in 0..size {
-        places.swap(place, place + dice.below(count - place));
+    for index in 0..size {
+        indices.swap(index, index + random.below(count - index));
     }
-    places.truncate(size);
-    places.sort_unstable();
-    places
+    indices.truncate(size);
+    indices.sort_unstable();
+    indices
 }
 
-/// How many times the queries are drawn anew.
-const DRAWS: usize = 2000;
+/// Number of bootstrap resamples.
+const RESAMPLES: usize = 2000;
 
-/// The 95 % percentile bootstrap interval of the mean (Efron, 1979): the queries are drawn anew
-/// with replacement, and the interval spans the middle 95 % of the means. `None` without values.
+/// The 95 % percentile bootstrap interval of the mean (Efron, 1979): the values are resampled with replacement,
+/// and the interval spans the middle 95 % of the means. `None` without values.
 pub fn interval(values: &[f64]) -> Option<Range<f64>> {
     if values.is_empty() {
         return None;
     }
-    let mut dice = Dice(1);
-    let mut means: Vec<f64> = (0..DRAWS)
+    let mut random = SplitMix64(1);
+    let mut means: Vec<f64> = (0..RESAMPLES)
         .map(|_| {
-            let sum: f64 = (0..values.len()).map(|_| values[dice.below(values.len())]).sum();
+            let sum: f64 = (0..values.len()).map(|_| values[random.below(values.len())]).sum();
             sum / values.len() as f64
         })
         .collect();
     means.sort_unstable_by(f64::total_cmp);
-    let at = |share: f64| means[(share * (DRAWS - 1) as f64).round() as usize];
-    Some(at(0.025)..at(0.975))
+    let quantile = |share: f64| means[(share * (RESAMPLES - 1) as f64).round() as usize];
+    Some(quantile(0.025)..quantile(0.975))
 }
 
 #[cfg(test)]
@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_sample_is_a_subset_that_the_seed_decides() {
+    fn a_sample_is_a_subset_determined_by_the_seed() {
         let first = sample(1000, 400, 1);
         assert_eq!(first.len(), 400);
         assert!(first.is_sorted_by(|a, b| a < b) && first[399] < 1000);
@@ -72,17 +72,17 @@ mod tests {
     }
 
     #[test]
-    fn every_query_is_as_likely_to_be_in_a_sample() {
-        let mut times = [0; 10];
+    fn every_query_is_equally_likely_to_be_sampled() {
+        let mut counts = [0; 10];
         for seed in 0..2000 {
-            sample(10, 3, seed).into_iter().for_each(|place| times[place] += 1);
+            sample(10, 3, seed).into_iter().for_each(|index| counts[index] += 1);
         }
         // Binomial with mean 600 and standard deviation 20.5.
-        assert!(times.iter().all(|times| (500..700).contains(times)), "{times:?}");
+        assert!(counts.iter().all(|count| (500..700).contains(count)), "{counts:?}");
     }
 
     #[test]
-    fn an_interval_is_that_of_a_binomial() {
+    fn the_interval_of_a_binomial_matches_the_normal_approximation() {
         let values: Vec<f64> = (0..400).map(|i| if i % 4 == 0 { 0.0 } else { 1.0 }).collect();
         let found = interval(&values).unwrap();
         // 0.75 ± 1.96 · sqrt(0.75 · 0.25 / 400) = 0.75 ± 0.042.

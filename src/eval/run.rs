@@ -1,4 +1,4 @@
-//! Asks every query: retrieves as a server would, and hands the candidates to the refiners.
+//! Evaluates every query: retrieves as a server would, and passes the candidates to the refiners.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use uuid::Uuid;
 use super::cache_key::CacheKey;
 use super::map::ReferenceMap;
 use super::outcome::OutcomeCache;
-use super::{Dataset, EvaluatedQuery, MethodOutcomes, Outcome, Prediction, Times};
+use super::{Dataset, EvaluatedQuery, MethodOutcomes, Prediction, QueryOutcome, StageTimes};
 use whereabouts_core::{Calibration, DescriptorKind, Digest, Map, RefinerKind, Scene, Usage};
 use whereabouts_index::SearchMode;
 use whereabouts_refine::{
@@ -23,17 +23,17 @@ use whereabouts_service::{Retrieved, Service};
 use whereabouts_store::Step;
 use whereabouts_vision::{AdmissionRequest, FeatureSet};
 
-/// A way to answer.
+/// A way to localize a query: coarse retrieval, with or without refinement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Method {
-    /// What the coarse retriever compares.
+    /// The descriptor that coarse retrieval compares.
     pub descriptor: DescriptorKind,
-    /// Who orders its candidates anew.
+    /// The refiner of the candidates; `None` for coarse retrieval alone.
     pub refiner: Option<RefinerKind>,
 }
 
 impl Method {
-    /// Its name, as in `gem` and `gem+local`.
+    /// Returns the name, such as `gem` or `gem+local`.
     pub fn name(&self) -> String {
         match self.refiner {
             Some(refiner) => format!("{}+{refiner}", self.descriptor),
@@ -42,85 +42,93 @@ impl Method {
     }
 }
 
-/// How queries are asked.
+/// How queries are evaluated.
 #[derive(Debug, Clone)]
 pub struct RunSettings {
-    /// Candidates that are refined.
+    /// Number of candidates to refine.
     pub k: usize,
     /// How the map is searched.
     pub search: SearchMode,
-    /// What the pictures show.
+    /// What the images show.
     pub scene: Scene,
-    /// Pictures in work at a time.
-    pub side_by_side: usize,
-    /// Where outcomes are kept.
-    pub work: PathBuf,
-    /// How often a refinement is attempted.
+    /// Number of images processed concurrently.
+    pub concurrency: usize,
+    /// Folder for the map and the cached outcomes.
+    pub work_dir: PathBuf,
+    /// Attempts at one refinement, and the pauses between them.
     pub attempts: AttemptPolicy,
-    /// All else that decides what the refiners find; part of the names of files.
+    /// Everything else that determines what the refiners return; part of the key of cached outcomes.
     pub refiner_settings: String,
 }
 
-/// Hears how far a run has come.
-pub trait Watch: Send + Sync {
-    /// So many of these are to be done.
+/// Observes the progress of a run.
+pub trait Observer: Send + Sync {
+    /// A phase with `total` items begins; `what` names the items in the plural.
     fn begin(&self, what: &str, total: usize);
-    /// One of them is done.
+    /// One item of the phase is done.
     fn step(&self);
-    /// All are done.
-    fn end(&self);
+    /// The phase is complete.
+    fn finish(&self);
 }
 
-/// Runs methods with the parts of a service.
+/// Evaluates methods with the parts of a service.
 pub struct Evaluator<'a> {
-    /// The service, on the work folder.
+    /// A service on the work folder.
     pub service: Arc<Service>,
-    /// Who refines.
+    /// The refiners to evaluate.
     pub refiners: Vec<Arc<dyn Refiner>>,
-    /// How queries are asked.
+    /// How queries are evaluated.
     pub settings: RunSettings,
-    /// Hears how far it has come.
-    pub watch: &'a dyn Watch,
+    /// Observes the progress.
+    pub observer: &'a dyn Observer,
 }
 
-/// Answers that are kept are the service's answers to k = 10 at least, for the field's Recall@10.
-const LEAST_ANSWERS: usize = 10;
+/// Fewest predictions per query: Recall@10 needs ten.
+const MIN_PREDICTIONS: usize = 10;
 
 impl Evaluator<'_> {
-    /// The outcomes of the coarse method with this descriptor, and of each refiner on top of it.
+    /// Evaluates the coarse method with this descriptor, and each refiner on top of it.
+    ///
+    /// # Errors
+    /// An image or the work folder cannot be read or written, retrieval fails, or a refiner has to be asked again
+    /// later. What was found until then is cached.
     pub async fn run(
         &self,
         data: &Dataset,
         descriptor: DescriptorKind,
     ) -> anyhow::Result<Vec<MethodOutcomes>> {
         let references = self.reference_map(&data.references, descriptor).await?;
-        let calibration = self.calibrated(&references.map).await?;
+        let calibration = self.calibrate(&references.map).await?;
         let kinds = self.refiners.iter().map(|refiner| Some(refiner.kind()));
         let methods: Vec<Method> =
             [None].into_iter().chain(kinds).map(|refiner| Method { descriptor, refiner }).collect();
-        let kept = methods
+        let caches = methods
             .iter()
-            .map(|method| self.kept(*method, &references))
+            .map(|method| self.open_cache(*method, &references))
             .collect::<anyhow::Result<Vec<OutcomeCache>>>()?;
 
-        self.watch.begin("queries", data.queries.len());
-        let mut outcomes: Vec<Vec<Outcome>> = methods.iter().map(|_| Vec::new()).collect();
-        let mut asked = futures_util::stream::iter(&data.queries)
-            .map(|query| self.ask(&references.map, &calibration, query, &kept))
-            .buffered(self.settings.side_by_side);
-        while let Some(found) = asked.try_next().await? {
-            outcomes.iter_mut().zip(found).for_each(|(all, one)| all.push(one));
-            self.watch.step();
+        self.observer.begin("queries", data.queries.len());
+        let mut by_method: Vec<Vec<QueryOutcome>> = methods.iter().map(|_| Vec::new()).collect();
+        let mut evaluated = futures_util::stream::iter(&data.queries)
+            .map(|query| self.evaluate(&references.map, &calibration, query, &caches))
+            .buffered(self.settings.concurrency);
+        while let Some(outcomes) = evaluated.try_next().await? {
+            by_method.iter_mut().zip(outcomes).for_each(|(all, outcome)| all.push(outcome));
+            self.observer.step();
         }
-        self.watch.end();
-        let outcomes = methods.into_iter().zip(outcomes);
-        Ok(outcomes.map(|(method, outcomes)| MethodOutcomes { method, outcomes }).collect())
+        self.observer.finish();
+        let by_method = methods.into_iter().zip(by_method);
+        Ok(by_method.map(|(method, outcomes)| MethodOutcomes { method, outcomes }).collect())
     }
 
-    /// The file of a method's outcomes.
-    fn kept(&self, method: Method, references: &ReferenceMap) -> anyhow::Result<OutcomeCache> {
-        let RunSettings { k, search, scene, refiner_settings, work, .. } = &self.settings;
-        let decides = CacheKey {
+    /// Opens the cache of a method's outcomes.
+    fn open_cache(
+        &self,
+        method: Method,
+        references: &ReferenceMap,
+    ) -> anyhow::Result<OutcomeCache> {
+        let RunSettings { k, search, scene, refiner_settings, work_dir, .. } = &self.settings;
+        let key = CacheKey {
             version: env!("CARGO_PKG_VERSION"),
             map: &references.map.name,
             references: references.digest,
@@ -130,73 +138,74 @@ impl Evaluator<'_> {
             calibration: self.service.calibrator.settings,
         }
         .text();
-        let folder = work.join("outcomes");
+        let folder = work_dir.join("outcomes");
         std::fs::create_dir_all(&folder)
-            .with_context(|| format!("cannot make the folder {}", folder.display()))?;
-        let digest = Digest::of(decides.as_bytes()).hex();
+            .with_context(|| format!("cannot create the folder {}", folder.display()))?;
+        let digest = Digest::of(key.as_bytes()).hex();
         OutcomeCache::open(&folder.join(format!("{}-{}.jsonl", method.name(), &digest[..16])))
     }
 
-    /// What chance resemblance is like in the map. Measured anew each time: what an earlier run kept may
-    /// be of other references.
-    async fn calibrated(&self, map: &Map) -> anyhow::Result<Arc<Calibration>> {
-        let measures = self.refiners.iter().find_map(|refiner| refiner.negative_evidence());
-        self.service.calibrator.calibrate(map, measures).await?;
+    /// Measures the null distribution of the map. A calibration in the store is not reused: it may be of
+    /// other references.
+    async fn calibrate(&self, map: &Map) -> anyhow::Result<Arc<Calibration>> {
+        let evidence = self.refiners.iter().find_map(|refiner| refiner.negative_evidence());
+        self.service.calibrator.calibrate(map, evidence).await?;
         Ok(self.service.maps.store.calibration(map).await?.unwrap_or_default())
     }
 
-    /// The outcome of each method for one query; what is kept is not worked out again.
-    async fn ask(
+    /// Returns the outcome of each method for one query, from the cache where it is there.
+    async fn evaluate(
         &self,
         map: &Map,
         calibration: &Calibration,
         query: &EvaluatedQuery,
-        kept: &[OutcomeCache],
-    ) -> anyhow::Result<Vec<Outcome>> {
-        let named = || query.picture.file.display().to_string();
-        let frame: Bytes = tokio::fs::read(&query.picture.file).await.with_context(named)?.into();
+        caches: &[OutcomeCache],
+    ) -> anyhow::Result<Vec<QueryOutcome>> {
+        let file = || query.picture.file.display().to_string();
+        let frame: Bytes = tokio::fs::read(&query.picture.file).await.with_context(file)?.into();
         let digest = Digest::of(&frame);
-        let known: Vec<Option<Outcome>> =
-            kept.iter().map(|kept| kept.get(&query.picture.id, digest)).collect();
-        if known.iter().all(Option::is_some) {
-            return Ok(known.into_iter().flatten().collect());
+        let cached: Vec<Option<QueryOutcome>> =
+            caches.iter().map(|cache| cache.get(&query.picture.id, digest)).collect();
+        if cached.iter().all(Option::is_some) {
+            return Ok(cached.into_iter().flatten().collect());
         }
-        let wanted = self.settings.k.max(LEAST_ANSWERS);
+        let k = self.settings.k.max(MIN_PREDICTIONS);
         let refines_locally =
             self.refiners.iter().any(|refiner| refiner.kind() == RefinerKind::Local);
         let features = match refines_locally {
             true => FeatureSet::DescriptorAndDense,
             false => FeatureSet::DescriptorOnly,
         };
-        let search = (wanted, self.settings.search);
+        let search = (k, self.settings.search);
         let retrieved = self
             .service
             .localizer
             .retrieve(&map.name, &frame, search, features, AdmissionRequest::BACKGROUND)
             .await
-            .with_context(named)?;
-        let coarse = coarse(query, digest, &retrieved, calibration);
-        let mut outcomes = Vec::with_capacity(kept.len());
-        let input = self.input(map, digest, retrieved);
-        // The refiners fetch the frame from the store; the pin keeps it there meanwhile.
+            .with_context(file)?;
+        let coarse = coarse_outcome(query, digest, &retrieved, calibration);
+        let mut outcomes = Vec::with_capacity(caches.len());
+        let input = self.refine_input(map, digest, retrieved);
+        // The refiners fetch the frame from the store; the pin protects it from removal until then.
         let _pin = self.service.images.blobs.put_blob(digest, frame).await?;
-        for (place, (known, kept)) in known.into_iter().zip(kept).enumerate() {
-            let outcome = match (known, place.checked_sub(1)) {
-                (Some(known), _) => known,
+        for (index, (cached, cache)) in cached.into_iter().zip(caches).enumerate() {
+            // The first method is the coarse one, the others are the refiners in their order.
+            let outcome = match (cached, index.checked_sub(1)) {
+                (Some(cached), _) => cached,
                 (None, None) => coarse.clone(),
                 (None, Some(refiner)) => {
                     let refiner = self.refiners[refiner].as_ref();
-                    self.refine(refiner, &input, &coarse, calibration).await.with_context(named)?
+                    self.refine(refiner, &input, &coarse, calibration).await.with_context(file)?
                 }
             };
-            kept.keep(&outcome)?;
+            cache.insert(&outcome)?;
             outcomes.push(outcome);
         }
         Ok(outcomes)
     }
 
-    /// The input of the job that a server would have queued.
-    fn input(&self, map: &Map, digest: Digest, retrieved: Retrieved) -> RefineInput {
+    /// Builds the input of the job that a server would have queued for the query.
+    fn refine_input(&self, map: &Map, digest: Digest, retrieved: Retrieved) -> RefineInput {
         let Retrieved { model, mut candidates, extraction, .. } = retrieved;
         candidates.truncate(self.settings.k);
         let key = DenseKey { model, picture: digest };
@@ -216,13 +225,14 @@ impl Evaluator<'_> {
         }
     }
 
+    /// Refines one query, with retries. A refiner that fails for good leaves the coarse ranking.
     async fn refine(
         &self,
         refiner: &dyn Refiner,
         input: &RefineInput,
-        coarse: &Outcome,
+        coarse: &QueryOutcome,
         calibration: &Calibration,
-    ) -> anyhow::Result<Outcome> {
+    ) -> anyhow::Result<QueryOutcome> {
         let mut input = input.clone();
         input.frame.descriptor.take_if(|_| !refiner.wants_descriptor());
         let attempt = || async {
@@ -230,7 +240,7 @@ impl Evaluator<'_> {
             Ok((refiner.refine(&input, &NoProgress).await?, start.elapsed()))
         };
         match self.settings.attempts.run(attempt).await {
-            Ok((refinement, took)) => {
+            Ok((refinement, elapsed)) => {
                 let confidence = refinement.ranking.first().map_or(0.0, |first| {
                     calibration.refined_confidence(
                         &input.candidates,
@@ -238,62 +248,67 @@ impl Evaluator<'_> {
                         refinement.evidence,
                     )
                 });
-                Ok(refined(coarse, refinement, confidence, took))
+                Ok(refined_outcome(coarse, refinement, confidence, elapsed))
             }
             Err(RefineError::Deferred { why, after }) => bail!(
-                "{why}; what was found so far is kept: run the same command again in {} s",
+                "{why}; the outcomes so far are saved: run the same command again in {} s",
                 after.as_secs()
             ),
             Err(RefineError::Transient(why) | RefineError::Permanent(why)) => {
-                Ok(Outcome { degraded: Some(why), ..coarse.clone() })
+                Ok(QueryOutcome { degraded: Some(why), ..coarse.clone() })
             }
         }
     }
 }
 
-fn coarse(
+fn coarse_outcome(
     query: &EvaluatedQuery,
     digest: Digest,
     retrieved: &Retrieved,
     calibration: &Calibration,
-) -> Outcome {
+) -> QueryOutcome {
     let times = retrieved.extraction.times;
     let candidates = &retrieved.candidates;
-    let first = candidates.first();
-    let answers = retrieved.candidates.iter().map(|candidate| Prediction {
+    let predictions = candidates.iter().map(|candidate| Prediction {
         image_id: candidate.image_id.clone(),
         similarity: candidate.similarity,
         coarse_rank: candidate.rank,
     });
-    Outcome {
+    QueryOutcome {
         query: query.picture.id.clone(),
         digest,
-        answers: answers.collect(),
-        confidence: first
+        predictions: predictions.collect(),
+        confidence: candidates
+            .first()
             .map_or(0.0, |first| calibration.refined_confidence(candidates, &first.image_id, None)),
         descriptions: Vec::new(),
         reasoning: None,
         usage: Usage::default(),
-        times: Times {
+        times: StageTimes {
             decode: ms(times.decode),
             extract: ms(times.extract),
             search: ms(retrieved.searched),
-            ..Times::default()
+            ..StageTimes::default()
         },
         degraded: None,
     }
 }
 
-/// The refined candidates first, those that were not refined behind them in coarse order.
-fn refined(coarse: &Outcome, refinement: Refinement, confidence: f32, took: Duration) -> Outcome {
+/// Puts the refined candidates first, followed by those that were not refined, in coarse order.
+fn refined_outcome(
+    coarse: &QueryOutcome,
+    refinement: Refinement,
+    confidence: f32,
+    elapsed: Duration,
+) -> QueryOutcome {
     let ranking = refinement.ranking.as_slice();
-    let at = |rank: usize| coarse.answers.iter().find(|answer| answer.coarse_rank == rank);
-    let first = ranking.iter().filter_map(|place| at(place.coarse_rank));
-    let rest = coarse.answers.iter().filter(|answer| answer.coarse_rank > ranking.len());
-    Outcome {
-        answers: first.chain(rest).cloned().collect(),
+    let at_rank = |rank: usize| coarse.predictions.iter().find(|one| one.coarse_rank == rank);
+    let refined = ranking.iter().filter_map(|ranked| at_rank(ranked.coarse_rank));
+    let rest = coarse.predictions.iter().filter(|one| one.coarse_rank > ranking.len());
+    QueryOutcome {
+        predictions: refined.chain(rest).cloned().collect(),
         confidence,
-        times: Times { refine: ms(took), pairs: ranking.len(), ..coarse.times },
+        times: StageTimes { refine: ms(elapsed), pairs: ranking.len(), ..coarse.times },
         descriptions: refinement.descriptions,
         reasoning: refinement.reasoning,
         usage: refinement.usage,
@@ -306,7 +321,7 @@ fn ms(duration: Duration) -> f64 {
     duration.as_secs_f64() * 1e3
 }
 
-/// Nobody watches a single job of an evaluation.
+/// Ignores the progress of single jobs; the evaluation reports that of whole queries.
 struct NoProgress;
 
 #[async_trait]

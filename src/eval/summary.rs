@@ -1,27 +1,27 @@
-//! The outcome of an evaluation in numbers.
+//! The results of an evaluation as numbers.
 
 use serde::{Deserialize, Serialize};
 
-use super::open_set::{Bounds, First, OpenSetMetrics};
-use super::recall::{AtK, Change, FirstTrue, change, first_true, recall};
-use super::{Dataset, EvaluatedQuery, MethodOutcomes, Outcome, QueryKind};
+use super::open_set::{OpenSetMetrics, Thresholds, TopPrediction};
+use super::recall::{AtK, Change, FirstCorrectRank, change, first_correct_rank, recall};
+use super::{Dataset, EvaluatedQuery, MethodOutcomes, QueryKind, QueryOutcome};
 use whereabouts_core::Usage;
 
-/// What was measured, under which conditions.
+/// The results of an evaluation and the conditions under which they were measured.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Summary {
     /// Queries that count in the recall.
     pub queries: usize,
-    /// Queries without a true reference, left out of the recall.
+    /// Queries without a correct reference, left out of the recall.
     pub skipped: usize,
-    /// Queries from places that are not in the map.
+    /// Queries of places outside the map.
     pub unknown: usize,
     /// Images in the map.
     pub references: usize,
     /// The conditions.
     #[serde(flatten)]
-    pub told: RunConditions,
-    /// One for each method, a coarse one before those that refine it.
+    pub conditions: RunConditions,
+    /// One summary per method; a coarse method is followed by those that refine it.
     pub methods: Vec<MethodSummary>,
 }
 
@@ -32,61 +32,61 @@ pub struct RunConditions {
     pub database: String,
     /// The folder of queries.
     pub query_folder: String,
-    /// What makes a reference true.
+    /// When a reference is correct, see [`TruthSource::criterion`](crate::TruthSource::criterion).
     pub truth: String,
     /// The model.
     pub model: String,
-    /// Who runs it, and at which precision; descriptors differ a little between them.
+    /// Execution provider and precision of the model; descriptors differ slightly between them.
     pub execution: String,
     /// Candidates that were refined.
     pub k: usize,
-    /// The least confidence of a known place, if one was given.
+    /// Threshold for known places that was requested, if any.
     pub known_threshold: Option<f64>,
-    /// From which confidence on the service calls a place known.
+    /// Confidence from which the service calls a place known.
     pub known_confidence: f64,
-    /// `fast` (a graph where the map is large) or `exact`.
+    /// `fast` (the graph, if the map is large) or `exact`.
     pub search: String,
 }
 
-/// How one method did.
+/// The results of one method.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct MethodSummary {
-    /// Such as `gem` or `gem+local`.
+    /// Name of the method, such as `gem` or `gem+local`.
     pub name: String,
     /// Recall@K in percent.
     pub recall: AtK<f64>,
     /// 95 % bootstrap intervals of the recall, in percent.
     pub interval: AtK<[f64; 2]>,
-    /// What it changed about the coarse order; null for a coarse method.
+    /// Change against the coarse method; `None` for a coarse method.
     pub change: Option<Change>,
-    /// How long the stages of a query took.
+    /// Duration of the stages of a query.
     pub timing_ms: Timing,
-    /// What calls to a model outside cost.
+    /// Calls and tokens spent on an external model.
     pub usage: Usage,
-    /// Queries whose refined order is the coarse one, in part or in all.
+    /// Queries whose refined ranking is the coarse one, in part or as a whole.
     pub degraded: usize,
-    /// Why the first of them is.
+    /// The reason for the first of them.
     pub degraded_why: Option<String>,
-    /// Telling known places from unknown ones by the confidence in the first answer.
+    /// How well the confidence separates known from unknown places.
     pub known: OpenSetMetrics,
 }
 
-/// How long the stages of a query took, in milliseconds.
+/// Duration of the stages of a query, in milliseconds.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Timing {
     /// Decoding and resizing.
     pub decode: Quantiles,
-    /// Inference and pooling, the wait for a session included.
+    /// Inference and pooling, including the wait for a session.
     pub extract: Quantiles,
     /// Search.
     pub search: Quantiles,
-    /// Refinement of all pairs of a query; null for a coarse method.
+    /// Refinement of all pairs of a query; `None` for a coarse method.
     pub refine: Option<Quantiles>,
-    /// The same for one pair.
+    /// Refinement of one pair; `None` for a coarse method.
     pub refine_pair: Option<Quantiles>,
 }
 
-/// Of a number that differs from query to query.
+/// Median and 95th percentile of a per-query value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Quantiles {
     /// The median.
@@ -96,18 +96,21 @@ pub struct Quantiles {
 }
 
 impl Summary {
-    /// Sums up what was found. Methods come as coarse ones each followed by its refined ones.
-    pub fn new(told: RunConditions, data: &Dataset, found: &[MethodOutcomes]) -> Self {
-        let bounds = Bounds { service: told.known_confidence, given: told.known_threshold };
-        let mut methods = Vec::with_capacity(found.len());
+    /// Computes the results. Each coarse method must be followed by those that refine it.
+    pub fn new(conditions: RunConditions, data: &Dataset, outcomes: &[MethodOutcomes]) -> Self {
+        let thresholds = Thresholds {
+            service: conditions.known_confidence,
+            requested: conditions.known_threshold,
+        };
+        let mut methods = Vec::with_capacity(outcomes.len());
         let mut coarse = Vec::new();
-        for method in found {
-            let first = first_places(data, method);
+        for method in outcomes {
+            let ranks = first_correct_ranks(data, method);
             let is_coarse = method.method.refiner.is_none();
-            let changed = (!is_coarse).then(|| change(&coarse, &first));
-            methods.push(summed_up(data, method, &first, changed, bounds));
+            let change = (!is_coarse).then(|| change(&coarse, &ranks));
+            methods.push(summarize_method(data, method, &ranks, change, thresholds));
             if is_coarse {
-                coarse = first;
+                coarse = ranks;
             }
         }
         Self {
@@ -115,83 +118,85 @@ impl Summary {
             skipped: data.count(QueryKind::Skipped),
             unknown: data.count(QueryKind::Unknown),
             references: data.references.len(),
-            told,
+            conditions,
             methods,
         }
     }
 }
 
-/// The queries with their outcomes.
-pub(super) fn visits<'a>(
+/// Pairs the queries with their outcomes.
+pub(super) fn query_outcomes<'a>(
     data: &'a Dataset,
     method: &'a MethodOutcomes,
-) -> impl Iterator<Item = (&'a EvaluatedQuery, &'a Outcome)> {
+) -> impl Iterator<Item = (&'a EvaluatedQuery, &'a QueryOutcome)> {
     data.queries.iter().zip(&method.outcomes)
 }
 
-/// The place of the first true reference, for the queries that count.
-fn first_places(data: &Dataset, method: &MethodOutcomes) -> Vec<FirstTrue> {
-    visits(data, method)
+/// Returns the rank of the first correct reference of each query that counts in the recall.
+fn first_correct_ranks(data: &Dataset, method: &MethodOutcomes) -> Vec<FirstCorrectRank> {
+    query_outcomes(data, method)
         .filter(|(query, _)| query.kind == QueryKind::InMap)
         .map(|(query, outcome)| {
-            first_true(outcome.answers.iter().map(|answer| &answer.image_id), &query.truth)
+            let ids = outcome.predictions.iter().map(|prediction| &prediction.image_id);
+            first_correct_rank(ids, &query.truth)
         })
         .collect()
 }
 
-/// The first answer to each query, of whatever kind.
-pub(super) fn firsts(data: &Dataset, method: &MethodOutcomes) -> Vec<First> {
-    visits(data, method)
+/// Returns the first prediction of each query, of every kind.
+pub(super) fn top_predictions(data: &Dataset, method: &MethodOutcomes) -> Vec<TopPrediction> {
+    query_outcomes(data, method)
         .filter_map(|(query, outcome)| {
-            let answer = outcome.answers.first()?;
-            Some(First {
+            let prediction = outcome.predictions.first()?;
+            Some(TopPrediction {
                 score: f64::from(outcome.confidence),
-                right: query.truth.contains(&answer.image_id),
+                correct: query.truth.contains(&prediction.image_id),
                 in_map: query.kind == QueryKind::InMap,
             })
         })
         .collect()
 }
 
-fn summed_up(
+fn summarize_method(
     data: &Dataset,
-    found: &MethodOutcomes,
-    first: &[FirstTrue],
+    method: &MethodOutcomes,
+    ranks: &[FirstCorrectRank],
     change: Option<Change>,
-    bounds: Bounds,
+    thresholds: Thresholds,
 ) -> MethodSummary {
-    let recall = recall(first);
-    let outcomes = &found.outcomes;
-    let spread = |of: fn(&Outcome) -> f64| Quantiles::of(outcomes.iter().map(of).collect());
-    let is_refined = found.method.refiner.is_some();
+    let recall = recall(ranks);
+    let outcomes = &method.outcomes;
+    let quantiles =
+        |value: fn(&QueryOutcome) -> f64| Quantiles::of(outcomes.iter().map(value).collect());
+    let is_refined = method.method.refiner.is_some();
     MethodSummary {
-        name: found.method.name(),
+        name: method.method.name(),
         recall: recall.at,
         interval: recall.interval,
         change,
         timing_ms: Timing {
-            decode: spread(|outcome| outcome.times.decode),
-            extract: spread(|outcome| outcome.times.extract),
-            search: spread(|outcome| outcome.times.search),
-            refine: is_refined.then(|| spread(|outcome| outcome.times.refine)),
+            decode: quantiles(|outcome| outcome.times.decode),
+            extract: quantiles(|outcome| outcome.times.extract),
+            search: quantiles(|outcome| outcome.times.search),
+            refine: is_refined.then(|| quantiles(|outcome| outcome.times.refine)),
             refine_pair: is_refined.then(|| {
-                spread(|outcome| outcome.times.refine / outcome.times.pairs.max(1) as f64)
+                quantiles(|outcome| outcome.times.refine / outcome.times.pairs.max(1) as f64)
             }),
         },
         usage: outcomes.iter().fold(Usage::default(), |sum, outcome| sum + outcome.usage),
         degraded: outcomes.iter().filter(|outcome| outcome.degraded.is_some()).count(),
         degraded_why: outcomes.iter().find_map(|outcome| outcome.degraded.clone()),
-        known: OpenSetMetrics::of(&firsts(data, found), bounds),
+        known: OpenSetMetrics::of(&top_predictions(data, method), thresholds),
     }
 }
 
 impl Quantiles {
     fn of(mut values: Vec<f64>) -> Self {
         values.sort_unstable_by(f64::total_cmp);
-        let at = |share: f64| {
-            let place = (share * values.len().saturating_sub(1) as f64).round() as usize;
-            values.get(place).copied().unwrap_or_default()
+        let quantile = |share: f64| {
+            let index = (share * values.len().saturating_sub(1) as f64).round() as usize;
+            values.get(index).copied().unwrap_or_default()
         };
-        Self { median: at(0.5), p95: at(0.95) }
+        Self { median: quantile(0.5), p95: quantile(0.95) }
     }
 }

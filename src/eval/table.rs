@@ -1,11 +1,11 @@
-//! The outcome as the field prints it: one line for each method, R@1, R@5, R@10.
+//! The results as a table: one row per method, with R@1, R@5 and R@10.
 
 use std::fmt::{self, Write};
 
 use super::recall::Change;
 use super::{MethodSummary, Summary};
 
-/// The table with what belongs to it, for a terminal of 80 columns.
+/// Formats the table and further figures for a terminal of 80 columns.
 pub fn table(summary: &Summary) -> String {
     let mut text = String::new();
     // Writing to a String never fails.
@@ -14,18 +14,18 @@ pub fn table(summary: &Summary) -> String {
 }
 
 fn write(summary: &Summary, out: &mut String) -> fmt::Result {
-    let Summary { queries, skipped, unknown, references, told, methods } = summary;
+    let Summary { queries, skipped, unknown, references, conditions, methods } = summary;
     writeln!(
         out,
         "{queries} queries, {references} references; model {} ({})",
-        told.model, told.execution
+        conditions.model, conditions.execution
     )?;
-    writeln!(out, "a reference is true if it is {}", told.truth)?;
+    writeln!(out, "a reference is correct if it is {}", conditions.truth)?;
     if *skipped > 0 {
-        writeln!(out, "{skipped} more queries have no true reference and are left out")?;
+        writeln!(out, "{skipped} more queries have no correct reference and are left out")?;
     }
     if *unknown > 0 {
-        writeln!(out, "{unknown} more queries are from places that are not in the map")?;
+        writeln!(out, "{unknown} more queries show places that are not in the map")?;
     }
     writeln!(out, "\n{:<11} {:>14} {:>14} {:>14}", "", "R@1", "R@5", "R@10")?;
     for method in methods {
@@ -42,30 +42,30 @@ fn write(summary: &Summary, out: &mut String) -> fmt::Result {
             cell(at.five, change.map(|change| change.five)),
             cell(at.ten, change.map(|change| change.ten)),
         )?;
-        let range = |[low, high]: [f64; 2]| format!("{low:.1} to {high:.1}");
-        let ranges = &method.interval;
-        let cells = [ranges.one, ranges.five, ranges.ten].map(range);
+        let interval = |[low, high]: [f64; 2]| format!("{low:.1} to {high:.1}");
+        let bounds = &method.interval;
+        let cells = [bounds.one, bounds.five, bounds.ten].map(interval);
         writeln!(out, "{:<11} {:>14} {:>14} {:>14}", "", cells[0], cells[1], cells[2])?;
     }
-    writeln!(out, "in percent; below each the 95 % bootstrap interval\n")?;
-    methods.iter().try_for_each(|method| write_method(method, told.k, out))
+    writeln!(out, "in percent, with the 95 % bootstrap interval below each\n")?;
+    methods.iter().try_for_each(|method| write_method(method, conditions.k, out))
 }
 
 fn write_method(method: &MethodSummary, k: usize, out: &mut String) -> fmt::Result {
     let name = &method.name;
-    if let Some(Change { helped, harmed, left_alone, interval: range, .. }) = &method.change {
+    if let Some(Change { helped, harmed, left_alone, interval, .. }) = &method.change {
         writeln!(
             out,
-            "{name}: helped {helped}, harmed {harmed}, left {left_alone} alone; R@1 by {:+.1} to \
-             {:+.1}",
-            range.one[0], range.one[1]
+            "{name}: helped {helped} queries, harmed {harmed}, left {left_alone} unchanged; R@1 changed by \
+             {:+.1} to {:+.1}",
+            interval.one[0], interval.one[1]
         )?;
     }
     let times = &method.timing_ms;
     match (&times.refine, &times.refine_pair) {
         (Some(refine), Some(pair)) => writeln!(
             out,
-            "{name}: refining {k} candidates {:.1} ms, a pair {:.2} ms (95 % within {:.2})",
+            "{name}: refine {k} candidates {:.1} ms, one pair {:.2} ms (medians; 95th percentile {:.2})",
             refine.median, pair.median, pair.p95
         )?,
         _ => writeln!(
@@ -78,14 +78,14 @@ fn write_method(method: &MethodSummary, k: usize, out: &mut String) -> fmt::Resu
     if usage.calls > 0 || usage.cached > 0 {
         writeln!(
             out,
-            "{name}: {} calls, {} descriptions from the cache, {} tokens sent, {} received",
+            "{name}: {} calls, {} cached descriptions, {} prompt tokens, {} completion tokens",
             usage.calls, usage.cached, usage.prompt_tokens, usage.completion_tokens
         )?;
     }
-    if let Some(why) = &method.degraded_why {
+    if let Some(reason) = &method.degraded_why {
         writeln!(
             out,
-            "{name}: WARNING, {} queries were not fully refined: {why}",
+            "{name}: WARNING: {} queries were not fully refined: {reason}",
             method.degraded
         )?;
     }
@@ -94,26 +94,27 @@ fn write_method(method: &MethodSummary, k: usize, out: &mut String) -> fmt::Resu
 
 fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
     let (name, known) = (&method.name, &method.known);
-    let called = &known.called;
+    let rates = &known.called;
     let kinds = [
-        (called.right, "true first answers"),
-        (called.wrong, "false ones"),
-        (called.unknown, "unknown places"),
+        (rates.right, "correct first answers"),
+        (rates.wrong, "wrong ones"),
+        (rates.unknown, "unknown places"),
     ];
-    let shares =
-        kinds.iter().filter_map(|(share, of)| Some(format!("{:.1} % of {of}", 100.0 * (*share)?)));
+    let rates_by_kind = kinds
+        .iter()
+        .filter_map(|(rate, kind)| Some(format!("{:.1} % of {kind}", 100.0 * (*rate)?)));
     writeln!(
         out,
-        "{name}: called known from a confidence of {}: {}",
-        called.threshold,
-        shares.collect::<Vec<_>>().join(", ")
+        "{name}: called known at a confidence of {} or more: {}",
+        rates.threshold,
+        rates_by_kind.collect::<Vec<_>>().join(", ")
     )?;
-    for (point, why) in [(&known.suggested, "best F1"), (&known.given, "as given")] {
+    for (point, origin) in [(&known.suggested, "best F1"), (&known.given, "requested")] {
         if let Some(point) = point {
             writeln!(
                 out,
-                "{name}: first answers of confidence {:.3} or more ({why}): {:.1} % true, {:.1} % of \
-                 all found",
+                "{name}: first answers at a confidence of {:.3} or more ({origin}): precision {:.1} %, recall \
+                 {:.1} %",
                 point.threshold,
                 100.0 * point.precision,
                 100.0 * point.recall
@@ -123,8 +124,8 @@ fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
     if let (Some(at_95), Some(at_99), Some(auc)) = (&known.at_95, &known.at_99, known.auc) {
         writeln!(
             out,
-            "{name}: known against {} unknown places: precision {:.1} % at 95 % recall (from {:.3}), \
-             {:.1} % at 99 % (from {:.3}); AUC {auc:.3}",
+            "{name}: known places against {} unknown ones: precision {:.1} % at 95 % recall (confidence \
+             {:.3}), {:.1} % at 99 % ({:.3}); AUC {auc:.3}",
             known.unknown,
             100.0 * at_95.precision,
             at_95.threshold,
@@ -133,4 +134,117 @@ fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
         )?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::open_set::{KnownRates, OpenSetMetrics, OperatingPoint};
+    use crate::recall::AtK;
+    use crate::summary::{Quantiles, RunConditions, Timing};
+    use whereabouts_core::Usage;
+
+    fn quantiles(median: f64) -> Quantiles {
+        Quantiles { median, p95: 2.0 * median }
+    }
+
+    fn point(threshold: f64) -> OperatingPoint {
+        OperatingPoint { threshold, precision: 0.975, recall: 0.8125 }
+    }
+
+    fn coarse() -> MethodSummary {
+        MethodSummary {
+            name: "gem".into(),
+            recall: AtK { one: 62.5, five: 87.5, ten: 100.0 },
+            interval: AtK { one: [37.5, 81.3], five: [68.8, 100.0], ten: [100.0, 100.0] },
+            change: None,
+            timing_ms: Timing {
+                decode: quantiles(2.04),
+                extract: quantiles(18.7),
+                search: quantiles(0.123),
+                refine: None,
+                refine_pair: None,
+            },
+            usage: Usage::default(),
+            degraded: 0,
+            degraded_why: None,
+            known: OpenSetMetrics {
+                called: KnownRates {
+                    threshold: 0.9,
+                    right: Some(0.75),
+                    wrong: Some(0.05),
+                    unknown: None,
+                },
+                suggested: Some(point(0.4321)),
+                given: None,
+                unknown: 0,
+                at_95: None,
+                at_99: None,
+                auc: None,
+            },
+        }
+    }
+
+    fn refined() -> MethodSummary {
+        let coarse = coarse();
+        MethodSummary {
+            name: "gem+mllm".into(),
+            recall: AtK { one: 81.25, ..coarse.recall },
+            change: Some(Change {
+                recall: AtK { one: 18.75, five: 0.0, ten: 0.0 },
+                interval: AtK { one: [6.25, 37.5], ..AtK::default() },
+                helped: 4,
+                harmed: 1,
+                left_alone: 11,
+            }),
+            timing_ms: Timing {
+                refine: Some(quantiles(5230.0)),
+                refine_pair: Some(quantiles(523.0)),
+                ..coarse.timing_ms
+            },
+            usage: Usage {
+                calls: 176,
+                cached: 3,
+                prompt_tokens: 90_000,
+                completion_tokens: 40_000,
+                estimated: 0,
+            },
+            degraded: 2,
+            degraded_why: Some("the model's answer is not JSON".into()),
+            known: OpenSetMetrics {
+                called: KnownRates { unknown: Some(0.125), ..coarse.known.called },
+                given: Some(point(0.5)),
+                unknown: 8,
+                at_95: Some(point(0.61)),
+                at_99: Some(point(0.42)),
+                auc: Some(0.9531),
+                ..coarse.known
+            },
+            ..coarse
+        }
+    }
+
+    #[test]
+    fn the_table_has_recalls_changes_times_and_open_set_metrics() {
+        let conditions = RunConditions {
+            database: "database".into(),
+            query_folder: "queries".into(),
+            truth: "within 25 m".into(),
+            model: "xfeat".into(),
+            execution: "cpu at full precision".into(),
+            k: 10,
+            known_threshold: Some(0.5),
+            known_confidence: 0.9,
+            search: "fast".into(),
+        };
+        let summary = Summary {
+            queries: 16,
+            skipped: 2,
+            unknown: 8,
+            references: 20,
+            conditions,
+            methods: vec![coarse(), refined()],
+        };
+        insta::assert_snapshot!("table", table(&summary));
+    }
 }

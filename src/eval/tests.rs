@@ -1,4 +1,4 @@
-//! Recalls against a brute-force computation that shares no code with the index or the recall.
+//! Compares the recall with a brute-force computation that shares no code with the index or the recall.
 
 use std::collections::HashSet;
 
@@ -14,7 +14,7 @@ const DIM: usize = 24;
 const REFERENCES: usize = 400;
 const QUERIES: usize = 60;
 
-/// Numbers between −1 and 1, always the same.
+/// A reproducible pseudorandom number between −1 and 1.
 fn noise(state: &mut u64) -> f32 {
     *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
     (*state >> 40) as f32 / (1_u32 << 23) as f32 - 1.0
@@ -26,11 +26,11 @@ fn descriptors(count: usize, seed: u64) -> Vec<Descriptor> {
     (0..count).map(|_| one()).collect()
 }
 
-fn id(place: usize) -> ImageId {
-    format!("{place:04}.jpg").parse().unwrap()
+fn id(index: usize) -> ImageId {
+    format!("{index:04}.jpg").parse().unwrap()
 }
 
-/// The true references of a query, made by hand: none, one, or a few that are scattered.
+/// The synthetic ground truth of a query: no reference, one, or a few scattered ones.
 fn truth(query: usize) -> Vec<usize> {
     (0..query % 5).map(|i| (query * 37 + i * 101) % REFERENCES).collect()
 }
@@ -75,10 +75,10 @@ async fn map_of(store: &EmbeddedStore, descriptors: &[Descriptor]) -> Map {
         created_at: now,
     };
     let (map, _) = store.put_map(map).await.unwrap();
-    for (place, descriptor) in descriptors.iter().enumerate() {
+    for (index, descriptor) in descriptors.iter().enumerate() {
         let image = Image {
-            id: id(place),
-            digest: Digest::of(&place.to_le_bytes()),
+            id: id(index),
+            digest: Digest::of(&index.to_le_bytes()),
             pose: None,
             captured_at: None,
             tags: Vec::new(),
@@ -103,32 +103,32 @@ fn dataset() -> Dataset {
         EvaluatedQuery { picture: picture(id(query)), kind, truth }
     };
     Dataset {
-        references: (0..REFERENCES).map(|place| picture(id(place))).collect(),
+        references: (0..REFERENCES).map(|index| picture(id(index))).collect(),
         queries: (0..QUERIES).map(query).collect(),
     }
 }
 
-async fn answered(
+async fn outcome(
     store: &EmbeddedStore,
     map: &Map,
     query: &Descriptor,
     mode: SearchMode,
-) -> Outcome {
+) -> QueryOutcome {
     let candidates = store.search(map, query.clone(), 10, mode).await.unwrap();
-    let answers = candidates.into_iter().map(|candidate| Prediction {
+    let predictions = candidates.into_iter().map(|candidate| Prediction {
         image_id: candidate.image_id,
         similarity: candidate.similarity,
         coarse_rank: candidate.rank,
     });
-    Outcome {
+    QueryOutcome {
         query: id(0),
         digest: Digest::of(b""),
-        answers: answers.collect(),
+        predictions: predictions.collect(),
         confidence: 0.0,
         descriptions: Vec::new(),
         reasoning: None,
         usage: Usage::default(),
-        times: Times::default(),
+        times: StageTimes::default(),
         degraded: None,
     }
 }
@@ -136,10 +136,10 @@ async fn answered(
 async fn summary(store: &EmbeddedStore, map: &Map, mode: SearchMode) -> Summary {
     let mut outcomes = Vec::new();
     for query in &descriptors(QUERIES, 2) {
-        outcomes.push(answered(store, map, query, mode).await);
+        outcomes.push(outcome(store, map, query, mode).await);
     }
     let method = Method { descriptor: DescriptorKind::Gem, refiner: None };
-    let told = RunConditions {
+    let conditions = RunConditions {
         database: String::new(),
         query_folder: String::new(),
         truth: String::new(),
@@ -150,38 +150,38 @@ async fn summary(store: &EmbeddedStore, map: &Map, mode: SearchMode) -> Summary 
         known_confidence: 0.9,
         search: String::new(),
     };
-    Summary::new(told, &dataset(), &[MethodOutcomes { method, outcomes }])
+    Summary::new(conditions, &dataset(), &[MethodOutcomes { method, outcomes }])
 }
 
-/// A query is right at K if fewer than K references are more similar than its best true one.
+/// A query is correct at K if fewer than K references are more similar than its best correct one.
 fn brute_force(references: &[Descriptor], k: usize) -> f64 {
     let cosine = |a: &Descriptor, b: &Descriptor| -> f64 {
         a.as_slice().iter().zip(b.as_slice()).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum()
     };
-    let (mut right, mut all) = (0, 0);
-    for (place, query) in descriptors(QUERIES, 2).iter().enumerate() {
-        let true_ones = truth(place);
-        if true_ones.is_empty() {
+    let (mut correct, mut all) = (0, 0);
+    for (index, query) in descriptors(QUERIES, 2).iter().enumerate() {
+        let references_of_query = truth(index);
+        if references_of_query.is_empty() {
             continue;
         }
-        let best = true_ones
+        let best = references_of_query
             .iter()
             .map(|&reference| cosine(query, &references[reference]))
             .fold(f64::NEG_INFINITY, f64::max);
         let above = references.iter().filter(|other| cosine(query, other) > best).count();
         all += 1;
-        right += usize::from(above < k);
+        correct += usize::from(above < k);
     }
-    100.0 * f64::from(u32::try_from(right).unwrap()) / f64::from(all)
+    100.0 * f64::from(u32::try_from(correct).unwrap()) / f64::from(all)
 }
 
 #[tokio::test]
-async fn recalls_are_those_of_brute_force() {
-    // Half of the queries' best true references are made near, so that no recall is 0 or 100.
+async fn recall_equals_brute_force() {
+    // Moves a correct reference of half of the queries near them, so that no recall is 0 or 100.
     let mut references = descriptors(REFERENCES, 1);
-    for (place, query) in descriptors(QUERIES, 2).iter().enumerate().step_by(2) {
-        if let Some(&near) = truth(place).first() {
-            let strength = (place % 7) as f32 / 7.0;
+    for (index, query) in descriptors(QUERIES, 2).iter().enumerate().step_by(2) {
+        if let Some(&near) = truth(index).first() {
+            let strength = (index % 7) as f32 / 7.0;
             let mixed = query.as_slice().iter().zip(references[near].as_slice());
             let mixed = mixed.map(|(q, r)| strength * q + r).collect();
             references[near] = Descriptor::normalised(mixed).unwrap();

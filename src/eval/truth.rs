@@ -1,10 +1,10 @@
-//! Ground truth: which references show the place of which query.
+//! Ground truth: the correct references of each query.
 //!
-//! | source | a reference is true if |
+//! | source | a reference is correct if |
 //! |---|---|
-//! | a CSV `query,references` | it is named |
-//! | positions (CSV, file names, EXIF GPS) | it was taken within so many metres of the query |
-//! | frame order | its place in the folder differs by no more than so many frames |
+//! | a CSV file `query,references` | it is listed |
+//! | positions (CSV, file names, EXIF GPS) | it was taken within a distance of the query |
+//! | frame order | its index in the folder differs by no more than a number of frames |
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -15,64 +15,69 @@ use serde::Deserialize;
 use super::{PictureFile, PoseSource};
 use whereabouts_core::{ImageId, Pose};
 
-/// Where the ground truth comes from.
+/// Source of the ground truth.
 #[derive(Debug, Clone)]
 pub enum TruthSource {
-    /// A CSV with the columns `query` and `references`, the latter separated by spaces.
+    /// A CSV file with the columns `query` and `references`, the references separated by spaces.
     Csv(PathBuf),
-    /// Both folders are in the order in which the same way was driven.
+    /// The order of the files: both folders were recorded along the same route.
     Frames {
-        /// By how many frames a true reference may be off.
+        /// Largest difference in frames of a correct reference.
         tolerance: usize,
     },
     /// The positions of both folders.
     Positions {
-        /// Positions of the references; found in the folder if `None`.
+        /// CSV file with the positions of the references; `None` to find them in the folder.
         database: Option<PathBuf>,
-        /// Positions of the queries; found in the folder if `None`.
+        /// CSV file with the positions of the queries; `None` to find them in the folder.
         queries: Option<PathBuf>,
-        /// The largest distance of a true reference, in metres.
+        /// Largest distance of a correct reference, in metres.
         threshold_m: f64,
     },
 }
 
-/// The name of a ground-truth file that is found without being named.
-const BESIDE: &str = "ground_truth.csv";
+/// Name of a ground-truth file that is found by itself.
+const GROUND_TRUTH_FILE: &str = "ground_truth.csv";
 
 impl TruthSource {
-    /// A `ground_truth.csv` in the folder of the queries, or beside the two folders.
-    pub fn beside(database: &Path, queries: &Path) -> Option<Self> {
+    /// Finds a `ground_truth.csv` in the folder of queries, or next to the two folders.
+    pub fn find_csv(database: &Path, queries: &Path) -> Option<Self> {
         let parent = queries.parent().filter(|parent| database.parent() == Some(parent));
         [Some(queries), parent]
             .into_iter()
             .flatten()
-            .map(|folder| folder.join(BESIDE))
+            .map(|folder| folder.join(GROUND_TRUTH_FILE))
             .find(|file| file.is_file())
             .map(Self::Csv)
     }
 
-    /// Says in a few words what makes a reference true.
-    pub fn said(&self) -> String {
+    /// Describes when a reference is correct; completes the sentence "a reference is correct if it is …".
+    pub fn criterion(&self) -> String {
         match self {
-            Self::Csv(file) => format!("named in {}", file.display()),
+            Self::Csv(file) => format!("listed in {}", file.display()),
             Self::Frames { tolerance } => format!("at most {tolerance} frames apart"),
             Self::Positions { threshold_m, .. } => format!("within {threshold_m} m"),
         }
     }
 
-    /// The true references of each query, in the order of the queries.
+    /// Reads the correct references of each query, in the order of the queries.
+    ///
+    /// # Errors
+    /// A file cannot be read, names an image that does not exist, or an image has no position.
     pub fn read(
         &self,
         database: (&Path, &[PictureFile]),
         queries: (&Path, &[PictureFile]),
     ) -> anyhow::Result<Vec<HashSet<ImageId>>> {
         match self {
-            Self::Csv(file) => named(file, database.1, queries.1),
-            Self::Frames { tolerance } => Ok(in_order(*tolerance, database.1, queries.1.len())),
+            Self::Csv(file) => from_csv(file, database.1, queries.1),
+            Self::Frames { tolerance } => {
+                Ok(within_frames(*tolerance, database.1, queries.1.len()))
+            }
             Self::Positions { database: poses, queries: query_poses, threshold_m } => {
-                let there = positions(database, poses.as_deref())?;
-                let here = positions(queries, query_poses.as_deref())?;
-                near(&there, &here, *threshold_m, database.1)
+                let poses = positions(database, poses.as_deref())?;
+                let query_poses = positions(queries, query_poses.as_deref())?;
+                within_distance(&poses, &query_poses, *threshold_m, database.1)
             }
         }
     }
@@ -84,7 +89,7 @@ struct Row {
     references: String,
 }
 
-fn named(
+fn from_csv(
     file: &Path,
     database: &[PictureFile],
     queries: &[PictureFile],
@@ -94,18 +99,18 @@ fn named(
         .from_path(file)
         .with_context(|| format!("cannot read {}", file.display()))?;
     let references: HashSet<&str> = database.iter().map(|picture| picture.id.as_str()).collect();
-    let known: HashSet<&str> = queries.iter().map(|picture| picture.id.as_str()).collect();
+    let query_ids: HashSet<&str> = queries.iter().map(|picture| picture.id.as_str()).collect();
     let mut rows: HashMap<String, HashSet<ImageId>> = HashMap::new();
     for (index, row) in reader.deserialize::<Row>().enumerate() {
-        let at = || format!("{} line {}", file.display(), index + 2);
-        let row = row.with_context(at)?;
-        if !known.contains(row.query.as_str()) {
-            bail!("{}: there is no query {:?} in the folder of the queries", at(), row.query);
+        let line = || format!("{} line {}", file.display(), index + 2);
+        let row = row.with_context(line)?;
+        if !query_ids.contains(row.query.as_str()) {
+            bail!("{}: the folder of queries has no image {:?}", line(), row.query);
         }
         let truth = rows.entry(row.query).or_default();
         for name in row.references.split_whitespace() {
             if !references.contains(name) {
-                bail!("{}: there is no reference {name:?} in the database folder", at());
+                bail!("{}: the folder of references has no image {name:?}", line());
             }
             truth.insert(name.parse()?);
         }
@@ -113,24 +118,28 @@ fn named(
     Ok(queries.iter().map(|query| rows.remove(query.id.as_str()).unwrap_or_default()).collect())
 }
 
-fn in_order(tolerance: usize, database: &[PictureFile], queries: usize) -> Vec<HashSet<ImageId>> {
+fn within_frames(
+    tolerance: usize,
+    database: &[PictureFile],
+    queries: usize,
+) -> Vec<HashSet<ImageId>> {
     (0..queries)
-        .map(|place| {
-            let end = place.saturating_add(tolerance).saturating_add(1).min(database.len());
-            let start = place.saturating_sub(tolerance).min(end);
+        .map(|index| {
+            let end = index.saturating_add(tolerance).saturating_add(1).min(database.len());
+            let start = index.saturating_sub(tolerance).min(end);
             database[start..end].iter().map(|picture| picture.id.clone()).collect()
         })
         .collect()
 }
 
-/// The position of every picture of a folder.
+/// Reads the position of every image in a folder.
 fn positions(
     (dir, pictures): (&Path, &[PictureFile]),
     csv: Option<&Path>,
 ) -> anyhow::Result<Vec<Pose>> {
     let source = PoseSource::find(dir, csv, pictures)?;
     let mut poses = Vec::with_capacity(pictures.len());
-    let mut without = Vec::new();
+    let mut missing = Vec::new();
     for picture in pictures {
         let bytes = match source {
             PoseSource::Exif => std::fs::read(&picture.file)
@@ -139,25 +148,25 @@ fn positions(
         };
         match source.pose(picture.id.as_str(), &bytes)? {
             Some(pose) => poses.push(pose),
-            None => without.push(picture.id.as_str()),
+            None => missing.push(picture.id.as_str()),
         }
     }
-    if let Some(first) = without.first() {
+    if let Some(first) = missing.first() {
         bail!(
-            "{} of {} pictures in {} have no position in {}, the first is {first}; give positions \
-             in a CSV (--database-poses, --queries-poses: file, and lat,lon or x,y), by \
-             @easting@northing@ names or by EXIF GPS, or give the true references with \
-             --ground-truth FILE or --frame-tolerance N",
-            without.len(),
+            "{} of {} images in {} have no position in {}, starting with {first}. Give positions in a CSV \
+             file (--database-poses, --queries-poses: file, and lat,lon or x,y), in file names \
+             @easting@northing@…, or as EXIF GPS; or give the correct references with --ground-truth FILE or \
+             --frame-tolerance N",
+            missing.len(),
             pictures.len(),
             dir.display(),
-            source.said()
+            source.name()
         );
     }
     Ok(poses)
 }
 
-fn near(
+fn within_distance(
     database: &[Pose],
     queries: &[Pose],
     threshold_m: f64,
@@ -165,19 +174,19 @@ fn near(
 ) -> anyhow::Result<Vec<HashSet<ImageId>>> {
     if database.first().map(Pose::frame) != queries.first().map(Pose::frame) {
         bail!(
-            "the database has {} positions and the queries {}; give both in the same frame",
+            "the references have {} positions and the queries have {}; give both in the same coordinate frame",
             database.first().map_or("no", |pose| pose.frame().as_str()),
             queries.first().map_or("no", |pose| pose.frame().as_str())
         );
     }
-    let within = |query: &Pose, reference: &Pose| {
+    let is_near = |query: &Pose, reference: &Pose| {
         query.distance_m(reference).is_some_and(|metres| metres <= threshold_m)
     };
     Ok(queries
         .iter()
         .map(|query| {
-            let true_ones = database.iter().zip(pictures).filter(|(pose, _)| within(query, pose));
-            true_ones.map(|(_, picture)| picture.id.clone()).collect()
+            let correct = database.iter().zip(pictures).filter(|(pose, _)| is_near(query, pose));
+            correct.map(|(_, picture)| picture.id.clone()).collect()
         })
         .collect())
 }
@@ -206,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_the_field_are_compared_by_distance() {
+    fn references_within_the_distance_are_correct() {
         let source = TruthSource::Positions { database: None, queries: None, threshold_m: 25.0 };
         let truth = read(
             &source,
@@ -217,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn frame_order_has_a_tolerance() {
+    fn references_within_the_frame_tolerance_are_correct() {
         let truth = read(
             &TruthSource::Frames { tolerance: 1 },
             &["0.jpg", "1.jpg", "2.jpg"],
@@ -234,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn a_csv_names_the_true_references() {
+    fn a_csv_lists_the_correct_references() {
         let dir = tempfile::TempDir::new().unwrap();
         let file = dir.path().join("truth.csv");
         std::fs::write(&file, "query,references\nq.jpg,a.jpg  b.jpg\n").unwrap();
@@ -249,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_without_positions_are_counted_and_the_ways_out_are_named() {
+    fn images_without_positions_are_counted_and_the_error_names_the_alternatives() {
         let dir = tempfile::TempDir::new().unwrap();
         std::fs::write(dir.path().join("a.jpg"), "no picture").unwrap();
         let database =

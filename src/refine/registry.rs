@@ -26,7 +26,7 @@ pub const REFINERS: &[RefinerEntry] = &[
     },
     RefinerEntry {
         kind: RefinerKind::Mllm,
-        summary: "A multimodal LLM ([mllm] says which)",
+        summary: "A multimodal LLM, configured in `[mllm]`",
         candidates: |settings| settings.mllm_candidates,
         validate: |settings| settings.mllm.validate(settings.job_timeout_s),
         fingerprint: mllm::fingerprint,

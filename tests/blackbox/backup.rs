@@ -281,7 +281,7 @@ async fn an_interrupted_backup_is_resumed() {
     }
     same(&answers(&to, "m").await, &answers(&from, "m").await);
     let why = refused(&run(&from, &["backup", again.to_str().unwrap()]));
-    assert!(why.contains("is there already"), "{why}");
+    assert!(why.contains("already exists"), "{why}");
 
     // If the map was created again meanwhile, the backup starts from the beginning.
     std::fs::write(&partial, &bytes[..bytes.len() / 2]).unwrap();

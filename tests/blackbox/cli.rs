@@ -89,7 +89,7 @@ async fn a_picture_is_localized_and_its_job_is_shown() {
     let found = json(&whereabouts(&["jobs", "--search", "PLACE-3", "--json", "--server", url]));
     assert_eq!((&found["jobs"][0]["id"], &found["next_cursor"]), (&id.into(), &().into()));
     let none = whereabouts(&["jobs", "--search", "no such thing", "--server", url]);
-    assert!(String::from_utf8_lossy(&none.stdout).contains("no job contains that"));
+    assert!(String::from_utf8_lossy(&none.stdout).contains("no job contains that text"));
     let shown = whereabouts(&["jobs", id, "--wait", "10", "--server", url]);
     assert!(String::from_utf8_lossy(&shown.stdout).contains("place-"), "{}", error(&shown));
     assert_eq!(whereabouts(&["healthcheck", "--server", url]).status.code(), Some(0));
@@ -214,7 +214,7 @@ async fn the_commands_take_the_key_from_the_environment() {
     if !deployment::is_scale_out() {
         let absent = dir.path().join("absent");
         let (ok, _, said) = run(None, &["keys", "list", "--data", absent.to_str().unwrap()]);
-        assert!(!ok && said.contains("no data folder") && !absent.exists(), "{said}");
+        assert!(!ok && said.contains("not a data folder") && !absent.exists(), "{said}");
         // A running server locks its data folder.
         let data = dir.path().to_str().unwrap();
         let (ok, _, said) = run(None, &["keys", "list", "--data", data]);

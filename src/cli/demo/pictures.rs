@@ -1,4 +1,4 @@
-//! One picture for each frame: the frame, the first candidate, and the first after refinement.
+//! One picture per frame: the frame, the first candidate, and the first candidate after refinement.
 
 use std::path::PathBuf;
 
@@ -6,9 +6,9 @@ use anyhow::Context;
 use image::{Rgb, RgbImage, imageops};
 use rayon::prelude::*;
 
-use super::Visit;
-use super::account::Verdict;
-use super::town::Folders;
+use super::LocalizedFrame;
+use super::report::Verdict;
+use super::town::DemoFolders;
 use whereabouts_core::ImageId;
 
 const WIDTH: u32 = 400;
@@ -19,36 +19,36 @@ const GREY: Rgb<u8> = Rgb([120, 120, 120]);
 const GREEN: Rgb<u8> = Rgb([30, 160, 60]);
 const RED: Rgb<u8> = Rgb([200, 40, 40]);
 
-/// Writes `pictures/frame-….png` for every visit: grey border for the frame, green for a right
-/// candidate, red for a wrong one.
-pub fn side_by_side(visits: &[Visit], folders: &Folders) -> anyhow::Result<()> {
-    visits.par_iter().try_for_each(|visit| {
-        let verdict = Verdict::of(visit);
-        let colour = |right: bool| if right { GREEN } else { RED };
-        let mut panels = vec![(visit.frame.file.clone(), GREY)];
-        if let Some(coarse) = visit.answer.candidates.first() {
-            panels.push((map_picture(folders, &coarse.image_id), colour(verdict.before)));
+/// Writes `pictures/frame-….png` for every frame. The frame has a grey border, a correct candidate a green
+/// one, a wrong candidate a red one.
+pub fn write_all(localized: &[LocalizedFrame], folders: &DemoFolders) -> anyhow::Result<()> {
+    localized.par_iter().try_for_each(|localized| {
+        let verdict = Verdict::of(localized);
+        let colour = |correct: bool| if correct { GREEN } else { RED };
+        let mut panels = vec![(localized.frame.file.clone(), GREY)];
+        if let Some(coarse) = localized.answer.candidates.first() {
+            panels.push((map_image(folders, &coarse.image_id), colour(verdict.before)));
         }
-        if let Some(refined) = visit.job.ranking.as_ref().and_then(|ranking| ranking.first()) {
-            panels.push((map_picture(folders, &refined.image_id), colour(verdict.after)));
+        if let Some(refined) = localized.job.ranking.as_ref().and_then(|ranking| ranking.first()) {
+            panels.push((map_image(folders, &refined.image_id), colour(verdict.after)));
         }
         let mut sheet =
             RgbImage::new(panels.len() as u32 * (WIDTH + 2 * BORDER), HEIGHT + 2 * BORDER);
         for (index, (file, colour)) in panels.iter().enumerate() {
             paint(&mut sheet, index as u32 * (WIDTH + 2 * BORDER), file, *colour)?;
         }
-        let file = picture_of(visit, folders);
+        let file = picture_path(localized, folders);
         sheet.save(&file).with_context(|| format!("cannot write {}", file.display()))
     })
 }
 
-/// Where the picture of a visit is.
-pub fn picture_of(visit: &Visit, folders: &Folders) -> PathBuf {
-    let name = visit.frame.file.file_stem().unwrap_or_default();
+/// Returns the path of the picture of a frame.
+pub fn picture_path(localized: &LocalizedFrame, folders: &DemoFolders) -> PathBuf {
+    let name = localized.frame.file.file_stem().unwrap_or_default();
     folders.pictures.join(name).with_extension("png")
 }
 
-fn map_picture(folders: &Folders, id: &ImageId) -> PathBuf {
+fn map_image(folders: &DemoFolders, id: &ImageId) -> PathBuf {
     folders.map.join(id.as_str())
 }
 

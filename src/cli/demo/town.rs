@@ -1,4 +1,4 @@
-//! The town's pictures as files, with their poses on the globe.
+//! Renders the town to image files, with geographic poses.
 
 use std::path::{Path, PathBuf};
 
@@ -9,39 +9,42 @@ use whereabouts_core::{GeographicPose, Pose};
 use whereabouts_town::{Shot, Town, TownSpec};
 use whereabouts_vision::decode::encode_jpeg;
 
-/// Where the demo puts things.
-pub struct Folders {
+/// The folders of the demo.
+pub struct DemoFolders {
     /// Map images, and poses.csv.
     pub map: PathBuf,
     /// Frames.
     pub frames: PathBuf,
-    /// Each frame beside its candidates.
+    /// Each frame next to its candidates.
     pub pictures: PathBuf,
     /// The server's data.
     pub data: PathBuf,
 }
 
-/// A frame whose true pose is known.
+/// A rendered frame with its true pose.
 pub struct Frame {
-    /// The picture.
+    /// The image.
     pub file: PathBuf,
     /// Where it was taken.
     pub pose: Pose,
-    /// The light it was taken in.
+    /// The light that it was rendered in.
     pub light: String,
 }
 
-/// Left in the folder, so that no other folder is ever cleared.
-const MARK: &str = ".whereabouts-demo";
+/// A file that marks a folder as the output of a demo. No other folder is ever emptied.
+const MARKER: &str = ".whereabouts-demo";
 
-impl Folders {
-    /// Empties the folder of an earlier demo, or makes a new one.
-    pub fn fresh(out: &Path) -> anyhow::Result<Self> {
+impl DemoFolders {
+    /// Creates the folder, and replaces one of an earlier demo.
+    pub fn create(out: &Path) -> anyhow::Result<Self> {
         let cannot = || format!("cannot use the folder {}", out.display());
-        if out.join(MARK).is_file() {
+        if out.join(MARKER).is_file() {
             std::fs::remove_dir_all(out).with_context(cannot)?;
         } else if out.exists() && out.read_dir().with_context(cannot)?.next().is_some() {
-            bail!("{} holds other things; name an empty or a new folder with --out", out.display());
+            bail!(
+                "{} is not empty and not the output of a demo; name another folder with --out",
+                out.display()
+            );
         }
         let folders = Self {
             map: out.join("map"),
@@ -52,13 +55,13 @@ impl Folders {
         for folder in [&folders.map, &folders.frames, &folders.pictures] {
             std::fs::create_dir_all(folder).with_context(cannot)?;
         }
-        std::fs::write(out.join(MARK), "`whereabouts demo` replaces this folder\n")?;
+        std::fs::write(out.join(MARKER), "`whereabouts demo` replaces this folder\n")?;
         Ok(folders)
     }
 }
 
-/// Draws one map image and one frame of every place.
-pub fn render(spec: TownSpec, folders: &Folders) -> anyhow::Result<Vec<Frame>> {
+/// Renders one map image and one frame of every place.
+pub fn render(spec: TownSpec, folders: &DemoFolders) -> anyhow::Result<Vec<Frame>> {
     let town = Town::new(spec);
     let places: Vec<(String, Frame)> = (0..town.places())
         .into_par_iter()
@@ -70,8 +73,8 @@ pub fn render(spec: TownSpec, folders: &Folders) -> anyhow::Result<Vec<Frame>> {
             let file = folders.frames.join(format!("frame-{place:04}.jpg"));
             std::fs::write(&file, encode_jpeg(&query.image)?)?;
             let light = format!("{:?}", query.light).to_lowercase();
-            let frame = Frame { file, pose: Pose::Geographic(on_globe(&query)), light };
-            Ok((csv_row(&name, &on_globe(&reference)), frame))
+            let frame = Frame { file, pose: Pose::Geographic(to_geographic(&query)), light };
+            Ok((csv_row(&name, &to_geographic(&reference)), frame))
         })
         .collect::<Result<_, _>>()?;
     let (rows, frames): (Vec<String>, Vec<Frame>) = places.into_iter().unzip();
@@ -84,11 +87,11 @@ fn csv_row(name: &str, pose: &GeographicPose) -> String {
     format!("{name},{:.7},{:.7},{:.1}", pose.lat, pose.lon, pose.heading.unwrap_or_default())
 }
 
-/// Lays the town's plane on the globe, at a place in the sea where no street is.
+/// Projects the town's plane onto the globe, at a point in the ocean.
 ///
-/// The plane touches the globe at the origin; across a town of a few kilometres the error is far
+/// The plane is tangent to the globe at the origin; across a town of a few kilometres the error is far
 /// below a metre.
-fn on_globe(shot: &Shot) -> GeographicPose {
+fn to_geographic(shot: &Shot) -> GeographicPose {
     const ORIGIN: (f64, f64) = (45.0, -30.0);
     const METRES_PER_DEGREE: f64 = 111_195.0;
     let lat = ORIGIN.0 + shot.y / METRES_PER_DEGREE;

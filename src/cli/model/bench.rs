@@ -1,4 +1,4 @@
-//! `whereabouts model bench`: which way of running a model is the fastest here.
+//! `whereabouts model bench`: finds the fastest way to run a model on this machine.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -7,27 +7,27 @@ use anyhow::{Context, bail};
 use serde_json::json;
 use toml_edit::{DocumentMut, Item, Table, value};
 
-use super::Place;
+use super::ModelContext;
 use whereabouts_vision::{Bench, BenchRow, BenchSettings, Layout, MIN_SIMILARITY};
 
-/// What to try, and what to do with the result.
+/// Benchmark a model on this machine with every provider, precision, thread count and batch size
 #[derive(Debug, clap::Args)]
 pub struct BenchArgs {
-    /// The model; without it, the one that a server would run
+    /// Name of the model [default: the default model of the server]
     name: Option<String>,
-    /// Threads to try; without it, one and one for each core
+    /// Numbers of threads to try [default: one, and one per core]
     #[arg(long, value_delimiter = ',', value_name = "N,…")]
     threads: Vec<usize>,
-    /// Pictures run side by side to try; no more than there are threads
+    /// Numbers of images to run concurrently; no more than there are threads
     #[arg(long, value_delimiter = ',', default_value = "1,2", value_name = "N,…")]
     sessions: Vec<usize>,
-    /// Pictures in one run to try
+    /// Batch sizes to try
     #[arg(long, value_delimiter = ',', default_value = "1,4", value_name = "N,…")]
     batch: Vec<usize>,
-    /// How long each figure is measured
+    /// Duration of each measurement
     #[arg(long, default_value_t = 2.0, value_name = "SECONDS")]
     seconds: f64,
-    /// Write the best choice into the [model] section of this configuration file
+    /// Write the best settings into the section [model] of this configuration file
     #[arg(long, value_name = "FILE")]
     write: Option<PathBuf>,
     /// Print JSON
@@ -35,24 +35,24 @@ pub struct BenchArgs {
     json: bool,
 }
 
-pub fn run(place: &Place, args: BenchArgs) -> anyhow::Result<()> {
+pub fn run(context: &ModelContext, args: BenchArgs) -> anyhow::Result<()> {
     if !(0.05..=600.0).contains(&args.seconds) {
         bail!("--seconds must be between 0.05 and 600");
     }
-    let preference = place.config.model.preference();
+    let preference = context.config.model.preference();
     let (name, why) =
-        place.assets.resolve(args.name.as_deref().unwrap_or(&place.config.model.name))?;
-    let bench = Bench::open(&place.assets, &name, preference)?;
+        context.assets.resolve(args.name.as_deref().unwrap_or(&context.config.model.name))?;
+    let bench = Bench::open(&context.assets, &name, preference)?;
     let settings = BenchSettings {
         preference,
         layouts: layouts(&args),
         duration: Duration::from_secs_f64(args.seconds),
     };
     if settings.layouts.is_empty() {
-        bail!("there is nothing to try: give --sessions no larger than --threads, and --batch");
+        bail!("nothing to measure: a value of --sessions must not exceed one of --threads");
     }
     if !args.json {
-        println!("{name} ({why}), pictures of streets, by each way of running it that is here\n");
+        println!("{name} ({why}), on street images, with each provider and precision available\n");
         println!("{HEADING}");
     }
     let rows = bench.run(&settings, |row| {
@@ -70,22 +70,24 @@ pub fn run(place: &Place, args: BenchArgs) -> anyhow::Result<()> {
         );
     }
     let Some(best) = best else {
-        bail!("no way of running {name} gives the right descriptors; see the reasons above");
+        bail!("no configuration of {name} gives correct descriptors; the reasons are listed above");
     };
     if !args.json {
         let Layout { threads, sessions, max_batch } = best.layout;
         println!(
-            "\nthe most pictures a second: {}, {threads} threads, {sessions} side by side, up to \
-             {max_batch} in one run",
+            "\nhighest throughput: {}, {threads} threads, {sessions} concurrent, batches of up to \
+             {max_batch}",
             best.execution
         );
     }
     match &args.write {
         Some(file) => {
             write(file, best)?;
-            eprintln!("written to [model] in {}", file.display());
+            eprintln!("wrote the settings to [model] in {}", file.display());
         }
-        None => eprintln!("--write FILE puts it into a configuration file"),
+        None => eprintln!(
+            "to keep these settings, write them to a configuration file with --write FILE"
+        ),
     }
     Ok(())
 }
@@ -94,12 +96,12 @@ fn layouts(args: &BenchArgs) -> Vec<Layout> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let mut threads = match args.threads.as_slice() {
         [] => vec![1, cores],
-        given => given.to_vec(),
+        threads => threads.to_vec(),
     };
     threads.dedup();
     let pairs = threads.iter().flat_map(|&threads| {
-        let fitting = args.sessions.iter().filter(move |&&sessions| sessions <= threads);
-        fitting.map(move |&sessions| (threads, sessions))
+        let sessions = args.sessions.iter().filter(move |&&sessions| sessions <= threads);
+        sessions.map(move |&sessions| (threads, sessions))
     });
     pairs
         .flat_map(|(threads, sessions)| {
@@ -109,39 +111,39 @@ fn layouts(args: &BenchArgs) -> Vec<Layout> {
         .collect()
 }
 
-/// The row with the most pictures a second; of those within a twentieth, the one that answers a
-/// picture alone the soonest.
+/// Returns the row with the lowest latency among those with at least 95 % of the highest throughput.
 fn best(rows: &[BenchRow]) -> Option<&BenchRow> {
-    let right = || rows.iter().filter_map(|row| Some((row, row.accepted()?)));
-    let most = right().map(|(_, figures)| figures.per_second).fold(0.0, f64::max);
-    right()
-        .filter(|(_, figures)| figures.per_second >= 0.95 * most)
+    let correct = || rows.iter().filter_map(|row| Some((row, row.accepted()?)));
+    let highest = correct().map(|(_, figures)| figures.per_second).fold(0.0, f64::max);
+    correct()
+        .filter(|(_, figures)| figures.per_second >= 0.95 * highest)
         .min_by_key(|(_, figures)| figures.alone)
         .map(|(row, _)| row)
 }
 
-const HEADING: &str = "provider  precision  threads  side by side  batch  alone ms  pictures/s  \
+const HEADING: &str = "provider  precision  threads  concurrent  batch  alone ms  images/s  \
                        cosine   of GEMM peak";
 
 fn line(row: &BenchRow, flop: Option<f64>) -> String {
     let Layout { threads, sessions, max_batch } = row.layout;
     let (provider, precision) = (row.execution.provider, row.execution.precision);
-    let how =
-        format!("{provider:<8}  {precision:<9}  {threads:>7}  {sessions:>12}  {max_batch:>5}");
+    let columns =
+        format!("{provider:<8}  {precision:<9}  {threads:>7}  {sessions:>10}  {max_batch:>5}");
     match &row.outcome {
         Ok(figures) => {
             let share = flop.map_or("-".to_owned(), |flop| {
                 format!("{:.0} %", 100.0 * figures.per_second * flop / figures.peak)
             });
-            let wrong = if figures.similarity < MIN_SIMILARITY { "  too far off" } else { "" };
+            let wrong =
+                if figures.similarity < MIN_SIMILARITY { "  descriptors differ" } else { "" };
             format!(
-                "{how}  {:>8.1}  {:>10.1}  {:.5}  {share:>12}{wrong}",
+                "{columns}  {:>8.1}  {:>8.1}  {:.5}  {share:>12}{wrong}",
                 figures.alone.as_secs_f64() * 1e3,
                 figures.per_second,
                 figures.similarity
             )
         }
-        Err(why) => format!("{how}  cannot be used: {why}"),
+        Err(why) => format!("{columns}  cannot be used: {why}"),
     }
 }
 
@@ -162,7 +164,7 @@ fn to_json(row: &BenchRow, flop: Option<f64>) -> serde_json::Value {
     })
 }
 
-/// Sets the keys of a choice; all else in the file stays as it is, comments too.
+/// Sets the keys of `best` and leaves the rest of the file unchanged, including comments.
 fn write(file: &Path, best: &BenchRow) -> anyhow::Result<()> {
     let text = match std::fs::read_to_string(file) {
         Ok(text) => text,
@@ -174,7 +176,7 @@ fn write(file: &Path, best: &BenchRow) -> anyhow::Result<()> {
     let model = document.entry("model").or_insert_with(|| Item::Table(Table::new()));
     let model = model
         .as_table_mut()
-        .with_context(|| format!("model in {} is not a section", file.display()))?;
+        .with_context(|| format!("`model` in {} is not a table", file.display()))?;
     let number = |number: usize| value(number as i64);
     model["provider"] = value(best.execution.provider.to_string());
     model["precision"] = value(best.execution.precision.to_string());
@@ -211,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn the_best_is_right_fast_and_among_equals_the_quickest() {
+    fn the_best_row_is_correct_and_has_the_lowest_latency_near_the_highest_throughput() {
         let rows = [
             row(Precision::Full, 1, 40, 25.0, 1.0),
             row(Precision::Bf16, 1, 20, 48.5, 0.9999),
@@ -223,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn a_choice_is_written_and_the_rest_of_the_file_stays() {
+    fn settings_are_written_and_the_rest_of_the_file_is_unchanged() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("whereabouts.toml");
         let best = row(Precision::Bf16, 2, 22, 50.0, 1.0);

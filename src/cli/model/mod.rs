@@ -1,221 +1,221 @@
 //! `whereabouts model`.
 
-mod account;
 mod bench;
-mod screen;
+mod download;
+mod inspect;
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-pub use self::screen::Screen;
+pub use self::download::DownloadMeter;
 use whereabouts_models::{Added, Catalogue, ModelsFolder, Pulled};
 use whereabouts_server::config::{Config, Overrides};
 use whereabouts_vision::{AUTO, Assets, BUILT_IN_MODEL};
 
-/// A map that names no model has the one that the server was started with. Where model.name is
-/// "auto", as it is by default, that is the model that `use` chose; else the first that is installed
-/// of dinov2-small, dinov2-base and dinov2-large; else the built-in xfeat.
+/// List, install, verify and select models
+///
+/// A map that names no model uses the default model of the server. If model.name is "auto", which it is by
+/// default, that is the model selected with `use`, otherwise the first installed one of dinov2-small,
+/// dinov2-base and dinov2-large, otherwise the built-in xfeat.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     #[command(subcommand)]
     action: Action,
-    /// A configuration file; [model] has the hub and the bounds on downloads
+    /// Configuration file; its section [model] sets the hub and the limits of downloads
     #[arg(long, global = true, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// The assets folder to install into and to look in first
+    /// Assets folder to install into and to search first
     #[arg(long, global = true, value_name = "DIR")]
     assets: Option<PathBuf>,
-    /// A catalogue to use instead of the built-in one
+    /// Catalogue to use instead of the built-in one
     #[arg(long, global = true, value_name = "FILE", hide = true, env = "WHEREABOUTS_CATALOGUE")]
     catalogue: Option<PathBuf>,
 }
 
 #[derive(Debug, clap::Subcommand)]
 enum Action {
-    /// List the models that are installed and those that can be pulled
+    /// List installed models and those that can be pulled
     List {
         /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Show what is known of a model
+    /// Show the details of a model
     Show {
-        /// The model
+        /// Name of the model
         name: String,
         /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Download a model; run it again to continue one that broke off
+    /// Download and install a model; run it again to resume an interrupted download
     Pull {
-        /// A model that `list` shows
+        /// Name of a model that `list` shows
         name: String,
     },
     /// Install a model from a file
     Add {
-        /// The ONNX file
+        /// ONNX file
         file: PathBuf,
-        /// How to feed and pool it; deploy/models/xfeat.toml is an example
+        /// Manifest with the preprocessing and pooling of the model; see deploy/models/xfeat.toml for an example
         #[arg(long, value_name = "TOML")]
         manifest: PathBuf,
-        /// Another name than the manifest's
+        /// Name to install it under [default: the name in the manifest]
         #[arg(long)]
         name: Option<String>,
     },
-    /// Hash installed models again; exit code 1 if a file is not the one that was installed
+    /// Verify the SHA-256 of installed models; the exit code is 1 if a file has changed
     Verify {
-        /// Only this model
+        /// Verify only this model
         name: Option<String>,
         /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Measure each way of running a model on this machine: provider, precision, threads, batch
+    /// Benchmark a model on this machine with every provider, precision, thread count and batch size
     Bench(bench::BenchArgs),
-    /// Choose the model that a server starts with
+    /// Select the default model of the server
     Use {
-        /// An installed model; or auto, to take a choice back
+        /// Name of an installed model, or auto to undo the selection
         name: String,
     },
 }
 
 /// What the actions work on.
-struct Place {
+struct ModelContext {
     config: Config,
     catalogue: Catalogue,
     assets: Assets,
-    /// The folder to install into, if a flag or the settings name one.
-    named: Option<PathBuf>,
+    /// The folder to install into, if a flag or a setting names one.
+    assets_dir: Option<PathBuf>,
 }
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
-    let place = Place::of(&args)?;
+    let context = ModelContext::new(&args)?;
     match args.action {
-        Action::List { json } => account::list(&place, json),
-        Action::Show { name, json } => account::show(&place, &name, json),
-        Action::Pull { name } => pull(&place, &name).await,
+        Action::List { json } => inspect::list(&context, json),
+        Action::Show { name, json } => inspect::show(&context, &name, json),
+        Action::Pull { name } => pull(&context, &name).await,
         Action::Add { file, manifest, name } => {
-            let added = place.folder()?.add(&file, &manifest, name.as_deref())?;
-            match added {
+            match context.folder()?.add(&file, &manifest, name.as_deref())? {
                 Added::Present(folder) => {
-                    println!("{}: this file is installed already", folder.display());
+                    println!("{}: this file is already installed", folder.display());
                 }
                 Added::Installed { folder, name, digests } => {
                     println!("{name}: installed in {}", folder.display());
-                    println!("  {}, recorded in its manifest", account::words(&digests));
+                    println!("  {}, recorded in its manifest", inspect::join(&digests));
                     println!("  run it with `whereabouts serve --model {name}`");
                     println!("  or make it the default with `whereabouts model use {name}`");
                 }
             }
             Ok(())
         }
-        Action::Verify { name, json } => account::verify(&place, name.as_deref(), json),
-        Action::Bench(args) => tokio::task::block_in_place(|| bench::run(&place, args)),
-        Action::Use { name } => choose(&place, &name),
+        Action::Verify { name, json } => inspect::verify(&context, name.as_deref(), json),
+        Action::Bench(args) => tokio::task::block_in_place(|| bench::run(&context, args)),
+        Action::Use { name } => select(&context, &name),
     }
 }
 
-impl Place {
-    fn of(args: &Args) -> anyhow::Result<Self> {
+impl ModelContext {
+    fn new(args: &Args) -> anyhow::Result<Self> {
         let config = Config::load(args.config.as_deref(), &Overrides::default())?;
         let catalogue = Catalogue::of(args.catalogue.as_deref())?;
-        let named = args.assets.as_deref().or(config.model.assets()).map(PathBuf::from);
-        let assets = Assets::locate(named.as_deref());
-        Ok(Self { config, catalogue, assets, named })
+        let assets_dir = args.assets.as_deref().or(config.model.assets()).map(PathBuf::from);
+        let assets = Assets::locate(assets_dir.as_deref());
+        Ok(Self { config, catalogue, assets, assets_dir })
     }
 
     fn folder(&self) -> anyhow::Result<ModelsFolder> {
-        models_folder(self.named.as_deref(), &self.assets)
+        models_folder(self.assets_dir.as_deref(), &self.assets)
     }
 
-    /// A folder that a server does not look in by itself has to be named to it.
-    fn say_how_it_is_found(&self) {
-        if let Some(named) = &self.named
-            && !Assets::locate(self.config.model.assets()).candidates().contains(named)
+    /// Prints the setting with which a server finds the folder, if it does not search it by default.
+    fn print_assets_setting(&self) {
+        if let Some(dir) = &self.assets_dir
+            && !Assets::locate(self.config.model.assets()).candidates().contains(dir)
         {
-            println!("  start the server with WHEREABOUTS_MODEL__ASSETS={}", named.display());
+            println!("  start the server with WHEREABOUTS_MODEL__ASSETS={}", dir.display());
         }
     }
 }
 
-/// Where to install: the folder named, or the first of the usual ones that is there and can be
-/// written.
-pub fn models_folder(named: Option<&Path>, assets: &Assets) -> anyhow::Result<ModelsFolder> {
-    if let Some(named) = named {
-        return Ok(ModelsFolder::open(named)?);
+/// Returns the folder to install into: `dir` if given, otherwise the first default folder that exists and is
+/// writable.
+pub fn models_folder(dir: Option<&Path>, assets: &Assets) -> anyhow::Result<ModelsFolder> {
+    if let Some(dir) = dir {
+        return Ok(ModelsFolder::open(dir)?);
     }
-    let there = assets.candidates().iter().filter(|folder| folder.is_dir());
-    there.flat_map(|folder| ModelsFolder::open(folder)).next().with_context(|| {
-        let looked: Vec<_> =
+    let existing = assets.candidates().iter().filter(|folder| folder.is_dir());
+    existing.flat_map(|folder| ModelsFolder::open(folder)).next().with_context(|| {
+        let candidates: Vec<_> =
             assets.candidates().iter().map(|path| path.display().to_string()).collect();
         format!(
-            "no assets folder is there that can be written (looked in {}); run `make build` in \
-             the checkout, or name a folder with --assets DIR",
-            looked.join(", ")
+            "found no writable assets folder (searched {}); run `make build` in the checkout, or name a \
+             folder with --assets DIR",
+            candidates.join(", ")
         )
     })
 }
 
-async fn pull(place: &Place, name: &str) -> anyhow::Result<()> {
-    let Some(entry) = place.catalogue.find(name) else {
+async fn pull(context: &ModelContext, name: &str) -> anyhow::Result<()> {
+    let Some(entry) = context.catalogue.find(name) else {
         if name == BUILT_IN_MODEL {
             bail!("{name} is built in: `make build` installs it");
         }
-        let names: Vec<_> = place.catalogue.entries().iter().map(|entry| entry.name()).collect();
+        let names: Vec<_> = context.catalogue.entries().iter().map(|entry| entry.name()).collect();
         bail!(
-            "the catalogue has no model {name:?}, only {}; `whereabouts model add FILE --manifest \
-             TOML` installs any other",
+            "the catalogue has no model {name:?}, only {}; `whereabouts model add FILE --manifest TOML` \
+             installs any other",
             names.join(", ")
         );
     };
-    let (hub, settings) = (&place.config.model.hub, place.config.model.download());
-    let mut screen = Screen::new(name);
-    let pulled = place
+    let (hub, settings) = (&context.config.model.hub, context.config.model.download());
+    let mut meter = DownloadMeter::new(name);
+    let pulled = context
         .folder()?
-        .pull(entry, hub, settings, |progress| screen.show(&progress))
+        .pull(entry, hub, settings, |progress| meter.show(&progress))
         .await
-        .inspect_err(|_| screen.end())
+        .inspect_err(|_| meter.finish())
         .with_context(|| format!("{name} was not installed"));
-    screen.end();
+    meter.finish();
     match pulled? {
         Pulled::Present(folder) => {
-            println!("{name}: installed already and whole, in {}", folder.display());
+            println!("{name}: already installed and intact, in {}", folder.display());
         }
         Pulled::Installed { folder, digests, pinned, replaced } => {
             if let Some(fault) = replaced {
-                println!("{name}: replaced the model that was there: {fault}");
+                println!("{name}: replaced the installed files: {fault}");
             }
             println!("{name}: installed in {}", folder.display());
-            let digests = account::words(&digests);
+            let digests = inspect::join(&digests);
             match pinned {
-                true => println!("  {digests}, as the catalogue pins it"),
+                true => println!("  {digests}, as pinned by the catalogue"),
                 false => println!(
-                    "  {digests}, recorded in its manifest: the catalogue pins none, so this first \
-                     download was taken as it came"
+                    "  {digests}, recorded in its manifest: the catalogue pins no digest, so this first \
+                     download could not be verified"
                 ),
             }
             println!("  licence {}, see the file LICENCE there", entry.manifest.licence);
         }
     }
-    account::say_in_use(place);
-    place.say_how_it_is_found();
+    inspect::print_default_model(context);
+    context.print_assets_setting();
     Ok(())
 }
 
-fn choose(place: &Place, name: &str) -> anyhow::Result<()> {
-    let choice = Some(name).filter(|name| *name != AUTO);
-    if let Some(name) = choice {
-        place.assets.model(name)?;
+fn select(context: &ModelContext, name: &str) -> anyhow::Result<()> {
+    let selection = Some(name).filter(|name| *name != AUTO);
+    if let Some(name) = selection {
+        context.assets.model(name)?;
     }
-    place.folder()?.choose(choice)?;
-    let chosen = place.assets.chosen();
-    if let Some((file, other)) = chosen
-        && choice != Some(other.as_str())
+    context.folder()?.choose(selection)?;
+    if let Some((file, other)) = context.assets.chosen()
+        && selection != Some(other.as_str())
     {
-        bail!("{} chooses {other:?} and goes first; remove it", file.display());
+        bail!("{} selects {other:?} and takes precedence; remove that file", file.display());
     }
-    account::say_in_use(place);
-    place.say_how_it_is_found();
+    inspect::print_default_model(context);
+    context.print_assets_setting();
     Ok(())
 }

@@ -1,314 +1,313 @@
-//! The page itself.
+//! The page of the report.
 
-use std::fmt::{self, Write};
+use maud::{DOCTYPE, Markup, PreEscaped, html};
 
-use super::super::open_set::precision_recall;
-use super::super::summary::firsts;
+use super::super::open_set::correctness_curve;
+use super::super::recall::{AtK, Change};
+use super::super::summary::{Quantiles, top_predictions};
 use super::super::{
-    Dataset, MethodOutcomes, MethodSummary, Outcome, Prediction, QueryKind, Summary,
+    Dataset, MethodOutcomes, MethodSummary, Prediction, QueryKind, QueryOutcome, Summary,
 };
-use super::Escaped;
 use super::charts;
 use super::examples::{Example, Group, Pictures};
 use whereabouts_core::ImageId;
 
 const STYLE: &str = include_str!("page.css");
 
-/// Puts the page together.
+/// Renders the page.
 pub fn page(
     summary: &Summary,
     data: &Dataset,
-    found: &[MethodOutcomes],
+    methods: &[MethodOutcomes],
     examples: &[Group<'_>],
     pictures: &Pictures<'_>,
 ) -> anyhow::Result<String> {
-    let mut out = String::new();
-    write!(
-        out,
-        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <title>Recall on {}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n",
-        Escaped(&summary.told.query_folder)
-    )?;
-    head(summary, &mut out)?;
-    recalls(summary, &mut out)?;
-    refinements(summary, &mut out)?;
-    curves(summary, data, found, &mut out)?;
-    times(summary, &mut out)?;
-    for group in examples {
-        write_group(group, pictures, &mut out)?;
-    }
-    out.push_str("</body>\n</html>\n");
-    Ok(out)
-}
-
-fn head(summary: &Summary, out: &mut String) -> fmt::Result {
-    let Summary { queries, skipped, unknown, references, told, .. } = summary;
-    write!(
-        out,
-        "<h1>How often the first answer is right</h1>\n<p>{queries} queries of <b>{}</b> against \
-         {references} references of <b>{}</b>, with the model <b>{}</b> ({}). A reference is true if it \
-         is {}.",
-        Escaped(&told.query_folder),
-        Escaped(&told.database),
-        Escaped(&told.model),
-        Escaped(&told.execution),
-        Escaped(&told.truth),
-    )?;
-    if *skipped > 0 {
-        write!(out, " {skipped} more queries have no true reference and are left out.")?;
-    }
-    if *unknown > 0 {
-        write!(out, " {unknown} more queries show places that are not in the map.")?;
-    }
-    out.push_str("</p>\n");
-    for method in &summary.methods {
-        if let Some(why) = &method.degraded_why {
-            writeln!(
-                out,
-                "<p class=\"warning\">{}: {} queries were not fully refined: {}</p>",
-                method.name,
-                method.degraded,
-                Escaped(why)
-            )?;
-        }
-    }
-    Ok(())
-}
-
-fn recalls(summary: &Summary, out: &mut String) -> fmt::Result {
-    out.push_str(
-        "<h2>Recall</h2>\n<div class=\"scroll\"><table>\n<tr><th>Method</th><th>R@1</th>\
-         <th>R@5</th><th>R@10</th></tr>\n",
-    );
-    for method in &summary.methods {
-        write!(out, "<tr><td>{}</td>", method.name)?;
-        let (at, range, change) = (&method.recall, &method.interval, &method.change);
-        let change = change.as_ref().map(|change| change.recall);
-        cell(at.one, range.one, change.map(|change| change.one), out)?;
-        cell(at.five, range.five, change.map(|change| change.five), out)?;
-        cell(at.ten, range.ten, change.map(|change| change.ten), out)?;
-        out.push_str("</tr>\n");
-    }
-    out.push_str(
-        "</table></div>\n<p class=\"soft\">In percent of the queries; below each the change by \
-         refinement and the 95 % bootstrap interval.</p>\n",
-    );
-    Ok(())
-}
-
-fn cell(recall: f64, [low, high]: [f64; 2], change: Option<f64>, out: &mut String) -> fmt::Result {
-    write!(out, "<td>{recall:.1}")?;
-    match change {
-        Some(change) if change >= 0.05 => {
-            write!(out, "<small class=\"up\">{change:.1} ↑</small>")?;
-        }
-        Some(change) if change <= -0.05 => {
-            write!(out, "<small class=\"down\">{:.1} ↓</small>", -change)?;
-        }
-        Some(_) => out.push_str("<small>no change</small>"),
-        None => {}
-    }
-    write!(out, "<small>{low:.1} – {high:.1}</small></td>")
-}
-
-fn refinements(summary: &Summary, out: &mut String) -> fmt::Result {
-    for method in &summary.methods {
-        if let Some(change) = &method.change {
-            write!(
-                out,
-                "<p><b>{}</b> put {} queries right, spoilt {} and left {} as they were; the change \
-                 of R@1 lies between {:+.1} and {:+.1} points.",
-                method.name,
-                change.helped,
-                change.harmed,
-                change.left_alone,
-                change.interval.one[0],
-                change.interval.one[1]
-            )?;
-            let usage = &method.usage;
-            if usage.calls > 0 || usage.cached > 0 {
-                write!(
-                    out,
-                    " It took {} calls, {} tokens sent and {} received; {} descriptions were known.",
-                    usage.calls, usage.prompt_tokens, usage.completion_tokens, usage.cached
-                )?;
+    let examples: Vec<Markup> =
+        examples.iter().map(|group| example_group(group, pictures)).collect::<Result<_, _>>()?;
+    let page = html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                title { "Recall on " (summary.conditions.query_folder) }
+                style { (PreEscaped(STYLE)) }
             }
-            out.push_str("</p>\n");
+            body {
+                (introduction(summary))
+                (recall_table(summary))
+                @for method in &summary.methods {
+                    @if let Some(change) = &method.change { (refinement(method, change)) }
+                }
+                (confidence(summary, data, methods))
+                (time_table(summary))
+                @for group in examples { (group) }
+            }
         }
-    }
-    Ok(())
+    };
+    Ok(page.into_string())
 }
 
-fn curves(
-    summary: &Summary,
-    data: &Dataset,
-    found: &[MethodOutcomes],
-    out: &mut String,
-) -> fmt::Result {
-    let first: Vec<_> = found.iter().map(|method| firsts(data, method)).collect();
-    let lines: Vec<_> = first.iter().map(|first| precision_recall(first)).collect();
-    out.push_str("<h2>When to believe the first answer</h2>\n<div class=\"charts\">\n<figure>");
-    out.push_str(&charts::precision_recall(&lines));
-    out.push_str("<figcaption>");
-    for (index, method) in summary.methods.iter().enumerate() {
-        write!(
-            out,
-            "<span class=\"key\"><svg viewBox=\"0 0 22 10\"><line class=\"line c{}\" x1=\"0\" \
-             x2=\"22\" y1=\"5\" y2=\"5\"/></svg>{}</span>",
-            index % charts::COLOURS + 1,
-            method.name
-        )?;
-    }
-    out.push_str("Taking the surest first answers first.</figcaption></figure>\n");
-    for (method, first) in summary.methods.iter().zip(&first) {
-        let suggested = method.known.suggested;
-        out.push_str("<figure>");
-        out.push_str(&charts::histogram(first, suggested.map(|point| point.threshold)));
-        write!(
-            out,
-            "<figcaption><b>{}</b>: <span class=\"up\">true</span> and <span class=\"down\">\
-             false</span> first answers.",
-            method.name
-        )?;
-        if let Some(point) = suggested {
-            write!(
-                out,
-                " From {:.3} on, {:.1} % are true, and {:.1} % of what can be found is found: the \
-                 suggested bound of <code>known</code> (best F1).",
-                point.threshold,
-                100.0 * point.precision,
-                100.0 * point.recall
-            )?;
+fn introduction(summary: &Summary) -> Markup {
+    let Summary { queries, skipped, unknown, references, conditions, methods } = summary;
+    html! {
+        h1 { "How often the first answer is correct" }
+        p {
+            (queries) " queries of " b { (conditions.query_folder) } " against " (references)
+            " references of " b { (conditions.database) } ", with the model " b { (conditions.model) }
+            " (" (conditions.execution) "). A reference is correct if it is " (conditions.truth) "."
+            @if *skipped > 0 {
+                " " (skipped) " more queries have no correct reference and are left out."
+            }
+            @if *unknown > 0 { " " (unknown) " more queries show places that are not in the map." }
         }
-        write_known(method, out)?;
-        out.push_str("</figcaption></figure>\n");
+        @for method in methods {
+            @if let Some(reason) = &method.degraded_why {
+                p.warning {
+                    (method.name) ": " (method.degraded) " queries were not fully refined: " (reason)
+                }
+            }
+        }
     }
-    out.push_str("</div>\n");
-    Ok(())
 }
 
-fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
+fn recall_table(summary: &Summary) -> Markup {
+    let columns = |method: &MethodSummary| {
+        let AtK { one, five, ten } = method.recall;
+        let interval = method.interval;
+        let change = method.change.map(|change| change.recall);
+        [
+            (one, interval.one, change.map(|change| change.one)),
+            (five, interval.five, change.map(|change| change.five)),
+            (ten, interval.ten, change.map(|change| change.ten)),
+        ]
+    };
+    html! {
+        h2 { "Recall" }
+        div.scroll {
+            table {
+                tr { th { "Method" } th { "R@1" } th { "R@5" } th { "R@10" } }
+                @for method in &summary.methods {
+                    tr {
+                        td { (method.name) }
+                        @for (recall, [low, high], change) in columns(method) {
+                            td {
+                                (format!("{recall:.1}"))
+                                @if let Some(change) = change { (recall_change(change)) }
+                                small { (format!("{low:.1} – {high:.1}")) }
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        p.soft {
+            "In percent of the queries, with the change by refinement and the 95 % bootstrap interval below."
+        }
+    }
+}
+
+fn recall_change(change: f64) -> Markup {
+    html! {
+        @if change >= 0.05 { small.up { (format!("{change:.1} ↑")) } }
+        @else if change <= -0.05 { small.down { (format!("{:.1} ↓", -change)) } }
+        @else { small { "no change" } }
+    }
+}
+
+fn refinement(method: &MethodSummary, change: &Change) -> Markup {
+    let (usage, [low, high]) = (&method.usage, change.interval.one);
+    html! {
+        p {
+            b { (method.name) } " corrected " (change.helped) " queries, made " (change.harmed)
+            " worse and left " (change.left_alone) " unchanged; the 95 % interval of the change of R@1 is "
+            (format!("{low:+.1} to {high:+.1}")) " points."
+            @if usage.calls > 0 || usage.cached > 0 {
+                " It took " (usage.calls) " calls, " (usage.prompt_tokens) " prompt tokens and "
+                (usage.completion_tokens) " completion tokens; " (usage.cached)
+                " descriptions came from the cache."
+            }
+        }
+    }
+}
+
+fn confidence(summary: &Summary, data: &Dataset, methods: &[MethodOutcomes]) -> Markup {
+    let predictions: Vec<_> = methods.iter().map(|method| top_predictions(data, method)).collect();
+    let curves: Vec<_> = predictions.iter().map(|method| correctness_curve(method)).collect();
+    html! {
+        h2 { "When to trust the first answer" }
+        div.charts {
+            figure {
+                (charts::precision_recall(&curves))
+                figcaption {
+                    @for (index, method) in summary.methods.iter().enumerate() {
+                        span.key {
+                            svg viewBox="0 0 22 10" {
+                                line class=(charts::line_class(index)) x1="0" x2="22" y1="5" y2="5" {}
+                            }
+                            (method.name)
+                        }
+                    }
+                    "Accepting first answers in the order of their confidence."
+                }
+            }
+            @for (method, predictions) in summary.methods.iter().zip(&predictions) {
+                @let suggested = method.known.suggested;
+                figure {
+                    (charts::histogram(predictions, suggested.map(|point| point.threshold)))
+                    figcaption {
+                        b { (method.name) } ": " span.up { "correct" } " and " span.down { "wrong" }
+                        " first answers."
+                        @if let Some(point) = suggested {
+                            (format!(
+                                " At a confidence of {:.3} or more, {:.1} % are correct (precision), out of \
+                                 {:.1} % of all that could be (recall): the suggested threshold of ",
+                                point.threshold, 100.0 * point.precision, 100.0 * point.recall
+                            ))
+                            code { "known" } " (best F1)."
+                        }
+                        (open_set(method))
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn open_set(method: &MethodSummary) -> Markup {
     let known = &method.known;
-    if let (Some(at_95), Some(at_99), Some(auc)) = (&known.at_95, &known.at_99, known.auc) {
-        write!(
-            out,
-            " Against {} places that are not in the map: precision {:.1} % at 95 % recall, {:.1} % \
-             at 99 %, AUC {auc:.3}.",
-            known.unknown,
-            100.0 * at_95.precision,
-            100.0 * at_99.precision
-        )?;
+    html! {
+        @if let (Some(at_95), Some(at_99), Some(auc)) = (&known.at_95, &known.at_99, known.auc) {
+            (format!(
+                " Against {} places that are not in the map: precision {:.1} % at 95 % recall, {:.1} % at \
+                 99 %, AUC {auc:.3}.",
+                known.unknown, 100.0 * at_95.precision, 100.0 * at_99.precision
+            ))
+        }
     }
-    Ok(())
 }
 
-fn times(summary: &Summary, out: &mut String) -> fmt::Result {
-    out.push_str(
-        "<h2>Time</h2>\n<div class=\"scroll\"><table>\n<tr><th>Method</th><th>decode</th>\
-         <th>extract</th><th>search</th><th>refine</th><th>a pair</th></tr>\n",
-    );
-    for method in &summary.methods {
-        let times = &method.timing_ms;
-        write!(out, "<tr><td>{}</td>", method.name)?;
-        let stages = [Some(times.decode), Some(times.extract), Some(times.search)];
-        for spread in stages.into_iter().chain([times.refine, times.refine_pair]) {
-            match spread {
-                Some(spread) => write!(
-                    out,
-                    "<td>{:.2}<small>95 %: {:.2}</small></td>",
-                    spread.median, spread.p95
-                )?,
-                None => out.push_str("<td>–</td>"),
+fn time_table(summary: &Summary) -> Markup {
+    let stages = |method: &MethodSummary| {
+        let times = method.timing_ms;
+        [
+            Some(times.decode),
+            Some(times.extract),
+            Some(times.search),
+            times.refine,
+            times.refine_pair,
+        ]
+    };
+    html! {
+        h2 { "Time" }
+        div.scroll {
+            table {
+                tr {
+                    @for heading in ["Method", "decode", "extract", "search", "refine", "one pair"] {
+                        th { (heading) }
+                    }
+                }
+                @for method in &summary.methods {
+                    tr {
+                        td { (method.name) }
+                        @for stage in stages(method) {
+                            td {
+                                @if let Some(Quantiles { median, p95 }) = stage {
+                                    (format!("{median:.2}")) small { (format!("95 %: {p95:.2}")) }
+                                } @else { "–" }
+                            }
+                        }
+                    }
+                }
             }
         }
-        out.push_str("</tr>\n");
+        p.soft { "Milliseconds per query: median and 95th percentile." }
     }
-    out.push_str(
-        "</table></div>\n<p class=\"soft\">Milliseconds for a query: the median, and what 95 % stay \
-         within.</p>\n",
-    );
-    Ok(())
 }
 
-fn write_group(group: &Group<'_>, pictures: &Pictures<'_>, out: &mut String) -> anyhow::Result<()> {
-    writeln!(out, "<h2>{}: {}</h2>", group.method, group.kind.heading())?;
-    match (group.count, group.shown.len()) {
-        (0, _) => out.push_str("<p class=\"soft\">No query.</p>\n"),
-        (count, shown) if count > shown => {
-            writeln!(out, "<p class=\"soft\">{shown} of {count} queries.</p>")?;
+fn example_group(group: &Group<'_>, pictures: &Pictures<'_>) -> anyhow::Result<Markup> {
+    let examples: Vec<Markup> =
+        group.shown.iter().map(|one| example(one, pictures)).collect::<Result<_, _>>()?;
+    Ok(html! {
+        h2 { (group.method) ": " (group.kind.heading()) }
+        @if group.count == 0 {
+            p.soft { "No query." }
+        } @else if group.count > examples.len() {
+            p.soft { (examples.len()) " of " (group.count) " queries." }
         }
-        _ => {}
-    }
-    group.shown.iter().try_for_each(|example| write_example(example, pictures, out))
+        @for example in examples { (example) }
+    })
 }
 
-fn write_example(
-    example: &Example<'_>,
-    pictures: &Pictures<'_>,
-    out: &mut String,
-) -> anyhow::Result<()> {
+fn example(example: &Example<'_>, pictures: &Pictures<'_>) -> anyhow::Result<Markup> {
     let Example { query, before, after } = example;
-    let figure = |class: &str, picture: &str, label: &str, name: &str, note: &str| {
-        format!(
-            "<figure class=\"{class}\"><img alt=\"{label}\" src=\"{picture}\"><figcaption>\
-             <b>{label}</b> {}{note}</figcaption></figure>\n",
-            Escaped(name)
-        )
+    let prediction = |label: &str, prediction: &Prediction| -> anyhow::Result<Markup> {
+        let class = if query.truth.contains(&prediction.image_id) { "right" } else { "wrong" };
+        let similarity = format!(", similarity {:.3}", prediction.similarity);
+        let picture = pictures.reference(&prediction.image_id)?;
+        Ok(figure(class, label, &prediction.image_id, &similarity, &picture))
     };
-    let answer = |label: &str, answer: &Prediction| -> anyhow::Result<String> {
-        let class = if query.truth.contains(&answer.image_id) { "right" } else { "wrong" };
-        let picture = pictures.reference(&answer.image_id)?;
-        let note = format!(", similarity {:.3}", answer.similarity);
-        Ok(figure(class, &picture, label, answer.image_id.as_str(), &note))
-    };
-    out.push_str("<section class=\"example\">\n<div class=\"pictures\">\n");
     let picture = pictures.picture(&query.picture.file)?;
-    out.push_str(&figure("query", &picture, "query", query.picture.id.as_str(), ""));
-    out.push_str(&answer("before", before)?);
+    let mut figures = vec![figure("query", "query", &query.picture.id, "", &picture)];
+    figures.push(prediction("before", before)?);
     if let Some((after, _)) = after {
-        out.push_str(&answer("after", after)?);
+        figures.push(prediction("after", after)?);
     }
-    let shown = |id: &ImageId| {
+    let is_shown = |id: &ImageId| {
         before.image_id == *id || after.is_some_and(|(after, _)| after.image_id == *id)
     };
-    let missed = query.kind == QueryKind::InMap && !query.truth.iter().any(shown);
-    if let Some(truth) = query.truth.iter().min().filter(|_| missed) {
-        let picture = pictures.reference(truth)?;
-        out.push_str(&figure("right", &picture, "a true one", truth.as_str(), ""));
+    let is_missed = query.kind == QueryKind::InMap && !query.truth.iter().any(is_shown);
+    if let Some(truth) = query.truth.iter().min().filter(|_| is_missed) {
+        figures.push(figure("right", "correct", truth, "", &pictures.reference(truth)?));
     }
-    out.push_str("</div>\n");
-    if let Some((after, outcome)) = after {
-        write_said(before, after, outcome, out)?;
-    }
-    out.push_str("</section>\n");
-    Ok(())
+    Ok(html! {
+        section.example {
+            div.pictures {
+                @for figure in figures { (figure) }
+            }
+            @if let Some((after, outcome)) = after { (refiner_texts(before, after, outcome)) }
+        }
+    })
 }
 
-/// What the refiner said of the first after refinement, and folded up what it said besides.
-fn write_said(
-    before: &Prediction,
-    after: &Prediction,
-    outcome: &Outcome,
-    out: &mut String,
-) -> fmt::Result {
-    let said = |id: &ImageId| {
-        let of = outcome.descriptions.iter().find(|description| description.image_id == *id);
-        of.map(|description| description.text.as_str())
-    };
-    if let Some(text) = said(&after.image_id) {
-        writeln!(out, "<p class=\"said\"><b>after:</b> {}</p>", Escaped(text))?;
-    }
-    let other = said(&before.image_id).filter(|_| before.image_id != after.image_id);
-    if other.is_none() && outcome.reasoning.is_none() {
-        return Ok(());
-    }
-    out.push_str("<details><summary>What else the refiner said</summary>\n");
-    for (label, text) in [("before", other), ("why", outcome.reasoning.as_deref())] {
-        if let Some(text) = text {
-            writeln!(out, "<p class=\"said\"><b>{label}:</b> {}</p>", Escaped(text))?;
+fn figure(class: &str, label: &str, id: &ImageId, note: &str, picture: &str) -> Markup {
+    html! {
+        figure class=(class) {
+            img alt=(label) src=(picture);
+            figcaption { b { (label) } " " (id.as_str()) (note) }
         }
     }
-    out.push_str("</details>\n");
-    Ok(())
+}
+
+/// Shows the refiner's description of the first candidate after refinement, and its other texts folded.
+fn refiner_texts(before: &Prediction, after: &Prediction, outcome: &QueryOutcome) -> Markup {
+    let description = |id: &ImageId| {
+        let mut descriptions = outcome.descriptions.iter();
+        let description = descriptions.find(|description| description.image_id == *id);
+        description.map(|description| description.text.as_str())
+    };
+    let text = |label: &str, text: &str| html! { p.said { b { (label) ":" } " " (text) } };
+    let before_text = description(&before.image_id).filter(|_| before.image_id != after.image_id);
+    html! {
+        @if let Some(after_text) = description(&after.image_id) { (text("after", after_text)) }
+        @if before_text.is_some() || outcome.reasoning.is_some() {
+            details {
+                summary { "More from the refiner" }
+                @if let Some(before_text) = before_text { (text("before", before_text)) }
+                @if let Some(reasoning) = &outcome.reasoning { (text("reasoning", reasoning)) }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_image_id_cannot_become_markup() {
+        let id: ImageId = r#"<b onclick="x">&.jpg"#.parse().unwrap();
+        let figure = figure("query", "query", &id, "", "data:").into_string();
+        assert!(figure.contains("&lt;b onclick=&quot;x&quot;&gt;&amp;.jpg"), "{figure}");
+    }
 }

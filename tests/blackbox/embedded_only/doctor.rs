@@ -48,7 +48,10 @@ async fn a_healthy_folder_is_reported_as_healthy() {
     let output = doctor(dir.path(), &["--deep"]);
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(output.status.success(), "{said}");
-    assert!(said.contains("all is in order") && said.contains("m: 4 images by xfeat"), "{said}");
+    assert!(
+        said.contains("no problems found") && said.contains("m: 4 images, model xfeat"),
+        "{said}"
+    );
     let (report, code) = report(dir.path(), &[]);
     assert_eq!((code, &report["version"]), (0, &2.into()));
     assert_eq!(report["jobs"]["succeeded"], 1);
@@ -130,7 +133,7 @@ async fn a_folder_in_use_a_newer_folder_and_a_missing_folder_are_reported() {
     assert!(findings(&older)[0].contains("of version 1"), "{older}");
 
     let output = doctor(&dir.path().join("nothing"), &[]);
-    assert!(String::from_utf8_lossy(&output.stderr).contains("there is no data folder"));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("there is not a data folder"));
     assert!(!dir.path().join("nothing").exists());
 }
 

@@ -280,7 +280,7 @@ fn positions_are_read_from_exif() {
     assert_eq!((&near["queries"], &near["skipped"]), (&6.into(), &0.into()));
     assert_eq!(recalls(&near)[0][2], 100.0);
     let refused = folders.refused(&["--refine", "off", "--threshold-m", "10"]);
-    assert!(refused.contains("none of the 6 queries has a true reference"), "{refused}");
+    assert!(refused.contains("none of the 6 queries has a correct reference"), "{refused}");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! What the actions that only look say.
+//! The actions that change nothing: list, show and verify.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -8,27 +8,27 @@ use indicatif::DecimalBytes;
 use serde::Serialize;
 use serde_json::json;
 
-use super::Place;
+use super::ModelContext;
 use whereabouts_core::{DescriptorKind, Digest};
 use whereabouts_models::InstallError;
 use whereabouts_vision::{AUTO, BUILT_IN_MODEL, MANIFEST, Manifest};
 
-/// One model in the list.
+/// One row of the list of models.
 #[derive(Serialize)]
-struct Line {
+struct ListedModel {
     name: String,
-    /// `installed`, `available`, or `damaged` where the manifest cannot be read.
+    /// `installed`, `available`, or `damaged` if the manifest cannot be read.
     state: &'static str,
     in_use: bool,
-    /// Numbers in its GeM descriptor.
+    /// Dimensions of its GeM descriptor.
     dimension: Option<usize>,
     licence: Option<String>,
     description: String,
     folder: Option<PathBuf>,
 }
 
-impl Line {
-    fn of(name: &str, state: &'static str, manifest: &Manifest, folder: Option<PathBuf>) -> Self {
+impl ListedModel {
+    fn new(name: &str, state: &'static str, manifest: &Manifest, folder: Option<PathBuf>) -> Self {
         Self {
             name: name.to_owned(),
             state,
@@ -42,7 +42,7 @@ impl Line {
 
     fn installed(name: &str, folder: PathBuf) -> Self {
         match Manifest::read(&folder.join(MANIFEST)) {
-            Ok(manifest) => Self::of(name, "installed", &manifest, Some(folder)),
+            Ok(manifest) => Self::new(name, "installed", &manifest, Some(folder)),
             Err(error) => Self {
                 name: name.to_owned(),
                 state: "damaged",
@@ -56,63 +56,68 @@ impl Line {
     }
 }
 
-/// The models that are installed, then those that can be pulled.
-pub fn list(place: &Place, json: bool) -> anyhow::Result<()> {
-    let installed = place.assets.installed();
-    let in_use = place.assets.resolve(&place.config.model.name);
-    let available = place.catalogue.entries().iter();
-    let available = available.filter(|entry| !installed.contains_key(entry.name()));
-    let mut lines: Vec<_> =
-        available.map(|entry| Line::of(entry.name(), "available", &entry.manifest, None)).collect();
-    let there = installed.into_iter().map(|(name, folder)| Line::installed(&name, folder));
-    lines.splice(..0, there);
-    for line in &mut lines {
-        line.in_use = in_use.as_ref().is_ok_and(|(name, _)| *name == line.name);
+/// Prints the installed models, then those that can be pulled.
+pub fn list(context: &ModelContext, json: bool) -> anyhow::Result<()> {
+    let installed = context.assets.installed();
+    let in_use = context.assets.resolve(&context.config.model.name);
+    let available = context.catalogue.entries().iter();
+    let available: Vec<_> = available
+        .filter(|entry| !installed.contains_key(entry.name()))
+        .map(|entry| ListedModel::new(entry.name(), "available", &entry.manifest, None))
+        .collect();
+    let mut models: Vec<_> =
+        installed.into_iter().map(|(name, folder)| ListedModel::installed(&name, folder)).collect();
+    models.extend(available);
+    for model in &mut models {
+        model.in_use = in_use.as_ref().is_ok_and(|(name, _)| *name == model.name);
     }
     if json {
         let in_use = in_use.ok().map(|(name, why)| json!({"name": name, "why": why.to_string()}));
-        println!("{}", json!({"models": lines, "in_use": in_use}));
+        println!("{}", json!({"models": models, "in_use": in_use}));
         return Ok(());
     }
     println!("  {:16} {:9} {:>5}  {:12} description", "name", "state", "dims", "licence");
-    for line in lines {
+    for model in models {
         println!(
             "{} {:16} {:9} {:>5}  {:12} {}",
-            if line.in_use { '*' } else { ' ' },
-            line.name,
-            line.state,
-            line.dimension.map_or("?".into(), |dimension| dimension.to_string()),
-            line.licence.as_deref().unwrap_or("?"),
-            line.description
+            if model.in_use { '*' } else { ' ' },
+            model.name,
+            model.state,
+            model.dimension.map_or("?".into(), |dimension| dimension.to_string()),
+            model.licence.as_deref().unwrap_or("?"),
+            model.description
         );
     }
-    say_in_use(place);
+    print_default_model(context);
     Ok(())
 }
 
-/// Which model a server would run, and why.
-pub fn say_in_use(place: &Place) {
-    let named = &place.config.model.name;
-    match place.assets.resolve(named) {
+/// Prints the default model of a server, and why it is the default.
+pub fn print_default_model(context: &ModelContext) {
+    let setting = &context.config.model.name;
+    match context.assets.resolve(setting) {
         Ok((name, why)) => println!("in use: {name} ({why})"),
         Err(error) => println!("in use: none; {error}"),
     }
-    if let Some((file, chosen)) = place.assets.chosen()
-        && named != AUTO
+    if let Some((file, selected)) = context.assets.chosen()
+        && setting != AUTO
     {
-        println!("  model.name = {named:?} goes over the choice of {chosen} in {}", file.display());
+        println!(
+            "  model.name = {setting:?} takes precedence over the selection of {selected} in {}",
+            file.display()
+        );
     }
 }
 
-/// What is known of one model.
-pub fn show(place: &Place, name: &str, json: bool) -> anyhow::Result<()> {
-    let entry = place.catalogue.find(name);
-    let folder = place.assets.model(name).ok();
+/// Prints the details of one model.
+pub fn show(context: &ModelContext, name: &str, json: bool) -> anyhow::Result<()> {
+    let entry = context.catalogue.find(name);
+    let folder = context.assets.model(name).ok();
     let manifest = match (&folder, entry) {
         (Some(folder), _) => Manifest::read(&folder.join(MANIFEST))?,
         (None, Some(entry)) => entry.manifest.clone(),
         (None, None) => {
-            bail!("there is no model {name:?}; `whereabouts model list` shows those there are")
+            bail!("there is no model {name:?}; `whereabouts model list` shows all models")
         }
     };
     let bytes = match &folder {
@@ -122,53 +127,51 @@ pub fn show(place: &Place, name: &str, json: bool) -> anyhow::Result<()> {
         }
         None => entry.and_then(|entry| entry.bytes),
     };
-    let address = entry.map(|entry| entry.url(&place.config.model.hub, &manifest.file));
+    let address = entry.map(|entry| entry.url(&context.config.model.hub, &manifest.file));
     if json {
-        let shown = json!({
+        let details = json!({
             "name": name, "installed": folder.is_some(), "folder": folder, "bytes": bytes,
             "address": address, "manifest": manifest,
         });
-        println!("{shown}");
+        println!("{details}");
         return Ok(());
     }
     let folder = folder.map_or("not installed".into(), |folder| folder.display().to_string());
-    let unknown = || "unknown".to_owned();
+    let size = bytes.map_or("unknown".into(), |bytes| DecimalBytes(bytes).to_string());
     let digest = manifest.sha256.map_or("recorded when it is pulled".into(), |d| d.to_string());
     let cls = manifest.dimension(DescriptorKind::Cls);
+    let cls = cls.map_or("none".into(), |dimension| format!("{dimension} dimensions"));
     println!("{name}: {}", manifest.description);
     println!("  folder   {folder}");
-    println!("  size     {}", bytes.map_or_else(unknown, |bytes| DecimalBytes(bytes).to_string()));
+    println!("  size     {size}");
     println!("  digest   {digest}");
     println!("  address  {}", address.unwrap_or_else(|| "not in the catalogue".into()));
     println!("  licence  {}", manifest.licence);
     println!("  source   {}", manifest.source);
-    println!("  gem      {} numbers", manifest.pooling.dimension);
-    println!(
-        "  cls      {}",
-        cls.map_or("none".into(), |dimension| format!("{dimension} numbers"))
-    );
+    println!("  gem      {} dimensions", manifest.pooling.dimension);
+    println!("  cls      {cls}");
     println!("\n{}", manifest.to_toml()?.trim_end());
     Ok(())
 }
 
-/// One model that was hashed again.
+/// The result of verifying one model.
 #[derive(Serialize)]
 struct Check {
     name: String,
     ok: bool,
     folder: PathBuf,
-    /// Whether its manifest pins a digest; without one there is nothing to compare with.
+    /// Whether its manifest pins every digest; otherwise there is nothing to compare with.
     pinned: bool,
-    /// The digest, or what is wrong.
+    /// The digests, or the error.
     detail: String,
 }
 
 impl Check {
-    fn of(name: String, folder: PathBuf) -> Self {
+    fn run(name: String, folder: PathBuf) -> Self {
         let (ok, pinned, detail) = match whereabouts_models::verify(&folder) {
             Ok(verdict) => {
                 let pinned = verdict.manifest.files().all(|(_, pinned)| pinned.is_some());
-                (true, pinned, words(&verdict.digests))
+                (true, pinned, join(&verdict.digests))
             }
             Err(error) => (false, matches!(error, InstallError::Damaged { .. }), error.to_string()),
         };
@@ -176,47 +179,49 @@ impl Check {
     }
 }
 
-/// The digests of a model's files.
-pub fn words(digests: &[Digest]) -> String {
+/// Joins the digests of a model's files for printing.
+pub fn join(digests: &[Digest]) -> String {
     digests.iter().map(Digest::to_string).collect::<Vec<_>>().join(" and ")
 }
 
-/// Hashes one model or all again; a bad one is an error.
-pub fn verify(place: &Place, name: Option<&str>, json: bool) -> anyhow::Result<()> {
+/// Verifies one model or all. A damaged model is an error.
+pub fn verify(context: &ModelContext, name: Option<&str>, json: bool) -> anyhow::Result<()> {
     let models = match name {
-        Some(name) => BTreeMap::from([(name.to_owned(), place.assets.model(name)?)]),
-        None => place.assets.installed(),
+        Some(name) => BTreeMap::from([(name.to_owned(), context.assets.model(name)?)]),
+        None => context.assets.installed(),
     };
-    let checks: Vec<_> = models.into_iter().map(|(name, folder)| Check::of(name, folder)).collect();
+    let checks: Vec<_> =
+        models.into_iter().map(|(name, folder)| Check::run(name, folder)).collect();
     if json {
         println!("{}", json!({ "models": checks }));
     } else {
-        checks.iter().for_each(say_check);
+        checks.iter().for_each(print_check);
     }
-    let bad: Vec<_> = checks.iter().filter(|check| !check.ok).collect();
-    match bad.first() {
+    let failed: Vec<_> = checks.iter().filter(|check| !check.ok).collect();
+    match failed.first() {
         None => Ok(()),
-        Some(first) => Err(remedy(place, first))
-            .with_context(|| format!("{} of {} models are bad", bad.len(), checks.len())),
+        Some(first) => Err(remedy(context, first)).with_context(|| {
+            format!("models that failed verification: {} of {}", failed.len(), checks.len())
+        }),
     }
 }
 
-fn say_check(check: &Check) {
+fn print_check(check: &Check) {
     match (check.ok, check.pinned) {
         (true, true) => println!("{}: good, {}", check.name, check.detail),
         (true, false) => println!(
-            "{}: {}; its manifest pins no sha256, so there is nothing to compare with",
+            "{}: {}; not verified, because its manifest pins no sha256",
             check.name, check.detail
         ),
         (false, _) => println!("{}: bad: {}", check.name, check.detail),
     }
 }
 
-fn remedy(place: &Place, check: &Check) -> anyhow::Error {
+fn remedy(context: &ModelContext, check: &Check) -> anyhow::Error {
     let Check { name, folder, .. } = check;
     let folder = folder.display();
-    if place.catalogue.find(name).is_some() {
-        anyhow!("`whereabouts model pull {name}` replaces it")
+    if context.catalogue.find(name).is_some() {
+        anyhow!("replace it with `whereabouts model pull {name}`")
     } else if name == BUILT_IN_MODEL {
         anyhow!("remove {folder} and run `make build`, which installs it again")
     } else {

@@ -1,4 +1,4 @@
-//! How a download goes on: a bar on a terminal, plain lines elsewhere.
+//! Progress of a download: a bar on a terminal, plain lines in a pipe.
 
 use std::io::IsTerminal;
 
@@ -6,20 +6,20 @@ use indicatif::{DecimalBytes, ProgressBar, ProgressStyle};
 
 use whereabouts_models::Progress;
 
-/// Shows one download on the standard error.
-pub struct Screen {
+/// Shows one download on standard error.
+pub struct DownloadMeter {
     name: String,
-    /// Only on a terminal.
+    /// `None` unless standard error is a terminal.
     bar: Option<ProgressBar>,
     total: Option<u64>,
-    /// The position from which on the next line is due.
+    /// The position at which the next line is printed.
     next_line: u64,
 }
 
-/// A line for each tenth, or for so many bytes where the length is not known.
-const BYTES_A_LINE: u64 = 64 << 20;
+/// Bytes between two lines if the length is not known; otherwise it is a tenth of the length.
+const BYTES_PER_LINE: u64 = 64 << 20;
 
-impl Screen {
+impl DownloadMeter {
     pub fn new(name: &str) -> Self {
         let bar = std::io::stderr().is_terminal().then(ProgressBar::no_length);
         Self { name: name.to_owned(), bar, total: None, next_line: 0 }
@@ -30,25 +30,24 @@ impl Screen {
             Progress::Started { at, total } => self.start(*at, *total),
             Progress::Received(at) => self.advance(*at),
             Progress::Retrying { pause, why } => {
-                self.say(&format!("{why}; trying again in {:.1} s", pause.as_secs_f64()));
+                self.println(&format!("{why}; retrying in {:.1} s", pause.as_secs_f64()));
             }
         }
     }
 
-    pub fn end(&self) {
+    pub fn finish(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
     }
 
-    fn start(&mut self, at: u64, total: Option<u64>) {
+    fn start(&mut self, position: u64, total: Option<u64>) {
         self.total = total;
-        self.next_line = at + self.bytes_a_line();
-        let whole =
-            total.map_or("a file of unknown length".into(), |b| DecimalBytes(b).to_string());
-        match at {
-            0 => self.say(&format!("downloading {whole}")),
-            _ => self.say(&format!("continuing at {} of {whole}", DecimalBytes(at))),
+        self.next_line = position + self.bytes_per_line();
+        let size = total.map_or("a file of unknown size".into(), |b| DecimalBytes(b).to_string());
+        match position {
+            0 => self.println(&format!("downloading {size}")),
+            _ => self.println(&format!("resuming at {} of {size}", DecimalBytes(position))),
         }
         if let Some(bar) = &self.bar {
             if let Some(total) = total {
@@ -59,30 +58,30 @@ impl Screen {
             if let Ok(style) = ProgressStyle::with_template(template) {
                 bar.set_style(style);
             }
-            bar.set_position(at);
+            bar.set_position(position);
             bar.reset_eta();
         }
     }
 
-    fn advance(&mut self, at: u64) {
+    fn advance(&mut self, position: u64) {
         if let Some(bar) = &self.bar {
-            bar.set_position(at);
-        } else if at >= self.next_line {
-            self.next_line = at + self.bytes_a_line();
+            bar.set_position(position);
+        } else if position >= self.next_line {
+            self.next_line = position + self.bytes_per_line();
             match self.total {
                 Some(total) => {
-                    self.say(&format!("{} of {}", DecimalBytes(at), DecimalBytes(total)))
+                    self.println(&format!("{} of {}", DecimalBytes(position), DecimalBytes(total)));
                 }
-                None => self.say(&DecimalBytes(at).to_string()),
+                None => self.println(&DecimalBytes(position).to_string()),
             }
         }
     }
 
-    fn bytes_a_line(&self) -> u64 {
-        self.total.map_or(BYTES_A_LINE, |total| (total / 10).max(1))
+    fn bytes_per_line(&self) -> u64 {
+        self.total.map_or(BYTES_PER_LINE, |total| (total / 10).max(1))
     }
 
-    fn say(&self, text: &str) {
+    fn println(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| eprintln!("{}: {text}", self.name)),
             None => eprintln!("{}: {text}", self.name),
