@@ -190,7 +190,7 @@ async fn each_role_has_its_permissions() {
         assert!(!log.contains(&key[17..]), "a key is in the log");
     }
     server.kill();
-    // With a database there is not a data folder to search.
+    // With a database there is no data folder to search.
     if !deployment::is_scale_out() {
         let stored = std::fs::read(dir.path().join("db/db")).unwrap();
         for key in [&admin, &operator, &robot] {

@@ -133,7 +133,7 @@ async fn a_folder_in_use_a_newer_folder_and_a_missing_folder_are_reported() {
     assert!(findings(&older)[0].contains("of version 1"), "{older}");
 
     let output = doctor(&dir.path().join("nothing"), &[]);
-    assert!(String::from_utf8_lossy(&output.stderr).contains("there is not a data folder"));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("there is no data folder"));
     assert!(!dir.path().join("nothing").exists());
 }
 
