@@ -129,7 +129,7 @@ impl Localizer {
             let id = request.idempotency_id.as_deref();
             let submit = self.submitter.submit(&map, frame, compared, request.priority, id);
             match submit.instrument(traces::stage("submit")).await? {
-                Submission::Queued(job) => (Some(job), None),
+                Submission::Queued(job) => (Some(*job), None),
                 Submission::Declined(why)
                     if request.refine == RefineMode::Wait && why.is_shedding() =>
                 {

@@ -39,7 +39,7 @@ pub(super) struct LocalizedFrame {
 #[derive(Debug)]
 pub(super) enum Submission {
     /// The queued job; that of an earlier attempt, if the request was sent again.
-    Queued(Job),
+    Queued(Box<Job>),
     /// The frame got no job, for this reason.
     Declined(NoJob),
 }
@@ -138,14 +138,14 @@ impl Submitter {
         };
         match submitted {
             // Queued by an attempt whose process ended before it could respond.
-            Ok(Some(earlier)) => return Ok(Submission::Queued(earlier)),
+            Ok(Some(earlier)) => return Ok(Submission::Queued(Box::new(earlier))),
             Ok(None) => self.metrics.job_submitted(),
             Err(StoreError::QueueFull { limit }) => {
                 return Ok(Submission::Declined(self.counted(queue_full(limit))));
             }
             Err(error) => return Err(error.into()),
         }
-        Ok(Submission::Queued(job))
+        Ok(Submission::Queued(Box::new(job)))
     }
 
     /// Returns why no job should be queued now; `None` if one may.

@@ -40,7 +40,7 @@ async fn a_frame_gets_a_queued_job_with_its_candidates() {
         panic!("declined")
     };
     let record = submitter.jobs.job(job.id).await.unwrap().unwrap();
-    assert_eq!(record.job, job);
+    assert_eq!(record.job, *job);
     assert_eq!(record.candidates, candidates(&[(0, 0.9)]));
     assert_eq!(record.query.descriptor, None, "this refiner does not use it");
     let (_, bytes) = fixture.service.jobs.frame(job.id, None).await.unwrap();
