@@ -241,8 +241,8 @@ async fn a_damaged_or_truncated_archive_is_rejected_before_anything_changes() {
     flipped[bytes.len() / 2] ^= 1;
     let cases: [(&str, &[u8]); 4] = [
         ("damaged", &flipped),
-        ("breaks off", &bytes[..bytes.len() - 2000]),
-        ("breaks off", &bytes[..bytes.len() / 2]),
+        ("truncated", &bytes[..bytes.len() - 2000]),
+        ("truncated", &bytes[..bytes.len() / 2]),
         ("manifest.json", b"no archive"),
     ];
     for (word, bytes) in cases {

@@ -355,7 +355,7 @@ async fn a_key_has_rate_limits_and_responses_report_the_rest() {
         assert!(rest.starts_with(&format!("\"requests\";r={left};t=")), "{rest}");
     }
     let refused = get(&server, &few, "/maps").await;
-    assert!(refused.problem(429).contains("3 requests a minute"));
+    assert!(refused.problem(429).contains("3 requests per minute"));
     let pause: u64 = refused.headers["retry-after"].to_str().unwrap().parse().unwrap();
     assert!((1..=20).contains(&pause), "{pause}");
     assert!(refused.headers.contains_key("ratelimit"));
@@ -367,7 +367,7 @@ async fn a_key_has_rate_limits_and_responses_report_the_rest() {
     post_jpeg(&server, &small, "/maps/m/images?id=a", reference(0)).await.expect(201);
     post_jpeg(&server, &small, "/maps/m/images?id=b", reference(1)).await;
     let refused = post_jpeg(&server, &small, "/maps/m/images?id=c", reference(2)).await;
-    assert!(refused.problem(429).contains("20000 bytes a minute"));
+    assert!(refused.problem(429).contains("20000 bytes per minute"));
 }
 
 #[tokio::test]
