@@ -152,7 +152,7 @@ async fn maps_of_several_models_are_served_with_a_bounded_number_loaded() {
             first(&look(&server, map, 2).await, 2, model);
         }
     }
-    assert!(server.log().contains("model dropped to make room"), "{}", server.log());
+    assert!(server.log().contains("model evicted"), "{}", server.log());
     // The refiner uses the model of the map, too.
     for (map, model) in [("a", "xfeat"), ("b", "small")] {
         let path = format!("/localize?map={map}&refine=wait");
