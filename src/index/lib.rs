@@ -9,7 +9,7 @@
 //!
 //! There are two graphs: a compact one over the map as it was when it was last sealed ([`SealedGraph`]), which is kept
 //! in a file, and one of `hnsw_rs` that grows with every new image. Once the growing one covers as many slots as the
-//! sealed one, a new sealed graph is built over all of them ([`Builder`]).
+//! sealed one, a new sealed graph is built over all of them (`builder`).
 
 mod builder;
 mod codes;

@@ -54,7 +54,7 @@ impl TrackStep {
     /// Validates a step; a frame without a time counts as taken now.
     ///
     /// # Errors
-    /// [`ErrorKind::Unprocessable`](super::ErrorKind) for an invalid id or distance.
+    /// [`ErrorKind::Unprocessable`](whereabouts_api::ErrorKind) for an invalid id or distance.
     pub fn new(
         caller: &Principal,
         id: String,
