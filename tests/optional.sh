@@ -31,7 +31,7 @@ may_mount() {
     folder=$(mktemp -d)
     mount -t tmpfs tmpfs "$folder" 2>/dev/null && umount "$folder" && may=0 || may=1
     rmdir "$folder"
-    return $may
+    return "$may"
 }
 
 for input in $required; do
