@@ -153,7 +153,7 @@ impl SealedGraph {
     }
 
     /// Scores candidates with the stored descriptors. Among images that hardly differ the coded similarity says
-    /// little, so scoring goes on until no further candidate can be one of the `k` best; the second value tells
+    /// little, so scoring continues until no further candidate can be one of the `k` best; the second value tells
     /// whether it got there.
     fn rescored(
         &self,

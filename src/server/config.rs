@@ -113,7 +113,7 @@ pub enum KeysWanted {
     Auto,
     /// Always.
     Required,
-    /// Never: whoever reaches the server may do everything.
+    /// Never: anyone who can reach the server has full access.
     Off,
 }
 

@@ -20,7 +20,7 @@ pub struct Idempotency {
 pub struct Localize {
     /// Candidates in an answer by default.
     pub k: usize,
-    /// Candidates in an answer at the most.
+    /// Maximum number of candidates in an answer.
     pub max_k: usize,
     /// The least confidence of a known place.
     pub known_confidence: f64,

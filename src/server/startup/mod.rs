@@ -213,7 +213,7 @@ fn check_keys(config: &Config, keys: &Keys) -> anyhow::Result<()> {
         (true, true) => tracing::info!("callers need a key"),
         (true, false) => anyhow::bail!(
             "callers of {listen} need a key, and there is none: make the first with `whereabouts keys \
-             create --data {} --role admin --name NAME`, or start with --no-keys if whoever reaches the \
+             create --data {} --role admin --name NAME`, or start with --no-keys if anyone who can reach the \
              server may do everything",
             config.data.dir.display()
         ),
@@ -221,7 +221,7 @@ fn check_keys(config: &Config, keys: &Keys) -> anyhow::Result<()> {
             tracing::info!("callers need no key, as the server listens on loopback only");
         }
         (false, _) => tracing::warn!(
-            "NO KEYS: whoever reaches {listen} may read, change and delete everything; leave --no-keys out \
+            "NO KEYS: anyone who can reach {listen} may read, change and delete everything; leave --no-keys out \
              (auth.keys) to ask for keys"
         ),
     }
