@@ -139,17 +139,15 @@ impl SealedGraph {
         let mut coded = Codes::new(self.dim(), 1);
         coded.push(query);
         let query_code = coded.of(0);
-        let mut ef = ef;
-        for _ in 0..WIDENINGS {
+        let (mut ef, widest) = (ef, ef << WIDENINGS);
+        loop {
             let near = self.near(query_code, ef, &keep);
             let (best, is_complete) = self.rescored(vectors, query, query_code, &near, k, &keep);
-            if is_complete || near.len() < ef {
+            if is_complete || near.len() < ef || ef >= widest {
                 return best;
             }
             ef *= 2;
         }
-        let near = self.near(query_code, ef, &keep);
-        self.rescored(vectors, query, query_code, &near, k, &keep).0
     }
 
     /// Scores candidates with the stored descriptors. Among images that hardly differ the coded similarity says
