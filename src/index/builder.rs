@@ -14,10 +14,13 @@
 //! - At the end every point is made reachable, and one that a search does not find is linked where the search ended
 //!   ([`Repair`]).
 //!
+//! A build advances in steps ([`Build`]), so that one map does not keep the indexer from the others.
+//!
 //! Descriptors are compared by their 8-bit codes, as in the search.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::sync::atomic::AtomicU32;
 
 use parking_lot::Mutex;
@@ -39,7 +42,36 @@ const FIRST: usize = 1000;
 /// Locks, each for the rows of many points.
 const LOCKS: usize = 1024;
 
-/// A graph under construction.
+/// A build in progress.
+pub(super) enum Build {
+    Linking(Builder),
+    Repairing(Repair),
+    Done(SealedGraph),
+}
+
+impl Build {
+    /// Starts a graph over the slots that are `live` and stored.
+    pub fn new(live: &[bool], vectors: &dyn Vectors, settings: IndexSettings) -> Self {
+        Self::Linking(Builder::new(live, vectors, settings))
+    }
+
+    /// Links or checks up to `most` points.
+    pub fn advance(self, most: usize, threads: &ThreadPool) -> Self {
+        match self {
+            Self::Linking(mut builder) => {
+                let is_linked = builder.link(most, threads);
+                if is_linked { Self::Repairing(builder.linked()) } else { Self::Linking(builder) }
+            }
+            Self::Repairing(mut repair) => {
+                let is_complete = repair.advance(most, threads);
+                if is_complete { Self::Done(repair.finish()) } else { Self::Repairing(repair) }
+            }
+            Self::Done(graph) => Self::Done(graph),
+        }
+    }
+}
+
+/// A graph whose points are being linked.
 pub(super) struct Builder {
     settings: IndexSettings,
     /// The first slot beyond the graph.
@@ -55,8 +87,7 @@ pub(super) struct Builder {
 }
 
 impl Builder {
-    /// Starts a graph over the slots that are `live` and stored.
-    pub fn new(live: &[bool], vectors: &dyn Vectors, settings: IndexSettings) -> Self {
+    fn new(live: &[bool], vectors: &dyn Vectors, settings: IndexSettings) -> Self {
         let (codes, twins) = distinct(live, vectors);
         let mut order: Vec<(usize, u32)> = (0..twins.len() as u32)
             .map(|point| (level(twins[point as usize][0] as usize, settings.m), point))
@@ -83,7 +114,7 @@ impl Builder {
     }
 
     /// Links up to `most` more points; returns whether all are linked.
-    pub fn link(&mut self, most: usize, threads: &ThreadPool) -> bool {
+    fn link(&mut self, most: usize, threads: &ThreadPool) -> bool {
         let end = self.slots.points().min(self.done + most);
         let alone = self.done..end.min(FIRST).max(self.done);
         let shared = alone.end..end;
@@ -93,12 +124,12 @@ impl Builder {
         end == self.slots.points()
     }
 
-    /// The finished graph, once all points are linked.
-    pub fn finish(self, threads: &ThreadPool) -> SealedGraph {
-        let mut layers: Vec<Layer<u32>> = self.layers.into_iter().map(Layer::sealed).collect();
-        Repair { codes: &self.codes, ef: self.settings.ef_search }.run(&mut layers, threads);
+    /// The graph, once all points are linked.
+    fn linked(self) -> Repair {
         let built = (self.settings.m, self.settings.ef_construction);
-        SealedGraph::new(built, self.end, self.slots, layers, self.codes)
+        let layers = self.layers.into_iter().map(Layer::sealed).collect();
+        let graph = SealedGraph::new(built, self.end, self.slots, layers, self.codes);
+        Repair::new(graph, self.settings.ef_search)
     }
 
     fn link_one(&self, point: u32) {
@@ -178,8 +209,8 @@ impl Builder {
 fn distinct(live: &[bool], vectors: &dyn Vectors) -> (Codes, Vec<Vec<u32>>) {
     let mut codes = Codes::new(vectors.dim(), 0);
     let mut twins: Vec<Vec<u32>> = Vec::new();
-    // Hash → points; different codes with one hash are rare.
-    let mut known: HashMap<u64, Vec<u32>> = HashMap::new();
+    // Hash → point. Different codes with one hash are rare; the later one takes the next free number.
+    let mut known: HashMap<u64, u32> = HashMap::new();
     vectors.scan(0..live.len(), &mut |slot, vector| {
         if !live[slot] {
             return;
@@ -187,14 +218,17 @@ fn distinct(live: &[bool], vectors: &dyn Vectors) -> (Codes, Vec<Vec<u32>>) {
         let new = twins.len() as u32;
         codes.push(vector);
         let coded = codes.of(new);
-        let same_hash = known.entry(coded.hash()).or_default();
-        match same_hash.iter().find(|point| codes.of(**point) == coded) {
-            Some(&point) => {
-                twins[point as usize].push(slot as u32);
+        let mut hash = coded.hash();
+        while known.get(&hash).is_some_and(|&point| codes.of(point) != coded) {
+            hash = hash.wrapping_add(1);
+        }
+        match known.entry(hash) {
+            Entry::Occupied(twin) => {
+                twins[*twin.get() as usize].push(slot as u32);
                 codes.pop();
             }
-            None => {
-                same_hash.push(new);
+            Entry::Vacant(free) => {
+                free.insert(new);
                 twins.push(vec![slot as u32]);
             }
         }

@@ -5,19 +5,19 @@
 //! many twins would be its twins, and the rest of the map could not be reached from them.
 //!
 //! `hnsw_rs` does not promise that a point is found: among many near duplicates some are not. Points are therefore
-//! searched for after they were inserted, and again each time the graph has doubled; those that are missed are
+//! searched for after they were inserted, and again at least once while the graph doubles; those that are missed are
 //! *stray* and are compared with every query.
 
 use std::collections::{BTreeSet, HashMap};
 use std::hash::{BuildHasher, RandomState};
-use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use hnsw_rs::prelude::{Distance, FilterT, Hnsw};
+use hnsw_rs::prelude::{Distance, Hnsw};
 use parking_lot::RwLock;
 use rayon::ThreadPool;
 use rayon::prelude::*;
 
+use super::sealed::WIDENINGS;
 use super::{IndexSettings, ScoredSlot, Vectors};
 use whereabouts_core::dot;
 
@@ -42,8 +42,10 @@ pub(super) struct Graph {
     hasher: RandomState,
     /// Points that a search for their own descriptor misses.
     stray: RwLock<BTreeSet<usize>>,
-    /// Points at the last check of the whole graph.
+    /// Points below this one were searched for at least once.
     checked: AtomicUsize,
+    /// The next point to be searched for again.
+    again: AtomicUsize,
     ef: usize,
 }
 
@@ -70,6 +72,7 @@ impl Graph {
             hasher: RandomState::new(),
             stray: RwLock::default(),
             checked: AtomicUsize::new(0),
+            again: AtomicUsize::new(0),
             ef: settings.ef_search,
         }
     }
@@ -91,15 +94,15 @@ impl Graph {
         self.hnsw.insert((vector, point));
     }
 
-    /// Searches for the points of these slots, which were just inserted, or for all if the graph has doubled since
-    /// all were checked; notes those that are missed.
-    pub fn check(&self, vectors: &dyn Vectors, inserted: Range<usize>, threads: &ThreadPool) {
+    /// Searches for the points that were inserted since the last call and for the next `most` of the others, in turn;
+    /// notes those that are missed. Only one thread may call it at a time.
+    pub fn check(&self, vectors: &dyn Vectors, most: usize, threads: &ThreadPool) {
         let points = self.points.read();
-        let all = points.slots.len() >= 2 * self.checked.load(Ordering::Relaxed).max(1);
-        if all {
-            self.checked.store(points.slots.len(), Ordering::Relaxed);
-        }
-        let is_due = |point: &usize| all || inserted.contains(&points.slots[*point][0]);
+        let end = points.slots.len();
+        let old = self.checked.swap(end, Ordering::Relaxed);
+        let from = Some(self.again.load(Ordering::Relaxed)).filter(|from| *from < old).unwrap_or(0);
+        let to = old.min(from + most);
+        self.again.store(to, Ordering::Relaxed);
         let is_missed = |point: &usize| {
             let mut missed = false;
             // A slot whose row is gone cannot be searched for; a twin of it can.
@@ -116,7 +119,7 @@ impl Graph {
             }
             missed
         };
-        let due: Vec<usize> = (0..points.slots.len()).filter(is_due).collect();
+        let due: Vec<usize> = (from..to).chain(old..end).collect();
         let missed: Vec<usize> =
             threads.install(|| due.into_par_iter().filter(is_missed).collect());
         self.stray.write().extend(missed);
@@ -130,8 +133,11 @@ impl Graph {
         stray.iter().flat_map(of).collect()
     }
 
-    /// The nearest of the slots that `keep` accepts: at least `k`, if there are as many, and at most `k` of each
-    /// point.
+    /// The nearest of the slots that `keep` accepts, at most `k` of each point. There may be fewer than `k` although
+    /// more are accepted, if most of the nearest are not.
+    ///
+    /// The filter is applied to the results: `hnsw_rs` itself does not stop early when it is given one, and takes
+    /// about ten times as long.
     pub fn search(
         &self,
         query: &[f32],
@@ -140,8 +146,18 @@ impl Graph {
         keep: &dyn Fn(usize) -> bool,
     ) -> Vec<ScoredSlot> {
         let points = self.points.read();
-        let filter = |point: &usize| points.slots[*point].iter().any(|&slot| keep(slot));
-        let near = self.hnsw.search_filter(query, k, ef, Some(&filter as &dyn FilterT));
+        let kept = |point: usize| points.slots[point].iter().any(|&slot| keep(slot));
+        let mut ef = ef.max(k);
+        let widest = ef << WIDENINGS;
+        let near = loop {
+            let mut near = self.hnsw.search(query, ef, ef);
+            let has_all = near.len() < ef;
+            near.retain(|neighbour| kept(neighbour.d_id));
+            if near.len() >= k || has_all || ef >= widest {
+                break near;
+            }
+            ef *= 2;
+        };
         let found = near.into_iter().flat_map(|neighbour| {
             let kept = points.slots[neighbour.d_id].iter().copied().filter(|&slot| keep(slot));
             let similarity = 1.0 - neighbour.distance;

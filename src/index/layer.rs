@@ -1,13 +1,12 @@
-//! One layer of a graph: rows of neighbours, and the beam search over them.
+//! One layer of a graph: rows of neighbours.
 
-use std::cmp::Reverse;
-use std::collections::BinaryHeap;
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use super::beam::Beam;
 use super::codes::{Coded, Codes, Ranked};
 
 /// Fills the unused cells of a row.
-const NONE: u32 = u32::MAX;
+pub(super) const NONE: u32 = u32::MAX;
 
 /// The neighbours of the points below [`Layer::points`], in rows.
 ///
@@ -88,7 +87,7 @@ impl<C: Cell> Layer<C> {
         self.cells.len() / self.degree.max(1)
     }
 
-    fn row(&self, point: u32) -> &[C] {
+    pub fn row(&self, point: u32) -> &[C] {
         &self.cells[point as usize * self.degree..][..self.degree]
     }
 
@@ -98,7 +97,7 @@ impl<C: Cell> Layer<C> {
     }
 
     /// The `ef` points most similar to `query` among those that `keep` accepts, the nearest first. Starts at
-    /// `entries`. Malkov and Yashunin (2018), algorithm 2.
+    /// `entries`.
     pub fn beam(
         &self,
         codes: &Codes,
@@ -107,58 +106,6 @@ impl<C: Cell> Layer<C> {
         ef: usize,
         keep: impl Fn(u32) -> bool,
     ) -> Vec<Ranked> {
-        let mut seen = vec![0_u64; self.points().div_ceil(64)];
-        let mut see = |point: u32| {
-            let (word, bit) = (&mut seen[point as usize / 64], 1 << (point % 64));
-            let new = *word & bit == 0;
-            *word |= bit;
-            new
-        };
-        let mut open = BinaryHeap::with_capacity(2 * ef);
-        let mut best: BinaryHeap<Reverse<Ranked>> = BinaryHeap::with_capacity(ef + 1);
-        for &entry in entries {
-            see(entry.point());
-            open.push(entry);
-            if keep(entry.point()) {
-                best.push(Reverse(entry));
-            }
-        }
-        while best.len() > ef {
-            best.pop();
-        }
-        let worst_of = |best: &BinaryHeap<Reverse<Ranked>>| {
-            best.peek().filter(|_| best.len() >= ef).map_or(Ranked::WORST, |worst| worst.0)
-        };
-        let mut fresh = Vec::with_capacity(self.degree);
-        while let Some(nearest) = open.pop() {
-            if nearest < worst_of(&best) {
-                break;
-            }
-            fresh.clear();
-            // A loop, because iterator adapters are not always inlined here.
-            for cell in self.row(nearest.point()) {
-                let point = cell.get();
-                if point == NONE {
-                    break;
-                }
-                if see(point) {
-                    fresh.push(point);
-                }
-            }
-            codes.prefetch(&fresh);
-            for &point in &fresh {
-                let candidate = codes.ranked(query, point);
-                if candidate > worst_of(&best) {
-                    open.push(candidate);
-                    if keep(point) {
-                        best.push(Reverse(candidate));
-                        if best.len() > ef {
-                            best.pop();
-                        }
-                    }
-                }
-            }
-        }
-        best.into_sorted_vec().into_iter().map(|Reverse(ranked)| ranked).collect()
+        Beam::new((self, codes), query, entries, ef, keep).run().nearest()
     }
 }

@@ -11,6 +11,7 @@
 //! in a file, and one of `hnsw_rs` that grows with every new image. Once the growing one covers as many slots as the
 //! sealed one, a new sealed graph is built over all of them (`builder`).
 
+mod beam;
 mod builder;
 mod codes;
 mod exact;
@@ -24,12 +25,12 @@ use std::collections::HashSet;
 use std::ops::Range;
 use std::sync::Arc;
 
-use parking_lot::{Mutex, MutexGuard, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use parking_lot::{Mutex, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use rayon::ThreadPool;
 use rayon::prelude::*;
 
-use self::builder::Builder;
+use self::builder::Build;
 use self::exact::TopK;
 use self::graph::Graph;
 pub use self::sealed::{DamagedGraph, SealedGraph};
@@ -72,7 +73,7 @@ pub struct MapIndex {
     live: RwLock<Live>,
     graphs: RwLock<Graphs>,
     /// The graph that will replace the others. Only the indexer uses it.
-    building: Mutex<Option<Builder>>,
+    building: Mutex<Option<Build>>,
 }
 
 #[derive(Default)]
@@ -222,7 +223,9 @@ impl MapIndex {
 
     /// Whether [`MapIndex::catch_up`] has work to do.
     pub fn has_work(&self) -> bool {
-        self.is_behind() || self.building().is_some() || self.wants_sealing()
+        // Locked only while the indexer is at work.
+        let is_building = || self.building.try_lock().is_none_or(|building| building.is_some());
+        self.is_behind() || is_building() || self.wants_sealing()
     }
 
     /// Whether as many slots lie beyond the sealed graph as in it, or too many of its slots are dead, which slow down
@@ -249,18 +252,23 @@ impl MapIndex {
         most: usize,
         threads: &ThreadPool,
     ) -> Option<Arc<SealedGraph>> {
-        let mut building = self.building();
-        if let Some(builder) = building.as_mut() {
-            if !builder.link(most, threads) {
-                return None;
-            }
-            let sealed = Arc::new(building.take()?.finish(threads));
-            self.replace_graphs(Arc::clone(&sealed));
-            return Some(sealed);
+        let mut building = self.building.lock();
+        if let Some(build) = building.take() {
+            return match build.advance(most, threads) {
+                Build::Done(sealed) => {
+                    let sealed = Arc::new(sealed);
+                    self.replace_graphs(Arc::clone(&sealed));
+                    Some(sealed)
+                }
+                unfinished => {
+                    *building = Some(unfinished);
+                    None
+                }
+            };
         }
         if self.wants_sealing() {
             let live = self.live().slots.clone();
-            *building = Some(Builder::new(&live, vectors, self.settings));
+            *building = Some(Build::new(&live, vectors, self.settings));
             return None;
         }
         if self.is_behind() {
@@ -268,7 +276,7 @@ impl MapIndex {
             let growing = graphs.growing.unwrap_or_else(|| Arc::new(Graph::new(&self.settings)));
             let end = self.live().slots.len().min(graphs.graphed + most);
             self.insert(&growing, vectors, graphs.graphed..end, threads);
-            growing.check(vectors, graphs.graphed..end, threads);
+            growing.check(vectors, most, threads);
             let mut graphs = self.graphs_mut();
             graphs.growing = Some(growing);
             graphs.graphed = end;
@@ -317,10 +325,6 @@ impl MapIndex {
 
     fn graphs_mut(&self) -> RwLockWriteGuard<'_, Graphs> {
         self.graphs.write()
-    }
-
-    fn building(&self) -> MutexGuard<'_, Option<Builder>> {
-        self.building.lock()
     }
 }
 

@@ -5,6 +5,7 @@
 //!
 //! Images with equal descriptors are one point with several slots.
 
+use super::beam::Beam;
 use super::codes::{Coded, Codes, Ranked};
 use super::exact::TopK;
 use super::layer::Layer;
@@ -20,8 +21,9 @@ const HEADER_BYTES: usize = 8 + 4;
 /// Beam width of the descent through the upper layers.
 pub(super) const DESCENT: usize = 8;
 
-/// How often a search is repeated with twice the beam width, if its candidates are too alike for their codes.
-const WIDENINGS: usize = 3;
+/// How often the beam of a search is doubled, while its result still changes or its candidates are too alike for their
+/// codes.
+pub(super) const WIDENINGS: usize = 3;
 
 /// A finished graph over the slots below [`SealedGraph::end`].
 #[derive(Debug, PartialEq)]
@@ -32,8 +34,8 @@ pub struct SealedGraph {
     end: usize,
     slots: Slots,
     /// The lowest first; there is always one.
-    layers: Vec<Layer<u32>>,
-    codes: Codes,
+    pub(super) layers: Vec<Layer<u32>>,
+    pub(super) codes: Codes,
 }
 
 /// The slots of each point, ascending.
@@ -139,14 +141,23 @@ impl SealedGraph {
         let mut coded = Codes::new(self.dim(), 1);
         coded.push(query);
         let query_code = coded.of(0);
+        let entries = descend(&self.layers, &self.codes, query_code);
+        let kept = |point: u32| self.slots.of(point).iter().any(|&slot| keep(slot as usize));
+        let layer = (&self.layers[0], &self.codes);
+        let mut beam = Beam::new(layer, query_code, &entries, ef, kept).widening(k).run();
         let (mut ef, widest) = (ef, ef << WIDENINGS);
         loop {
-            let near = self.near(query_code, ef, &keep);
-            let (best, is_complete) = self.rescored(vectors, query, query_code, &near, k, &keep);
-            if is_complete || near.len() < ef || ef >= widest {
-                return best;
+            let is_last = beam.has_all() || ef >= widest;
+            if is_last || beam.has_converged() {
+                let near = beam.nearest();
+                let (best, is_complete) =
+                    self.rescored(vectors, query, query_code, &near, k, &keep);
+                if is_last || is_complete {
+                    return best;
+                }
             }
             ef *= 2;
+            beam = beam.widen(ef);
         }
     }
 
@@ -178,13 +189,6 @@ impl SealedGraph {
             }
         }
         (best.into_sorted(), false)
-    }
-
-    /// The `ef` nearest points with a slot that `keep` accepts, the nearest first.
-    fn near(&self, query: Coded<'_>, ef: usize, keep: impl Fn(usize) -> bool) -> Vec<Ranked> {
-        let entries = descend(&self.layers, &self.codes, query);
-        let kept = |point: u32| self.slots.of(point).iter().any(|&slot| keep(slot as usize));
-        self.layers[0].beam(&self.codes, query, &entries, ef, kept)
     }
 
     /// The graph as a file: a header with a checksum, then the arrays, little-endian.

@@ -143,7 +143,7 @@ fn an_image_is_found_before_it_is_in_the_graph() {
     index.catch_up(&rows, 100, &threads());
     index.catch_up(&rows, 100, &threads());
     assert_eq!((index.graphed(), found(7), found(199)), (0, 7, 199));
-    index.catch_up(&rows, 100, &threads());
+    caught_up(&index, &rows);
     assert_eq!(index.graphed(), 200);
     (200..300).for_each(|slot| index.add(slot));
     index.catch_up(&rows, 50, &threads());
