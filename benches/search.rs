@@ -141,8 +141,8 @@ fn run_peer(
     truth: &[Vec<usize>],
 ) -> anyhow::Result<Measured> {
     let dir = tempfile::tempdir()?;
-    write(&dir.path().join("vectors"), bytemuck::cast_slice(&rows.0))?;
-    write(&dir.path().join("queries"), bytemuck::cast_slice(&queries.0))?;
+    write(&dir.path().join("vectors"), bytemuck::cast_slice(&rows.numbers))?;
+    write(&dir.path().join("queries"), bytemuck::cast_slice(&queries.numbers))?;
     let truth: Vec<u32> = truth.iter().flatten().map(|&slot| slot as u32).collect();
     write(&dir.path().join("truth"), bytemuck::cast_slice(&truth))?;
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers/search.py");

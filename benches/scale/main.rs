@@ -1,0 +1,69 @@
+//! Search at scale and among many equal pictures, in both stores: the graphs of the embedded store in this process,
+//! and pgvector through the store in PostgreSQL.
+//!
+//! `WHEREABOUTS_TEST_SHARED_BUFFERS=4GB tests/postgres.sh target/postgres-venv cargo bench --bench scale -- \
+//! 10000 twins one-picture by-place standing`. A number is as many clustered vectors of 384 dimensions; the names are
+//! those of [`sets`]. With `embedded` or `postgres` only that store is measured, and `embedded` needs no database.
+//!
+//! *Recall* is of the ten nearest, against brute force; results that are as similar as the tenth best count. *Lost* are
+//! images whose own descriptor finds neither them nor an equal one first.
+
+mod embedded;
+mod postgres;
+mod sets;
+#[path = "../vectors/mod.rs"]
+mod vectors;
+
+use std::time::Duration;
+
+use anyhow::Context;
+use whereabouts_index::IndexSettings;
+
+const K: usize = 10;
+/// The defaults, but for maps that are searched through a graph earlier.
+const INDEX: IndexSettings = IndexSettings {
+    exact_up_to: 1000,
+    m: 16,
+    ef_construction: 200,
+    ef_search: 96,
+    threads: 0,
+    max_dead_share: 0.3,
+    check_s: 0,
+};
+
+#[tokio::main]
+async fn main() -> anyhow::Result<()> {
+    let arguments: Vec<String> =
+        std::env::args().skip(1).filter(|argument| !argument.starts_with("--")).collect();
+    let only = |store: &str| arguments.iter().any(|argument| argument == store);
+    let names = arguments.iter().filter(|name| !["embedded", "postgres"].contains(&name.as_str()));
+    let mut names: Vec<&str> = names.map(String::as_str).collect();
+    if names.is_empty() {
+        names = sets::ALL.to_vec();
+    }
+    for name in names {
+        let set = sets::named(name)?;
+        if !only("postgres") {
+            embedded::measure(&set)?;
+        }
+        if !only("embedded") {
+            let url = std::env::var("WHEREABOUTS_TEST_DATABASE_URL")
+                .context("run it through tests/postgres.sh, or with `embedded`")?;
+            postgres::measure(&url, &set).await?;
+        }
+    }
+    Ok(())
+}
+
+fn median(took: Vec<Duration>) -> Duration {
+    percentile(took, 0.5)
+}
+
+fn percentile(mut took: Vec<Duration>, share: f64) -> Duration {
+    took.sort();
+    took[((took.len() - 1) as f64 * share) as usize]
+}
+
+fn ms(duration: Duration) -> f64 {
+    duration.as_secs_f64() * 1e3
+}
