@@ -16,6 +16,7 @@ use crate::support::{Fixture, Random, Tuning, add, descriptor, eventually, image
 contract!(
     exact_search_equals_brute_force,
     a_graph_has_high_recall_and_finds_no_removed_image,
+    identical_images_crowd_no_other_image_out,
     a_search_for_more_images_than_there_are_returns_all,
     equal_images_are_ranked_in_the_order_of_addition,
     the_similarity_is_the_cosine_from_one_to_minus_one,
@@ -148,6 +149,36 @@ async fn a_graph_has_high_recall_and_finds_no_removed_image(fixture: &Fixture) {
     let store = fixture.open_with(tuning).await;
     let found = recall(&*store, &removed).await;
     assert!(found >= 0.95, "{found}");
+}
+
+/// A robot that stood still, or tiles without imagery: one descriptor very often, and others around few centres.
+async fn identical_images_crowd_no_other_image_out(fixture: &Fixture) {
+    const TWINS: usize = 600;
+    let store = fixture.open_with(Tuning { exact_up_to: 100, ..Tuning::default() }).await;
+    let (map, _) = store.put_map(map("m", 48)).await.unwrap();
+    let others = clustered(900, 48);
+    let twin = others[0].clone();
+    let mut descriptors = vec![twin.clone(); TWINS];
+    descriptors.extend(others);
+    let finds_itself = async |number: usize| {
+        let query = descriptors[number].clone();
+        let found = store.search(&map, query, 10, SearchMode::Fast).await.unwrap();
+        assert!((found[0].similarity - 1.0).abs() < 1e-3, "{number}: {found:?}");
+        assert_eq!(found.len(), 10, "{number}");
+    };
+    add_all(&store, &map, &descriptors).await;
+    graph_is_ready(&*store, &map).await;
+    for number in (TWINS..descriptors.len()).step_by(3) {
+        finds_itself(number).await;
+    }
+    // All twins but one go.
+    for number in 1..TWINS {
+        let id = number.to_string().parse().unwrap();
+        assert!(store.delete_image(&map, &id).await.unwrap());
+    }
+    for number in (TWINS..descriptors.len()).step_by(30).chain([0]) {
+        finds_itself(number).await;
+    }
 }
 
 async fn a_search_for_more_images_than_there_are_returns_all(fixture: &Fixture) {
