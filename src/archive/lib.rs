@@ -14,14 +14,16 @@
 //! Images are sorted by id. A file without `end.json` is incomplete: it can be resumed, but not restored. A reader
 //! accepts exactly these entries in this order.
 
+mod checkpoint;
 mod read;
 mod write;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+pub use self::checkpoint::Checkpoint;
 pub use self::read::{Item, Reader};
-pub use self::write::{Checkpoint, Resumed, Writer, partial_path};
+pub use self::write::{Resumed, Writer, partial_path};
 use whereabouts_core::{Digest, ImageId, MapName, MediaType};
 
 /// Name of the format in `manifest.json`.

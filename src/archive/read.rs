@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 use sha2::{Digest as _, Sha256};
 use tar::{EntryType, Header};
 
-use super::write::{Checkpoint, disk};
+use super::checkpoint::{Checkpoint, disk};
 use super::{
     ArchiveError, ArchivedMap, BLOCK, END, End, FORMAT, LeftOut, MANIFEST, Manifest, VERSION,
     bytes_name, left_out_name, map_name, record_name,

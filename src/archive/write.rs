@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
 use serde::Serialize;
-use sha2::{Digest as _, Sha256};
 use tar::{EntryType, Header};
 
+use super::checkpoint::{Checkpoint, disk};
 use super::read::{Item, Reader};
 use super::{
     ArchiveError, ArchivedMap, BLOCK, END, End, LeftOut, MANIFEST, Manifest, bytes_name,
@@ -24,14 +24,6 @@ pub struct Writer {
     position: Checkpoint,
     /// Modification time of all entries, in Unix seconds.
     made_at: u64,
-}
-
-/// A position in the archive to which the writer can rewind.
-#[derive(Clone)]
-pub struct Checkpoint {
-    hash: Sha256,
-    bytes: u64,
-    entries: u64,
 }
 
 /// The state of an interrupted backup.
@@ -59,7 +51,7 @@ impl Writer {
     pub fn begin(path: &Path, manifest: &Manifest) -> Result<Self, ArchiveError> {
         let partial = partial_path(path);
         let file = File::create(&partial).map_err(disk("write", &partial))?;
-        let position = Checkpoint { hash: Sha256::new(), bytes: 0, entries: 0 };
+        let position = Checkpoint::default();
         let (file, made_at) = (BufWriter::new(file), seconds(manifest));
         let mut writer = Self { file, path: path.to_owned(), position, made_at };
         writer.json(MANIFEST, manifest)?;
@@ -196,22 +188,6 @@ impl Writer {
     }
 }
 
-impl Checkpoint {
-    pub(super) fn new(hash: Sha256, bytes: u64, entries: u64) -> Self {
-        Self { hash, bytes, entries }
-    }
-
-    /// The SHA-256 and number of all bytes before the checkpoint, and the number of entries.
-    pub(super) fn totals(self) -> (Digest, u64, u64) {
-        (Digest::from(<[u8; 32]>::from(self.hash.finalize())), self.bytes, self.entries)
-    }
-
-    fn advance(&mut self, bytes: &[u8]) {
-        self.hash.update(bytes);
-        self.bytes += bytes.len() as u64;
-    }
-}
-
 fn seconds(manifest: &Manifest) -> u64 {
     manifest.created_at.as_second().try_into().unwrap_or(0)
 }
@@ -219,9 +195,4 @@ fn seconds(manifest: &Manifest) -> u64 {
 fn to_json<T: Serialize>(value: &T) -> Result<Vec<u8>, ArchiveError> {
     serde_json::to_vec(value)
         .map_err(|error| ArchiveError::Disk { what: "write JSON".into(), source: error.into() })
-}
-
-pub(super) fn disk(what: &str, path: &Path) -> impl FnOnce(io::Error) -> ArchiveError + use<> {
-    let what = format!("{what} {}", path.display());
-    move |source| ArchiveError::Disk { what, source }
 }

@@ -17,6 +17,7 @@ mod pose;
 mod secret;
 mod service_time;
 mod spend;
+pub mod units;
 mod webhook;
 
 pub use self::image::{ExportedImage, Image, ImageId, MediaType};

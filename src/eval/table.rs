@@ -137,7 +137,7 @@ fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::open_set::{KnownRates, OpenSetMetrics, OperatingPoint};
     use crate::recall::AtK;
@@ -224,8 +224,8 @@ mod tests {
         }
     }
 
-    #[test]
-    fn the_table_has_recalls_changes_times_and_open_set_metrics() {
+    /// A coarse and a refined method.
+    pub fn summary() -> Summary {
         let conditions = RunConditions {
             database: "database".into(),
             query_folder: "queries".into(),
@@ -237,14 +237,23 @@ mod tests {
             known_confidence: 0.9,
             search: "fast".into(),
         };
-        let summary = Summary {
+        Summary {
             queries: 16,
             skipped: 2,
             unknown: 8,
             references: 20,
             conditions,
             methods: vec![coarse(), refined()],
-        };
-        insta::assert_snapshot!("table", table(&summary));
+        }
+    }
+
+    #[test]
+    fn the_table_has_recalls_changes_times_and_open_set_metrics() {
+        insta::assert_snapshot!("table", table(&summary()));
+    }
+
+    #[test]
+    fn the_summary_is_written_as_json() {
+        insta::assert_snapshot!("summary", serde_json::to_string_pretty(&summary()).unwrap());
     }
 }

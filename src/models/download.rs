@@ -1,4 +1,6 @@
 //! Resumable download of one large file over an unreliable connection, with retries.
+//!
+//! Ours, because hf-hub neither resumes a partial file nor verifies a SHA-256.
 
 use std::io;
 use std::path::{Path, PathBuf};

@@ -8,12 +8,14 @@
 mod attempts;
 mod dense_cache;
 mod input;
+mod job_settings;
 pub mod local;
 mod metrics;
 pub mod mllm;
 mod refiner;
 mod registry;
 mod store_retry;
+mod sync;
 mod worker;
 
 use std::sync::Arc;
@@ -24,6 +26,7 @@ use whereabouts_core::ServiceTime;
 pub use attempts::{AttemptPolicy, NextAttempt};
 pub use dense_cache::{DenseCache, DenseKey};
 pub use input::{QueryFrame, RefineInput};
+pub use job_settings::JobSettings;
 pub use local::LocalRefiner;
 pub use metrics::{CacheLookup, RefineMetrics};
 pub use refiner::{
@@ -31,7 +34,8 @@ pub use refiner::{
     RegionMatcher,
 };
 pub use registry::{BuildError, REFINERS, RefinerContext, RefinerEntry, RefinerSettings};
-pub use worker::{Worker, WorkerSettings};
+pub use store_retry::retry_for;
+pub use worker::Worker;
 
 pub(crate) use refiner::milliseconds;
 

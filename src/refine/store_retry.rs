@@ -34,10 +34,10 @@ where
 }
 
 /// Retries a call while the store is unavailable, until `limit` has passed.
-pub(super) async fn retry_for<T, F>(
-    limit: Duration,
-    call: impl FnMut() -> F,
-) -> Result<T, StoreError>
+///
+/// # Errors
+/// The last error of the call.
+pub async fn retry_for<T, F>(limit: Duration, call: impl FnMut() -> F) -> Result<T, StoreError>
 where
     F: Future<Output = Result<T, StoreError>>,
 {

@@ -14,24 +14,9 @@ use whereabouts_telemetry::traces;
 
 use super::store_retry::retry_for;
 use super::{
-    AttemptPolicy, JobServiceTime, NextAttempt, Progress, RefineError, RefineInput, RefineMetrics,
+    JobServiceTime, JobSettings, NextAttempt, Progress, RefineError, RefineInput, RefineMetrics,
     Refinement, Refiner,
 };
-
-/// The settings of a worker.
-#[derive(Debug, Clone, Copy)]
-pub struct WorkerSettings {
-    /// How long a claim lasts. It must outlast `timeout`.
-    pub lease: Duration,
-    /// The longest a job may take.
-    pub timeout: Duration,
-    /// How often a job is attempted.
-    pub attempts: AttemptPolicy,
-    /// The least confidence of a known place.
-    pub known_confidence: f64,
-    /// How many workers the process has.
-    pub workers: usize,
-}
 
 /// Refines one job after another.
 pub struct Worker {
@@ -45,8 +30,10 @@ pub struct Worker {
     pub metrics: Arc<RefineMetrics>,
     /// Averages the time that jobs take.
     pub service_time: JobServiceTime,
-    /// The settings.
-    pub settings: WorkerSettings,
+    /// The settings of jobs.
+    pub settings: JobSettings,
+    /// The least confidence of a known place.
+    pub known_confidence: f64,
 }
 
 /// The outcome of one attempt.
@@ -111,7 +98,7 @@ impl Worker {
         job: Job,
         error: RefineError,
     ) -> Result<(), StoreError> {
-        match self.settings.attempts.next(job.attempts, &error) {
+        match self.settings.attempt_policy().next(job.attempts, &error) {
             NextAttempt::Never => self.fail(claim, job, &error).await,
             NextAttempt::After { pause, counts } => {
                 let (why, seconds) = (error.to_string(), pause.as_secs());
@@ -189,7 +176,7 @@ impl Worker {
             &first.image_id,
             refinement.evidence,
         );
-        let known_from = self.settings.known_confidence;
+        let known_from = self.known_confidence;
         Some(Estimate::new(&first.image_id, first.pose, confidence, known_from))
     }
 

@@ -2,12 +2,11 @@
 //!
 //! Defaults (`deploy/whereabouts.toml`) < the file of `--config` < environment < flags.
 
-mod answers;
 mod database;
 mod model;
 mod overrides;
+mod refine;
 mod refiner;
-mod server;
 
 use std::path::{Path, PathBuf};
 
@@ -15,16 +14,20 @@ use figment::Figment;
 use figment::providers::{Env, Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
-pub use self::answers::{Confidence, Idempotency, Jobs, Localize, Refine};
 pub use self::database::{Database, ObjectStore};
 pub use self::model::Model;
 pub use self::overrides::Overrides;
+pub use self::refine::Refine;
 pub use self::refiner::RefinerChoice;
-pub use self::server::Server;
+pub use crate::gate::ServerSettings;
 use crate::http::Tiles;
 use whereabouts_index::IndexSettings;
+use whereabouts_refine::JobSettings;
 use whereabouts_refine::mllm::MllmSettings;
-use whereabouts_service::{BulkSettings, TrackSettings, WebhookSettings};
+use whereabouts_service::{
+    BulkSettings, ConfidenceSettings, IdempotencySettings, LocalizeSettings, TrackSettings,
+    WebhookSettings,
+};
 use whereabouts_telemetry::{LogSettings, TraceSettings};
 use whereabouts_vision::ImageSettings;
 
@@ -36,7 +39,7 @@ pub const DEFAULTS: &str = include_str!("../../deploy/whereabouts.toml");
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// The HTTP server.
-    pub server: Server,
+    pub server: ServerSettings,
     /// The embedded store.
     pub data: Data,
     /// The store of many processes.
@@ -52,17 +55,17 @@ pub struct Config {
     /// Who may ask.
     pub auth: Auth,
     /// Answers.
-    pub localize: Localize,
+    pub localize: LocalizeSettings,
     /// How maps are measured.
-    pub confidence: Confidence,
+    pub confidence: ConfidenceSettings,
     /// The frames of one robot, one after another.
     pub track: TrackSettings,
     /// Many images in one request.
     pub bulk: BulkSettings,
     /// Requests that may be sent again.
-    pub idempotency: Idempotency,
+    pub idempotency: IdempotencySettings,
     /// Refinement jobs.
-    pub jobs: Jobs,
+    pub jobs: JobSettings,
     /// Who is told of the ends of jobs.
     pub webhooks: WebhookSettings,
     /// The refiner.
@@ -197,7 +200,10 @@ impl Config {
     }
 
     fn contradiction_of_a_section(&self) -> Option<String> {
-        let track = || self.track.validate();
+        let sections = self.server.validate().or_else(|| self.localize.validate());
+        if let Some(why) = sections.or_else(|| self.jobs.validate()) {
+            return Some(why);
+        }
         if self.bulk.memory_bytes < self.server.body_limit_bytes {
             return Some("bulk.memory_bytes must not be less than server.body_limit_bytes".into());
         }
@@ -208,7 +214,7 @@ impl Config {
                     .into(),
             );
         }
-        let timeout = self.server.request_timeout().as_secs();
+        let timeout = self.server.request_timeout.as_secs();
         let console = || self.console.validate();
         let objects = || self.objects.validate(timeout);
         let scale = || match self.database.is_set() {
@@ -216,34 +222,18 @@ impl Config {
             false => None,
         };
         let traces = || self.traces.validate();
-        self.server.validate().or_else(track).or_else(console).or_else(scale).or_else(traces)
+        self.track.validate().or_else(console).or_else(scale).or_else(traces)
     }
 
     fn validate(&self) -> Option<String> {
         let at_least_one = [
-            ("server.body_limit_bytes", self.server.body_limit_bytes),
-            ("server.max_requests", self.server.max_requests),
-            ("server.max_streams", self.server.max_streams),
-            ("server.max_connections", self.server.max_connections),
-            ("server.max_headers", self.server.max_headers),
-            ("server.max_concurrent", self.server.max_concurrent as usize),
-            ("server.stream_idle_s", self.server.stream_idle_s as usize),
-            ("server.header_timeout_s", self.server.header_timeout_s as usize),
-            ("server.body_timeout_s", self.server.body_timeout_s as usize),
-            ("server.body_pause_s", self.server.body_pause_s as usize),
-            ("server.write_timeout_s", self.server.write_timeout_s as usize),
             ("data.usage_days", self.data.usage_days as usize),
             ("data.commit_batch", self.data.commit_batch),
             ("model.max_batch", self.model.max_batch),
             ("model.download_attempts", self.model.download_attempts as usize),
             ("model.download_stall_s", self.model.download_stall_s as usize),
-            ("localize.k", self.localize.k),
             ("bulk.in_flight", self.bulk.in_flight),
             ("bulk.max_images", self.bulk.max_images),
-            ("jobs.queue", self.jobs.queue),
-            ("jobs.attempts", self.jobs.attempts as usize),
-            ("jobs.sweep_s", self.jobs.sweep_s as usize),
-            ("jobs.sweep_batch", self.jobs.sweep_batch),
             ("refine.candidates", self.refine.candidates),
             ("refine.local_candidates", self.refine.local_candidates),
         ];
@@ -252,12 +242,6 @@ impl Config {
         }
         if self.model.loaded < 2 {
             return Some("model.loaded must be at least 2: a reindex needs two models".into());
-        }
-        if self.localize.max_k > 100 || self.localize.k > self.localize.max_k {
-            return Some("localize.k <= localize.max_k <= 100 must hold".into());
-        }
-        if self.jobs.lease_s > 24 * 3600 {
-            return Some("jobs.lease_s must be at most a day".into());
         }
         if self.refine.candidates.max(self.refine.local_candidates) > self.localize.max_k {
             return Some(
@@ -279,21 +263,14 @@ impl Config {
         if let Some(why) = self.contradiction_of_a_section() {
             return Some(why);
         }
-        if let Some(why) = self.webhooks.validate() {
-            return Some(why);
-        }
-        if !(0.0..=1.0).contains(&self.jobs.shed_at) {
-            return Some("jobs.shed_at must be from 0 to 1".into());
-        }
-        if self.jobs.lease_s <= self.jobs.timeout_s {
-            return Some(format!(
-                "jobs.lease_s ({}) must outlast jobs.timeout_s ({}), or two workers would refine \
-                 one job",
-                self.jobs.lease_s, self.jobs.timeout_s
-            ));
-        }
-        None
+        self.webhooks.validate()
     }
+}
+
+/// The settings of a server that none were given.
+#[cfg(test)]
+pub(crate) fn defaults() -> Config {
+    Config::load(None, &Overrides::default()).unwrap()
 }
 
 #[cfg(test)]

@@ -23,6 +23,7 @@ mod levels;
 mod metrics;
 mod router;
 pub mod startup;
+mod sync;
 
 pub use levels::Levels;
 pub use metrics::Metrics;

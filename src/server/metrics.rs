@@ -116,3 +116,18 @@ impl Metrics {
         metrics::encode(&self.registry)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_family_has_its_name_type_and_help() {
+        let metrics = Metrics::new();
+        let families = metrics.registry.families().iter();
+        let lines: Vec<String> = families
+            .map(|family| format!("{} {}: {}", family.name, family.kind, family.help))
+            .collect();
+        insta::assert_snapshot!("families", lines.join("\n"));
+    }
+}

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use serde::{Deserialize, Serialize};
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
@@ -32,6 +33,28 @@ const ATTEMPTS: AttemptPolicy = AttemptPolicy {
 
 /// A map is calibrated again when its number of images has changed by one in this many.
 const CHANGED_SHARE: usize = 5;
+
+/// `[confidence]`
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ConfidenceSettings {
+    /// Maximum number of images used as queries.
+    pub images: usize,
+    /// Number of these queries that are also refined.
+    pub refined: usize,
+    /// Images added this shortly before or after one, in order of addition, count as the same place.
+    pub place_images: usize,
+    /// Images whose poses are within this many metres count as the same place.
+    pub place_m: f64,
+}
+
+impl ConfidenceSettings {
+    /// Returns how a map is calibrated if a job compares this many candidates.
+    pub fn calibration(&self, candidates: usize) -> CalibrationSettings {
+        let Self { images, refined, place_images, place_m } = *self;
+        CalibrationSettings { images, refined, candidates, place_images, place_m }
+    }
+}
 
 /// Calibrates maps: measures how similar images of different places look in each.
 pub struct Calibrator {

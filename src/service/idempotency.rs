@@ -6,19 +6,24 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
 use super::ServiceError;
 use super::retention::before;
 use whereabouts_core::Digest;
+use whereabouts_core::units::hours;
 use whereabouts_store::{IdempotencyRecord, IdempotencyStore, Progress, StoredResponse};
 
-/// Retention of responses to requests with an idempotency key.
-#[derive(Debug, Clone, Copy)]
+/// `[idempotency]`
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct IdempotencySettings {
     /// How long a response is kept.
+    #[serde(rename = "keep_hours", with = "hours")]
     pub keep: Duration,
     /// The maximum number of responses.
+    #[serde(rename = "max")]
     pub most: usize,
 }
 

@@ -37,7 +37,7 @@ use tokio::sync::Semaphore;
 use uuid::Uuid;
 
 pub use self::bulk::{BulkImage, BulkResult, BulkSettings};
-pub use self::calibration::Calibrator;
+pub use self::calibration::{Calibrator, ConfidenceSettings};
 pub use self::cancellation::Deadline;
 pub use self::error::ServiceError;
 pub use self::events::{AnyJobEvent, JobEvent};
@@ -54,14 +54,13 @@ pub use self::readiness::{Readiness, ReadinessPhase};
 pub use self::recall::RecallCheck;
 pub use self::reindex::{Reindexer, Reindexes};
 pub use self::rejections::{Rejection, Rejections};
-pub use self::retention::{Janitor, RetentionSettings};
+pub use self::retention::Janitor;
 pub use self::submit::Submitter;
 pub use self::track::{TrackSettings, TrackStep, Tracks};
 pub use self::transfer::Transfer;
 pub use self::usage::UsageReports;
 pub use self::webhooks::{Dispatcher, WebhookSettings, Webhooks};
-use whereabouts_core::CalibrationSettings;
-use whereabouts_refine::{DenseCache, JobServiceTime, Refiner};
+use whereabouts_refine::{DenseCache, JobServiceTime, JobSettings, Refiner};
 use whereabouts_store::{Retention, Store};
 use whereabouts_vision::{Admission, CpuPool, LoadedModels};
 
@@ -133,13 +132,11 @@ pub struct ServiceSettings {
     /// Tracks.
     pub track: TrackSettings,
     /// Calibration of confidence.
-    pub calibration: CalibrationSettings,
-    /// Maximum number of jobs that are queued or running.
-    pub job_queue: usize,
-    /// Jobs are shed while more than this share of the admission queue is in use.
-    pub shed_jobs_at: f64,
-    /// The longest time that a caller may wait for a job.
-    pub max_wait: Duration,
+    pub confidence: ConfidenceSettings,
+    /// Refinement jobs.
+    pub jobs: JobSettings,
+    /// Number of candidates that a job compares.
+    pub compared: usize,
     /// Pause between two comparisons of a search with exact search; `None` for none.
     pub recall_check: Option<Duration>,
     /// Retention of usage, in days.
@@ -174,7 +171,7 @@ impl Service {
             refiner: refiner.clone(),
             matching: Arc::new(Semaphore::new(1)),
             searching: Arc::new(Semaphore::new(1)),
-            max_wait: settings.max_wait,
+            max_wait: settings.jobs.max_wait,
         };
         let submitter = Submitter {
             jobs: store.clone(),
@@ -184,10 +181,9 @@ impl Service {
             admission,
             service_time: job_service_time,
             metrics: Arc::clone(&metrics),
-            queue: settings.job_queue,
-            shed_at: settings.shed_jobs_at,
+            settings: settings.jobs,
         };
-        let place_m = settings.calibration.place_m;
+        let place_m = settings.confidence.place_m;
         Self {
             images: Images {
                 maps: maps.clone(),
@@ -202,6 +198,7 @@ impl Service {
                 jobs: jobs.clone(),
                 recall: RecallCheck::new(settings.recall_check),
                 settings: settings.localize,
+                compared: settings.compared,
             },
             jobs,
             reindexer: Reindexer {
@@ -212,7 +209,7 @@ impl Service {
             calibrator: Calibrator {
                 store: store.clone(),
                 refiner: refiner.clone(),
-                settings: settings.calibration,
+                settings: settings.confidence.calibration(settings.compared),
             },
             transfer: Transfer { maps: maps.clone(), exports: store.clone(), blobs: store.clone() },
             usage: UsageReports { store: store.clone(), refiner, keep_days: settings.usage_days },

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use serde::{Deserialize, Serialize};
 use tracing::Instrument;
 use uuid::Uuid;
 
@@ -55,17 +56,30 @@ pub struct Retrieved {
     pub searched: Duration,
 }
 
-/// Bounds and defaults of localization.
-#[derive(Debug, Clone, Copy)]
+/// Maximum of `localize.max_k`.
+const MAX_CANDIDATES: usize = 100;
+
+/// `[localize]`
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct LocalizeSettings {
     /// Default number of candidates in an answer.
     pub k: usize,
     /// Maximum number of candidates in an answer.
     pub max_k: usize,
-    /// Number of candidates that a job compares.
-    pub compared: usize,
     /// Minimum confidence of a known place.
     pub known_confidence: f64,
+}
+
+impl LocalizeSettings {
+    /// Returns what is invalid; `None` if the settings are valid.
+    pub fn validate(&self) -> Option<String> {
+        if self.k == 0 {
+            return Some("localize.k must be at least 1".into());
+        }
+        (self.max_k > MAX_CANDIDATES || self.k > self.max_k)
+            .then(|| format!("localize.k <= localize.max_k <= {MAX_CANDIDATES} must hold"))
+    }
 }
 
 /// Localizes frames: coarse retrieval, tracks, and the jobs that refine the answers.
@@ -82,6 +96,8 @@ pub struct Localizer {
     pub recall: RecallCheck,
     /// Bounds and defaults.
     pub settings: LocalizeSettings,
+    /// Number of candidates that a job compares.
+    pub compared: usize,
 }
 
 impl Localizer {
@@ -98,7 +114,7 @@ impl Localizer {
             self.submitter.check_capacity().await?;
         }
         let admission = AdmissionRequest { class: WorkClass::Localize, deadline: request.deadline };
-        let compared = if is_refined { self.settings.compared } else { 0 };
+        let compared = if is_refined { self.compared } else { 0 };
         let tracked = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
         let retrieved = k.max(compared).max(COMPARED).max(tracked);
         let features =
@@ -116,7 +132,7 @@ impl Localizer {
         let (mut job, no_job) = if request.refine == RefineMode::Off {
             (None, None)
         } else {
-            let compared = candidates.iter().take(self.settings.compared).cloned().collect();
+            let compared = candidates.iter().take(self.compared).cloned().collect();
             let frame = LocalizedFrame {
                 query_id,
                 bytes: request.frame,

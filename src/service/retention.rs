@@ -10,26 +10,8 @@ use tokio_util::sync::CancellationToken;
 use super::IdempotencySettings;
 use crate::ServiceMetrics;
 use whereabouts_core::utc_day;
+use whereabouts_refine::JobSettings;
 use whereabouts_store::{IdempotencyStore, JobRetention, RemovedJobs, Retention, StoreError};
-
-/// Retention periods, and the pace of removal.
-#[derive(Debug, Clone, Copy)]
-pub struct RetentionSettings {
-    /// How long a job is kept after it has ended; `None` for no limit.
-    pub keep: Option<Duration>,
-    /// Maximum number of jobs that have ended; `None` for no limit.
-    pub most: Option<usize>,
-    /// Minimum time that a job is kept after it has ended, so that callers that wait for it see its end.
-    pub settle: Duration,
-    /// Pause between two sweeps.
-    pub pause: Duration,
-    /// Maximum number of jobs removed in one transaction.
-    pub batch: usize,
-    /// Retention of usage, in days.
-    pub usage_days: u32,
-    /// Retention of responses to requests with an idempotency key.
-    pub idempotency: IdempotencySettings,
-}
 
 /// Removes jobs that have ended, with their queries and frames, and expired usage and idempotency records.
 pub struct Janitor {
@@ -39,8 +21,12 @@ pub struct Janitor {
     pub answers: Arc<dyn IdempotencyStore>,
     /// Counts removed jobs and frames.
     pub metrics: Arc<ServiceMetrics>,
-    /// Retention periods.
-    pub settings: RetentionSettings,
+    /// Retention of jobs, and the pace of removal.
+    pub jobs: JobSettings,
+    /// Retention of usage, in days.
+    pub usage_days: u32,
+    /// Retention of responses to requests with an idempotency key.
+    pub idempotency: IdempotencySettings,
 }
 
 impl Janitor {
@@ -52,7 +38,7 @@ impl Janitor {
             }
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = tokio::time::sleep(self.settings.pause) => {}
+                () = tokio::time::sleep(self.jobs.sweep) => {}
             }
         }
     }
@@ -60,22 +46,22 @@ impl Janitor {
     /// Removes everything that has expired; stops between two batches at `shutdown`.
     pub(crate) async fn sweep(&self, shutdown: &CancellationToken) -> Result<(), StoreError> {
         let now = Timestamp::now();
-        let days = SignedDuration::from_hours(24 * i64::from(self.settings.usage_days));
+        let days = SignedDuration::from_hours(24 * i64::from(self.usage_days));
         self.store.forget_usage(utc_day(now).saturating_sub(days)).await?;
         self.store.collect_garbage().await?;
-        let idempotency = self.settings.idempotency;
-        self.answers.prune_responses(idempotency.since(now), idempotency.most).await?;
+        let IdempotencySettings { most, .. } = self.idempotency;
+        self.answers.prune_responses(self.idempotency.since(now), most).await?;
         let keep = JobRetention {
-            since: self.settings.keep.map(|keep| before(now, keep)),
-            most: self.settings.most,
-            settled: before(now, self.settings.settle),
+            since: self.jobs.keep.map(|keep| before(now, keep)),
+            most: self.jobs.keep_count,
+            settled: before(now, self.jobs.max_wait),
         };
         let mut removed = RemovedJobs::default();
         while !shutdown.is_cancelled() {
-            let batch = self.store.remove_ended(keep, self.settings.batch).await?;
+            let batch = self.store.remove_ended(keep, self.jobs.sweep_batch).await?;
             self.metrics.jobs_removed(&batch);
             removed += batch;
-            if batch.jobs() < self.settings.batch {
+            if batch.jobs() < self.jobs.sweep_batch {
                 break;
             }
         }

@@ -12,7 +12,7 @@ use whereabouts_api::{ErrorKind, NoJob, NoJobReason};
 use whereabouts_core::{
     Candidate, DenseFeatures, Descriptor, Digest, Job, Map, MediaType, Priority,
 };
-use whereabouts_refine::{DenseCache, DenseKey, JobServiceTime, Refiner};
+use whereabouts_refine::{DenseCache, DenseKey, JobServiceTime, JobSettings, Refiner};
 use whereabouts_store::{BlobStore, JobRecord, JobStore, Query, StoreError};
 use whereabouts_telemetry::traces;
 use whereabouts_vision::Admission;
@@ -61,10 +61,8 @@ pub struct Submitter {
     pub service_time: JobServiceTime,
     /// Counts jobs and rejections.
     pub metrics: Arc<ServiceMetrics>,
-    /// Maximum number of jobs that are queued or running.
-    pub queue: usize,
-    /// Jobs are shed while more than this share of the admission queue is in use.
-    pub shed_at: f64,
+    /// When frames get no job.
+    pub settings: JobSettings,
 }
 
 impl Submitter {
@@ -131,7 +129,7 @@ impl Submitter {
             }
             Err(error) => return Err(error.into()),
         };
-        let limit = self.queue;
+        let limit = self.settings.queue;
         let submitted = match request {
             Some(request) => self.jobs.submit_once(record, limit, request).await,
             None => self.jobs.submit(record, limit).await.map(|()| None),
@@ -150,10 +148,10 @@ impl Submitter {
 
     /// Returns why no job should be queued now; `None` if one may.
     async fn reason_to_shed(&self) -> Result<Option<NoJob>, ServiceError> {
-        if self.jobs.queued().await? >= self.queue {
-            return Ok(Some(self.counted(queue_full(self.queue))));
+        if self.jobs.queued().await? >= self.settings.queue {
+            return Ok(Some(self.counted(queue_full(self.settings.queue))));
         }
-        if self.admission.pressure() <= self.shed_at {
+        if self.admission.pressure() <= self.settings.shed_at {
             return Ok(None);
         }
         let detail = "the queue of pictures is too long for frames to get jobs (jobs.shed_at); post a later \

@@ -97,6 +97,7 @@ impl Transfer {
         if !is_compatible(&map, &source) {
             return Err(incompatible(&map, &source));
         }
+        check_digest(&image, &bytes).await?;
         check_image(&image, &map, &bytes)?;
         let descriptor = match descriptor {
             Some(descriptor) if descriptor.dim() == map.dim => descriptor,
@@ -168,14 +169,25 @@ fn check_map(map: &Map) -> Result<(), ServiceError> {
     }
 }
 
-fn check_image(image: &Image, map: &Map, bytes: &Bytes) -> Result<(), ServiceError> {
-    let invalid = |why: &str| {
-        let id = image.id.as_str();
-        Err(ServiceError::unprocessable(format!("the image {id:?} cannot be imported: {why}")))
-    };
-    if Digest::of(bytes) != image.digest {
-        return invalid("its bytes do not match its digest");
+fn invalid_image(image: &Image, why: &str) -> ServiceError {
+    let id = image.id.as_str();
+    ServiceError::unprocessable(format!("the image {id:?} cannot be imported: {why}"))
+}
+
+/// Hashes the bytes of an image on a blocking thread.
+async fn check_digest(image: &Image, bytes: &Bytes) -> Result<(), ServiceError> {
+    let bytes = bytes.clone();
+    let digest = tokio::task::spawn_blocking(move || Digest::of(&bytes))
+        .await
+        .map_err(|error| ServiceError::new(ErrorKind::Internal, error.to_string()))?;
+    match digest == image.digest {
+        true => Ok(()),
+        false => Err(invalid_image(image, "its bytes do not match its digest")),
     }
+}
+
+fn check_image(image: &Image, map: &Map, bytes: &Bytes) -> Result<(), ServiceError> {
+    let invalid = |why: &str| Err(invalid_image(image, why));
     if MediaType::sniff(bytes) != Some(image.media_type) {
         return invalid("its bytes do not match its media type");
     }

@@ -226,8 +226,12 @@ pub(super) fn disable(stored: &mut StoredWebhook, at: Timestamp, why: &str) -> b
     true
 }
 
-/// Returns a delivery as it is after an attempt; `None` if it was no longer waiting.
+/// Returns a delivery as it is after an attempt; `None` if it was no longer waiting. An attempt that is recorded
+/// already, by a call that failed after its commit, counts once.
 pub(super) fn attempted(delivery: Delivery, attempt: Attempt) -> Option<Delivery> {
+    if delivery.last_attempt_at == Some(attempt.at) {
+        return Some(delivery);
+    }
     // A success counts even if the delivery was given up while the attempt ran.
     let counts =
         delivery.state == DeliveryState::Waiting || attempt.disposition == Disposition::Delivered;

@@ -78,7 +78,8 @@ pub trait WebhookStore: Send + Sync {
         now: Timestamp,
         limit: usize,
     ) -> Result<Vec<StoredDelivery>, StoreError>;
-    /// Records an attempt. Returns the delivery in its new state, or `None` if it was no longer waiting.
+    /// Records an attempt. Returns the delivery in its new state, or `None` if it was no longer waiting. May be
+    /// repeated: an attempt that ended at the same time as the last one is that one.
     async fn note_attempt(
         &self,
         webhook: Uuid,

@@ -4,12 +4,36 @@ use std::fmt;
 
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
-use prometheus_client::registry::Metric;
-pub use prometheus_client::registry::Registry;
+use prometheus_client::registry::{self, Metric};
+
+/// All metrics of a process.
+#[derive(Debug)]
+pub struct Registry {
+    metrics: registry::Registry,
+    families: Vec<FamilyInfo>,
+}
+
+/// What is known of a family before it has a sample.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FamilyInfo {
+    /// Name without the prefix of all metrics and without the suffix of counters.
+    pub name: String,
+    /// Type in the OpenMetrics format.
+    pub kind: String,
+    /// Help text.
+    pub help: String,
+}
+
+impl Registry {
+    /// The families in the order of their registration, also those that have no samples and are not encoded.
+    pub fn families(&self) -> &[FamilyInfo] {
+        &self.families
+    }
+}
 
 /// Creates an empty registry. All metric names are prefixed with `whereabouts_`.
 pub fn registry() -> Registry {
-    Registry::with_prefix("whereabouts")
+    Registry { metrics: registry::Registry::with_prefix("whereabouts"), families: Vec::new() }
 }
 
 /// Registers a metric under its name, with its help text, and returns it.
@@ -19,7 +43,9 @@ pub fn register<M: Metric + Clone>(
     help: &str,
     metric: M,
 ) -> M {
-    registry.register(name, help, metric.clone());
+    let kind = metric.metric_type().as_str().to_owned();
+    registry.families.push(FamilyInfo { name: name.to_owned(), kind, help: help.to_owned() });
+    registry.metrics.register(name, help, metric.clone());
     metric
 }
 
@@ -31,6 +57,6 @@ pub fn latency() -> Histogram {
 /// Encodes all metrics of a registry in the OpenMetrics text format.
 pub fn encode(registry: &Registry) -> Result<String, fmt::Error> {
     let mut out = String::new();
-    text::encode(&mut out, registry)?;
+    text::encode(&mut out, &registry.metrics)?;
     Ok(out)
 }

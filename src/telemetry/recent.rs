@@ -1,4 +1,6 @@
 //! Statistics of the last hour per minute, and recent warnings and errors, for the operator console.
+//!
+//! The histograms are ours: hdrhistogram needs twice the memory for the same accuracy.
 
 use std::collections::VecDeque;
 use std::fmt::{self, Write as _};

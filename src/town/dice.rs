@@ -4,7 +4,7 @@
 //! textures are made of. Neither keeps state outside the value, so a place can be built without
 //! building the places before it.
 
-use super::geometry::Rgb;
+use super::geometry::{ROUNDER, Rgb};
 
 /// A stream of draws. Copies continue independently from the same point.
 #[derive(Clone, Copy)]
@@ -131,7 +131,3 @@ pub(super) fn floor(x: f32) -> i32 {
 pub(super) fn whole(x: f32) -> f32 {
     (x - 0.5 + ROUNDER) - ROUNDER
 }
-
-/// The float nearest to a whole number `n` of magnitude below 2²², plus this, has `n` in its low
-/// bits.
-pub(super) const ROUNDER: f32 = 12_582_912.0;

@@ -3,7 +3,9 @@
 
 use std::ops::{Add, Mul, Sub};
 
-use super::dice::ROUNDER;
+/// The float nearest to a whole number `n` of magnitude below 2²², plus this, has `n` in its low
+/// bits.
+pub(super) const ROUNDER: f32 = 12_582_912.0;
 
 /// A point or direction, in metres.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -7,10 +7,11 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::oneshot;
 
 use whereabouts_core::ServiceTime;
+
+use super::sync::{Mutex, MutexGuard};
 
 /// Limits on pictures in progress and in the queue.
 #[derive(Debug, Clone, Copy)]
@@ -210,8 +211,9 @@ impl Permit {
 
 impl Drop for Permit {
     fn drop(&mut self) {
-        self.shared.lock().in_use -= 1;
-        self.shared.admit_waiting();
+        let mut queue = self.shared.lock();
+        queue.in_use -= 1;
+        self.shared.admit_waiting(queue);
     }
 }
 
@@ -277,19 +279,18 @@ impl Shared {
         pause.min(self.settings.max_retry_after).max(Duration::from_secs(1))
     }
 
-    /// Gives free permits to waiting requests.
-    fn admit_waiting(self: &Arc<Self>) {
-        loop {
-            let mut queue = self.lock();
-            if queue.in_use >= self.settings.permits {
-                return;
-            }
+    /// Gives free permits to waiting requests. The lock is held since a permit became free, so that no
+    /// newcomer overtakes a waiting request.
+    fn admit_waiting(self: &Arc<Self>, mut queue: MutexGuard<'_, WaitQueue>) {
+        while queue.in_use < self.settings.permits {
             let next = queue.waiting.iter_mut().find_map(VecDeque::pop_front);
             let Some(waiter) = next else { return };
             queue.in_use += 1;
-            drop(queue);
-            // If the waiter has left, the permit is dropped here, which admits the next one.
-            let _ = waiter.send(self.permit());
+            if let Err(unused) = waiter.send(self.permit()) {
+                // The waiter has left. Dropping its permit, without the lock, admits the next one.
+                drop(queue);
+                return drop(unused);
+            }
         }
     }
 }
@@ -308,5 +309,7 @@ impl WaitQueue {
     }
 }
 
+#[cfg(test)]
+mod schedules;
 #[cfg(test)]
 mod tests;

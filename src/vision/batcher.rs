@@ -1,19 +1,21 @@
 //! The queue in front of inference, and the session threads that serve it.
 
+mod batch;
+
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
-use parking_lot::{Condvar, Mutex, MutexGuard};
 use serde::{Deserialize, Serialize};
 use tokio::sync::oneshot;
 use whereabouts_core::{DenseFeatures, Descriptor, DescriptorKind};
 
+use super::execution::Execution;
 use super::manifest::Manifest;
 use super::pooling::FeatureSet;
 use super::preprocess::Tensor;
-use super::provider::Execution;
 use super::session::{InferenceError, Model, Runner};
+use super::sync::{Condvar, Mutex, MutexGuard};
 
 /// How inference divides its threads among sessions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -87,7 +89,7 @@ impl Batcher {
         });
         let latency = model.load(execution, threads, layout.max_batch)?;
         let serving = Arc::clone(&queue);
-        let serve = move || serving.serve(latency, SessionKind::Latency);
+        let serve = move || serving.serve_with(latency, SessionKind::Latency);
         let threads = vec![spawn("inference", serve)?];
         Ok(Self { queue, threads })
     }
@@ -147,8 +149,7 @@ impl Batcher {
         if state.closed {
             return Err(InferenceError::Stopped);
         }
-        state.overlapped |= state.in_progress();
-        state.waiting.push_back(Request { tensor, kind, features, reply });
+        state.push(Request { tensor, kind, features, reply });
         drop(state);
         self.queue.work_available.notify_all();
         Ok(PendingInference(result))
@@ -187,6 +188,9 @@ struct Request {
 
 type Reply = oneshot::Sender<Result<Pooled, InferenceError>>;
 
+/// Each request of a batch with its result.
+type Replies = Vec<(Reply, Result<Pooled, InferenceError>)>;
+
 #[derive(Debug)]
 struct Queue {
     state: Mutex<State>,
@@ -219,6 +223,11 @@ impl State {
         self.latency_running || self.throughput_running > 0 || !self.waiting.is_empty()
     }
 
+    fn push(&mut self, request: Request) {
+        self.overlapped |= self.in_progress();
+        self.waiting.push_back(request);
+    }
+
     fn may_take(&self, kind: SessionKind) -> bool {
         let throughput_mode = self.throughput_mode && self.throughput_sessions > 0;
         !self.waiting.is_empty()
@@ -235,40 +244,38 @@ impl Queue {
         self.state.lock()
     }
 
+    /// Stops serving. Callers that are waiting get no result.
     fn close(&self) {
-        self.lock().closed = true;
+        let mut state = self.lock();
+        state.closed = true;
+        let abandoned = std::mem::take(&mut state.waiting);
+        drop(state);
+        drop(abandoned);
         self.work_available.notify_all();
         self.room_available.notify_all();
     }
 
-    /// Runs one batch after another until the queue is closed.
-    fn serve(&self, mut runner: Runner, kind: SessionKind) {
+    /// Registers a throughput session that is about to serve, and wakes it: it may have found, while it was not
+    /// counted yet, that the pictures in the queue are for the latency session.
+    fn add_throughput_session(&self) {
+        self.lock().throughput_sessions += 1;
+        self.work_available.notify_all();
+    }
+
+    /// Runs one batch after another on `runner` until the queue is closed.
+    fn serve_with(&self, mut runner: Runner, kind: SessionKind) {
+        self.serve(kind, |batch| batch::run(&mut runner, &self.manifest, batch));
+    }
+
+    /// Passes one batch after another to `run` until the queue is closed.
+    fn serve(&self, kind: SessionKind, mut run: impl FnMut(Vec<Request>) -> Replies) {
         while let Some(batch) = self.take(kind) {
             let running = Running { queue: self, kind };
-            let mut results = Vec::with_capacity(batch.len());
-            for group in group_by_shape(batch) {
-                let tensors: Vec<&Tensor> = group.iter().map(|request| &request.tensor).collect();
-                let batch = tensors.len();
-                match runner.run(&tensors) {
-                    Ok(outputs) => {
-                        for (request, local) in group.into_iter().zip(outputs) {
-                            let Request { kind, features, reply, .. } = request;
-                            let pooled = local
-                                .pool(kind, features, &self.manifest.pooling)
-                                .map(|(descriptor, dense)| Pooled { descriptor, dense, batch });
-                            results.push((reply, pooled.map_err(InferenceError::from)));
-                        }
-                    }
-                    Err(error) => {
-                        let replies = group.into_iter().map(|request| request.reply);
-                        results.extend(replies.map(|reply| (reply, Err(error.clone()))));
-                    }
-                }
-            }
+            let replies = run(batch);
             // End the run before replying: a caller that sends one picture after another must not find
             // its own previous picture in progress.
             drop(running);
-            for (reply, result) in results {
+            for (reply, result) in replies {
                 let _ = reply.send(result);
             }
         }
@@ -344,9 +351,9 @@ fn start_throughput_session(
     let mut runner = model.load(execution, threads, queue.layout.max_batch)?;
     runner.warm_up()?;
     let serving = Arc::clone(queue);
-    let serve = move || serving.serve(runner, SessionKind::Throughput);
+    let serve = move || serving.serve_with(runner, SessionKind::Throughput);
     let thread = spawn(&format!("inference-{index}"), serve)?;
-    queue.lock().throughput_sessions += 1;
+    queue.add_throughput_session();
     Ok(thread)
 }
 
@@ -365,21 +372,7 @@ fn join(threads: Vec<JoinHandle<()>>) {
     }
 }
 
-/// Groups a batch by the shape of the tensors, because one run takes tensors of one shape.
-fn group_by_shape(batch: Vec<Request>) -> Vec<Vec<Request>> {
-    let mut groups: Vec<Vec<Request>> = Vec::new();
-    for request in batch {
-        let Tensor { height, width, .. } = request.tensor;
-        let same_shape = |group: &&mut Vec<Request>| {
-            group[0].tensor.height == height && group[0].tensor.width == width
-        };
-        match groups.iter_mut().find(same_shape) {
-            Some(group) => group.push(request),
-            None => groups.push(vec![request]),
-        }
-    }
-    groups
-}
-
+#[cfg(test)]
+mod schedules;
 #[cfg(test)]
 mod tests;

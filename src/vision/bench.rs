@@ -6,11 +6,12 @@ use std::time::{Duration, Instant};
 use ort::value::TensorRef;
 
 use super::batcher::{Batcher, Layout};
+use super::execution::{Execution, ProviderPreference};
 use super::extractor::{ExtractError, VerifiedModel, sample};
 use super::manifest;
 use super::pooling::FeatureSet;
 use super::preprocess::Tensor;
-use super::provider::{self, Execution, MIN_SIMILARITY, ProviderPreference};
+use super::provider::{self, MIN_SIMILARITY};
 use super::runtime::Assets;
 use super::session::{InferenceError, Model};
 use whereabouts_core::DescriptorKind;

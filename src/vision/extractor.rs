@@ -6,10 +6,11 @@ use std::time::{Duration, Instant};
 
 use super::batcher::{Batcher, Layout, PendingInference, Pooled};
 use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jpeg};
+use super::execution::{Execution, Provider, ProviderPreference};
 use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest};
 use super::pooling::{FeatureSet, PoolingError};
 use super::preprocess::{self, PreprocessError, Tensor, preprocess};
-use super::provider::{self, Execution, Provider, ProviderPreference};
+use super::provider;
 use super::runtime::{Assets, RuntimeError};
 use super::session::{InferenceError, Model};
 use whereabouts_core::{DenseFeatures, Descriptor, DescriptorKind, Digest, MediaType};

@@ -9,6 +9,7 @@ mod admission;
 mod batcher;
 mod bench;
 pub mod decode;
+mod execution;
 mod extractor;
 mod jpeg;
 mod loaded;
@@ -20,6 +21,7 @@ mod provider;
 mod runtime;
 mod session;
 mod settings;
+mod sync;
 
 pub use admission::{
     Admission, AdmissionLevels, AdmissionRequest, AdmissionSettings, Permit, RejectReason,
@@ -28,6 +30,7 @@ pub use admission::{
 pub use batcher::Layout;
 pub use bench::{Bench, BenchFigures, BenchRow, BenchSettings};
 pub use decode::{DecodeError, ImageLimits, Needed, Picture};
+pub use execution::{Execution, Provider, ProviderPreference};
 pub use extractor::{
     ExtractError, Extraction, Extractor, ExtractorSettings, PendingExtraction, StageTimes,
 };
@@ -35,6 +38,6 @@ pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
 pub use pooling::FeatureSet;
-pub use provider::{Execution, MIN_SIMILARITY, Measurement, Provider, ProviderPreference, Trial};
+pub use provider::{MIN_SIMILARITY, Measurement, Trial};
 pub use runtime::{AUTO, Assets, BUILT_IN_MODEL, CHOSEN, PREFERRED_MODELS, RuntimeError, WhyModel};
 pub use settings::{ImageSettings, auto, threads_or_cores};

@@ -1,13 +1,15 @@
 //! A cache of loaded models. Models are loaded on first use and evicted least recently used first.
+//!
+//! The cache is ours: those of moka and quick_cache grow past their limit if every entry is in use.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::decode::ImageLimits;
+use super::execution::{Execution, ProviderPreference};
 use super::extractor::{Extractor, ExtractorSettings};
 use super::manifest::{MANIFEST, Manifest};
-use super::provider::{Execution, ProviderPreference};
 use super::runtime::{Assets, RuntimeError};
 use parking_lot::{Mutex, MutexGuard};
 use whereabouts_core::{Digest, Map, Precision};

@@ -1,12 +1,14 @@
 //! A thread pool with a bounded queue, for work that would block the async runtime.
 
+use std::collections::VecDeque;
+use std::fmt;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread;
 use std::time::Duration;
 
-use parking_lot::{Condvar, Mutex};
 use tokio::sync::oneshot;
+
+use super::sync::{Condvar, Mutex};
 
 type Job = Box<dyn FnOnce() + Send>;
 
@@ -15,24 +17,28 @@ type Job = Box<dyn FnOnce() + Send>;
 /// When the queue is full, [`CpuPool::run`] fails at once. Jobs whose caller has left are dropped without being
 /// run. The threads end when the last clone of the pool is dropped.
 #[derive(Debug, Clone)]
-pub struct CpuPool {
-    queue: SyncSender<Job>,
-    running: Arc<Running>,
+pub struct CpuPool(Arc<Handle>);
+
+/// Closes the queue when the last clone of the pool is dropped.
+#[derive(Debug)]
+struct Handle(Arc<Queue>);
+
+struct Queue {
+    /// Maximum number of waiting jobs.
+    capacity: usize,
+    state: Mutex<State>,
+    /// Notified when a job is queued, and when the pool is dropped.
+    work_available: Condvar,
+    /// Notified when the last job has ended.
+    idle: Condvar,
 }
 
-/// The number of jobs that are running.
-#[derive(Debug, Default)]
-struct Running {
-    count: Mutex<usize>,
-    /// Notified when a job ends.
-    ended: Condvar,
-}
-
-impl Running {
-    fn change(&self, change: impl FnOnce(&mut usize)) {
-        change(&mut self.count.lock());
-        self.ended.notify_all();
-    }
+#[derive(Default)]
+struct State {
+    waiting: VecDeque<Job>,
+    /// Jobs that a thread has taken and not finished.
+    running: usize,
+    closed: bool,
 }
 
 /// The queue is full.
@@ -54,16 +60,22 @@ pub enum PoolError {
 impl CpuPool {
     /// Starts `threads` threads named `name` with a queue of at most `queue` jobs.
     pub fn new(name: &str, threads: usize, queue: usize) -> std::io::Result<Self> {
-        let (sender, receiver) = sync_channel::<Job>(queue);
-        let receiver = Arc::new(Mutex::new(receiver));
-        let running = Arc::new(Running::default());
+        let pool = Self::without_threads(queue);
         for index in 0..threads.max(1) {
-            let (receiver, running) = (Arc::clone(&receiver), Arc::clone(&running));
-            thread::Builder::new()
-                .name(format!("{name}-{index}"))
-                .spawn(move || run_all(&receiver, &running))?;
+            let queue = Arc::clone(&pool.0.0);
+            thread::Builder::new().name(format!("{name}-{index}")).spawn(move || queue.work())?;
         }
-        Ok(Self { queue: sender, running })
+        Ok(pool)
+    }
+
+    fn without_threads(capacity: usize) -> Self {
+        let queue = Queue {
+            capacity,
+            state: Mutex::default(),
+            work_available: Condvar::new(),
+            idle: Condvar::new(),
+        };
+        Self(Arc::new(Handle(Arc::new(queue))))
     }
 
     /// Runs `job` on a pool thread and waits for its result.
@@ -73,38 +85,84 @@ impl CpuPool {
         F: FnOnce() -> T + Send + 'static,
     {
         let (reply, result) = oneshot::channel();
-        let queued: Job = Box::new(move || {
+        self.0.0.push(Box::new(move || {
             if !reply.is_closed() {
                 let _ = reply.send(job());
             }
-        });
-        self.queue.try_send(queued).map_err(|error| match error {
-            TrySendError::Full(_) => PoolError::Overloaded(Overloaded),
-            TrySendError::Disconnected(_) => PoolError::Aborted,
-        })?;
+        }))?;
         result.await.map_err(|_| PoolError::Aborted)
     }
 
-    /// Blocks until no job is running, for at most `timeout`. If a process exits while a native library is
-    /// still working, the library may crash and replace the exit code.
+    /// Blocks until no job is queued or running, for at most `timeout`. If a process exits while a native
+    /// library is still working, the library may crash and replace the exit code.
     pub fn wait_until_idle(&self, timeout: Duration) {
-        let mut count = self.running.count.lock();
-        let _ = self.running.ended.wait_while_for(&mut count, |count| *count > 0, timeout);
+        let Queue { state, idle, .. } = &*self.0.0;
+        let is_busy = |state: &mut State| state.running > 0 || !state.waiting.is_empty();
+        idle.wait_while_for(&mut state.lock(), is_busy, timeout);
     }
 }
 
-fn run_all(receiver: &Mutex<Receiver<Job>>, running: &Running) {
-    loop {
-        let next = receiver.lock().recv();
-        let Ok(job) = next else { return };
-        running.change(|count| *count += 1);
-        // A panicking job must not take its thread from the jobs behind it.
-        if std::panic::catch_unwind(std::panic::AssertUnwindSafe(job)).is_err() {
-            tracing::error!("a job on a pool thread panicked; its caller received an error");
-        }
-        running.change(|count| *count -= 1);
+impl Drop for Handle {
+    fn drop(&mut self) {
+        self.0.state.lock().closed = true;
+        self.0.work_available.notify_all();
     }
 }
+
+impl Queue {
+    fn push(&self, job: Job) -> Result<(), Overloaded> {
+        let mut state = self.state.lock();
+        if state.waiting.len() >= self.capacity {
+            return Err(Overloaded);
+        }
+        state.waiting.push_back(job);
+        drop(state);
+        self.work_available.notify_one();
+        Ok(())
+    }
+
+    /// Runs one job after another until the pool is dropped and the queue is empty.
+    fn work(&self) {
+        while let Some(job) = self.take() {
+            // A panicking job must not take its thread from the jobs behind it.
+            if std::panic::catch_unwind(std::panic::AssertUnwindSafe(job)).is_err() {
+                tracing::error!("a job on a pool thread panicked; its caller received an error");
+            }
+            self.finish();
+        }
+    }
+
+    fn take(&self) -> Option<Job> {
+        let mut state = self.state.lock();
+        loop {
+            if let Some(job) = state.waiting.pop_front() {
+                state.running += 1;
+                return Some(job);
+            }
+            if state.closed {
+                return None;
+            }
+            self.work_available.wait(&mut state);
+        }
+    }
+
+    fn finish(&self) {
+        let mut state = self.state.lock();
+        state.running -= 1;
+        if state.running == 0 && state.waiting.is_empty() {
+            self.idle.notify_all();
+        }
+    }
+}
+
+impl fmt::Debug for Queue {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.debug_struct("Queue").field("capacity", &self.capacity).finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod schedules;
 
 #[cfg(test)]
 mod tests {
@@ -159,6 +217,6 @@ mod tests {
         assert!(!idle.is_finished());
         release.send(()).unwrap();
         idle.join().unwrap();
-        assert_eq!(*pool.running.count.lock(), 0);
+        assert_eq!(pool.0.0.state.lock().running, 0);
     }
 }

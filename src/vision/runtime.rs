@@ -8,8 +8,8 @@ use std::sync::Arc;
 use ort::environment::Environment;
 use parking_lot::Mutex;
 
+use super::execution::Provider;
 use super::manifest::MANIFEST;
-use super::provider::Provider;
 
 /// The model name that [`Assets::resolve`] replaces by an installed model.
 pub const AUTO: &str = "auto";

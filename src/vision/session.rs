@@ -8,10 +8,10 @@ use ort::session::Session;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::value::TensorRef;
 
+use super::execution::Execution;
 use super::manifest::{Input, Manifest, Output, Resize};
 use super::pooling::{LocalFeatures, PoolingError};
 use super::preprocess::Tensor;
-use super::provider::Execution;
 
 impl Output {
     /// Rows and columns of cells in the feature map of a tensor.

@@ -200,8 +200,10 @@ async fn a_retried_delivery_is_due_at_its_next_attempt(fixture: &Fixture) {
             error: Some("busy".into()),
             ..attempt(now, Disposition::RetryAt(now + SignedDuration::from_millis(100)))
         };
-        let noted = store.note_attempt(id, pings[0], failed).await.unwrap().unwrap();
+        let noted = store.note_attempt(id, pings[0], failed.clone()).await.unwrap().unwrap();
         assert_eq!((noted.attempts, noted.last_status), (tries, Some(503)));
+        // Recorded again, after a call whose answer was lost, it counts once.
+        assert_eq!(store.note_attempt(id, pings[0], failed).await.unwrap(), Some(noted.clone()));
         assert_eq!(listed(&*store, id).await, [noted]);
         assert!(due(&*store, id, now).await.is_empty());
         eventually(async || {

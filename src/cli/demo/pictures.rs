@@ -37,15 +37,9 @@ pub fn write_all(localized: &[LocalizedFrame], folders: &DemoFolders) -> anyhow:
         for (index, (file, colour)) in panels.iter().enumerate() {
             paint(&mut sheet, index as u32 * (WIDTH + 2 * BORDER), file, *colour)?;
         }
-        let file = picture_path(localized, folders);
+        let file = folders.picture_of(&localized.frame);
         sheet.save(&file).with_context(|| format!("cannot write {}", file.display()))
     })
-}
-
-/// Returns the path of the picture of a frame.
-pub fn picture_path(localized: &LocalizedFrame, folders: &DemoFolders) -> PathBuf {
-    let name = localized.frame.file.file_stem().unwrap_or_default();
-    folders.pictures.join(name).with_extension("png")
 }
 
 fn map_image(folders: &DemoFolders, id: &ImageId) -> PathBuf {

@@ -3,7 +3,6 @@
 use std::time::Duration;
 
 use super::super::localize::format_pose;
-use super::pictures::picture_path;
 use super::town::DemoFolders;
 use super::{LocalizedFrame, MAP, ModelChoice, index, shown};
 use whereabouts_core::Pose;
@@ -144,7 +143,7 @@ fn print_example(localized: &LocalizedFrame, verdict: &Verdict, folders: &DemoFo
     if let Some(description) = description {
         println!("   its description: {}", description.text);
     }
-    println!("   image: {}", shown(&picture_path(localized, folders)));
+    println!("   image: {}", shown(&folders.picture_of(frame)));
 }
 
 fn print_figures(

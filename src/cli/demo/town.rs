@@ -35,6 +35,12 @@ pub struct Frame {
 const MARKER: &str = ".whereabouts-demo";
 
 impl DemoFolders {
+    /// Returns the path of the picture that shows a frame next to its candidates.
+    pub fn picture_of(&self, frame: &Frame) -> PathBuf {
+        let name = frame.file.file_stem().unwrap_or_default();
+        self.pictures.join(name).with_extension("png")
+    }
+
     /// Creates the folder, and replaces one of an earlier demo.
     pub fn create(out: &Path) -> anyhow::Result<Self> {
         let cannot = || format!("cannot use the folder {}", out.display());

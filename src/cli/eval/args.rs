@@ -9,7 +9,6 @@ use whereabouts_eval::{RunSettings, TruthSource};
 use whereabouts_index::SearchMode;
 use whereabouts_refine::{REFINERS, RefinerSettings};
 use whereabouts_server::config::{Config, Overrides, RefinerChoice};
-use whereabouts_server::startup;
 
 /// Measure Recall@K on a folder of references and a folder of queries, without a server
 ///
@@ -183,7 +182,7 @@ impl Args {
             scene: self.scene,
             concurrency: self.concurrency(),
             work_dir: config.data.dir.clone(),
-            attempts: startup::attempts(config),
+            attempts: config.jobs.attempt_policy(),
             refiner_settings: fingerprint(&config.refiner_settings())?,
         })
     }

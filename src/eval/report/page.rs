@@ -305,6 +305,20 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_page_has_conditions_recalls_changes_and_times() {
+        let summary = crate::table::tests::summary();
+        let [_, refined] = &summary.methods[..] else { panic!() };
+        let sections = [
+            introduction(&summary),
+            recall_table(&summary),
+            refinement(refined, refined.change.as_ref().unwrap()),
+            time_table(&summary),
+        ];
+        let page = sections.map(Markup::into_string).join("\n\n");
+        insta::assert_snapshot!("page", page.replace("><", ">\n<"));
+    }
+
+    #[test]
     fn an_image_id_cannot_become_markup() {
         let id: ImageId = r#"<b onclick="x">&.jpg"#.parse().unwrap();
         let figure = figure("query", "query", &id, "", "data:").into_string();

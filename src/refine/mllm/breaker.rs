@@ -1,4 +1,6 @@
 //! A circuit breaker, which suspends calls to a server that keeps failing.
+//!
+//! Its state is in a watch channel of tokio, whose changes are atomic; it has no locks of its own.
 
 use std::time::Duration;
 
@@ -153,6 +155,9 @@ impl Drop for Admission<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod schedules;
 
 #[cfg(test)]
 mod tests {

@@ -1,7 +1,7 @@
 //! Descriptions are bought once: looked up in the cache, and bought by one caller if they are not there.
 //!
 //! Concurrent jobs of this process share the call ([`SingleFlight`]); of all processes that share a store,
-//! one makes it ([`DescriptionLease`]).
+//! one makes it ([`DescriptionLease`]). The synchronisation is theirs; there is none here.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

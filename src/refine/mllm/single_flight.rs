@@ -3,10 +3,11 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::OnceCell;
 
 use whereabouts_core::Digest;
+
+use crate::sync::{Mutex, MutexGuard};
 
 type Cell<T> = Arc<OnceCell<T>>;
 
@@ -59,6 +60,9 @@ impl<T: Clone> Drop for Follower<'_, T> {
         }
     }
 }
+
+#[cfg(test)]
+mod schedules;
 
 #[cfg(test)]
 mod tests {

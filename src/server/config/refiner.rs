@@ -76,7 +76,7 @@ impl Config {
             local_candidates: self.refine.local_candidates,
             mllm_candidates: self.refine.candidates,
             mllm: self.mllm.clone(),
-            job_timeout_s: self.jobs.timeout_s,
+            job_timeout_s: self.jobs.timeout.as_secs(),
         }
     }
 

@@ -7,7 +7,8 @@ use axum::http::Method;
 use axum::response::Response;
 use whereabouts_core::{ApiKey, Token};
 
-use super::observe::{RequestId, status_of};
+use super::request_id::RequestId;
+use super::status::status_of;
 
 /// A call for the audit log; written when this is dropped, so that a call that was abandoned is logged too.
 pub(super) struct AuditEntry {

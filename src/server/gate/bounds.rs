@@ -44,12 +44,12 @@ pub(super) async fn bound(State(gate): State<Gate>, mut request: Request, next: 
         gate.metrics.refused(Rejection::Requests);
         let detail = format!(
             "{} requests are in progress, the limit (server.max_requests); try again in a moment",
-            gate.settings.max_requests
+            gate.settings.server.max_requests
         );
         return refuse(request, Problem::new(ErrorKind::Overloaded, detail));
     };
     let length = request.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok());
-    let limit = gate.settings.body_limit_bytes;
+    let limit = gate.settings.server.body_limit_bytes;
     if length.and_then(|length| length.parse::<u64>().ok()).is_some_and(|n| n > limit as u64) {
         return refuse(request, Problem::new(ErrorKind::TooLarge, too_large(limit)));
     }
@@ -102,7 +102,7 @@ async fn bound_stream(
     request.extensions_mut().insert(budget.clone());
     let request = request.map(|body| match policy.is_grpc() {
         true => messages(body, policy, gate, &budget),
-        false => upload::bounded(body, gate.settings.body_pause),
+        false => upload::bounded(body, gate.settings.server.body_pause),
     });
     let mut response = next.run(request).await;
     if policy.bulk || ended_at_once(&response) {
@@ -145,5 +145,6 @@ fn ended_at_once(_: &Response) -> bool {
 /// The longest time that a request may take.
 fn longest(gate: &Gate, request: &Request, policy: Option<RoutePolicy>) -> Duration {
     let waits = policy.is_some_and(|policy| policy.waits.apply_to(request.uri()));
-    gate.settings.request_timeout + if waits { gate.settings.max_wait } else { Duration::ZERO }
+    gate.settings.server.request_timeout
+        + if waits { gate.settings.max_wait } else { Duration::ZERO }
 }

@@ -67,7 +67,7 @@ async fn answer(gate: Gate, request: Request, next: Next) -> Result<Response, Pr
     let scope = request.extensions().get::<Principal>().map_or("-", Principal::scope);
     let id = format!("{scope} {key}");
     let (parts, body) = request.into_parts();
-    let body = read_whole(body, gate.settings.body_limit_bytes).await?;
+    let body = read_whole(body, gate.settings.server.body_limit_bytes).await?;
     let fingerprint = fingerprint(&parts, &body).await?;
     match service.idempotency.begin(&id, fingerprint).await? {
         IdempotencyOutcome::Replay(stored) => Ok(replay(stored)),

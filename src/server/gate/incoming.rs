@@ -11,6 +11,7 @@ use tokio::time::{Instant, timeout_at};
 
 use super::body_budget::BodyBudget;
 use super::problem::Problem;
+use super::settings::ServerSettings;
 use super::state::GateSettings;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::Rejection;
@@ -79,7 +80,7 @@ impl BodyWatch {
         let chunks = Chunks {
             body: body.into_data_stream(),
             watch: self.clone(),
-            end: Instant::now() + settings.body_timeout,
+            end: Instant::now() + settings.server.body_timeout,
             settings: Arc::clone(settings),
             memory: Arc::clone(memory),
             counted: 0,
@@ -111,7 +112,8 @@ impl Chunks {
         if self.watch.fault.get().is_some() {
             return None;
         }
-        let GateSettings { body_timeout, body_pause, body_limit_bytes, .. } = *self.settings;
+        let ServerSettings { body_timeout, body_pause, body_limit_bytes, .. } =
+            self.settings.server;
         let pause = Instant::now() + body_pause;
         let chunk = match timeout_at(pause.min(self.end), self.body.next()).await {
             Ok(next) => next?,
@@ -125,7 +127,7 @@ impl Chunks {
         if self.counted <= body_limit_bytes {
             self.counted += chunk.len();
             if !self.watch.budget.try_add(&self.memory, chunk.len()) {
-                let most = self.settings.bodies_limit_bytes;
+                let most = self.settings.server.bodies_limit_bytes;
                 return Some(Err(self.watch.fail(Fault::NoMemory(most))));
             }
         }

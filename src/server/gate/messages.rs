@@ -72,8 +72,8 @@ impl Messages {
         }
         let within = self.missing > 0 || self.prefix_bytes > 0;
         let pause = match self.policy.streams && !within {
-            true => self.settings.stream_idle,
-            false => self.settings.body_pause,
+            true => self.settings.server.stream_idle,
+            false => self.settings.server.body_pause,
         };
         let start = Instant::now();
         let chunk = match timeout(pause, self.body.next()).await {
@@ -109,7 +109,7 @@ impl Messages {
         if self.policy.bulk || self.budget.try_add(&self.memory, chunk.len()) {
             return Ok(());
         }
-        let detail = no_memory(self.settings.bodies_limit_bytes);
+        let detail = no_memory(self.settings.server.bodies_limit_bytes);
         Err(Problem::new(ErrorKind::Overloaded, detail))
     }
 
@@ -119,7 +119,7 @@ impl Messages {
         let length = u32::from_be_bytes(length);
         (self.prefix_bytes, self.missing) = (0, length as usize);
         let limit = match self.policy.pictures {
-            true => self.settings.body_limit_bytes,
+            true => self.settings.server.body_limit_bytes,
             false => LARGEST_PLAIN,
         };
         if self.missing > limit {
@@ -129,7 +129,7 @@ impl Messages {
             return Ok(());
         }
         let permit = Arc::clone(&self.memory).acquire_many_owned(length);
-        match timeout(self.settings.request_timeout, permit).await {
+        match timeout(self.settings.server.request_timeout, permit).await {
             Ok(Ok(permit)) => self.budget.add(permit),
             _ => return Err(no_bulk_memory()),
         }

@@ -21,7 +21,10 @@ mod observe;
 mod policy;
 mod problem;
 mod rate_limit;
+mod request_id;
+mod settings;
 mod state;
+mod status;
 mod upload;
 
 use std::sync::Arc;
@@ -34,10 +37,11 @@ use tower_http::catch_panic::CatchPanicLayer;
 pub(crate) use self::body::{read_whole, throw_away, too_large};
 #[cfg(feature = "grpc")]
 pub(crate) use self::body_budget::BodyBudget;
-pub(crate) use self::connections::{ConnectionSettings, Connections, Tls, TlsError};
+pub(crate) use self::connections::Connections;
 pub(crate) use self::idempotency::{IdempotencyId, LONGEST_KEY};
 pub(crate) use self::policy::{Access, MapSource, Policies, RoutePolicy, Routes, Waits};
 pub(crate) use self::problem::Problem;
+pub use self::settings::ServerSettings;
 pub(crate) use self::state::{Gate, GateSettings};
 pub(crate) use self::state::{Ready, no_bulk_memory};
 pub(crate) use self::upload::BodyPaused;
@@ -47,7 +51,7 @@ pub(crate) fn guard<S: Clone + Send + Sync + 'static>(routes: Routes<S>, gate: &
     let Routes { router, policies } = routes;
     router
         .fallback(problem::no_such_path)
-        .layer(DefaultBodyLimit::max(gate.settings.body_limit_bytes))
+        .layer(DefaultBodyLimit::max(gate.settings.server.body_limit_bytes))
         .layer(CatchPanicLayer::custom(problem::panicked))
         .layer(from_fn(policy::refuse_undeclared))
         .layer(from_fn_with_state(gate.clone(), idempotency::replay_or_run))

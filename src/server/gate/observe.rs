@@ -3,21 +3,17 @@
 use std::time::Instant;
 
 use axum::extract::{MatchedPath, Request, State};
-use axum::http::{HeaderName, HeaderValue};
+use axum::http::HeaderValue;
 use axum::middleware::Next;
 use axum::response::Response;
 use tracing::Instrument;
 
 use super::audit::without_secrets;
 use super::policy::policy;
+use super::request_id::{REQUEST_ID, request_id};
 use super::state::Gate;
+use super::status::status_of;
 use whereabouts_telemetry::traces;
-
-/// The id of a request: the caller's `x-request-id`, or a generated one.
-#[derive(Debug, Clone, Default)]
-pub(super) struct RequestId(pub String);
-
-const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 
 /// Gives the request an id, counts it, and logs it.
 pub(super) async fn observe(
@@ -44,25 +40,4 @@ pub(super) async fn observe(
         response.headers_mut().insert(REQUEST_ID, value);
     }
     response
-}
-
-/// The HTTP status of a response. A gRPC response, whose HTTP status is always 200, counts as the status
-/// nearest to its code.
-pub(super) fn status_of(response: &Response) -> u16 {
-    #[cfg(feature = "grpc")]
-    if let Some(status) = super::grpc_status::as_http(response) {
-        return status;
-    }
-    response.status().as_u16()
-}
-
-fn request_id(request: &Request) -> RequestId {
-    let usable = |text: &&str| {
-        (1..=64).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_graphic())
-    };
-    let sent = request.headers().get(REQUEST_ID).and_then(|value| value.to_str().ok());
-    RequestId(match sent.filter(usable) {
-        Some(id) => id.to_owned(),
-        None => uuid::Uuid::now_v7().to_string(),
-    })
 }

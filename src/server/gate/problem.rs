@@ -11,7 +11,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::observe::RequestId;
+use super::request_id::RequestId;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::ServiceError;
 

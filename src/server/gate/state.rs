@@ -8,6 +8,7 @@ use axum::http::request::Parts;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::problem::Problem;
+use super::settings::ServerSettings;
 use crate::Metrics;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::{Readiness, Rejection, Service};
@@ -15,27 +16,12 @@ use whereabouts_service::{Readiness, Rejection, Service};
 /// Bounds on requests.
 #[derive(Debug, Clone)]
 pub struct GateSettings {
-    /// Largest body, in bytes.
-    pub body_limit_bytes: usize,
-    /// Memory for all bodies in progress except those of bulk uploads, in bytes.
-    pub bodies_limit_bytes: usize,
+    /// Bounds of the server.
+    pub server: ServerSettings,
+    /// Added to the longest time of a request for one that waits for a job.
+    pub max_wait: Duration,
     /// Memory for the images of bulk uploads in progress, in bytes.
     pub bulk_memory_bytes: usize,
-    /// Longest time that a body may take to arrive.
-    pub body_timeout: Duration,
-    /// Longest pause within a body.
-    pub body_pause: Duration,
-    /// Longest time that a request may take.
-    pub request_timeout: Duration,
-    /// Added to `request_timeout` for a request that waits for a job.
-    pub max_wait: Duration,
-    /// Most requests in progress.
-    pub max_requests: usize,
-    /// Most streams that are open.
-    pub max_streams: usize,
-    /// Longest pause between two messages of a gRPC stream.
-    #[cfg_attr(not(feature = "grpc"), expect(dead_code, reason = "only gRPC streams messages"))]
-    pub stream_idle: Duration,
     /// Whether callers need a key.
     pub keys_required: bool,
 }
@@ -60,9 +46,9 @@ impl Gate {
     /// A gate with no service behind it yet: until there is one, every call except `/livez` answers 503.
     pub fn new(settings: GateSettings, metrics: Arc<Metrics>) -> Self {
         Self {
-            requests: Arc::new(Semaphore::new(settings.max_requests)),
-            streams: Arc::new(Semaphore::new(settings.max_streams)),
-            bodies_memory: Arc::new(Semaphore::new(settings.bodies_limit_bytes)),
+            requests: Arc::new(Semaphore::new(settings.server.max_requests)),
+            streams: Arc::new(Semaphore::new(settings.server.max_streams)),
+            bodies_memory: Arc::new(Semaphore::new(settings.server.bodies_limit_bytes)),
             bulk_memory: Arc::new(Semaphore::new(settings.bulk_memory_bytes)),
             settings: Arc::new(settings),
             metrics,
@@ -82,7 +68,7 @@ impl Gate {
             let detail = format!(
                 "{} streams are open, the limit (server.max_streams); poll GET /jobs or \
                  GET /jobs/{{id}}?wait= instead",
-                self.settings.max_streams
+                self.settings.server.max_streams
             );
             Problem::new(ErrorKind::Overloaded, detail)
         })
@@ -94,16 +80,19 @@ impl GateSettings {
     /// Bounds that allow next to nothing.
     pub(crate) fn small() -> Self {
         Self {
-            body_limit_bytes: 100,
-            bodies_limit_bytes: 250,
-            bulk_memory_bytes: 150,
-            body_timeout: Duration::from_secs(1),
-            body_pause: Duration::from_millis(60),
-            request_timeout: Duration::from_millis(200),
+            server: ServerSettings {
+                body_limit_bytes: 100,
+                bodies_limit_bytes: 250,
+                body_timeout: Duration::from_secs(1),
+                body_pause: Duration::from_millis(60),
+                request_timeout: Duration::from_millis(200),
+                max_requests: 1,
+                max_streams: 1,
+                stream_idle: Duration::from_millis(60),
+                ..crate::config::defaults().server
+            },
             max_wait: Duration::from_secs(1),
-            max_requests: 1,
-            max_streams: 1,
-            stream_idle: Duration::from_millis(60),
+            bulk_memory_bytes: 150,
             keys_required: false,
         }
     }

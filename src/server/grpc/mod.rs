@@ -40,7 +40,7 @@ struct Api {
 pub(crate) fn routes<S: Clone + Send + Sync + 'static>(gate: &Gate) -> Routes<S> {
     let api = Api { readiness: gate.readiness.clone(), metrics: Arc::clone(&gate.metrics) };
     // The gate has refused larger messages before.
-    let largest = gate.settings.body_limit_bytes;
+    let largest = gate.settings.server.body_limit_bytes;
     let localization =
         LocalizationServiceServer::new(api.clone()).max_decoding_message_size(largest);
     let maps = MapServiceServer::new(api.clone()).max_decoding_message_size(largest);

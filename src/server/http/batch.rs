@@ -46,18 +46,18 @@ struct Room {
 
 impl Room {
     fn is_too_small(&self, bytes: usize) -> bool {
-        bytes > self.settings.body_limit_bytes
+        bytes > self.settings.server.body_limit_bytes
     }
 
     fn too_large(&self) -> ServiceError {
-        ServiceError::new(ErrorKind::TooLarge, too_large(self.settings.body_limit_bytes))
+        ServiceError::new(ErrorKind::TooLarge, too_large(self.settings.server.body_limit_bytes))
     }
 
     /// Reserves `bytes` of the memory for bulk uploads, waiting until earlier images have released them.
     async fn reserve(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Problem> {
         let count = u32::try_from(bytes).unwrap_or(u32::MAX);
         let permit = Arc::clone(&self.memory).acquire_many_owned(count);
-        let permit = tokio::time::timeout(self.settings.request_timeout, permit).await;
+        let permit = tokio::time::timeout(self.settings.server.request_timeout, permit).await;
         permit.ok().and_then(Result::ok).ok_or_else(no_bulk_memory)
     }
 

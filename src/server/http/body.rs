@@ -48,7 +48,8 @@ impl<T: DeserializeOwned> FromRequest<AppState> for JsonBody<T> {
     type Rejection = Problem;
 
     async fn from_request(request: Request, state: &AppState) -> Result<Self, Problem> {
-        let bytes = read_whole(request.into_body(), state.gate.settings.body_limit_bytes).await?;
+        let bytes =
+            read_whole(request.into_body(), state.gate.settings.server.body_limit_bytes).await?;
         let text: &[u8] = if bytes.is_empty() { b"{}" } else { &bytes };
         serde_json::from_slice(text).map(Self).map_err(|error| {
             Problem::new(
@@ -79,11 +80,14 @@ impl PictureBody {
         }
         match body_type(request.headers())? {
             BodyType::Raw => Ok(Self {
-                picture: read_whole(request.into_body(), state.gate.settings.body_limit_bytes)
-                    .await?,
+                picture: read_whole(
+                    request.into_body(),
+                    state.gate.settings.server.body_limit_bytes,
+                )
+                .await?,
                 meta: None,
             }),
-            BodyType::Form => from_form(request, state.gate.settings.body_limit_bytes).await,
+            BodyType::Form => from_form(request, state.gate.settings.server.body_limit_bytes).await,
         }
     }
 }

@@ -27,9 +27,8 @@ use utoipa_axum::routes;
 use crate::gate::{MapSource, Policies, RoutePolicy, Routes, Waits};
 
 pub use self::examples::{Captured, Example, ExampleBody, ExamplePart, examples};
-pub(crate) use self::state::AppState;
-pub(crate) use self::status::About;
-pub use self::status::Tiles;
+pub use self::state::Tiles;
+pub(crate) use self::state::{About, AppState};
 
 #[derive(OpenApi)]
 #[openapi(

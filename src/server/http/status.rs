@@ -1,44 +1,18 @@
 //! `/status`: the state of the server, for its operators.
 
-use std::sync::Arc;
-
 use axum::Json;
 use axum::extract::State;
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::state::AppState;
+use super::state::{AppState, Tiles};
 use crate::gate::Problem;
 use crate::gate::Ready;
 use whereabouts_api::Today;
 use whereabouts_core::RefinerKind;
 use whereabouts_service::ServiceError;
-use whereabouts_telemetry::{LogIssue, LogIssues, Minute};
-
-/// What `/status` reports that is fixed at startup.
-#[derive(Debug)]
-pub(crate) struct About {
-    /// When the process started.
-    pub started_at: Timestamp,
-    /// Effective settings in TOML, without secrets.
-    pub settings: String,
-    /// Most pictures that may wait to be decoded.
-    pub pictures: usize,
-    /// The server of map tiles for the console, if one is configured.
-    pub tiles: Option<Tiles>,
-    /// Latest warnings and errors.
-    pub troubles: Arc<LogIssues>,
-}
-
-/// A server of map tiles.
-#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
-pub struct Tiles {
-    /// URL template with `{z}`, `{x}` and `{y}` (Web Mercator, as OpenStreetMap uses).
-    pub url: String,
-    /// Attribution to show with the tiles.
-    pub attribution: String,
-}
+use whereabouts_telemetry::{LogIssue, Minute};
 
 /// State of the server.
 #[derive(Debug, Serialize, ToSchema)]
@@ -129,7 +103,10 @@ pub(super) async fn status(
         keys_required: state.gate.settings.keys_required,
         default_model: service.maps.imaging.models.default_model().to_owned(),
         models: models.collect(),
-        jobs: OpenOf { open: service.jobs.open().await?, limit: service.localizer.submitter.queue },
+        jobs: OpenOf {
+            open: service.jobs.open().await?,
+            limit: service.localizer.submitter.settings.queue,
+        },
         pictures: OpenOf {
             open: waiting.localize + waiting.index + waiting.background,
             limit: about.pictures,

@@ -1,6 +1,5 @@
 //! Wiring: builds the parts, serves until shutdown, drains. The only module that knows all others.
 
-mod settings;
 mod store;
 
 use std::net::SocketAddr;
@@ -17,19 +16,18 @@ use uuid::Uuid;
 
 use crate::Metrics;
 use crate::config::Config;
-use crate::gate::{Connections, Gate};
+use crate::gate::{Connections, Gate, GateSettings};
 use crate::http::{About, AppState};
 use crate::router::{router, worker_router};
-use whereabouts_refine::{
-    DenseCache, JobServiceTime, Refiner, RefinerContext, Worker, WorkerSettings,
+use whereabouts_refine::{DenseCache, JobServiceTime, Refiner, RefinerContext, Worker};
+use whereabouts_service::{
+    Dispatcher, Janitor, Keys, Limits, Service, ServiceParts, ServiceSettings, Webhooks,
 };
-use whereabouts_service::{Dispatcher, Janitor, Keys, Limits, Service, ServiceParts, Webhooks};
 use whereabouts_store::TokenBuckets;
 use whereabouts_telemetry::LogIssues;
 use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings};
 use whereabouts_vision::{LoadedModels, LoadedSettings, WhyModel};
 
-pub use self::settings::attempts;
 #[cfg(feature = "postgres")]
 pub use self::store::postgres_settings;
 pub use self::store::{OpenStore, open_store};
@@ -55,10 +53,10 @@ pub async fn run(
 ) -> anyhow::Result<()> {
     let address = listener.local_addr().context("the listener has no address")?;
     let metrics = Arc::new(Metrics::new());
-    let gate = Gate::new(settings::gate(&config), Arc::clone(&metrics));
+    let gate = Gate::new(gate_settings(&config), Arc::clone(&metrics));
     let state = AppState { gate, about: Arc::new(about(&config, issues)?) };
     let connections = Connections {
-        settings: config.server.connections(),
+        settings: config.server.clone(),
         router: match role {
             Role::Serve => router(state.clone()),
             Role::Worker => worker_router(state.clone()),
@@ -68,7 +66,8 @@ pub async fn run(
     };
     let encrypted = connections.tls.is_some();
     let server = tokio::spawn(connections.serve(listener, shutdown.clone()));
-    let (drain_timeout, retention) = (config.server.drain_timeout(), settings::retention(&config));
+    let (drain_timeout, jobs) = (config.server.drain_timeout, config.jobs);
+    let (idempotency, usage_days) = (config.idempotency, config.data.usage_days);
     let counted = Arc::clone(&metrics.service);
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
     let Parts { service, workers, pools, .. } = building.await.context("the start failed")??;
@@ -76,7 +75,9 @@ pub async fn run(
         store: Arc::clone(&service.retention),
         answers: Arc::clone(&service.idempotency.store),
         metrics: Arc::clone(&counted),
-        settings: retention,
+        jobs,
+        usage_days,
+        idempotency,
     };
     let Webhooks { store, settings } = &service.webhooks;
     let dispatcher = Dispatcher::new(Arc::clone(store), counted, settings.clone());
@@ -128,6 +129,33 @@ fn about(config: &Config, issues: Arc<LogIssues>) -> anyhow::Result<About> {
     })
 }
 
+/// The settings of the gate, which come from several sections.
+fn gate_settings(config: &Config) -> GateSettings {
+    GateSettings {
+        server: config.server.clone(),
+        max_wait: config.jobs.max_wait,
+        bulk_memory_bytes: config.bulk.memory_bytes,
+        keys_required: config.keys_required(),
+    }
+}
+
+/// The sections that the use cases own.
+fn service_settings(config: &Config) -> ServiceSettings {
+    let recall_check = Duration::from_secs(config.index.check_s);
+    ServiceSettings {
+        localize: config.localize,
+        track: config.track.clone(),
+        confidence: config.confidence,
+        jobs: config.jobs,
+        compared: config.compared_candidates(),
+        recall_check: Some(recall_check).filter(|pause| !pause.is_zero()),
+        usage_days: config.data.usage_days,
+        idempotency: config.idempotency,
+        bulk: config.bulk,
+        webhooks: config.webhooks.clone(),
+    }
+}
+
 /// The parts of a running process.
 pub struct Parts {
     /// The use cases.
@@ -173,13 +201,8 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
             refiner: Arc::clone(refiner),
             metrics: Arc::clone(&metrics.refine),
             service_time: Arc::clone(&job_service_time),
-            settings: WorkerSettings {
-                lease: Duration::from_secs(config.jobs.lease_s),
-                timeout: Duration::from_secs(config.jobs.timeout_s),
-                attempts: attempts(config),
-                known_confidence: config.localize.known_confidence,
-                workers: config.jobs.workers,
-            },
+            settings: config.jobs,
+            known_confidence: config.localize.known_confidence,
         })
     });
     let workers = workers.collect();
@@ -198,7 +221,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         job_service_time,
         metrics: Arc::clone(&metrics.service),
     };
-    let service = Service::new(parts, settings::service(config));
+    let service = Service::new(parts, service_settings(config));
     let model = service.maps.imaging.models.default_model();
     tracing::info!(model, %why, "the model of maps that name none");
     service.maps.imaging.models.manifest(model)?;

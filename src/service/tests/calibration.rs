@@ -60,7 +60,7 @@ async fn an_image_on_which_the_refiner_fails_for_good_is_left_out() {
 
 #[tokio::test]
 async fn at_most_the_configured_number_of_images_is_refined() {
-    let fixture = Fixture::with(0, |settings| settings.calibration.refined = 2).await;
+    let fixture = Fixture::with(0, |settings| settings.confidence.refined = 2).await;
     let measured = calibrated(&fixture, true).await;
     assert_eq!((measured.similarity.len(), measured.agreement.len()), (IMAGES, 2));
 }

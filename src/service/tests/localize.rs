@@ -47,7 +47,7 @@ async fn a_map_that_does_not_exist_or_lacks_its_model_cannot_be_localized_in() {
 async fn a_full_queue_rejects_a_caller_that_waits_for_the_job_before_any_other_check() {
     let fixture = Fixture::new().await;
     let localizer = &fixture.service.localizer;
-    for _ in 0..localizer.submitter.queue {
+    for _ in 0..localizer.submitter.settings.queue {
         fixture.job("yard").await;
     }
     let waiting = LocalizeRequest { refine: RefineMode::Wait, ..request(None, b"frame") };

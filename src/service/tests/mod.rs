@@ -142,9 +142,27 @@ fn open(dir: &Path, min_free_bytes: u64) -> EmbeddedStore {
     .unwrap()
 }
 
+/// Jobs that are kept until they are removed by hand.
+fn job_settings() -> JobSettings {
+    JobSettings {
+        queue: 3,
+        shed_at: 0.4,
+        workers: 1,
+        lease: Duration::from_secs(60),
+        timeout: Duration::from_secs(30),
+        attempts: 3,
+        retry_pause: Duration::from_secs(2),
+        max_wait: Duration::from_secs(60),
+        keep: None,
+        keep_count: None,
+        sweep: Duration::from_secs(60),
+        sweep_batch: 1,
+    }
+}
+
 fn settings() -> ServiceSettings {
     ServiceSettings {
-        localize: LocalizeSettings { k: 5, max_k: 20, compared: 5, known_confidence: 0.5 },
+        localize: LocalizeSettings { k: 5, max_k: 20, known_confidence: 0.5 },
         track: TrackSettings {
             max: 2,
             idle_s: 600,
@@ -157,16 +175,9 @@ fn settings() -> ServiceSettings {
             states: 64,
             known_probability: 0.5,
         },
-        calibration: CalibrationSettings {
-            images: 100,
-            refined: 100,
-            candidates: 3,
-            place_images: 0,
-            place_m: 5.0,
-        },
-        job_queue: 3,
-        shed_jobs_at: 0.4,
-        max_wait: Duration::from_secs(60),
+        confidence: ConfidenceSettings { images: 100, refined: 100, place_images: 0, place_m: 5.0 },
+        jobs: job_settings(),
+        compared: 5,
         recall_check: None,
         usage_days: 30,
         idempotency: IdempotencySettings { keep: Duration::from_secs(3600), most: 100 },

@@ -1,11 +1,13 @@
 use std::time::Duration;
 
+use jiff::Timestamp;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::Fixture;
-use crate::{IdempotencyOutcome, IdempotencySettings, Janitor, RetentionSettings};
+use crate::{IdempotencyOutcome, IdempotencySettings, Janitor};
 use whereabouts_core::Digest;
+use whereabouts_refine::JobSettings;
 use whereabouts_store::{JobFilter, StoredResponse};
 
 /// A janitor that removes whatever has ended, one job at a time.
@@ -14,15 +16,13 @@ fn janitor(fixture: &Fixture) -> Janitor {
         store: fixture.store.clone(),
         answers: fixture.store.clone(),
         metrics: fixture.service.metrics.clone(),
-        settings: RetentionSettings {
+        jobs: JobSettings {
             keep: Some(Duration::ZERO),
-            most: None,
-            settle: Duration::ZERO,
-            pause: Duration::from_secs(60),
-            batch: 1,
-            usage_days: 1,
-            idempotency: IdempotencySettings { keep: Duration::from_secs(3600), most: 100 },
+            max_wait: Duration::ZERO,
+            ..super::job_settings()
         },
+        usage_days: 1,
+        idempotency: IdempotencySettings { keep: Duration::from_secs(3600), most: 100 },
     }
 }
 
@@ -48,10 +48,10 @@ async fn jobs_are_removed_with_their_frames_when_they_ended_too_long_ago() {
     let fixture = Fixture::new().await;
     let ids = jobs(&fixture).await;
     let mut janitor = janitor(&fixture);
-    janitor.settings.keep = Some(Duration::from_secs(3600));
+    janitor.jobs.keep = Some(Duration::from_secs(3600));
     janitor.sweep(&CancellationToken::new()).await.unwrap();
     assert_eq!(left(&fixture).await, ids);
-    janitor.settings.keep = Some(Duration::ZERO);
+    janitor.jobs.keep = Some(Duration::ZERO);
     janitor.sweep(&CancellationToken::new()).await.unwrap();
     assert_eq!(left(&fixture).await, ids[3..]);
     let blobs = &fixture.service.jobs.blobs;
@@ -66,10 +66,10 @@ async fn the_first_jobs_to_end_are_removed_when_there_are_too_many() {
     let fixture = Fixture::new().await;
     let ids = jobs(&fixture).await;
     let mut janitor = janitor(&fixture);
-    janitor.settings.keep = None;
+    janitor.jobs.keep = None;
     janitor.sweep(&CancellationToken::new()).await.unwrap();
     assert_eq!(left(&fixture).await, ids, "there is no bound");
-    janitor.settings.most = Some(1);
+    janitor.jobs.keep_count = Some(1);
     janitor.sweep(&CancellationToken::new()).await.unwrap();
     assert_eq!(left(&fixture).await, ids[2..]);
 }
@@ -79,8 +79,8 @@ async fn a_job_that_has_just_ended_stays_until_its_waiters_have_seen_it() {
     let fixture = Fixture::new().await;
     let ids = jobs(&fixture).await;
     let mut janitor = janitor(&fixture);
-    janitor.settings.most = Some(0);
-    janitor.settings.settle = Duration::from_secs(60);
+    janitor.jobs.keep_count = Some(0);
+    janitor.jobs.max_wait = Duration::from_secs(60);
     janitor.sweep(&CancellationToken::new()).await.unwrap();
     assert_eq!(left(&fixture).await, ids);
 }
@@ -106,7 +106,12 @@ async fn expired_responses_are_removed() {
     let mut janitor = janitor(&fixture);
     janitor.sweep(&CancellationToken::new()).await.unwrap();
     assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::Replay(response));
-    janitor.settings.idempotency.keep = Duration::ZERO;
+    janitor.idempotency.keep = Duration::ZERO;
+    // The store counts ages in whole milliseconds.
+    let answered = Timestamp::now().as_millisecond();
+    while Timestamp::now().as_millisecond() == answered {
+        tokio::task::yield_now().await;
+    }
     janitor.sweep(&CancellationToken::new()).await.unwrap();
     assert_eq!(requests.begin("key", body).await.unwrap(), IdempotencyOutcome::First);
 }

@@ -65,7 +65,7 @@ async fn without_a_refiner_or_candidates_there_is_no_job() {
 async fn a_full_queue_declines_jobs_and_rejects_callers_that_wait_for_one() {
     let fixture = Fixture::new().await;
     let submitter = &fixture.service.localizer.submitter;
-    for _ in 0..submitter.queue {
+    for _ in 0..submitter.settings.queue {
         submitter.check_capacity().await.unwrap();
         assert_eq!(reason(submit(submitter, None).await.unwrap()), None);
     }
@@ -75,7 +75,7 @@ async fn a_full_queue_declines_jobs_and_rejects_callers_that_wait_for_one() {
     assert_eq!(rejected.kind, ErrorKind::Overloaded);
     assert!(rejected.detail.contains("refine=off"), "{rejected}");
     assert!(rejected.retry_after.is_some());
-    assert_eq!(submitter.jobs.queued().await.unwrap(), submitter.queue);
+    assert_eq!(submitter.jobs.queued().await.unwrap(), submitter.settings.queue);
 }
 
 #[tokio::test]

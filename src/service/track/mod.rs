@@ -1,7 +1,8 @@
 //! Tracks: sequences of frames of one robot, whose estimates are filtered over time.
 //!
 //! [`belief`] is the filter, [`places`] the positions of the map's images. This file keeps the tracks in memory,
-//! bounded in number and age; they do not survive a restart.
+//! bounded in number and age; they do not survive a restart. The map of tracks is a plain one with strict LRU: moka and
+//! quick_cache would evict newcomers first.
 
 mod belief;
 mod places;

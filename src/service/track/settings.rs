@@ -5,6 +5,12 @@ use serde::{Deserialize, Serialize};
 /// Maximum speed that can be configured, in metres per second.
 const MAX_SPEED_M_S: f64 = 1000.0;
 
+/// Odometry that errs by more than this many times the distance moved says nothing.
+const MAX_ODOMETRY_ERROR: f64 = 1000.0;
+
+/// Limits of the exponent. Beyond them, single precision makes every image equally likely, or one certain.
+const SHARPNESS: [f64; 2] = [1e-6, 1e6];
+
 /// `[track]`
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -52,6 +58,16 @@ impl TrackSettings {
             .or_else(|| share("jump", self.jump))
             .or_else(|| above_zero("max_speed_m_s", self.max_speed_m_s))
             .or_else(|| above_zero("odometry_error", self.odometry_error))
-            .or_else(|| above_zero("sharpness", self.sharpness))
+            .or_else(|| {
+                let wrong = self.odometry_error > MAX_ODOMETRY_ERROR;
+                wrong.then(|| format!("track.odometry_error must be at most {MAX_ODOMETRY_ERROR}"))
+            })
+            .or_else(|| {
+                let [least, most] = SHARPNESS;
+                let wrong = !(least..=most).contains(&self.sharpness);
+                wrong.then(|| {
+                    format!("track.sharpness = {} must be from {least} to {most}", self.sharpness)
+                })
+            })
     }
 }

@@ -17,6 +17,7 @@ use super::messenger::{Messenger, Reply};
 use crate::{AttemptOutcome, ServiceMetrics};
 use whereabouts_core::{Attempt, Delivery, Disposition, StoredWebhook};
 use whereabouts_refine::mllm::random_fraction;
+use whereabouts_refine::retry_for;
 use whereabouts_store::{StoreError, StoredDelivery, WebhookStore};
 
 /// Pause between two scans for due deliveries, if nothing happens.
@@ -27,6 +28,9 @@ const CLEANUP_PAUSE: Duration = Duration::from_secs(10);
 
 /// Maximum number of deliveries given up or removed in one transaction.
 const BATCH: usize = 256;
+
+/// How long an attempt is recorded again while the store is unavailable.
+const RECORD_LIMIT: Duration = Duration::from_secs(600);
 
 /// Pause after an attempt that could not be recorded; without it, a full disk would cause a flood of messages.
 const STORE_FAILED_PAUSE: Duration = Duration::from_secs(10);
@@ -161,7 +165,9 @@ impl Dispatcher {
             }
         };
         self.metrics.webhook_attempt(outcome);
-        self.store.note_attempt(webhook, id, attempt).await.map(drop)
+        // Without this, a store that is busy for a moment would make the receiver get the message again.
+        let note = || self.store.note_attempt(webhook, id, attempt.clone());
+        retry_for(RECORD_LIMIT, note).await.map(drop)
     }
 
     /// Removes old deliveries until `shutdown`.

@@ -21,7 +21,7 @@ use super::trees::{
     BlobOwner, Lease, Trees, blob_ref_key, decode, encode, ended_key, failed, get, put, queue_key,
     queued_job, transaction_failed,
 };
-use super::webhooks::WebhookTrees;
+use super::webhooks::trees::WebhookTrees;
 use super::{EmbeddedStore, blocking, idempotency};
 use whereabouts_core::{Job, Priority};
 

@@ -25,6 +25,7 @@ mod jobs;
 mod keys;
 mod live_map;
 mod maps;
+mod records;
 mod retention;
 mod schema;
 mod segments;

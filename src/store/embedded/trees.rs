@@ -5,13 +5,12 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
-use serde::Serialize;
-use serde::de::DeserializeOwned;
 use uuid::Uuid;
 
 use super::super::changes::queue_rank;
 use super::super::{JobRecord, StoreError};
-use super::webhooks::WebhookTrees;
+pub(super) use super::records::{decode, encode, failed, get, put, transaction_failed};
+use super::webhooks::trees::WebhookTrees;
 use whereabouts_core::{Digest, Image, ImageId, Job, JobState, Map};
 
 /// The sled trees. Clones share the same database.
@@ -264,51 +263,6 @@ pub(super) fn blob_ref_key(digest: &Digest, owner: &BlobOwner<'_>) -> Vec<u8> {
         }
     }
     key
-}
-
-pub(super) fn get<T: DeserializeOwned>(
-    tree: &sled::Tree,
-    key: &[u8],
-) -> Result<Option<T>, StoreError> {
-    tree.get(key).map_err(failed)?.map(|value| decode(&value)).transpose()
-}
-
-pub(super) fn put<T: Serialize>(
-    tree: &sled::Tree,
-    key: &[u8],
-    value: &T,
-) -> Result<(), StoreError> {
-    tree.insert(key, encode(value)?).map(drop).map_err(failed)
-}
-
-pub(super) fn encode<T: Serialize>(value: &T) -> Result<Vec<u8>, StoreError> {
-    serde_json::to_vec(value).map_err(|error| StoreError::Failed(error.to_string()))
-}
-
-pub(super) fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, StoreError> {
-    serde_json::from_slice(bytes).map_err(|error| {
-        StoreError::Damaged(format!("a record cannot be read ({error}); restore a backup"))
-    })
-}
-
-pub(super) fn failed(error: sled::Error) -> StoreError {
-    match error {
-        sled::Error::Corruption { .. } => StoreError::Damaged(
-            "the files of the record database are inconsistent; restore a backup into another folder"
-                .into(),
-        ),
-        error => StoreError::Failed(error.to_string()),
-    }
-}
-
-/// Converts the error of a transaction whose closure never aborts it.
-pub(super) fn transaction_failed(error: sled::transaction::TransactionError<()>) -> StoreError {
-    match error {
-        sled::transaction::TransactionError::Abort(()) => {
-            StoreError::Failed("a transaction was aborted".into())
-        }
-        sled::transaction::TransactionError::Storage(error) => failed(error),
-    }
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 //! delivery in one transaction. The body of the message is a separate record, so that attempts do not
 //! rewrite it.
 
-mod trees;
+pub(super) mod trees;
 
 use std::sync::Arc;
 
@@ -19,12 +19,12 @@ use super::super::changes::{
 use super::super::{
     DeliveryRetention, RemovedDeliveries, StoreError, StoredDelivery, WebhookStore,
 };
-use super::trees::{Trees, decode, failed, put};
+use super::records::{decode, failed, put};
+use super::trees::Trees;
 use super::{EmbeddedStore, blocking};
 use whereabouts_core::{Attempt, Delivery, DeliveryState, StoredWebhook};
 
-pub(super) use self::trees::WebhookTrees;
-use self::trees::{DeliveryRecord, key};
+use self::trees::{DeliveryRecord, WebhookTrees, key};
 
 /// Deliveries removed in one change when their webhook is deleted.
 const REMOVAL_BATCH: usize = 256;

@@ -8,7 +8,7 @@ use super::*;
 
 type Entering = Pin<Box<dyn Future<Output = Result<Permit, Rejected>>>>;
 
-fn admission(permits: usize, queue: usize) -> Admission {
+pub(super) fn admission(permits: usize, queue: usize) -> Admission {
     Admission::new(AdmissionSettings {
         permits,
         queue,
@@ -17,7 +17,7 @@ fn admission(permits: usize, queue: usize) -> Admission {
     })
 }
 
-fn request(class: WorkClass) -> AdmissionRequest {
+pub(super) fn request(class: WorkClass) -> AdmissionRequest {
     AdmissionRequest { class, deadline: None }
 }
 

@@ -7,7 +7,7 @@ fn manifest() -> Arc<Manifest> {
     Arc::new(Manifest::parse(text, std::path::Path::new("xfeat.toml")).unwrap())
 }
 
-fn queue(throughput_sessions: usize, max_batch: usize) -> Queue {
+pub(super) fn queue(throughput_sessions: usize, max_batch: usize) -> Queue {
     let layout = Layout { threads: 4, sessions: throughput_sessions.max(1), max_batch };
     let state = State { throughput_sessions, ..State::default() };
     Queue {
@@ -22,9 +22,8 @@ fn queue(throughput_sessions: usize, max_batch: usize) -> Queue {
 fn submit(queue: &Queue) -> PendingInference {
     let (reply, result) = oneshot::channel();
     let mut state = queue.lock();
-    state.overlapped |= state.in_progress();
     let (kind, features) = (DescriptorKind::Gem, FeatureSet::DescriptorOnly);
-    state.waiting.push_back(Request { tensor: Tensor::grey(1, 1), kind, features, reply });
+    state.push(Request { tensor: Tensor::grey(1, 1), kind, features, reply });
     PendingInference(result)
 }
 
@@ -109,6 +108,19 @@ fn abandoned_pictures_make_room_in_the_queue() {
     let batch = queue.take(SessionKind::Latency).unwrap();
     assert_eq!((batch.len(), batch[0].tensor.width), (1, 2));
     assert!(waiting.join().unwrap().1.is_ok());
+}
+
+#[test]
+fn waiting_callers_fail_when_a_session_panics() {
+    let queue = Arc::new(queue(0, 1));
+    let pending = [submit(&queue), submit(&queue)];
+    let serving = Arc::clone(&queue);
+    let session =
+        thread::spawn(move || serving.serve(SessionKind::Latency, |_| panic!("on purpose")));
+    for pending in pending {
+        assert!(matches!(pending.wait(), Err(InferenceError::Stopped)));
+    }
+    assert!(session.join().is_err() && queue.take(SessionKind::Latency).is_none());
 }
 
 #[test]

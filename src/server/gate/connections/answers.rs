@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
 
@@ -21,6 +22,8 @@ const CHUNK: usize = 16 << 10;
 pub(super) struct Answers {
     slot: Arc<Slot>,
     waiting: Arc<Mutex<Waiting>>,
+    /// Whether bytes wait for the client to read.
+    unwritten: Arc<AtomicBool>,
 }
 
 /// For each response that waits for its client, the time since when.
@@ -39,7 +42,17 @@ pub(super) struct InProgress {
 
 impl Answers {
     pub fn new(slot: Arc<Slot>) -> Self {
-        Self { slot, waiting: Arc::default() }
+        Self { slot, waiting: Arc::default(), unwritten: Arc::default() }
+    }
+
+    /// A flag to set while a write to the client is pending.
+    pub fn unwritten(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.unwritten)
+    }
+
+    /// Whether no request is in progress and the client has taken all responses.
+    pub fn are_over(&self) -> bool {
+        self.slot.is_idle() && !self.unwritten.load(Ordering::Relaxed)
     }
 
     /// Registers a request.

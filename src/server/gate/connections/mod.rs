@@ -10,6 +10,7 @@ use std::convert::Infallible;
 use std::io::{ErrorKind, Write as _};
 use std::pin::pin;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use axum::Router;
@@ -31,6 +32,7 @@ use self::preface::{Peeked, Version};
 use self::slots::{Slot, Slots};
 pub use self::tls::{Tls, TlsError};
 use self::writes::TimedWrites;
+use super::ServerSettings;
 use crate::Metrics;
 use whereabouts_service::Rejection;
 
@@ -40,27 +42,13 @@ const STREAM_WINDOW: u32 = 512 << 10;
 /// Flow-control window of an HTTP/2 connection, in bytes.
 const CONNECTION_WINDOW: u32 = 1 << 20;
 
-/// Bounds on connections.
-#[derive(Debug, Clone)]
-pub struct ConnectionSettings {
-    /// Most connections that are open.
-    pub most: usize,
-    /// Longest time for the whole head of a request to arrive.
-    pub header_timeout: Duration,
-    /// Largest head, in bytes, at least 8192.
-    pub max_header_bytes: usize,
-    /// Most headers of an HTTP/1 request.
-    pub max_headers: usize,
-    /// Most requests in progress on one HTTP/2 connection.
-    pub max_concurrent: u32,
-    /// Longest time that a client may read nothing of a response.
-    pub write_timeout: Duration,
-}
+/// While draining, how often idle HTTP/2 connections whose client does not answer are closed.
+const DRAIN_CHECK: Duration = Duration::from_secs(1);
 
 /// Serves a router on connections.
 pub struct Connections {
     /// Bounds.
-    pub settings: ConnectionSettings,
+    pub settings: ServerSettings,
     /// Answers the requests.
     pub router: Router,
     /// Counts connections and rejections.
@@ -73,7 +61,7 @@ impl Connections {
     /// Accepts connections until `shutdown`, then returns once the last request has been answered.
     pub async fn serve(self, listener: TcpListener, shutdown: CancellationToken) {
         let (this, open) = (Arc::new(self), TaskTracker::new());
-        let slots = Slots::new(this.settings.most);
+        let slots = Slots::new(this.settings.max_connections);
         if let Some(tls) = this.tls.clone() {
             let shutdown = shutdown.clone();
             open.spawn(async move { tls.reload_until(shutdown).await });
@@ -106,14 +94,16 @@ impl Connections {
     async fn serve_one(&self, stream: TcpStream, slot: &Arc<Slot>, shutdown: CancellationToken) {
         // Nagle's algorithm would delay a response until the previous one is acknowledged.
         let _ = stream.set_nodelay(true);
+        let answers = Answers::new(Arc::clone(slot));
+        let pending = answers.unwritten();
         let Some(tls) = &self.tls else {
-            let plain = TimedWrites::new(stream, self.settings.write_timeout);
-            return self.answer_all(plain, slot, shutdown).await;
+            let plain = TimedWrites::new(stream, self.settings.write_timeout, pending);
+            return self.answer_all(plain, answers, shutdown).await;
         };
         let handshake =
-            tokio::time::timeout(self.settings.header_timeout, self.encrypt(tls, stream));
+            tokio::time::timeout(self.settings.header_timeout, self.encrypt(tls, stream, pending));
         match shutdown.run_until_cancelled(handshake).await {
-            Some(Ok(Ok(encrypted))) => self.answer_all(encrypted, slot, shutdown.clone()).await,
+            Some(Ok(Ok(encrypted))) => self.answer_all(encrypted, answers, shutdown.clone()).await,
             Some(Ok(Err(error))) => tracing::debug!(%error, "a TLS handshake failed"),
             Some(Err(_)) => self.metrics.refused(Rejection::Slow),
             None => {}
@@ -125,27 +115,28 @@ impl Connections {
         &self,
         tls: &Tls,
         stream: TcpStream,
+        pending: Arc<AtomicBool>,
     ) -> std::io::Result<TlsStream<TimedWrites>> {
         const HANDSHAKE: u8 = 22;
         let mut first = [0];
         if stream.peek(&mut first).await? == 1 && first != [HANDSHAKE] {
             let detail = "this port speaks HTTPS; begin the address with https://";
             let answer = raw_problem("400 Bad Request", "malformed", "Malformed request", detail);
-            let mut plain = TimedWrites::new(stream, self.settings.write_timeout);
+            let mut plain = TimedWrites::new(stream, self.settings.write_timeout, pending);
             plain.write_all(answer.as_bytes()).await?;
             return Err(ErrorKind::InvalidData.into());
         }
-        tls.acceptor().accept(TimedWrites::new(stream, self.settings.write_timeout)).await
+        let timed = TimedWrites::new(stream, self.settings.write_timeout, pending);
+        tls.acceptor().accept(timed).await
     }
 
     /// Answers the requests of a connection, in the version of HTTP that the client speaks.
     async fn answer_all<S: AsyncRead + AsyncWrite + Unpin>(
         &self,
         stream: S,
-        slot: &Arc<Slot>,
+        answers: Answers,
         shutdown: CancellationToken,
     ) {
-        let answers = Answers::new(Arc::clone(slot));
         let mut stream = Peeked::new(stream);
         let detected = tokio::time::timeout(self.settings.header_timeout, stream.version());
         match shutdown.run_until_cancelled(detected).await {
@@ -198,7 +189,7 @@ impl Connections {
     }
 
     /// Answers HTTP/2, several requests at a time. The connection is closed if the client stops reading any
-    /// one response, even if it reads others.
+    /// one response, even if it reads others. A drain does not wait for an idle client to agree to it.
     async fn answer_http2<S: AsyncRead + AsyncWrite + Unpin>(
         &self,
         stream: Peeked<S>,
@@ -230,13 +221,18 @@ impl Connections {
         let mut stopping = pin!(shutdown.cancelled());
         let mut draining = false;
         let mut stall_checks = tokio::time::interval(timeout / 4);
+        let mut drain_checks = tokio::time::interval(DRAIN_CHECK);
         let ended = loop {
             tokio::select! {
                 ended = &mut connection => break ended,
                 () = &mut stopping, if !draining => {
                     draining = true;
                     connection.as_mut().graceful_shutdown();
+                    drain_checks.reset();
                 }
+                _ = drain_checks.tick(), if draining => if answers.are_over() {
+                    return tracing::debug!("an idle client did not answer that the server stops");
+                },
                 _ = stall_checks.tick() => if answers.are_stalled(timeout) {
                     self.metrics.refused(Rejection::Slow);
                     return tracing::debug!("a client reads nothing of a response");
@@ -327,3 +323,6 @@ fn raw_problem(status: &str, word: &str, title: &str, detail: &str) -> String {
         body.len()
     )
 }
+
+#[cfg(test)]
+mod tests;

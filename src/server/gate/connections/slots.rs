@@ -3,8 +3,9 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use parking_lot::{Mutex, MutexGuard};
 use tokio_util::sync::CancellationToken;
+
+use crate::sync::{Mutex, MutexGuard};
 
 /// Slots for connections. Clones share them.
 #[derive(Debug, Clone)]
@@ -54,7 +55,10 @@ impl State {
     fn add_idle(&mut self, evicted: &CancellationToken) -> u64 {
         let key = self.next_key;
         self.next_key += 1;
-        self.idle.insert(key, evicted.clone());
+        // A connection that was evicted during a request has no slot left to give.
+        if !evicted.is_cancelled() {
+            self.idle.insert(key, evicted.clone());
+        }
         key
     }
 }
@@ -90,6 +94,11 @@ impl Slot {
         self.evicted.cancelled().await;
     }
 
+    /// Whether no request is in progress.
+    pub fn is_idle(&self) -> bool {
+        matches!(*self.activity.lock(), Activity::Idle(_))
+    }
+
     pub fn request_began(&self) {
         let mut activity = self.activity.lock();
         *activity = match *activity {
@@ -119,6 +128,9 @@ impl Drop for Slot {
         }
     }
 }
+
+#[cfg(test)]
+mod schedules;
 
 #[cfg(test)]
 mod tests {

@@ -2,6 +2,8 @@
 
 use std::io::{Error, ErrorKind, IoSlice};
 use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -14,13 +16,16 @@ use tokio::time::{Sleep, sleep};
 pub(super) struct TimedWrites {
     stream: TcpStream,
     timeout: Duration,
+    /// Whether a write is pending.
+    pending: Arc<AtomicBool>,
     /// Runs while a write is pending.
     stalled: Option<Pin<Box<Sleep>>>,
 }
 
 impl TimedWrites {
-    pub fn new(stream: TcpStream, timeout: Duration) -> Self {
-        Self { stream, timeout, stalled: None }
+    /// Sets `pending` while a write waits for the client.
+    pub fn new(stream: TcpStream, timeout: Duration, pending: Arc<AtomicBool>) -> Self {
+        Self { stream, timeout, pending, stalled: None }
     }
 
     fn timed<T>(
@@ -28,6 +33,7 @@ impl TimedWrites {
         context: &mut Context<'_>,
         written: Poll<Result<T, Error>>,
     ) -> Poll<Result<T, Error>> {
+        self.pending.store(written.is_pending(), Ordering::Relaxed);
         if written.is_ready() {
             self.stalled = None;
             return written;

@@ -76,7 +76,7 @@ async fn picture(
     room: &Room,
     mut part: Field<'_>,
 ) -> Result<Result<(Bytes, OwnedSemaphorePermit), ServiceError>, Problem> {
-    let limit = room.settings.body_limit_bytes;
+    let limit = room.settings.server.body_limit_bytes;
     let mut reserved = room.reserve(FIRST_RESERVATION.min(limit)).await?;
     let (mut bytes, mut too_large) = (BytesMut::new(), false);
     while let Some(chunk) = part.chunk().await.map_err(broken)? {

@@ -7,7 +7,7 @@ use uuid::Uuid;
 
 use super::super::super::changes::{check_enabled, deliveries_for, no_webhook};
 use super::super::super::{DeliveryRetention, StoreError};
-use super::super::trees::{decode, encode, failed, get, transaction_failed};
+use super::super::records::{decode, encode, failed, get, transaction_failed};
 use whereabouts_core::{Delivery, DeliveryState, Job, StoredWebhook};
 
 /// The sled trees of webhooks.
