@@ -55,42 +55,16 @@ where
     Option::deserialize(value).map(Some)
 }
 
-/// An image, and what the request did to it.
+/// An image as it is stored now, and what the request changed of it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ImageAnswer {
     /// The image as it is stored now.
     #[serde(flatten)]
     pub image: Image,
-    /// Whether the image is new, was changed, or was there already.
-    pub status: ImageStatus,
-    /// Fields of a stored image that the request changed.
+    /// Fields of an image stored before that the request changed: `pose`, `captured_at`, `tags`. Empty for an image
+    /// that is new or stayed as it was.
     #[serde(default)]
     pub changed: Vec<ImageField>,
-}
-
-/// What a request did to an image.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum ImageStatus {
-    /// The image is new.
-    Stored,
-    /// The image was stored before, and nothing changed.
-    Present,
-    /// The image was stored before, and its pose, time or tags changed.
-    Updated,
-}
-
-impl ImageAnswer {
-    /// An image that is new.
-    pub fn stored(image: Image) -> Self {
-        Self { image, status: ImageStatus::Stored, changed: Vec::new() }
-    }
-
-    /// An image that was stored before, in which `changed` changed.
-    pub fn known(image: Image, changed: Vec<ImageField>) -> Self {
-        let status = if changed.is_empty() { ImageStatus::Present } else { ImageStatus::Updated };
-        Self { image, status, changed }
-    }
 }
 
 /// A page of images, sorted by id.

@@ -38,8 +38,12 @@ pub struct Images {
 
 impl Images {
     /// Extracts the descriptor of an image and stores both. If the image is stored already, its pose, time and
-    /// tags become those that `new` states.
-    pub async fn add(&self, name: &MapName, new: NewImage) -> Result<ImageAnswer, ServiceError> {
+    /// tags become those that `new` states. Returns the image, and whether it is new.
+    pub async fn add(
+        &self,
+        name: &MapName,
+        new: NewImage,
+    ) -> Result<(ImageAnswer, bool), ServiceError> {
         if new.bytes.is_empty() {
             return Err(empty_body());
         }
@@ -74,8 +78,12 @@ impl Images {
                 Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
                 added => {
                     return match added? {
-                        Added::Created(image) => Ok(ImageAnswer::stored(image)),
-                        Added::Present(image) => self.restate(name, &image.id, &stated).await,
+                        Added::Created(image) => {
+                            Ok((ImageAnswer { image, changed: Vec::new() }, true))
+                        }
+                        Added::Present(image) => {
+                            Ok((self.restate(name, &image.id, &stated).await?, false))
+                        }
                     };
                 }
             }

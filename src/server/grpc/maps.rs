@@ -12,7 +12,7 @@ use super::proto::{
     PutMapResponse, Stored, UpdateImageRequest, UpdateImageResponse,
 };
 use super::{Api, CallContext, convert, status};
-use whereabouts_api::{ImageAnswer, ImageMeta, ImagePatch, ImageStatus, MapChange};
+use whereabouts_api::{ImageAnswer, ImageMeta, ImagePatch, MapChange};
 use whereabouts_core::{ImageField, MapName};
 use whereabouts_service::{BulkImage, BulkResult, ServiceError};
 
@@ -133,7 +133,7 @@ fn image(
 }
 
 fn result(result: BulkResult) -> AddImageResult {
-    let ImageAnswer { image, status, changed } = match result {
+    let (ImageAnswer { image, changed }, new) = match result {
         Ok(answer) => answer,
         Err((id, error)) => {
             let outcome = Some(Outcome::Problem(convert::problem(error)));
@@ -142,7 +142,7 @@ fn result(result: BulkResult) -> AddImageResult {
         }
     };
     let stored = Stored {
-        present: status != ImageStatus::Stored,
+        present: !new,
         digest: image.digest.to_string(),
         width: image.width,
         height: image.height,

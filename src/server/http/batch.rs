@@ -19,7 +19,7 @@ use super::maps::map_name;
 use super::state::AppState;
 use crate::gate::{BodyPaused, GateSettings, Problem, Ready, no_bulk_memory, too_large};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
-use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImageStatus};
+use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta};
 use whereabouts_service::{BulkImage, BulkResult, Deadline, Principal, ServiceError};
 
 /// Largest `meta` of an image, in bytes.
@@ -187,11 +187,8 @@ fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, Servi
 
 fn batch_result(result: BulkResult) -> BatchResult {
     let (id, outcome, changed, problem) = match result {
-        Ok(ImageAnswer { image, status, changed }) => {
-            let outcome = match status {
-                ImageStatus::Stored => BatchOutcome::Stored,
-                ImageStatus::Present | ImageStatus::Updated => BatchOutcome::Present,
-            };
+        Ok((ImageAnswer { image, changed }, new)) => {
+            let outcome = if new { BatchOutcome::Stored } else { BatchOutcome::Present };
             (Some(image.id.into()), outcome, changed, None)
         }
         Err((id, error)) => {

@@ -15,7 +15,7 @@ use super::maps::map_name;
 use super::state::AppState;
 use crate::gate::Problem;
 use crate::gate::Ready;
-use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage, ImagePatch, ImageStatus};
+use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage, ImagePatch};
 use whereabouts_core::{Image, ImageId, MediaType, PoseInput, moment};
 use whereabouts_service::{Deadline, NewImage, ServiceError};
 use whereabouts_vision::{AdmissionRequest, WorkClass};
@@ -131,12 +131,8 @@ pub(super) async fn add_image(
         None => params.into_meta(),
     };
     let new = NewImage { bytes: body.picture, meta, demand };
-    let answer = service.images.add(&map_name(&map)?, new).await?;
-    let status = match answer.status {
-        ImageStatus::Stored => StatusCode::CREATED,
-        ImageStatus::Present | ImageStatus::Updated => StatusCode::OK,
-    };
-    Ok((status, Json(answer)))
+    let (answer, new) = service.images.add(&map_name(&map)?, new).await?;
+    Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(answer)))
 }
 
 /// The form of an upload.
