@@ -137,7 +137,7 @@ pub struct Image {
 
 /// A field of an image that can be changed after the image was stored. Its id, its bytes and its descriptor
 /// cannot.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ImageField {
     /// The pose of the camera.

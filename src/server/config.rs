@@ -240,6 +240,7 @@ impl Config {
             ("localize.k", self.localize.k),
             ("bulk.in_flight", self.bulk.in_flight),
             ("bulk.max_images", self.bulk.max_images),
+            ("bulk.meta_bytes", self.bulk.meta_bytes),
             ("jobs.queue", self.jobs.queue),
             ("jobs.attempts", self.jobs.attempts as usize),
             ("jobs.sweep_s", self.jobs.sweep_s as usize),

@@ -14,7 +14,7 @@ use super::proto::{
 use super::{Api, CallContext, convert, status};
 use whereabouts_api::{ImageAnswer, ImageMeta, ImagePatch, MapChange};
 use whereabouts_core::{ImageField, MapName};
-use whereabouts_service::{BulkImage, BulkResult, ServiceError};
+use whereabouts_service::{BulkImage, BulkItem, BulkResult, ServiceError};
 
 #[tonic::async_trait]
 impl MapService for Api {
@@ -69,7 +69,11 @@ impl MapService for Api {
         let map = context.map(&first.map).map_err(status::of)?;
         context.service.maps.get(&map).await.map_err(status::of)?;
         let images = stream::iter([Ok(first)]).chain(incoming);
-        let images = images.map_ok(|next| image(&map, next, context.budget.take()));
+        let images = images.map_ok(|next| match image(&map, next, context.budget.take()) {
+            Ok(image) => BulkItem::Image(image),
+            Err(error) => BulkItem::Failed(error),
+        });
+        let images = images.enumerate().map(|(number, image)| image.map(|image| (number, image)));
         let until =
             context.service.cancelled_by(&self.readiness, context.caller.clone(), context.deadline);
         let results = context.service.images.add_many(&map, &context.caller, images, until).await?;
@@ -133,22 +137,24 @@ fn image(
 }
 
 fn result(result: BulkResult) -> AddImageResult {
-    let (ImageAnswer { image, changed }, new) = match result {
-        Ok(answer) => answer,
-        Err((id, error)) => {
-            let outcome = Some(Outcome::Problem(convert::problem(error)));
-            let id = id.map(Into::into).unwrap_or_default();
-            return AddImageResult { id, outcome };
+    let problem = |id: String, error: ServiceError| AddImageResult {
+        id,
+        outcome: Some(Outcome::Problem(convert::problem(error))),
+    };
+    match result {
+        BulkResult::Saved(ImageAnswer { image, changed }, new) => {
+            let stored = Stored {
+                present: !new,
+                digest: image.digest.to_string(),
+                width: image.width,
+                height: image.height,
+                changed: names(&changed),
+            };
+            AddImageResult { id: image.id.to_string(), outcome: Some(Outcome::Stored(stored)) }
         }
-    };
-    let stored = Stored {
-        present: !new,
-        digest: image.digest.to_string(),
-        width: image.width,
-        height: image.height,
-        changed: names(&changed),
-    };
-    AddImageResult { id: image.id.to_string(), outcome: Some(Outcome::Stored(stored)) }
+        BulkResult::Failed(id, error) => problem(id.map(Into::into).unwrap_or_default(), error),
+        BulkResult::Skipped(name, why) => problem(name, ServiceError::malformed(why)),
+    }
 }
 
 fn names(fields: &[ImageField]) -> Vec<String> {

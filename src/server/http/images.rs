@@ -12,6 +12,7 @@ use utoipa::IntoParams;
 
 use super::body::{JsonBody, Params, PictureBody, Segments};
 use super::maps::map_name;
+use super::pixels::PixelParams;
 use super::state::AppState;
 use crate::gate::Problem;
 use crate::gate::Ready;
@@ -55,9 +56,23 @@ pub(super) struct MetaParams {
     qz: Option<f64>,
     /// Unit quaternion.
     qw: Option<f64>,
+    /// If the body is pixels without a file format, their layout: `mono8`, `mono16` (little-endian), `rgb8`, `bgr8`,
+    /// `rgba8` or `bgra8`. The picture is stored as PNG.
+    encoding: Option<String>,
+    /// With `encoding`: pixels in a row.
+    width: Option<u32>,
+    /// With `encoding`: number of rows.
+    height: Option<u32>,
+    /// With `encoding`: bytes from one row to the next; by default rows follow each other without padding.
+    step: Option<u64>,
 }
 
 impl MetaParams {
+    fn pixels(&self) -> PixelParams<'_> {
+        let Self { encoding, width, height, step, .. } = self;
+        PixelParams { encoding: encoding.as_deref(), width: *width, height: *height, step: *step }
+    }
+
     fn is_empty(&self) -> bool {
         self.id.is_none()
             && self.captured_at.is_none()
@@ -120,7 +135,8 @@ pub(super) async fn add_image(
     request: Request,
 ) -> Result<(StatusCode, Json<ImageAnswer>), Problem> {
     let demand = AdmissionRequest { class: WorkClass::Index, deadline };
-    let body = PictureBody::read(request, &state, &service, demand).await?;
+    let layout = params.pixels().layout()?;
+    let body = PictureBody::read(request, &state, &service, demand, layout).await?;
     let meta = match body.meta {
         Some(_) if !params.is_empty() => {
             let detail = "describe the image either in the part \"meta\" or in the query string, \

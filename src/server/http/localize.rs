@@ -8,6 +8,7 @@ use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody};
 use super::maps::map_name;
+use super::pixels::PixelParams;
 use super::state::AppState;
 use crate::gate::IdempotencyId;
 use crate::gate::Problem;
@@ -45,6 +46,15 @@ pub(super) struct LocalizeParams {
     /// Metres that the robot has moved since the previous frame, by its odometry, for a frame with
     /// `track`; by default, any distance up to the maximum speed (`track.max_speed_m_s`) is possible.
     moved_m: Option<f64>,
+    /// If the body is pixels without a file format, their layout: `mono8`, `mono16` (little-endian), `rgb8`, `bgr8`,
+    /// `rgba8` or `bgra8`.
+    encoding: Option<String>,
+    /// With `encoding`: pixels in a row.
+    width: Option<u32>,
+    /// With `encoding`: number of rows.
+    height: Option<u32>,
+    /// With `encoding`: bytes from one row to the next; by default rows follow each other without padding.
+    step: Option<u64>,
 }
 
 impl LocalizeParams {
@@ -109,7 +119,10 @@ pub(super) async fn localize(
     let map = map_name(&params.map)?;
     let track = params.step(&caller)?;
     let demand = AdmissionRequest { class: WorkClass::Localize, deadline };
-    let body = PictureBody::read(request, &state, &service, demand).await?;
+    let LocalizeParams { width, height, step, .. } = params;
+    let pixels = PixelParams { encoding: params.encoding.as_deref(), width, height, step };
+    let layout = pixels.layout()?;
+    let body = PictureBody::read(request, &state, &service, demand, layout).await?;
     let request = LocalizeRequest {
         map,
         k: params.k,

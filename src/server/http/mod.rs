@@ -11,6 +11,7 @@ mod jobs;
 mod keys;
 mod localize;
 mod maps;
+mod pixels;
 mod state;
 mod status;
 mod transfer;
