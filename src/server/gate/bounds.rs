@@ -55,7 +55,7 @@ pub(super) async fn bound(State(gate): State<Gate>, mut request: Request, next: 
     }
     let wait = match deadline::requested(request.headers()) {
         Ok(wait) => wait,
-        Err(problem) => return problem.into_response(),
+        Err(problem) => return refuse(request, problem),
     };
     request.extensions_mut().insert(Deadline(wait.map(|wait| arrival + wait)));
     let watch = BodyWatch::default();

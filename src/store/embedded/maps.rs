@@ -1,6 +1,5 @@
 //! Maps and images. Every change goes through the writer thread; reads bypass it.
 
-use std::path::Path;
 use std::sync::Arc;
 
 use async_trait::async_trait;
@@ -10,8 +9,9 @@ use uuid::Uuid;
 
 use super::super::changes::{MapContent, changed_map, check_dim, check_frame, removed, same_bytes};
 use super::super::{Added, BlobPin, BlobStore, HardNegatives, IndexState, MapStore, StoreError};
-use super::blobs::Blobs;
+use super::corrections::content;
 use super::live_map::{LiveMap, folder_of};
+use super::orphans::{remove_folder, sweep};
 use super::trees::{
     BlobOwner, StoredImage, Trees, blob_ref_key, decode, encode, failed, get, image_key, put,
     transaction_failed,
@@ -22,9 +22,6 @@ use whereabouts_core::{
     Pose,
 };
 use whereabouts_index::SearchMode;
-
-/// Images removed in one transaction when a map is deleted.
-const SWEEP_BATCH: usize = 256;
 
 impl Inner {
     /// Returns the loaded map, whatever its revision.
@@ -54,19 +51,6 @@ impl Inner {
         let drafts = self.drafts.read();
         if let Some(draft) = drafts.get(&map.uid) {
             draft.withdraw(slot);
-        }
-    }
-
-    /// Makes the changed pose of an image visible, also in the map's draft. Call it on the writer thread.
-    fn publish_pose(&self, map_uid: Uuid, stored: &StoredImage) {
-        let maps = self.maps.read();
-        if let Some(live) = maps.values().find(|live| live.map().uid == map_uid) {
-            live.move_image(stored);
-        }
-        drop(maps);
-        let drafts = self.drafts.read();
-        if let Some(draft) = drafts.get(&map_uid) {
-            draft.move_image(stored);
         }
     }
 
@@ -206,32 +190,7 @@ impl MapStore for EmbeddedStore {
         current: &Image,
         next: Image,
     ) -> Result<bool, StoreError> {
-        self.inner.live(map)?;
-        let (map, uid, current) = (map.clone(), map.uid, current.clone());
-        let inner = Arc::clone(&self.inner);
-        let replaced = self
-            .inner
-            .writer
-            .commit(
-                move |trees, _| {
-                    check_frame(&stored_map(trees, &map)?, &next)?;
-                    let Some(stored) = trees.image(uid, &current.id)? else { return Ok(None) };
-                    if stored.image != current {
-                        return Ok(None);
-                    }
-                    let moved = current.pose != next.pose;
-                    let stored = StoredImage { image: next, slot: stored.slot };
-                    replace_record(trees, uid, &stored, moved)?;
-                    Ok(Some((stored, moved)))
-                },
-                move |replaced| {
-                    if let Some((stored, true)) = replaced {
-                        inner.publish_pose(uid, stored);
-                    }
-                },
-            )
-            .await?;
-        Ok(replaced.is_some())
+        self.inner.replace_image(map, current, next).await
     }
 
     async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
@@ -346,20 +305,8 @@ impl BlobStore for EmbeddedStore {
     }
 }
 
-/// Returns what a map contains.
-fn content(trees: &Trees, uid: Uuid) -> Result<MapContent, StoreError> {
-    let mut content = MapContent::Empty;
-    for stored in trees.images_of(uid) {
-        if stored?.image.pose.is_some() {
-            return Ok(MapContent::WithPoses);
-        }
-        content = MapContent::WithoutPoses;
-    }
-    Ok(content)
-}
-
 /// Returns the stored map, whatever its revision.
-fn stored_map(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
+pub(super) fn stored_map(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
     let stored: Option<Map> = get(&trees.maps, map.name.as_str().as_bytes())?;
     stored.filter(|stored| stored.uid == map.uid).ok_or_else(|| removed(map))
 }
@@ -371,27 +318,6 @@ pub(super) fn check_revision(trees: &Trees, map: &Map) -> Result<Map, StoreError
         true => Ok(stored),
         false => Err(StoreError::Superseded(stored.name)),
     }
-}
-
-/// Replaces the record of an image, whose bytes stay the same, and counts a changed pose.
-fn replace_record(
-    trees: &Trees,
-    uid: Uuid,
-    stored: &StoredImage,
-    moved: bool,
-) -> Result<(), StoreError> {
-    let key = image_key(uid, &stored.image.id);
-    let value = encode(stored)?;
-    let count = encode(&(trees.moved(uid)? + u64::from(moved)))?;
-    (&trees.images, &trees.moves)
-        .transaction(|(images, moves)| {
-            images.insert(key.as_slice(), value.as_slice())?;
-            if moved {
-                moves.insert(uid.as_bytes().as_slice(), count.as_slice())?;
-            }
-            Ok(())
-        })
-        .map_err(transaction_failed)
 }
 
 fn insert_image(trees: &Trees, uid: Uuid, stored: &StoredImage) -> Result<(), StoreError> {
@@ -408,7 +334,11 @@ fn insert_image(trees: &Trees, uid: Uuid, stored: &StoredImage) -> Result<(), St
         .map_err(transaction_failed)
 }
 
-fn remove_images(trees: &Trees, uid: Uuid, stored: &[StoredImage]) -> Result<(), StoreError> {
+pub(super) fn remove_images(
+    trees: &Trees,
+    uid: Uuid,
+    stored: &[StoredImage],
+) -> Result<(), StoreError> {
     (&trees.images, &trees.blob_refs)
         .transaction(|(images, refs)| {
             for StoredImage { image, .. } in stored {
@@ -419,64 +349,4 @@ fn remove_images(trees: &Trees, uid: Uuid, stored: &[StoredImage]) -> Result<(),
             Ok(())
         })
         .map_err(transaction_failed)
-}
-
-/// Removes orphans: images and descriptor folders of deleted maps, left by a process that ended before
-/// it had removed them.
-pub(super) fn collect_orphans(
-    trees: &Trees,
-    blobs: &Blobs,
-    descriptors: &Path,
-) -> Result<(), StoreError> {
-    let maps = trees.maps()?;
-    let known: Vec<Uuid> = maps.iter().map(|map| map.uid).collect();
-    let mut at = Uuid::nil();
-    while let Some(entry) = trees.images.range(at.as_bytes().to_vec()..).next() {
-        let (key, _) = entry.map_err(failed)?;
-        let Some(uid) = key.get(..16).and_then(|uid| Uuid::from_slice(uid).ok()) else { break };
-        if !known.contains(&uid) {
-            sweep(uid, trees, blobs)?;
-        }
-        match uid.as_u128().checked_add(1) {
-            Some(next) => at = Uuid::from_u128(next),
-            None => break,
-        }
-    }
-    // Folders are left by deleted maps, by a map whose model changed while it was empty, and by a
-    // reindex that did not finish.
-    let in_use: Vec<_> = maps.iter().map(|map| folder_of(map, descriptors)).collect();
-    for folder in std::fs::read_dir(descriptors).into_iter().flatten().flatten() {
-        if !in_use.contains(&folder.path()) {
-            remove_folder(&folder.path());
-        }
-    }
-    trees.flush()
-}
-
-/// Removes the frames, images, references and bytes of a deleted map.
-fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs) -> Result<(), StoreError> {
-    trees.forget_frames(uid)?;
-    trees.moves.remove(uid.as_bytes()).map_err(failed)?;
-    loop {
-        let batch: Vec<StoredImage> =
-            trees.images_of(uid).take(SWEEP_BATCH).collect::<Result<_, _>>()?;
-        if batch.is_empty() {
-            break;
-        }
-        remove_images(trees, uid, &batch)?;
-        trees.flush()?;
-        for stored in &batch {
-            blobs.remove_unreferenced(&stored.image.digest, trees);
-        }
-    }
-    Ok(())
-}
-
-/// Removes a folder of descriptors. One that cannot be removed is harmless and only takes up space.
-pub(super) fn remove_folder(folder: &Path) {
-    if let Err(error) = std::fs::remove_dir_all(folder)
-        && error.kind() != std::io::ErrorKind::NotFound
-    {
-        tracing::warn!(folder = %folder.display(), %error, "cannot remove old descriptors");
-    }
 }
