@@ -11,7 +11,6 @@
 )]
 
 mod archives;
-mod archives;
 mod backup;
 mod bad_input;
 mod batch;

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use sled::Transactional;
 use uuid::Uuid;
 
-use super::super::changes::{MapContent, changed_map, check_dim, check_frame, removed, same_bytes};
+use super::super::changes::{changed_map, check_dim, check_frame, removed, same_bytes};
 use super::super::{Added, BlobPin, BlobStore, HardNegatives, IndexState, MapStore, StoreError};
 use super::corrections::content;
 use super::live_map::{LiveMap, folder_of};
