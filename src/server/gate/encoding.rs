@@ -72,8 +72,14 @@ fn body_of(body: Body, encoding: Encoding) -> Body {
         Encoding::Gzip => Decoder::Gzip(Box::new(MultiGzDecoder::new(Vec::new()))),
         Encoding::Deflate => Decoder::Deflate(Box::new(ZlibDecoder::new(Vec::new()))),
     };
-    let expanding =
-        Expanding { body: body.into_data_stream(), input: Bytes::new(), decoder, read: 0, made: 0 };
+    let expanding = Expanding {
+        body: body.into_data_stream(),
+        input: Bytes::new(),
+        decoder,
+        ended: false,
+        read: 0,
+        made: 0,
+    };
     Body::from_stream(stream::unfold(Some(expanding), |expanding| async {
         let mut expanding = expanding?;
         match expanding.next().await? {
@@ -117,6 +123,8 @@ struct Expanding {
     /// Compressed bytes that have arrived.
     input: Bytes,
     decoder: Decoder,
+    /// Whether the compressed body has ended.
+    ended: bool,
     /// Compressed bytes so far.
     read: u64,
     /// Expanded bytes so far.
@@ -126,11 +134,15 @@ struct Expanding {
 impl Expanding {
     async fn next(&mut self) -> Option<Result<Bytes, axum::Error>> {
         loop {
+            if self.ended {
+                return None;
+            }
             if self.input.is_empty() {
                 match self.body.next().await {
                     Some(Ok(chunk)) => self.input = chunk,
                     Some(Err(error)) => return Some(Err(error)),
                     None => {
+                        self.ended = true;
                         let ended = self.decoder.finish().map_err(damaged);
                         let rest = self.decoder.take();
                         return match ended {
@@ -188,7 +200,11 @@ mod tests {
     }
 
     async fn read(chunks: Vec<Vec<u8>>, encoding: Encoding) -> Result<Vec<u8>, String> {
-        let chunks = stream::iter(chunks.into_iter().map(Ok::<_, axum::Error>));
+        // A stream that panics when it is polled after its end, as bodies may.
+        let chunks = stream::unfold(chunks.into_iter(), |mut chunks| async {
+            let next = chunks.next()?;
+            Some((Ok::<_, axum::Error>(next), chunks))
+        });
         let mut body = body_of(Body::from_stream(chunks), encoding).into_data_stream();
         let mut whole = Vec::new();
         while let Some(chunk) = body.next().await {
