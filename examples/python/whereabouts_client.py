@@ -126,7 +126,7 @@ class ImageAnswer(Image):
     """An image as it is stored now, and what the call changed of it."""
 
     changed: tuple[Literal["pose", "captured_at", "tags"], ...] = ()
-    """Fields of an image stored before that the call changed. Empty if the image is new or stayed as it was."""
+    """Fields of an image stored before that the call changed; empty if it is new or stayed as it was."""
 
 
 class Keep:
@@ -466,8 +466,8 @@ class Whereabouts:
     ) -> ImageAnswer:
         """Adds an image to a map. Repeating an id is allowed with the same bytes, and 409 with others.
 
-        Repeated with another pose, time or tags, it changes those: see `changed` of the answer. What is omitted
-        keeps its value.
+        Repeated with another pose, time or tags, it changes those: see `changed` of the answer. What is
+        omitted keeps its value.
         """
         name, data, media_type = _load(picture)
         meta = _given(
