@@ -234,6 +234,7 @@ impl Config {
             ("model.download_stall_s", self.model.download_stall_s as usize),
             ("bulk.in_flight", self.bulk.in_flight),
             ("bulk.max_images", self.bulk.max_images),
+            ("bulk.meta_bytes", self.bulk.meta_bytes),
             ("refine.candidates", self.refine.candidates),
             ("refine.local_candidates", self.refine.local_candidates),
         ];

@@ -1,7 +1,8 @@
 //! Bulk uploads: stores a stream of images, several at a time. How a request is split into images is for the
 //! server.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -10,10 +11,10 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
 
+use super::images::StatedMeta;
 use super::{Images, NewImage, Principal, ServiceError};
-use whereabouts_api::{ErrorKind, ImageMeta};
-use whereabouts_core::{ImageId, MapName};
-use whereabouts_store::Added;
+use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta};
+use whereabouts_core::{Image, ImageId, MapName};
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 /// Bounds of bulk uploads.
@@ -28,6 +29,8 @@ pub struct BulkSettings {
     pub max_images: usize,
     /// Memory budget for the images of all uploads, in bytes.
     pub memory_bytes: usize,
+    /// Maximum size of the descriptions of one archive whose pictures have not arrived, in bytes.
+    pub meta_bytes: usize,
 }
 
 /// An image of an upload.
@@ -41,76 +44,211 @@ pub struct BulkImage {
     pub memory: Option<OwnedSemaphorePermit>,
 }
 
-/// The result of one image of an upload: the stored image, or the id that the caller gave it, if any, and the
-/// error.
-pub type BulkResult = Result<Added, (Option<ImageId>, ServiceError)>;
+/// A part of an upload.
+#[derive(Debug)]
+pub enum BulkItem {
+    /// An image to store.
+    Image(BulkImage),
+    /// The id, pose, time and tags of an image that came before it, or why they cannot be read. They replace those
+    /// that the image came with.
+    Meta(Result<ImageMeta, ServiceError>),
+    /// Something that is not an image, its name, and why it is skipped.
+    Skipped(String, &'static str),
+    /// Something that cannot be stored.
+    Failed(ServiceError),
+}
+
+/// The result of one image of an upload.
+#[derive(Debug)]
+pub enum BulkResult {
+    /// The stored image, and whether it is new.
+    Saved(ImageAnswer, bool),
+    /// The name of something that is not an image, and why it was skipped.
+    Skipped(String, &'static str),
+    /// The id that the caller gave the image, if any, and the error.
+    Failed(Option<ImageId>, ServiceError),
+}
+
+/// Results of earlier images of an upload, by the number of their item.
+type Earlier = HashMap<usize, Arc<OnceLock<SavedImage>>>;
+
+/// An image that an upload has stored.
+#[derive(Debug, Clone)]
+struct SavedImage {
+    answer: ImageAnswer,
+    is_new: bool,
+}
 
 impl Images {
-    /// Stores images as they arrive and returns their results in the same order. The error of one image does not
-    /// affect the others. The upload ends with the first image over the maximum, with an error of the stream, or
-    /// when `until` ends; images that were read before that are still stored.
+    /// Stores images as they arrive, each item with its number, and returns the results in the order of the numbers.
+    /// A [`BulkItem::Meta`] has the number of the image that it describes, and changes the result of that image. The
+    /// error of one image does not affect the others. The upload ends with the first item over the maximum, with an
+    /// error of the stream, or when `until` ends; images that were read before that are still stored.
     pub async fn add_many<E, O>(
         &self,
         map: &MapName,
         caller: &Principal,
-        images: impl Stream<Item = Result<Result<BulkImage, ServiceError>, E>> + Send,
+        items: impl Stream<Item = Result<(usize, BulkItem), E>> + Send,
         until: impl Future<Output = O> + Send,
     ) -> Result<Vec<BulkResult>, E> {
         let BulkSettings { in_flight, max_images, .. } = self.bulk;
         let mut stream_error = None;
-        // The last image so far of each id, and when it is done: images of one id are stored in order, so that
-        // the first wins.
+        // When the last item so far of each image and of each id is done: items of one image or id are processed in
+        // order, so that the first picture wins, and a description finds its image.
         let mut last_of: HashMap<ImageId, CancellationToken> = HashMap::new();
-        let until_error = images.scan((), |(), next| {
+        let mut done_of: HashMap<usize, CancellationToken> = HashMap::new();
+        let mut earlier = Earlier::new();
+        let (mut taken, mut counted) = (0, 0);
+        let until_error = items.scan((), |(), next| {
             future::ready(next.map_err(|error| stream_error = Some(error)).ok())
         });
-        let results = until_error
+        let results: Vec<(usize, Option<BulkResult>)> = until_error
             .take_until(Box::pin(until))
-            .take(max_images + 1)
-            .enumerate()
-            .map(|(index, image)| (index, self.checked(index, image)))
-            .map(|(index, image)| {
+            .take_while(|(_, item)| {
+                let is_within = taken <= max_images;
+                taken += usize::from(!matches!(item, BulkItem::Meta(_)));
+                future::ready(is_within)
+            })
+            .map(|(number, item)| {
+                let index = counted;
+                counted += usize::from(!matches!(item, BulkItem::Meta(_)));
+                let item = self.checked(index, item);
+                let saved = Arc::clone(earlier.entry(number).or_default());
                 let done = CancellationToken::new();
-                let id = image.as_ref().ok().and_then(|(_, id)| id.clone());
-                let before = id.and_then(|id| last_of.insert(id, done.clone()));
+                let id = item.as_ref().ok().and_then(|(_, id)| id.clone());
+                let of_id = id.and_then(|id| last_of.insert(id, done.clone()));
+                let of_image = done_of.insert(number, done.clone());
                 async move {
                     let _done = done.drop_guard();
-                    if let Some(before) = before {
+                    for before in [of_id, of_image].into_iter().flatten() {
                         before.cancelled().await;
                     }
-                    let (image, id) = image?;
-                    // Each image counts as a request of the key; the first was counted with the upload.
-                    if index > 0 {
-                        let counted = self.keys.limits.take_extra_request(caller).await;
-                        counted.map_err(|error| (id.clone(), error))?;
-                    }
-                    self.add_when_admitted(map, image).await.map_err(|error| (id, error))
+                    let result = match item {
+                        Ok((item, id)) => self.process(map, caller, index, item, id, &saved).await,
+                        Err(failed) => Some(failed),
+                    };
+                    (number, result)
                 }
             })
             .buffered(in_flight)
             .collect()
             .await;
-        stream_error.map_or(Ok(results), Err)
+        match stream_error {
+            Some(error) => Err(error),
+            None => {
+                // A description comes after its image, and its result replaces that of the image.
+                let results = results.into_iter().filter_map(|(at, result)| Some((at, result?)));
+                Ok(results.collect::<BTreeMap<_, _>>().into_values().collect())
+            }
+        }
     }
 
     /// Parses the id that the caller gave an image, and enforces the maximum number of images.
     fn checked(
         &self,
         index: usize,
-        image: Result<BulkImage, ServiceError>,
-    ) -> Result<(BulkImage, Option<ImageId>), (Option<ImageId>, ServiceError)> {
-        let image = image.map_err(|error| (None, error))?;
-        let id = image.meta.id.as_deref().map(str::parse::<ImageId>).transpose();
-        let id = id.map_err(|error| (None, error.into()))?;
+        item: BulkItem,
+    ) -> Result<(BulkItem, Option<ImageId>), BulkResult> {
+        let given = match &item {
+            BulkItem::Image(BulkImage { meta, .. }) | BulkItem::Meta(Ok(meta)) => {
+                meta.id.as_deref()
+            }
+            _ => None,
+        };
+        let id = given.map(str::parse::<ImageId>).transpose();
         let max_images = self.bulk.max_images;
-        if index >= max_images {
-            let detail = format!(
-                "an upload has at most {max_images} images (bulk.max_images); send this one and the rest in \
-                 another upload"
-            );
-            return Err((id, ServiceError::new(ErrorKind::TooLarge, detail)));
+        match (id, &item) {
+            (Err(error), BulkItem::Meta(_)) => Ok((BulkItem::Meta(Err(error.into())), None)),
+            (Err(error), _) => Err(BulkResult::Failed(None, error.into())),
+            (Ok(id), BulkItem::Meta(_)) => Ok((item, id)),
+            (Ok(id), _) if index >= max_images => {
+                let detail = format!(
+                    "an upload has at most {max_images} images (bulk.max_images); send this one and the rest in \
+                     another upload"
+                );
+                Err(BulkResult::Failed(id, ServiceError::new(ErrorKind::TooLarge, detail)))
+            }
+            (Ok(id), _) => Ok((item, id)),
         }
-        Ok((image, id))
+    }
+
+    /// Processes an item. Returns `None` if the result of its image stays as it is.
+    async fn process(
+        &self,
+        map: &MapName,
+        caller: &Principal,
+        index: usize,
+        item: BulkItem,
+        id: Option<ImageId>,
+        saved: &OnceLock<SavedImage>,
+    ) -> Option<BulkResult> {
+        let result = match item {
+            BulkItem::Skipped(name, why) => return Some(BulkResult::Skipped(name, why)),
+            BulkItem::Failed(error) => return Some(BulkResult::Failed(None, error)),
+            BulkItem::Meta(meta) => self.describe(map, saved.get()?.clone(), meta).await,
+            BulkItem::Image(image) => {
+                // Each image counts as a request of the key; the first was counted with the upload.
+                let within_limit = match index {
+                    0 => Ok(()),
+                    _ => self.keys.limits.take_extra_request(caller).await,
+                };
+                match within_limit {
+                    Ok(()) => self.add_when_admitted(map, image).await,
+                    Err(error) => Err(error),
+                }
+            }
+        };
+        Some(match result {
+            Ok((answer, is_new)) => {
+                let _ = saved.set(SavedImage { answer: answer.clone(), is_new });
+                BulkResult::Saved(answer, is_new)
+            }
+            Err(error) => BulkResult::Failed(id, error),
+        })
+    }
+
+    /// Gives an image of this upload the id, pose, time and tags that came after it, so that the result is the same
+    /// as if they had come before it: an image that they do not allow is removed again if it is new.
+    async fn describe(
+        &self,
+        map: &MapName,
+        saved: SavedImage,
+        meta: Result<ImageMeta, ServiceError>,
+    ) -> Result<(ImageAnswer, bool), ServiceError> {
+        let SavedImage { answer: ImageAnswer { image, changed }, is_new } = saved;
+        let described = self.described(map, &image, meta).await;
+        let moved = described.as_ref().is_ok_and(|(other, _)| other.image.id != image.id);
+        if is_new && (described.is_err() || moved) {
+            self.delete(map, &image.id).await?;
+        }
+        let (mut answer, is_other_new) = described?;
+        if moved {
+            return Ok((answer, is_other_new));
+        }
+        if is_new {
+            answer.changed = Vec::new();
+        } else {
+            answer.changed.extend(changed);
+            answer.changed.sort();
+            answer.changed.dedup();
+        }
+        Ok((answer, is_new))
+    }
+
+    async fn described(
+        &self,
+        map: &MapName,
+        image: &Image,
+        meta: Result<ImageMeta, ServiceError>,
+    ) -> Result<(ImageAnswer, bool), ServiceError> {
+        let meta = meta?;
+        let stated = StatedMeta::new(meta.clone())?;
+        if stated.id.as_ref().is_none_or(|id| *id == image.id) {
+            return Ok((self.restate(map, &image.id, &stated).await?, false));
+        }
+        // It came under the name of its file, and is to have another id.
+        let (_, bytes) = self.content(map, &image.id, None).await?;
+        self.add_when_admitted(map, BulkImage { bytes, meta, memory: None }).await
     }
 
     /// Stores an image, and retries while the admission queue is full.
@@ -118,7 +256,7 @@ impl Images {
         &self,
         map: &MapName,
         image: BulkImage,
-    ) -> Result<Added, ServiceError> {
+    ) -> Result<(ImageAnswer, bool), ServiceError> {
         const MAX_PAUSE: Duration = Duration::from_secs(1);
         let demand = AdmissionRequest { class: WorkClass::Index, deadline: None };
         let until = Instant::now() + Duration::from_secs(self.bulk.patience_s);

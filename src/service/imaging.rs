@@ -10,7 +10,7 @@ use whereabouts_core::{DescriptorKind, MediaType};
 use whereabouts_store::MapStore;
 use whereabouts_vision::{
     Admission, AdmissionRequest, CpuPool, ExtractError, Extraction, Extractor, FeatureSet,
-    LoadedModels, Manifest, Permit, PoolError, Rejected, WorkClass, decode, preprocess,
+    LoadedModels, Manifest, Permit, PoolError, RawPixels, Rejected, WorkClass, decode, preprocess,
 };
 
 use super::models::unusable;
@@ -70,6 +70,20 @@ impl Imaging {
         let extraction = self.on_pool(decode).await?.result().await?;
         permit.complete();
         Ok(extraction)
+    }
+
+    /// Returns pixels without a file format as PNG.
+    pub async fn png_of(&self, raw: RawPixels, bytes: Bytes) -> Result<Bytes, ServiceError> {
+        let limits = self.models.limits();
+        let png = self.pool.run(move || raw.to_png(&bytes, limits)).await;
+        match png {
+            Ok(Ok(png)) => Ok(png.into()),
+            Ok(Err(error)) => Err(ServiceError::unprocessable(error.to_string())),
+            Err(PoolError::Overloaded(overloaded)) => Err(overloaded.into()),
+            Err(error @ PoolError::Aborted) => {
+                Err(ServiceError::new(ErrorKind::Internal, error.to_string()))
+            }
+        }
     }
 
     /// Returns a picture as it was uploaded, or as a JPEG whose longer edge is at most `max_edge` pixels.

@@ -5,6 +5,7 @@
 mod bulk;
 mod calibration;
 mod cancellation;
+mod corrections;
 mod error;
 mod events;
 mod idempotency;
@@ -36,7 +37,7 @@ use std::time::Duration;
 use tokio::sync::Semaphore;
 use uuid::Uuid;
 
-pub use self::bulk::{BulkImage, BulkResult, BulkSettings};
+pub use self::bulk::{BulkImage, BulkItem, BulkResult, BulkSettings};
 pub use self::calibration::{Calibrator, ConfidenceSettings};
 pub use self::cancellation::Deadline;
 pub use self::error::ServiceError;

@@ -10,12 +10,14 @@
     reason = "clippy lets tests do this, but not what tests call"
 )]
 
+mod archives;
 mod backup;
 mod bad_input;
 mod batch;
 mod cli;
 mod confidence;
 mod console;
+mod content;
 mod durability;
 mod embedded_only;
 mod events;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use super::ledger::{Fact, Key, Ledger, Picture};
+use super::ledger::{Fact, Key, Ledger, Stored};
 use super::support::{frame, reference};
 
 /// A seeded random number generator: SplitMix64 (Steele, Lea and Flood, 2014).
@@ -77,11 +77,12 @@ impl Client {
 
     async fn step(&mut self, url: &str) -> Result<(), Killed> {
         let map = self.maps()[usize::from(self.random.below(3) == 0)].clone();
-        match self.random.below(20) {
+        match self.random.below(23) {
             0..=11 => self.add(url, &map).await,
             12..=14 => self.delete(url).await,
             15 => self.replace(url).await,
             16..=18 => self.localize(url).await,
+            19..=21 => self.correct(url).await,
             _ => self.delete_map(url).await,
         }
     }
@@ -100,9 +101,9 @@ impl Client {
         send(request, &[200, 201]).await.map(drop)
     }
 
-    async fn put_image(&mut self, url: &str, key: &Key, picture: Picture) -> Result<(), Killed> {
+    async fn put_image(&mut self, url: &str, key: &Key, picture: usize) -> Result<(), Killed> {
         let (map, id) = key;
-        self.ledger.begin(key, Some(picture));
+        self.ledger.begin(key, Some(Stored { picture, pose: 0 }));
         let request = self
             .http
             .post(format!("{url}/maps/{map}/images?id={id}"))
@@ -114,7 +115,7 @@ impl Client {
     }
 
     async fn delete(&mut self, url: &str) -> Result<(), Killed> {
-        let Some(key) = self.ledger.some_present(&mut self.random) else { return Ok(()) };
+        let Some((key, _)) = self.ledger.some_present(&mut self.random) else { return Ok(()) };
         self.delete_image(url, &key).await
     }
 
@@ -128,10 +129,24 @@ impl Client {
 
     /// Another picture under the same id.
     async fn replace(&mut self, url: &str) -> Result<(), Killed> {
-        let Some(key) = self.ledger.some_present(&mut self.random) else { return Ok(()) };
+        let Some((key, _)) = self.ledger.some_present(&mut self.random) else { return Ok(()) };
         let picture = self.random.below(self.pictures.images.len());
         self.delete_image(url, &key).await?;
         self.put_image(url, &key, picture).await
+    }
+
+    /// Another pose of the same image.
+    async fn correct(&mut self, url: &str) -> Result<(), Killed> {
+        let present = self.ledger.some_present(&mut self.random);
+        let Some((key, stored)) = present else { return Ok(()) };
+        let next = Stored { pose: stored.pose + 1, ..stored };
+        self.ledger.begin(&key, Some(next));
+        let (map, id) = &key;
+        let body = serde_json::json!({"pose": {"lat": latitude(next.pose), "lon": 0}});
+        let request = self.http.patch(format!("{url}/maps/{map}/images/{id}")).json(&body);
+        send(request, &[200]).await?;
+        self.ledger.acknowledged(&key);
+        Ok(())
     }
 
     async fn localize(&mut self, url: &str) -> Result<(), Killed> {
@@ -148,11 +163,13 @@ impl Client {
             let id = candidate["image_id"].as_str().unwrap();
             let key = (map.clone(), id.to_owned());
             // A client knows which of its own images exist.
-            let own = id.starts_with(&format!("c{}-", self.number));
-            assert!(
-                !own || matches!(self.ledger.images.get(&key), Some(Fact::Acknowledged(Some(_)))),
-                "{key:?} was found after it had been deleted"
-            );
+            if !id.starts_with(&format!("c{}-", self.number)) {
+                continue;
+            }
+            let Some(Fact::Acknowledged(Some(stored))) = self.ledger.images.get(&key) else {
+                panic!("{key:?} was found after it had been deleted")
+            };
+            assert_eq!(pose_of(candidate), stored.pose, "{key:?} was found with another pose");
         }
         if let Some(id) = answer["job"]["id"].as_str() {
             self.ledger.jobs.push(id.to_owned());
@@ -168,6 +185,16 @@ impl Client {
         self.ledger.images.retain(|_, fact| *fact != Fact::Acknowledged(None));
         Ok(())
     }
+}
+
+/// The latitude that stands for the pose of this number.
+fn latitude(pose: u32) -> f64 {
+    f64::from(pose) / 1024.0
+}
+
+/// The number of the pose of an image or a candidate; 0 without a pose.
+pub fn pose_of(image: &Value) -> u32 {
+    image["pose"]["lat"].as_f64().map_or(0, |latitude| (latitude * 1024.0) as u32)
 }
 
 /// Sends a request; returns its response, which must have one of these statuses.

@@ -10,8 +10,8 @@ use serde_json::Value;
 use tempfile::TempDir;
 use whereabouts_core::Digest;
 
-use super::clients::{Client, Pictures, Random};
-use super::ledger::{Key, Picture};
+use super::clients::{Client, Pictures, Random, pose_of};
+use super::ledger::{Key, Stored};
 use super::support::{BINARY, Server};
 use super::wait::until;
 
@@ -52,7 +52,7 @@ struct Driver {
     dir: TempDir,
     random: Random,
     pictures: Arc<Pictures>,
-    numbers: BTreeMap<String, Picture>,
+    numbers: BTreeMap<String, usize>,
     clients: Vec<Client>,
     slowest: Duration,
 }
@@ -137,7 +137,7 @@ impl Driver {
         let keys: Vec<&Key> = found.keys().collect();
         for _ in 0..closely.min(keys.len()) {
             let key = keys[self.random.below(keys.len())];
-            self.look_closely(server, key, found[key]).await;
+            self.look_closely(server, key, found[key].picture).await;
         }
         for client in &self.clients {
             for id in client.ledger.jobs.iter().rev().take(closely) {
@@ -147,7 +147,7 @@ impl Driver {
     }
 
     /// All images that the server lists.
-    async fn found(&self, server: &Server) -> BTreeMap<Key, Picture> {
+    async fn found(&self, server: &Server) -> BTreeMap<Key, Stored> {
         let mut found = BTreeMap::new();
         for map in server.get("/maps").await.expect(200)["maps"].as_array().unwrap() {
             let map = map["name"].as_str().unwrap();
@@ -157,7 +157,8 @@ impl Driver {
                 for image in page["images"].as_array().unwrap() {
                     let id = image["id"].as_str().unwrap().to_owned();
                     let digest = image["digest"].as_str().unwrap();
-                    found.insert((map.to_owned(), id), self.numbers[digest]);
+                    let stored = Stored { picture: self.numbers[digest], pose: pose_of(image) };
+                    found.insert((map.to_owned(), id), stored);
                 }
                 let Some(cursor) = page["next_cursor"].as_str() else { break };
                 path = format!("/maps/{map}/images?limit=1000&cursor={cursor}");
@@ -167,7 +168,7 @@ impl Driver {
     }
 
     /// Asserts that the bytes of an image are there and that it is found by them.
-    async fn look_closely(&self, server: &Server, key: &Key, picture: Picture) {
+    async fn look_closely(&self, server: &Server, key: &Key, picture: usize) {
         let (map, id) = key;
         let bytes = &self.pictures.images[picture];
         let content = server.get(&format!("/maps/{map}/images/{id}/content")).await;

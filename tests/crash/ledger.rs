@@ -7,20 +7,26 @@ use super::clients::Random;
 /// A map and an image in it.
 pub type Key = (String, String);
 
-/// Bytes of an image: the number of a picture.
-pub type Picture = usize;
+/// What is stored of an image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stored {
+    /// The number of its picture.
+    pub picture: usize,
+    /// How often its pose was corrected, which is also the pose; 0 without a pose.
+    pub pose: u32,
+}
 
 /// What is known of one image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fact {
-    /// Acknowledged: the image has this picture, or does not exist.
-    Acknowledged(Option<Picture>),
+    /// Acknowledged: the image is this, or does not exist.
+    Acknowledged(Option<Stored>),
     /// A change was in flight at the kill: it may have been made or not.
-    Either(Option<Picture>, Option<Picture>),
+    Either(Option<Stored>, Option<Stored>),
 }
 
 impl Fact {
-    pub fn allows(self, found: Option<Picture>) -> bool {
+    pub fn allows(self, found: Option<Stored>) -> bool {
         match self {
             Self::Acknowledged(picture) => picture == found,
             Self::Either(before, after) => found == before || found == after,
@@ -38,19 +44,18 @@ pub struct Ledger {
 }
 
 impl Ledger {
-    /// An image that certainly exists.
-    pub fn some_present(&self, random: &mut Random) -> Option<Key> {
-        let present: Vec<&Key> = self
-            .images
-            .iter()
-            .filter(|(_, fact)| matches!(fact, Fact::Acknowledged(Some(_))))
-            .map(|(key, _)| key)
-            .collect();
+    /// An image that certainly exists, and what is stored of it.
+    pub fn some_present(&self, random: &mut Random) -> Option<(Key, Stored)> {
+        let stored = |(key, fact): (&Key, &Fact)| match fact {
+            Fact::Acknowledged(Some(stored)) => Some((key.clone(), *stored)),
+            _ => None,
+        };
+        let present: Vec<_> = self.images.iter().filter_map(stored).collect();
         (!present.is_empty()).then(|| present[random.below(present.len())].clone())
     }
 
     /// Records that a change begins: until it is acknowledged, both states are possible.
-    pub fn begin(&mut self, key: &Key, after: Option<Picture>) {
+    pub fn begin(&mut self, key: &Key, after: Option<Stored>) {
         let before = match self.images.get(key) {
             None => None,
             Some(Fact::Acknowledged(picture)) => *picture,
@@ -79,7 +84,7 @@ impl Ledger {
     }
 
     /// After a restart: asserts that the state found is possible, and records it.
-    pub fn settle(&mut self, found: &BTreeMap<Key, Picture>) {
+    pub fn settle(&mut self, found: &BTreeMap<Key, Stored>) {
         for (key, fact) in &mut self.images {
             let found = found.get(key).copied();
             assert!(fact.allows(found), "{key:?}: {found:?} was found, but {fact:?} was recorded");

@@ -12,13 +12,13 @@ use axum::response::{IntoResponse, Response};
 use http_body_util::BodyExt;
 use tokio::time::timeout;
 
-use super::body::{closing, refuse, too_large};
+use super::body::{closing, drained, refuse, too_large};
 use super::body_budget::BodyBudget;
 use super::incoming::BodyWatch;
 use super::policy::{RoutePolicy, policy};
 use super::problem::{Problem, is_grpc};
 use super::state::Gate;
-use super::{deadline, upload};
+use super::{deadline, encoding, upload};
 use whereabouts_api::ErrorKind;
 use whereabouts_service::{Deadline, Rejection};
 
@@ -55,14 +55,25 @@ pub(super) async fn bound(State(gate): State<Gate>, mut request: Request, next: 
     }
     let wait = match deadline::requested(request.headers()) {
         Ok(wait) => wait,
-        Err(problem) => return problem.into_response(),
+        Err(problem) => return refuse(request, problem),
     };
     request.extensions_mut().insert(Deadline(wait.map(|wait| arrival + wait)));
     let watch = BodyWatch::default();
-    let request = request.map(|body| match policy {
-        Some(policy) if policy.is_grpc() => messages(body, policy, &gate, &watch.budget),
-        _ => watch.over(body, &gate.settings, &gate.bodies_memory),
-    });
+    let request = match policy {
+        Some(policy) if policy.is_grpc() => {
+            request.map(|body| messages(body, policy, &gate, &watch.budget))
+        }
+        _ => {
+            let encoding = match encoding::of(request.headers()) {
+                Ok(encoding) => encoding,
+                Err(problem) => return encoding::refuse(request, problem),
+            };
+            let headers = request.headers().clone();
+            let request = request.map(|body| drained(body, &headers));
+            encoding::expanded(request, encoding)
+                .map(|body| watch.over(body, &gate.settings, &gate.bodies_memory))
+        }
+    };
     let longest = longest(&gate, &request, policy);
     let allowed = wait.map_or(longest, |wait| wait.min(longest));
     let answered = timeout(allowed, next.run(request)).await;
@@ -100,10 +111,17 @@ async fn bound_stream(
     let budget = BodyBudget::default();
     request.extensions_mut().insert(Deadline(wait.map(|wait| arrival + wait)));
     request.extensions_mut().insert(budget.clone());
-    let request = request.map(|body| match policy.is_grpc() {
-        true => messages(body, policy, gate, &budget),
-        false => upload::bounded(body, gate.settings.server.body_pause),
-    });
+    let request = if policy.is_grpc() {
+        request.map(|body| messages(body, policy, gate, &budget))
+    } else {
+        let encoding = match encoding::of(request.headers()) {
+            Ok(encoding) => encoding,
+            Err(problem) => return encoding::refuse(request, problem),
+        };
+        let headers = request.headers().clone();
+        let request = request.map(|body| upload::bounded(body, &headers, gate.settings.server.body_pause));
+        encoding::expanded(request, encoding)
+    };
     let mut response = next.run(request).await;
     if policy.bulk || ended_at_once(&response) {
         budget.close();

@@ -11,6 +11,7 @@ mod body_budget;
 mod bounds;
 mod connections;
 mod deadline;
+mod encoding;
 #[cfg(feature = "grpc")]
 pub(crate) mod grpc_status;
 mod idempotency;

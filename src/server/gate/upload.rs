@@ -2,17 +2,16 @@
 
 use std::time::Duration;
 
-use axum::body::{Body, BodyDataStream};
+use axum::body::Body;
+use axum::http::HeaderMap;
 use bytes::Bytes;
-use futures_util::{StreamExt, stream};
-use tokio::runtime::Handle;
+use futures_util::stream;
 
-use super::body::discard;
+use super::body::DrainedBody;
 
-/// Bounds the pauses of a body. What the handler leaves unread is discarded for a while: a client that is
-/// still sending would see a reset connection instead of the answer.
-pub(super) fn bounded(body: Body, pause: Duration) -> Body {
-    let upload = Upload { body: Some(body.into_data_stream()), pause };
+/// Bounds the pauses of a body, and discards what the handler leaves unread.
+pub(super) fn bounded(body: Body, headers: &HeaderMap, pause: Duration) -> Body {
+    let upload = Upload { body: DrainedBody::new(body, headers), pause };
     Body::from_stream(stream::unfold(upload, |mut upload| async move {
         let next = upload.next().await?;
         Some((next, upload))
@@ -20,27 +19,17 @@ pub(super) fn bounded(body: Body, pause: Duration) -> Body {
 }
 
 struct Upload {
-    /// `None` once it has ended or failed.
-    body: Option<BodyDataStream>,
+    body: DrainedBody,
     pause: Duration,
 }
 
 impl Upload {
     async fn next(&mut self) -> Option<Result<Bytes, axum::Error>> {
-        let next = tokio::time::timeout(self.pause, self.body.as_mut()?.next()).await;
-        let next = next.unwrap_or_else(|_| Some(Err(axum::Error::new(BodyPaused(self.pause)))));
-        if !matches!(next, Some(Ok(_))) {
-            self.body = None;
-        }
-        next
-    }
-}
-
-impl Drop for Upload {
-    fn drop(&mut self) {
-        if let (Some(body), Ok(runtime)) = (self.body.take(), Handle::try_current()) {
-            runtime.spawn(discard(body));
-        }
+        let next = tokio::time::timeout(self.pause, self.body.next()).await;
+        next.unwrap_or_else(|_| {
+            self.body.give_up();
+            Some(Err(axum::Error::new(BodyPaused(self.pause))))
+        })
     }
 }
 

@@ -19,15 +19,14 @@ use super::maps::map_name;
 use super::state::AppState;
 use crate::gate::{BodyPaused, GateSettings, Problem, Ready, no_bulk_memory, too_large};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
-use whereabouts_api::{ErrorKind, ImageMeta};
-use whereabouts_service::{BulkImage, BulkResult, Deadline, Principal, ServiceError};
-use whereabouts_store::Added;
+use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta};
+use whereabouts_service::{BulkItem, BulkResult, Deadline, Principal, ServiceError};
 
 /// Largest `meta` of an image, in bytes.
 const LARGEST_META: usize = 64 << 10;
 
-/// The images of a request in order, each with the error if it cannot be stored. A problem with the request ends it.
-type Images = Pin<Box<dyn Stream<Item = Result<Result<BulkImage, ServiceError>, Problem>> + Send>>;
+/// The images of a request in order, each with its number. A problem with the request ends it.
+type Images = Pin<Box<dyn Stream<Item = Result<(usize, BulkItem), Problem>> + Send>>;
 
 /// Most bytes around an image: names, headers of parts, and padding.
 const OVERHEAD: usize = 1 << 20;
@@ -40,6 +39,8 @@ const FIRST_RESERVATION: usize = 4 << 20;
 struct Room {
     settings: Arc<GateSettings>,
     memory: Arc<Semaphore>,
+    /// Maximum size of the descriptions of an archive whose pictures have not arrived, in bytes.
+    meta_bytes: usize,
     /// Bytes the reader may still receive before it must make progress.
     allowance: Arc<AtomicUsize>,
 }
@@ -103,14 +104,17 @@ struct BatchForm {
 /// Add many images
 ///
 /// Send a form with a part `image` for each picture, preceded by a part `meta` (JSON) if something is known
-/// about it; or a tar archive of pictures, in which `a.jpg.json`, directly before or after `a.jpg`, says what
-/// is known about it. An image whose `meta` has no id gets its file name as id. Several images are processed
-/// at a time. The request as a whole is not bounded, only each image (`server.body_limit_bytes`) and their
-/// number (`bulk.max_images`). An error of one image does not affect the others, and it is safe to send the
-/// whole request again. A problem with the request itself ends it; the images before it are stored.
+/// about it; or a tar archive of pictures, plain or compressed with gzip, in which `a.jpg.json` says what is known
+/// about `a.jpg`, wherever in the archive it is. An image whose `meta` has no id gets its file name as id. An image
+/// that is stored already gets the pose, time and tags of its `meta`; `changed` names them. Links, hidden files of
+/// macOS and the like are skipped, each with its own result. Several images are processed at a time. The request as a
+/// whole is not bounded, only each image (`server.body_limit_bytes`) and their number (`bulk.max_images`). An error of
+/// one image does not affect the others, and it is safe to send the whole request again. A problem with the request
+/// itself ends it; the images before it are stored.
 #[utoipa::path(post, path = "/maps/{map}/images:batch", tag = "images", params(("map" = String, Path)),
     request_body(content(
         (BatchForm = "multipart/form-data"), (Vec<u8> = "application/x-tar"),
+        (Vec<u8> = "application/gzip"),
     )),
     responses(
         (status = 200, body = BatchAnswer, description = "The outcome for each image"),
@@ -131,15 +135,22 @@ pub(super) async fn add_images(
     let map = map_name(&map)?;
     service.maps.get(&map).await?;
     let until = service.cancelled_by(&state.gate.readiness, caller.clone(), deadline);
-    let (settings, memory) = (state.gate.settings, state.gate.bulk_memory);
-    let images = images(request, Room { settings, memory, allowance: Arc::default() }).await?;
+    let room = Room {
+        settings: state.gate.settings,
+        memory: state.gate.bulk_memory,
+        meta_bytes: service.images.bulk.meta_bytes,
+        allowance: Arc::default(),
+    };
+    let images = images(request, room).await?;
     let results = service.images.add_many(&map, &caller, images, until).await?;
     let results: Vec<BatchResult> = results.into_iter().map(batch_result).collect();
     let count = |of| results.iter().filter(|result| result.outcome == of).count();
     Ok(Json(BatchAnswer {
         stored: count(BatchOutcome::Stored),
         present: count(BatchOutcome::Present),
+        updated: results.iter().filter(|result| !result.changed.is_empty()).count(),
         failed: count(BatchOutcome::Failed),
+        skipped: count(BatchOutcome::Skipped),
         results,
     }))
 }
@@ -147,18 +158,38 @@ pub(super) async fn add_images(
 async fn images(request: Request, room: Room) -> Result<Images, Problem> {
     let (header, media_type) = content_type(request.headers());
     let header = header.to_owned();
-    let request = request.map(|body| room.over(body));
-    match media_type.as_str() {
-        "multipart/form-data" => Ok(Box::pin(form::images(request, room).await?)),
-        "application/x-tar" => Ok(Box::pin(archive::images(request.into_body(), room))),
-        _ => Err(Problem::new(
-            ErrorKind::UnsupportedMedia,
-            format!(
-                "the Content-Type is {header:?}; send a form (with curl: -F image=@a.jpg -F image=@b.jpg), \
-                 or a tar archive (tar c *.jpg | curl -H 'Content-Type: application/x-tar' --data-binary \
-                 @- …)"
-            ),
-        )),
+    if media_type == "multipart/form-data" {
+        let form = form::images(request.map(|body| room.over(body)), room).await?;
+        let items = form.enumerate().map(|(number, image)| {
+            Ok(match image? {
+                Ok(image) => (number, BulkItem::Image(image)),
+                Err(error) => (number, BulkItem::Failed(error)),
+            })
+        });
+        return Ok(Box::pin(items));
+    }
+    // Whatever the header says, the bytes decide.
+    let (head, body) = archive::head_of(request.into_body()).await?;
+    match archive::Format::of(&head) {
+        Some(format) => Ok(Box::pin(archive::images(room.over(body), format, room))),
+        None if archive::MEDIA_TYPES.contains(&media_type.as_str()) => {
+            let detail =
+                "the body is not a tar archive; send one (tar c *.jpg | curl --data-binary @- …)";
+            Err(Problem::new(ErrorKind::Malformed, detail))
+        }
+        None => {
+            let what =
+                if head.starts_with(b"PK") { "a zip archive; unpack it, and" } else { "neither;" };
+            Err(Problem::new(
+                ErrorKind::UnsupportedMedia,
+                format!(
+                    "the Content-Type is {header:?}, and many images are sent as a form or a tar archive, plain or \
+                     compressed with gzip; the body is {what} send a form (with curl: -F image=@a.jpg -F \
+                     image=@b.jpg), or an archive (tar c *.jpg | curl -H 'Content-Type: application/x-tar' \
+                     --data-binary @- …)"
+                ),
+            ))
+        }
     }
 }
 
@@ -186,15 +217,22 @@ fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, Servi
 }
 
 fn batch_result(result: BulkResult) -> BatchResult {
-    let (id, outcome, problem) = match result {
-        Ok(Added::Created(image)) => (Some(image.id.into()), BatchOutcome::Stored, None),
-        Ok(Added::Present(image)) => (Some(image.id.into()), BatchOutcome::Present, None),
-        Err((id, error)) => {
+    let (id, outcome, changed, problem) = match result {
+        BulkResult::Saved(ImageAnswer { image, changed }, new) => {
+            let outcome = if new { BatchOutcome::Stored } else { BatchOutcome::Present };
+            (Some(image.id.into()), outcome, changed, None)
+        }
+        BulkResult::Failed(id, error) => {
             let kind = error.kind.word().to_owned();
             let retry_after_s = error.retry_after.map(|pause| pause.as_secs_f64());
             let problem = BatchProblem { kind, detail: error.detail, retry_after_s };
-            (id.map(Into::into), BatchOutcome::Failed, Some(problem))
+            (id.map(Into::into), BatchOutcome::Failed, Vec::new(), Some(problem))
+        }
+        BulkResult::Skipped(name, why) => {
+            let detail = format!("{name:?} was skipped: {why}");
+            let problem = BatchProblem { kind: "skipped".into(), detail, retry_after_s: None };
+            (Some(name), BatchOutcome::Skipped, Vec::new(), Some(problem))
         }
     };
-    BatchResult { id, outcome, problem }
+    BatchResult { id, outcome, changed, problem }
 }

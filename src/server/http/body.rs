@@ -10,8 +10,9 @@ use serde::de::DeserializeOwned;
 use super::state::AppState;
 use crate::gate::{Problem, read_whole, throw_away, too_large};
 use whereabouts_api::ErrorKind;
+use whereabouts_core::MediaType;
 use whereabouts_service::Service;
-use whereabouts_vision::AdmissionRequest;
+use whereabouts_vision::{AdmissionRequest, RawPixels};
 
 /// The query string.
 pub(super) struct Params<T>(pub T);
@@ -20,11 +21,50 @@ impl<T: DeserializeOwned> FromRequestParts<AppState> for Params<T> {
     type Rejection = Problem;
 
     async fn from_request_parts(parts: &mut Parts, state: &AppState) -> Result<Self, Problem> {
+        check_utf8(parts.uri.query().unwrap_or_default())?;
         match Query::<T>::from_request_parts(parts, state).await {
             Ok(Query(params)) => Ok(Self(params)),
             Err(rejection) => Err(Problem::new(ErrorKind::Malformed, rejection.body_text())),
         }
     }
+}
+
+/// Refuses a query string that is not UTF-8, which the parser would repair with replacement characters.
+fn check_utf8(query: &str) -> Result<(), Problem> {
+    for pair in query.split('&') {
+        if std::str::from_utf8(&percent_decoded(pair)).is_err() {
+            let name = pair.split('=').next().unwrap_or_default();
+            let detail = format!(
+                "the query parameter {:?} is not UTF-8; percent-encode its text as UTF-8, such as %C3%A9 for é",
+                name.chars().take(80).collect::<String>()
+            );
+            return Err(Problem::new(ErrorKind::Malformed, detail));
+        }
+    }
+    Ok(())
+}
+
+fn percent_decoded(text: &str) -> Vec<u8> {
+    let mut rest = text.as_bytes();
+    let mut decoded = Vec::with_capacity(rest.len());
+    let digit = |byte: u8| char::from(byte).to_digit(16);
+    while let Some((&byte, after)) = rest.split_first() {
+        let escaped = match (byte, after) {
+            (b'%', [high, low, ..]) => digit(*high).zip(digit(*low)),
+            _ => None,
+        };
+        match escaped {
+            Some((high, low)) => {
+                decoded.push((high * 16 + low) as u8);
+                rest = &after[2..];
+            }
+            None => {
+                decoded.push(byte);
+                rest = after;
+            }
+        }
+    }
+    decoded
 }
 
 /// The variable segments of the path.
@@ -67,34 +107,42 @@ pub(super) struct PictureBody {
 }
 
 impl PictureBody {
-    /// Reads a picture, unless the server is overloaded: then it is refused before its body is read.
+    /// Reads a picture, a file or pixels with this layout, unless the server is overloaded: then it is refused before
+    /// its body is read.
     pub async fn read(
         request: Request,
         state: &AppState,
         service: &Service,
         demand: AdmissionRequest,
+        layout: Option<RawPixels>,
     ) -> Result<Self, Problem> {
         if let Err(rejected) = service.maps.imaging.check_admission(demand) {
             throw_away(request);
             return Err(rejected.into());
         }
-        match body_type(request.headers())? {
-            BodyType::Raw => Ok(Self {
-                picture: read_whole(
-                    request.into_body(),
-                    state.gate.settings.server.body_limit_bytes,
-                )
-                .await?,
-                meta: None,
-            }),
-            BodyType::Form => from_form(request, state.gate.settings.server.body_limit_bytes).await,
+        let limit = state.gate.settings.server.body_limit_bytes;
+        let (header, media_type) = content_type(request.headers());
+        let body = match media_type.as_str() {
+            "multipart/form-data" => from_form(request, limit).await?,
+            other if other.starts_with("multipart/") => return Err(unsupported(header)),
+            other => {
+                let (trusted, header) = (may_be_picture(other), header.to_owned());
+                let picture = read_whole(request.into_body(), limit).await?;
+                // Whatever the header says, the bytes decide.
+                if !trusted && layout.is_none() && MediaType::sniff(&picture).is_none() {
+                    return Err(unsupported(&header));
+                }
+                Self { picture, meta: None }
+            }
+        };
+        match layout {
+            None => Ok(body),
+            Some(layout) => {
+                let picture = service.maps.imaging.png_of(layout, body.picture).await?;
+                Ok(Self { picture, ..body })
+            }
         }
     }
-}
-
-enum BodyType {
-    Raw,
-    Form,
 }
 
 /// The `Content-Type` as it was sent, and its media type in lower case without parameters.
@@ -103,20 +151,27 @@ pub(super) fn content_type(headers: &HeaderMap) -> (&str, String) {
     (header, header.split(';').next().unwrap_or("").trim().to_ascii_lowercase())
 }
 
-fn body_type(headers: &HeaderMap) -> Result<BodyType, Problem> {
-    let (header, media_type) = content_type(headers);
-    match media_type.as_str() {
-        "image/jpeg" | "image/png" | "image/webp" | "application/octet-stream" => Ok(BodyType::Raw),
-        "multipart/form-data" => Ok(BodyType::Form),
-        _ => Err(Problem::new(
-            ErrorKind::UnsupportedMedia,
-            format!(
-                "the Content-Type is {header:?}; send a picture as image/jpeg, image/png or \
-                 image/webp (with curl: -H 'Content-Type: image/jpeg' --data-binary @frame.jpg), or \
-                 multipart/form-data with a part \"image\" (-F image=@frame.jpg)"
-            ),
-        )),
-    }
+/// Whether a body of this type is given to the decoders, whose errors say more.
+fn may_be_picture(media_type: &str) -> bool {
+    media_type.starts_with("image/")
+        || ["", "*/*", "application/octet-stream", "binary/octet-stream"].contains(&media_type)
+}
+
+fn unsupported(header: &str) -> Problem {
+    let detail = format!(
+        "the Content-Type is {header:?}, and the body is not a picture; send the bytes of a picture (with curl: \
+         -H 'Content-Type: image/jpeg' --data-binary @frame.jpg), or multipart/form-data with a part \"image\" (-F \
+         image=@frame.jpg)"
+    );
+    Problem::new(ErrorKind::UnsupportedMedia, detail)
+}
+
+/// Says that a body cannot be read as a form.
+pub(super) fn no_form(why: &str) -> String {
+    format!(
+        "{why}; leave the Content-Type of a form to the HTTP client, which adds the boundary (with curl: -F, with \
+         Python requests: files=)"
+    )
 }
 
 /// Reads a form. The router bounds its size; `limit` is only for the error.
@@ -124,7 +179,7 @@ pub(super) async fn from_form(request: Request, limit: usize) -> Result<PictureB
     let malformed = |detail: String| Problem::new(ErrorKind::Malformed, detail);
     let mut form = Multipart::from_request(request, &())
         .await
-        .map_err(|rejection| malformed(rejection.body_text()))?;
+        .map_err(|rejection| malformed(no_form(&rejection.body_text())))?;
     let unreadable = |error: axum::extract::multipart::MultipartError| match error.status() {
         StatusCode::PAYLOAD_TOO_LARGE => Problem::new(ErrorKind::TooLarge, too_large(limit)),
         _ => malformed(format!("the form cannot be read: {}", error.body_text())),

@@ -8,12 +8,13 @@ use utoipa::IntoParams;
 
 use super::body::{Params, PictureBody};
 use super::maps::map_name;
+use super::pixels::PixelParams;
 use super::state::AppState;
 use crate::gate::IdempotencyId;
 use crate::gate::Problem;
 use crate::gate::Ready;
 use whereabouts_api::{Answer, RefineMode};
-use whereabouts_core::Priority;
+use whereabouts_core::{Priority, moment};
 use whereabouts_service::{Deadline, LocalizeRequest, Principal, ServiceError, TrackStep};
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
@@ -37,11 +38,23 @@ pub(super) struct LocalizeParams {
     /// `_`, `.` and `:`. The field `track` of the answer then estimates where the robot is, given all its
     /// frames. The images of the map need poses. A track expires when no frame arrives for a while.
     track: Option<String>,
-    /// When the frame was taken (RFC 3339), for a frame with `track`; by default now.
+    /// When the frame was taken, for a frame with `track`: RFC 3339 with an offset, or seconds since 1970; by
+    /// default now.
+    #[param(value_type = Option<String>)]
+    #[serde(default, deserialize_with = "moment::optional")]
     captured_at: Option<Timestamp>,
     /// Metres that the robot has moved since the previous frame, by its odometry, for a frame with
     /// `track`; by default, any distance up to the maximum speed (`track.max_speed_m_s`) is possible.
     moved_m: Option<f64>,
+    /// If the body is pixels without a file format, their layout: `mono8`, `mono16` (little-endian), `rgb8`, `bgr8`,
+    /// `rgba8` or `bgra8`.
+    encoding: Option<String>,
+    /// With `encoding`: pixels in a row.
+    width: Option<u32>,
+    /// With `encoding`: number of rows.
+    height: Option<u32>,
+    /// With `encoding`: bytes from one row to the next; by default rows follow each other without padding.
+    step: Option<u64>,
 }
 
 impl LocalizeParams {
@@ -106,7 +119,10 @@ pub(super) async fn localize(
     let map = map_name(&params.map)?;
     let track = params.step(&caller)?;
     let demand = AdmissionRequest { class: WorkClass::Localize, deadline };
-    let body = PictureBody::read(request, &state, &service, demand).await?;
+    let LocalizeParams { width, height, step, .. } = params;
+    let pixels = PixelParams { encoding: params.encoding.as_deref(), width, height, step };
+    let layout = pixels.layout()?;
+    let body = PictureBody::read(request, &state, &service, demand, layout).await?;
     let request = LocalizeRequest {
         map,
         k: params.k,

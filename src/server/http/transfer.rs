@@ -91,7 +91,7 @@ pub(super) async fn import_image(
     request: Request,
 ) -> Result<(StatusCode, Json<Image>), Problem> {
     let demand = AdmissionRequest { class: WorkClass::Index, deadline: None };
-    let body = PictureBody::read(request, &state, &service, demand).await?;
+    let body = PictureBody::read(request, &state, &service, demand, None).await?;
     let meta = body.meta.unwrap_or_default();
     let from: ImportedImage = serde_json::from_slice(&meta).map_err(|error| {
         let detail = format!("the part \"meta\" is not the JSON expected: {error}");

@@ -2,7 +2,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::Fixture;
-use whereabouts_core::{Calibration, Map};
+use tokio_util::sync::CancellationToken;
+use whereabouts_core::{Calibration, Image, Map};
 use whereabouts_refine::{NegativeEvidence, RefineError};
 use whereabouts_store::MapStore;
 
@@ -63,4 +64,32 @@ async fn at_most_the_configured_number_of_images_is_refined() {
     let fixture = Fixture::with(0, |settings| settings.confidence.refined = 2).await;
     let measured = calibrated(&fixture, true).await;
     assert_eq!((measured.similarity.len(), measured.agreement.len()), (IMAGES, 2));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_map_is_calibrated_again_once_a_fifth_of_its_poses_has_changed() {
+    let fixture = Fixture::new().await;
+    let map = road(&fixture).await;
+    let images = fixture.store.images(&map, None, IMAGES).await.unwrap();
+    let shutdown = CancellationToken::new();
+    let move_image = async |index: usize| {
+        let moved = Image { pose: None, ..images[index].clone() };
+        assert!(fixture.store.replace_image(&map, &images[index], moved).await.unwrap());
+    };
+    let moved_at_calibration = async || {
+        // Longer than the longest pause between two scans.
+        tokio::time::sleep(Duration::from_secs(60)).await;
+        let calibration = fixture.store.calibration(&map).await.unwrap().unwrap();
+        assert!(calibration.complete);
+        calibration.moved
+    };
+    let changing = async {
+        assert_eq!(moved_at_calibration().await, 0);
+        move_image(0).await;
+        assert_eq!(moved_at_calibration().await, 0);
+        move_image(1).await;
+        assert_eq!(moved_at_calibration().await, 2);
+        shutdown.cancel();
+    };
+    tokio::join!(fixture.service.calibrator.run(shutdown.clone()), changing);
 }

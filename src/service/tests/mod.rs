@@ -181,7 +181,13 @@ fn settings() -> ServiceSettings {
         recall_check: None,
         usage_days: 30,
         idempotency: IdempotencySettings { keep: Duration::from_secs(3600), most: 100 },
-        bulk: BulkSettings { in_flight: 1, patience_s: 1, max_images: 10, memory_bytes: 1 << 20 },
+        bulk: BulkSettings {
+            in_flight: 1,
+            patience_s: 1,
+            max_images: 10,
+            memory_bytes: 1 << 20,
+            meta_bytes: 1 << 16,
+        },
         webhooks: crate::webhooks::defaults(),
     }
 }

@@ -1,6 +1,5 @@
 //! Maps and images. Every change goes through the writer thread; reads bypass it.
 
-use std::path::Path;
 use std::sync::Arc;
 
 use async_trait::async_trait;
@@ -8,10 +7,11 @@ use bytes::Bytes;
 use sled::Transactional;
 use uuid::Uuid;
 
-use super::super::changes::{changed_map, check_dim, removed, same_bytes};
+use super::super::changes::{changed_map, check_dim, check_frame, removed, same_bytes};
 use super::super::{Added, BlobPin, BlobStore, HardNegatives, IndexState, MapStore, StoreError};
-use super::blobs::Blobs;
+use super::corrections::content;
 use super::live_map::{LiveMap, folder_of};
+use super::orphans::{remove_folder, sweep};
 use super::trees::{
     BlobOwner, StoredImage, Trees, blob_ref_key, decode, encode, failed, get, image_key, put,
     transaction_failed,
@@ -22,9 +22,6 @@ use whereabouts_core::{
     Pose,
 };
 use whereabouts_index::SearchMode;
-
-/// Images removed in one transaction when a map is deleted.
-const SWEEP_BATCH: usize = 256;
 
 impl Inner {
     /// Returns the loaded map, whatever its revision.
@@ -64,8 +61,7 @@ impl Inner {
             None => (requested, true),
             Some(stored) => {
                 let uid = stored.uid;
-                let has_images = || trees.images.scan_prefix(uid.as_bytes()).next().is_some();
-                (changed_map(stored, requested, has_images)?, false)
+                (changed_map(stored, requested, || content(trees, uid))?, false)
             }
         };
         put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
@@ -146,6 +142,7 @@ impl MapStore for EmbeddedStore {
             graph: live.index.graphed() > 0,
             behind: live.index.is_behind(),
             changes: live.changes(),
+            moved: live.moved(),
         })
     }
 
@@ -168,7 +165,7 @@ impl MapStore for EmbeddedStore {
                         let image = same_bytes(present.image, &image)?;
                         return Ok((StoredImage { image, slot }, false));
                     }
-                    check_revision(trees, &map)?;
+                    check_frame(&check_revision(trees, &map)?, &image)?;
                     let slot = writing.allocate_slot();
                     writing.vectors.write(slot, descriptor.as_slice())?;
                     touched.vectors.push(Arc::clone(&writing.vectors));
@@ -185,6 +182,15 @@ impl MapStore for EmbeddedStore {
             )
             .await?;
         Ok(if new { Added::Created(stored.image) } else { Added::Present(stored.image) })
+    }
+
+    async fn replace_image(
+        &self,
+        map: &Map,
+        current: &Image,
+        next: Image,
+    ) -> Result<bool, StoreError> {
+        self.inner.replace_image(map, current, next).await
     }
 
     async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
@@ -299,12 +305,18 @@ impl BlobStore for EmbeddedStore {
     }
 }
 
+/// Returns the stored map, whatever its revision.
+pub(super) fn stored_map(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
+    let stored: Option<Map> = get(&trees.maps, map.name.as_str().as_bytes())?;
+    stored.filter(|stored| stored.uid == map.uid).ok_or_else(|| removed(map))
+}
+
 /// Returns the stored map, if it still has the revision that the caller knows.
 pub(super) fn check_revision(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
-    match get::<Map>(&trees.maps, map.name.as_str().as_bytes())? {
-        Some(stored) if stored.uid == map.uid && stored.revision == map.revision => Ok(stored),
-        Some(stored) if stored.uid == map.uid => Err(StoreError::Superseded(stored.name)),
-        _ => Err(removed(map)),
+    let stored = stored_map(trees, map)?;
+    match stored.revision == map.revision {
+        true => Ok(stored),
+        false => Err(StoreError::Superseded(stored.name)),
     }
 }
 
@@ -322,7 +334,11 @@ fn insert_image(trees: &Trees, uid: Uuid, stored: &StoredImage) -> Result<(), St
         .map_err(transaction_failed)
 }
 
-fn remove_images(trees: &Trees, uid: Uuid, stored: &[StoredImage]) -> Result<(), StoreError> {
+pub(super) fn remove_images(
+    trees: &Trees,
+    uid: Uuid,
+    stored: &[StoredImage],
+) -> Result<(), StoreError> {
     (&trees.images, &trees.blob_refs)
         .transaction(|(images, refs)| {
             for StoredImage { image, .. } in stored {
@@ -333,63 +349,4 @@ fn remove_images(trees: &Trees, uid: Uuid, stored: &[StoredImage]) -> Result<(),
             Ok(())
         })
         .map_err(transaction_failed)
-}
-
-/// Removes orphans: images and descriptor folders of deleted maps, left by a process that ended before
-/// it had removed them.
-pub(super) fn collect_orphans(
-    trees: &Trees,
-    blobs: &Blobs,
-    descriptors: &Path,
-) -> Result<(), StoreError> {
-    let maps = trees.maps()?;
-    let known: Vec<Uuid> = maps.iter().map(|map| map.uid).collect();
-    let mut at = Uuid::nil();
-    while let Some(entry) = trees.images.range(at.as_bytes().to_vec()..).next() {
-        let (key, _) = entry.map_err(failed)?;
-        let Some(uid) = key.get(..16).and_then(|uid| Uuid::from_slice(uid).ok()) else { break };
-        if !known.contains(&uid) {
-            sweep(uid, trees, blobs)?;
-        }
-        match uid.as_u128().checked_add(1) {
-            Some(next) => at = Uuid::from_u128(next),
-            None => break,
-        }
-    }
-    // Folders are left by deleted maps, by a map whose model changed while it was empty, and by a
-    // reindex that did not finish.
-    let in_use: Vec<_> = maps.iter().map(|map| folder_of(map, descriptors)).collect();
-    for folder in std::fs::read_dir(descriptors).into_iter().flatten().flatten() {
-        if !in_use.contains(&folder.path()) {
-            remove_folder(&folder.path());
-        }
-    }
-    trees.flush()
-}
-
-/// Removes the frames, images, references and bytes of a deleted map.
-fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs) -> Result<(), StoreError> {
-    trees.forget_frames(uid)?;
-    loop {
-        let batch: Vec<StoredImage> =
-            trees.images_of(uid).take(SWEEP_BATCH).collect::<Result<_, _>>()?;
-        if batch.is_empty() {
-            break;
-        }
-        remove_images(trees, uid, &batch)?;
-        trees.flush()?;
-        for stored in &batch {
-            blobs.remove_unreferenced(&stored.image.digest, trees);
-        }
-    }
-    Ok(())
-}
-
-/// Removes a folder of descriptors. One that cannot be removed is harmless and only takes up space.
-pub(super) fn remove_folder(folder: &Path) {
-    if let Err(error) = std::fs::remove_dir_all(folder)
-        && error.kind() != std::io::ErrorKind::NotFound
-    {
-        tracing::warn!(folder = %folder.display(), %error, "cannot remove old descriptors");
-    }
 }

@@ -15,6 +15,7 @@
 
 mod blobs;
 mod compact;
+mod corrections;
 mod descriptions;
 mod doctor;
 mod drafts;
@@ -25,6 +26,7 @@ mod jobs;
 mod keys;
 mod live_map;
 mod maps;
+mod orphans;
 mod records;
 mod retention;
 mod schema;
@@ -121,7 +123,7 @@ impl EmbeddedStore {
         let descriptors = dir.join("descriptors");
         create_folder(&descriptors)?;
         let blobs = Blobs::open(dir.join("images"), settings.min_free_bytes)?;
-        maps::collect_orphans(&trees, &blobs, &descriptors)?;
+        orphans::collect_orphans(&trees, &blobs, &descriptors)?;
         let mut loaded = BTreeMap::new();
         for map in trees.maps()? {
             let name = map.name.clone();

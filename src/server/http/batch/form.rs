@@ -8,6 +8,7 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use super::{FIRST_RESERVATION, LARGEST_META, Room, described, unreadable};
 use crate::gate::Problem;
+use crate::http::body::no_form;
 use whereabouts_api::ErrorKind;
 use whereabouts_service::{BulkImage, ServiceError};
 
@@ -19,7 +20,7 @@ pub(super) async fn images(
     let malformed = |detail: String| Problem::new(ErrorKind::Malformed, detail);
     let form = Multipart::from_request(request, &())
         .await
-        .map_err(|rejection| malformed(rejection.body_text()))?;
+        .map_err(|rejection| malformed(no_form(&rejection.body_text())))?;
     Ok(stream::try_unfold(Parts { form, room }, |mut parts| async {
         Ok(parts.next().await?.map(|image| (image, parts)))
     }))

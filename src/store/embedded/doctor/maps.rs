@@ -8,7 +8,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::super::live_map::folder_of;
-use super::super::maps::remove_folder;
+use super::super::orphans::remove_folder;
 use super::super::segments::VectorFiles;
 use super::super::trees::{BlobOwner, StoredImage, blob_ref_key, decode, failed};
 use super::{Doctor, list};
