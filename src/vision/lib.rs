@@ -9,6 +9,7 @@ mod admission;
 mod batcher;
 mod bench;
 pub mod decode;
+pub mod exif;
 mod extractor;
 mod jpeg;
 mod loaded;
