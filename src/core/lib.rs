@@ -17,6 +17,7 @@ mod pose;
 mod secret;
 mod service_time;
 mod spend;
+mod utm;
 mod webhook;
 
 pub use self::image::{ExportedImage, Image, ImageId, MediaType};
@@ -35,6 +36,7 @@ pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, Pose
 pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;
+pub use utm::UtmZone;
 pub use webhook::{
     Attempt, Delivery, DeliveryState, Disposition, Message, StoredWebhook, Webhook, WebhookEvent,
     WebhookSecret,

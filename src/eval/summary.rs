@@ -12,7 +12,7 @@ use whereabouts_core::Usage;
 pub struct Summary {
     /// Queries that count in the recall.
     pub queries: usize,
-    /// Queries without a correct reference, left out of the recall.
+    /// Queries without a correct reference or without a position, left out of the recall.
     pub skipped: usize,
     /// Queries of places outside the map.
     pub unknown: usize,
@@ -115,7 +115,7 @@ impl Summary {
         }
         Self {
             queries: data.count(QueryKind::InMap),
-            skipped: data.count(QueryKind::Skipped),
+            skipped: data.count(QueryKind::Skipped) + data.left_out.queries.len(),
             unknown: data.count(QueryKind::Unknown),
             references: data.references.len(),
             conditions,
