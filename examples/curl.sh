@@ -94,6 +94,11 @@ call 201 -F "image=@$second" \
     "$url/maps/curl-example/images"
 call 200 -H "$jpeg" --data-binary "@$first" "$url/maps/curl-example/images?id=gate"
 call 409 -H "$jpeg" --data-binary "@$second" "$url/maps/curl-example/images?id=gate"
+
+# Correct the pose, time or tags: a JSON merge patch, or the same upload again.
+call 200 -X PATCH "$url/maps/curl-example/images/gate" -H "$json" \
+    -d '{"pose": {"lat": 45.0005}, "captured_at": "2026-03-01T12:00:00Z", "tags": null}'
+call 200 -H "$jpeg" --data-binary "@$first" "$url/maps/curl-example/images?id=gate&lat=45.0004&lon=-30.0005"
 call 200 "$url/maps/curl-example/images?limit=1"
 call 200 "$url/maps/curl-example/images?limit=1&cursor=$(pick '.*"next_cursor":"([^"]*)".*')"
 call 200 "$url/maps/curl-example/images/gate"

@@ -234,6 +234,25 @@ class RealServer(unittest.TestCase):
         self.assertEqual(raised.exception.status, 404)
         self.assertLessEqual({"town", "yard"}, {state.name for state in self.service.maps()})
 
+    def test_the_pose_time_and_tags_of_an_image_are_changed(self) -> None:
+        self.service.put_map("moved", frame="metric")
+        first = self.service.add_image("moved", self.place(0), id="a", pose=MetricPose(1, 2, z=3), tags=["x"])
+        self.assertEqual(first.changed, ())
+        again = self.service.add_image("moved", self.place(0), id="a", pose=MetricPose(4, 5))
+        self.assertEqual((again.changed, again.pose, again.tags), (("pose",), MetricPose(4, 5), ("x",)))
+        moved = self.service.update_image("moved", "a", pose=MetricPose(6, 7, z=8))
+        self.assertEqual((moved.changed, moved.pose), (("pose",), MetricPose(6, 7, z=8)))
+        flat = self.service.update_image("moved", "a", pose=MetricPose(6, 7), tags=["y"])
+        self.assertEqual((flat.changed, flat.pose, flat.tags), (("pose", "tags"), MetricPose(6, 7), ("y",)))
+        taken = datetime(2026, 5, 1, 12, tzinfo=timezone.utc)
+        self.assertEqual(self.service.update_image("moved", "a", captured_at=taken).captured_at, taken)
+        bare = self.service.update_image("moved", "a", pose=None, captured_at=None, tags=None)
+        self.assertEqual((bare.pose, bare.captured_at, bare.tags), (None, None, ()))
+        self.assertEqual(self.service.update_image("moved", "a").changed, ())
+        with self.assertRaises(Problem) as raised:
+            self.service.update_image("moved", "a", pose=GeographicPose(1, 2))
+        self.assertEqual(raised.exception.status, 422)
+
     def test_adding_the_same_image_twice_succeeds_and_other_bytes_conflict(self) -> None:
         again = self.service.add_image("town", self.place(0), id="place-0000.jpg")
         self.assertEqual(again.tags, ("drawn, by day",))

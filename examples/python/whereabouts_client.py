@@ -122,6 +122,22 @@ class Image:
 
 
 @dataclass(frozen=True)
+class ImageAnswer(Image):
+    """An image as it is stored now, and what the call changed of it."""
+
+    changed: tuple[Literal["pose", "captured_at", "tags"], ...] = ()
+    """Fields of an image stored before that the call changed. Empty if the image is new or stayed as it was."""
+
+
+class Keep:
+    """The type of `KEEP`."""
+
+
+KEEP = Keep()
+"""Leaves a field of `update_image` as it is; None removes its value."""
+
+
+@dataclass(frozen=True)
 class CalibrationState:
     """The sample that a map's confidence was calibrated on."""
 
@@ -447,8 +463,12 @@ class Whereabouts:
         captured_at: datetime | None = None,
         tags: Sequence[str] = (),
         deadline_ms: int | None = None,
-    ) -> Image:
-        """Adds an image to a map. Repeating an id is allowed with the same bytes, and 409 with others."""
+    ) -> ImageAnswer:
+        """Adds an image to a map. Repeating an id is allowed with the same bytes, and 409 with others.
+
+        Repeated with another pose, time or tags, it changes those: see `changed` of the answer. What is omitted
+        keeps its value.
+        """
         name, data, media_type = _load(picture)
         meta = _given(
             id=id,
@@ -457,7 +477,7 @@ class Whereabouts:
             tags=list(tags) or None,
         )
         return self._call(
-            Image,
+            ImageAnswer,
             "POST",
             f"/maps/{_segment(map)}/images",
             repeatable=True,
@@ -467,6 +487,27 @@ class Whereabouts:
                 "meta": ("meta.json", json.dumps(meta).encode(), "application/json"),
             },
         )
+
+    def update_image(
+        self,
+        map: str,
+        id: str,
+        *,
+        pose: Pose | None | Keep = KEEP,
+        captured_at: datetime | None | Keep = KEEP,
+        tags: Sequence[str] | None | Keep = KEEP,
+    ) -> ImageAnswer:
+        """Changes the pose, time or tags of an image. A pose is replaced as a whole; None removes a value."""
+        change: dict[str, Any] = {}
+        if not isinstance(pose, Keep):
+            # In a merge patch, None removes what an earlier pose had and this one has not.
+            change["pose"] = asdict(pose) if pose else None
+        if not isinstance(captured_at, Keep):
+            change["captured_at"] = _rfc3339(captured_at) if captured_at else None
+        if not isinstance(tags, Keep):
+            change["tags"] = list(tags or ())
+        path = f"/maps/{_segment(map)}/images/{_segment(id)}"
+        return self._call(ImageAnswer, "PATCH", path, json=change)
 
     def images(self, map: str, *, page_size: int = 100) -> Iterator[Image]:
         """Iterates over the images of a map, sorted by id, fetching pages lazily."""

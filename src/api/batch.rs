@@ -2,14 +2,18 @@
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
+use whereabouts_core::ImageField;
 
 /// The result of a bulk upload.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
 pub struct BatchAnswer {
     /// Number of images that were stored.
     pub stored: usize,
-    /// Number of images that were already present.
+    /// Number of images that were already present, including those that were updated.
     pub present: usize,
+    /// Number of images that were already present and whose pose, time or tags the upload changed.
+    #[serde(default)]
+    pub updated: usize,
     /// Number of images that could not be stored.
     pub failed: usize,
     /// One result per image, in upload order.
@@ -24,6 +28,9 @@ pub struct BatchResult {
     pub id: Option<String>,
     /// Whether the image was stored.
     pub outcome: BatchOutcome,
+    /// Fields of an image already present that the upload changed.
+    #[serde(default)]
+    pub changed: Vec<ImageField>,
     /// Why the image could not be stored; null if it was.
     #[schema(nullable)]
     pub problem: Option<BatchProblem>,
@@ -35,7 +42,7 @@ pub struct BatchResult {
 pub enum BatchOutcome {
     /// The image was stored.
     Stored,
-    /// The image was already present.
+    /// The image was already present. `changed` names the fields that the upload changed.
     Present,
     /// The image could not be stored.
     Failed,

@@ -7,6 +7,9 @@ use reqwest::header::{AUTHORIZATION, HeaderMap, HeaderValue};
 use reqwest::{RequestBuilder, Response, StatusCode};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
+use whereabouts_core::{ImageId, MapName};
+
+use crate::{ImageAnswer, ImagePatch};
 
 /// A client of one server. Clones share its connections.
 #[derive(Debug, Clone)]
@@ -54,6 +57,22 @@ impl Client {
     /// Builds a PUT request to a path of the API.
     pub fn put(&self, path: &str) -> RequestBuilder {
         self.http.put(format!("{}{path}", self.base))
+    }
+
+    /// Builds a PATCH request to a path of the API.
+    pub fn patch(&self, path: &str) -> RequestBuilder {
+        self.http.patch(format!("{}{path}", self.base))
+    }
+
+    /// Changes the pose, time or tags of an image.
+    pub async fn update_image(
+        &self,
+        map: &MapName,
+        id: &ImageId,
+        change: &ImagePatch,
+    ) -> anyhow::Result<ImageAnswer> {
+        let path = format!("/maps/{}/images/{}", segment(map.as_str()), segment(id.as_str()));
+        self.json(self.patch(&path).json(change)).await
     }
 
     /// Builds a POST request to a path of the API.

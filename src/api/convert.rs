@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 use whereabouts_core::{
-    Candidate, CoordinateFrame, Description, DescriptorKind, Estimate, Job, JobState, Pose,
+    Candidate, CoordinateFrame, Description, DescriptorKind, Estimate, Image, Job, JobState, Pose,
     Priority, RankedCandidate, RefinerKind, Scene, Usage,
 };
 
@@ -200,6 +200,21 @@ impl From<Job> for proto::Job {
             usage: Some(job.usage.into()),
             error: job.error.unwrap_or_default(),
             trace_id: job.trace_id.unwrap_or_default(),
+        }
+    }
+}
+
+impl From<Image> for proto::Image {
+    fn from(image: Image) -> Self {
+        Self {
+            id: image.id.into(),
+            digest: image.digest.to_string(),
+            pose: image.pose.map(Into::into),
+            captured_at: image.captured_at.map(moment_to),
+            tags: image.tags,
+            width: image.width,
+            height: image.height,
+            created_at: Some(moment_to(image.created_at)),
         }
     }
 }

@@ -1,9 +1,9 @@
 //! Reference images: metadata and pages.
 
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use utoipa::ToSchema;
-use whereabouts_core::{ExportedImage, Image, Map, Pose, PoseInput};
+use whereabouts_core::{ExportedImage, Image, ImageField, Map, Pose, PoseInput, PosePatch, moment};
 
 /// Metadata of an image to be added.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
@@ -16,12 +16,55 @@ pub struct ImageMeta {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(value_type = Option<Pose>)]
     pub pose: Option<PoseInput>,
-    /// When the picture was taken.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    /// When the picture was taken: RFC 3339 with an offset, or seconds since 1970.
+    #[serde(
+        default,
+        deserialize_with = "moment::optional",
+        skip_serializing_if = "Option::is_none"
+    )]
     pub captured_at: Option<Timestamp>,
     /// Up to 32 tags of up to 64 characters each.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub tags: Vec<String>,
+}
+
+/// A change of an image (JSON merge patch, RFC 7396): an omitted field keeps its value, and null removes it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ImagePatch {
+    /// Changes of the pose: `{"lat": 1.5}` changes only the latitude.
+    #[serde(default, deserialize_with = "given", skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<PosePatch>, nullable)]
+    pub pose: Option<Option<PosePatch>>,
+    /// When the picture was taken: RFC 3339 with an offset, or seconds since 1970.
+    #[serde(default, deserialize_with = "moment::given", skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>, format = DateTime, nullable)]
+    pub captured_at: Option<Option<Timestamp>>,
+    /// The new tags, which replace all old ones: up to 32 of up to 64 characters each.
+    #[serde(default, deserialize_with = "given", skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<Vec<String>>, nullable)]
+    pub tags: Option<Option<Vec<String>>>,
+}
+
+/// Distinguishes null from an omitted field.
+fn given<'de, T, D>(value: D) -> Result<Option<Option<T>>, D::Error>
+where
+    T: Deserialize<'de>,
+    D: Deserializer<'de>,
+{
+    Option::deserialize(value).map(Some)
+}
+
+/// An image as it is stored now, and what the request changed of it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ImageAnswer {
+    /// The image as it is stored now.
+    #[serde(flatten)]
+    pub image: Image,
+    /// Fields of an image stored before that the request changed: `pose`, `captured_at`, `tags`. Empty for an image
+    /// that is new or stayed as it was.
+    #[serde(default)]
+    pub changed: Vec<ImageField>,
 }
 
 /// A page of images, sorted by id.

@@ -17,7 +17,7 @@ pub struct MapChange {
     /// `gem` (default) or `cls`. Once the map has images, only a reindex changes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub descriptor: Option<DescriptorKind>,
-    /// `wgs84` (default) or `metric`. Fixed once the map has images.
+    /// `wgs84` (default) or `metric`. Fixed while an image of the map has a pose.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frame: Option<CoordinateFrame>,
     /// Name of an installed model. A new map gets the server's default model if omitted. Once the map has

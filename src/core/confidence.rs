@@ -109,6 +109,9 @@ impl NullDistribution {
 pub struct Calibration {
     /// Number of images in the map when it was calibrated.
     pub images: usize,
+    /// How often poses of the map's images had been changed when it was calibrated.
+    #[serde(default)]
+    pub moved: u64,
     /// Settings of the calibration.
     pub settings: CalibrationSettings,
     /// Whether the calibration is complete; `false` while it is running or after it was interrupted.

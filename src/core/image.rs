@@ -135,6 +135,42 @@ pub struct Image {
     pub created_at: Timestamp,
 }
 
+/// A field of an image that can be changed after the image was stored. Its id, its bytes and its descriptor
+/// cannot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ImageField {
+    /// The pose of the camera.
+    Pose,
+    /// When the picture was taken.
+    CapturedAt,
+    /// The tags.
+    Tags,
+}
+
+impl ImageField {
+    /// The name used in the API.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Pose => "pose",
+            Self::CapturedAt => "captured_at",
+            Self::Tags => "tags",
+        }
+    }
+}
+
+impl Image {
+    /// Returns the changeable fields whose values differ from those of `other`.
+    pub fn differences(&self, other: &Self) -> Vec<ImageField> {
+        let differs = [
+            (ImageField::Pose, self.pose != other.pose),
+            (ImageField::CapturedAt, self.captured_at != other.captured_at),
+            (ImageField::Tags, self.tags != other.tags),
+        ];
+        differs.into_iter().filter(|(_, differs)| *differs).map(|(field, _)| field).collect()
+    }
+}
+
 /// An image with its descriptor, as exported and imported.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ExportedImage {

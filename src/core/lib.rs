@@ -13,6 +13,7 @@ mod image;
 mod job;
 mod key;
 mod map;
+pub mod moment;
 mod pose;
 mod secret;
 mod service_time;
@@ -20,7 +21,7 @@ mod spend;
 mod utm;
 mod webhook;
 
-pub use self::image::{ExportedImage, Image, ImageId, MediaType};
+pub use self::image::{ExportedImage, Image, ImageField, ImageId, MediaType};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
 pub use confidence::{Calibration, CalibrationSettings, Estimate, Evidence};
 pub use dense::DenseFeatures;
@@ -32,7 +33,7 @@ pub use job::{
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use map::{CoordinateFrame, DescriptorKind, Map, MapName, Precision, Scene};
-pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, PoseInput};
+pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, PoseInput, PosePatch};
 pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;

@@ -3,7 +3,10 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+pub use self::patch::PosePatch;
 use super::CoordinateFrame;
+
+mod patch;
 
 /// The pose of a camera in the coordinate frame of its map.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]

@@ -11,9 +11,8 @@ use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
 
 use super::{Images, NewImage, Principal, ServiceError};
-use whereabouts_api::{ErrorKind, ImageMeta};
+use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta};
 use whereabouts_core::{ImageId, MapName};
-use whereabouts_store::Added;
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 /// Bounds of bulk uploads.
@@ -41,9 +40,9 @@ pub struct BulkImage {
     pub memory: Option<OwnedSemaphorePermit>,
 }
 
-/// The result of one image of an upload: the stored image, or the id that the caller gave it, if any, and the
-/// error.
-pub type BulkResult = Result<Added, (Option<ImageId>, ServiceError)>;
+/// The result of one image of an upload: the stored image and whether it is new, or the id that the caller gave
+/// it, if any, and the error.
+pub type BulkResult = Result<(ImageAnswer, bool), (Option<ImageId>, ServiceError)>;
 
 impl Images {
     /// Stores images as they arrive and returns their results in the same order. The error of one image does not
@@ -118,7 +117,7 @@ impl Images {
         &self,
         map: &MapName,
         image: BulkImage,
-    ) -> Result<Added, ServiceError> {
+    ) -> Result<(ImageAnswer, bool), ServiceError> {
         const MAX_PAUSE: Duration = Duration::from_secs(1);
         let demand = AdmissionRequest { class: WorkClass::Index, deadline: None };
         let until = Instant::now() + Duration::from_secs(self.bulk.patience_s);

@@ -30,7 +30,7 @@ const ATTEMPTS: AttemptPolicy = AttemptPolicy {
     longest_pause: Duration::from_millis(200),
 };
 
-/// A map is calibrated again when its number of images has changed by one in this many.
+/// A map is calibrated again when one in this many of its images was added, removed or given another pose.
 const CHANGED_SHARE: usize = 5;
 
 /// Calibrates maps: measures how similar images of different places look in each.
@@ -66,17 +66,17 @@ impl Calibrator {
         }
     }
 
-    /// Calibrates the maps that need it and whose number of images is the same as in the last scan.
+    /// Calibrates the maps that need it and whose images and poses have not changed since the last scan.
     async fn calibrate_settled(
         &self,
-        seen: &mut BTreeMap<Uuid, usize>,
+        seen: &mut BTreeMap<Uuid, (usize, u64)>,
     ) -> Result<(), ServiceError> {
         let maps = self.store.maps().await?;
         seen.retain(|uid, _| maps.iter().any(|map| map.uid == *uid));
         for map in maps {
-            let IndexState { images, .. } = self.store.index_state(&map).await?;
-            let settled = seen.insert(map.uid, images) == Some(images);
-            if settled && self.is_due(&map, images).await? {
+            let IndexState { images, moved, .. } = self.store.index_state(&map).await?;
+            let settled = seen.insert(map.uid, (images, moved)) == Some((images, moved));
+            if settled && self.is_due(&map, images, moved).await? {
                 let refiner = self.refiner.as_deref();
                 self.calibrate(&map, refiner.and_then(Refiner::negative_evidence)).await?;
             }
@@ -84,11 +84,13 @@ impl Calibrator {
         Ok(())
     }
 
-    async fn is_due(&self, map: &Map, images: usize) -> Result<bool, ServiceError> {
+    async fn is_due(&self, map: &Map, images: usize, moved: u64) -> Result<bool, ServiceError> {
         let Some(known) = self.store.calibration(map).await? else { return Ok(images > 1) };
+        let moved = usize::try_from(moved.abs_diff(known.moved)).unwrap_or(usize::MAX);
+        let changed = known.images.abs_diff(images).saturating_add(moved);
         Ok(!known.complete
             || known.settings != self.settings
-            || known.images.abs_diff(images) * CHANGED_SHARE > known.images)
+            || changed.saturating_mul(CHANGED_SHARE) > known.images)
     }
 
     /// Calibrates a map: first similarity, which is fast, then the agreement that `refiner` finds. Each is in effect
@@ -99,13 +101,14 @@ impl Calibrator {
         refiner: Option<&dyn NegativeEvidence>,
     ) -> Result<(), ServiceError> {
         let settings = self.settings;
-        let IndexState { images, .. } = self.store.index_state(map).await?;
+        let IndexState { images, moved, .. } = self.store.index_state(map).await?;
         let asked =
             self.store.hard_negatives(map, settings, COMPARED.max(settings.candidates)).await?;
         let similarity = NullDistribution::from(values(asked.iter().filter_map(|asked| {
             Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
         })));
-        let mut measured = Calibration { images, settings, similarity, ..Calibration::default() };
+        let mut measured =
+            Calibration { images, moved, settings, similarity, ..Calibration::default() };
         self.store.put_calibration(map, measured.clone()).await?;
         if let Some(refiner) = refiner {
             let step = asked.len().div_ceil(settings.refined.max(1)).max(1);

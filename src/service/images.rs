@@ -1,5 +1,5 @@
-//! Reference images: add one, list, show and delete. Many at once are for `bulk`, their copies in other
-//! stores for `transfer`.
+//! Reference images: add one, list, show and delete. Many at once are for `bulk`, changes of stored ones for
+//! `corrections`, their copies in other stores for `transfer`.
 
 use std::sync::Arc;
 
@@ -7,8 +7,8 @@ use bytes::Bytes;
 use jiff::Timestamp;
 
 use super::{BulkSettings, Keys, Maps, SUPERSEDED_RETRIES, ServiceError};
-use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
-use whereabouts_core::{Image, ImageId, Map, MapName, MediaType, Pose};
+use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage};
+use whereabouts_core::{Image, ImageId, Map, MapName, MediaType, Pose, PoseInput};
 use whereabouts_store::{Added, BlobStore, StoreError};
 use whereabouts_vision::{AdmissionRequest, FeatureSet};
 
@@ -37,15 +37,21 @@ pub struct Images {
 }
 
 impl Images {
-    /// Extracts the descriptor of an image and stores both.
-    pub async fn add(&self, map: &MapName, new: NewImage) -> Result<Added, ServiceError> {
+    /// Extracts the descriptor of an image and stores both. If the image is stored already, its pose, time and
+    /// tags become those that `new` states. Returns the image, and whether it is new.
+    pub async fn add(
+        &self,
+        name: &MapName,
+        new: NewImage,
+    ) -> Result<(ImageAnswer, bool), ServiceError> {
         if new.bytes.is_empty() {
             return Err(empty_body());
         }
+        let stated = StatedMeta::new(new.meta)?;
         let (mut pin, mut retries) = (None, SUPERSEDED_RETRIES);
         loop {
-            let (map, extractor) = self.maps.usable(map).await?;
-            let meta = CheckedMeta::new(new.meta.clone(), &map)?;
+            let (map, extractor) = self.maps.usable(name).await?;
+            let pose = stated.pose(&map)?;
             let bytes = new.bytes.clone();
             let (kind, features) = (map.descriptor, FeatureSet::DescriptorOnly);
             let imaging = &self.maps.imaging;
@@ -53,11 +59,11 @@ impl Images {
             imaging.metrics.observe_extraction(&extraction);
             let digest = extraction.digest;
             let image = Image {
-                id: meta.id.unwrap_or_else(|| ImageId::from_digest(&digest)),
+                id: stated.id.clone().unwrap_or_else(|| ImageId::from_digest(&digest)),
                 digest,
-                pose: meta.pose,
-                captured_at: meta.captured_at,
-                tags: meta.tags,
+                pose,
+                captured_at: stated.captured_at,
+                tags: stated.tags.clone(),
                 media_type: extraction.media_type,
                 width: extraction.width,
                 height: extraction.height,
@@ -67,9 +73,19 @@ impl Images {
                 pin = Some(self.blobs.put_blob(digest, new.bytes.clone()).await?);
             }
             match self.maps.store.add_image(&map, image, extraction.descriptor).await {
-                // A reindex ended meanwhile: the descriptor is of the model before it.
+                // A reindex ended meanwhile, so the descriptor is of the model before it; or the coordinate
+                // frame has changed.
                 Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
-                added => return Ok(added?),
+                added => {
+                    return match added? {
+                        Added::Created(image) => {
+                            Ok((ImageAnswer { image, changed: Vec::new() }, true))
+                        }
+                        Added::Present(image) => {
+                            Ok((self.restate(name, &image.id, &stated).await?, false))
+                        }
+                    };
+                }
             }
         }
     }
@@ -125,22 +141,32 @@ impl Images {
     }
 }
 
-/// An [`ImageMeta`] that was validated against its map.
-struct CheckedMeta {
-    id: Option<ImageId>,
-    pose: Option<Pose>,
+/// What the caller states of an image. The pose is validated against the map.
+pub(super) struct StatedMeta {
+    pub id: Option<ImageId>,
+    pose: Option<PoseInput>,
     captured_at: Option<Timestamp>,
     tags: Vec<String>,
 }
 
-impl CheckedMeta {
-    fn new(meta: ImageMeta, map: &Map) -> Result<Self, ServiceError> {
-        check_tags(&meta.tags)?;
-        Ok(Self {
-            id: meta.id.map(|id| id.parse()).transpose()?,
-            pose: meta.pose.map(|pose| pose.check(map.frame)).transpose()?,
-            captured_at: meta.captured_at,
-            tags: meta.tags,
+impl StatedMeta {
+    pub fn new(meta: ImageMeta) -> Result<Self, ServiceError> {
+        let ImageMeta { id, pose, captured_at, tags } = meta;
+        check_tags(&tags)?;
+        Ok(Self { id: id.map(|id| id.parse()).transpose()?, pose, captured_at, tags })
+    }
+
+    pub fn pose(&self, map: &Map) -> Result<Option<Pose>, ServiceError> {
+        Ok(self.pose.map(|pose| pose.check(map.frame)).transpose()?)
+    }
+
+    /// Returns a stored image with what is stated of it; the rest stays.
+    pub fn stated_of(&self, image: &Image, map: &Map) -> Result<Image, ServiceError> {
+        Ok(Image {
+            pose: self.pose(map)?.or(image.pose),
+            captured_at: self.captured_at.or(image.captured_at),
+            tags: if self.tags.is_empty() { image.tags.clone() } else { self.tags.clone() },
+            ..image.clone()
         })
     }
 }
@@ -169,6 +195,6 @@ pub(super) fn page_size(limit: Option<usize>) -> Result<usize, ServiceError> {
     }
 }
 
-fn no_image(map: &MapName, id: &ImageId) -> ServiceError {
+pub(super) fn no_image(map: &MapName, id: &ImageId) -> ServiceError {
     ServiceError::not_found(format!("there is no image {:?} in the map {map}", id.as_str()))
 }

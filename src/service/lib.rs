@@ -5,6 +5,7 @@
 mod bulk;
 mod calibration;
 mod cancellation;
+mod corrections;
 mod error;
 mod events;
 mod idempotency;

@@ -120,27 +120,60 @@ pub(super) fn deliveries_for(
     Ok(subscribed.map(delivery).collect())
 }
 
+/// What a map contains, as far as it limits changes of the map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum MapContent {
+    /// No images.
+    Empty,
+    /// Images, none of which has a pose.
+    WithoutPoses,
+    /// Images with poses.
+    WithPoses,
+}
+
 /// Returns the record to store when a map is changed from `stored` to `requested`.
 pub(super) fn changed_map(
     stored: Map,
     requested: Map,
-    has_images: impl FnOnce() -> bool,
+    content: impl FnOnce() -> Result<MapContent, StoreError>,
 ) -> Result<Map, StoreError> {
     if stored.revision != requested.revision {
         return Err(StoreError::Superseded(stored.name));
     }
-    let same = stored.is_compatible_with(&requested) && stored.frame == requested.frame;
-    if !same && has_images() {
-        return Err(StoreError::Conflict(format!(
-            "the map {} has images, so its model ({} at {} precision), descriptor ({}) and frame ({}) \
-             are fixed; `whereabouts index --reindex` changes model and descriptor; another frame \
-             needs a new map",
-            stored.name, stored.model, stored.precision, stored.descriptor, stored.frame
-        )));
-    }
+    let same_descriptors = stored.is_compatible_with(&requested);
+    let same_frame = stored.frame == requested.frame;
     // A new uid gives descriptors of another shape a folder or table of their own.
-    let uid = if same { stored.uid } else { requested.uid };
+    let mut uid = stored.uid;
+    if !(same_descriptors && same_frame) {
+        match content()? {
+            MapContent::Empty => uid = requested.uid,
+            MapContent::WithoutPoses if same_descriptors => {}
+            MapContent::WithPoses if same_descriptors => {
+                return Err(StoreError::Conflict(format!(
+                    "images of the map {} have poses in the coordinate frame {}, so it cannot become {}; \
+                     remove their poses first (PATCH each image with {{\"pose\": null}}), or index them in \
+                     a new map",
+                    stored.name, stored.frame, requested.frame
+                )));
+            }
+            MapContent::WithoutPoses | MapContent::WithPoses => {
+                return Err(StoreError::Conflict(format!(
+                    "the map {} has images, so its model ({} at {} precision) and descriptor ({}) are \
+                     fixed; `whereabouts index --reindex` changes both",
+                    stored.name, stored.model, stored.precision, stored.descriptor
+                )));
+            }
+        }
+    }
     Ok(Map { uid, created_at: stored.created_at, ..requested })
+}
+
+/// Refuses a pose in another coordinate frame than the map's, which was changed after the caller read it.
+pub(super) fn check_frame(map: &Map, image: &Image) -> Result<(), StoreError> {
+    match image.pose {
+        Some(pose) if pose.frame() != map.frame => Err(StoreError::Superseded(map.name.clone())),
+        _ => Ok(()),
+    }
 }
 
 /// Returns the stored image if it has the bytes that were sent, otherwise a conflict.

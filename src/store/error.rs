@@ -13,8 +13,10 @@ pub enum StoreError {
     /// The change contradicts the stored state.
     #[error("{0}")]
     Conflict(String),
-    /// The map was reindexed after the caller read it.
-    #[error("the descriptors of the map {0} were replaced meanwhile; try again")]
+    /// The map was reindexed, or its coordinate frame changed, after the caller read it.
+    #[error(
+        "the descriptors or the coordinate frame of the map {0} were replaced meanwhile; try again"
+    )]
     Superseded(MapName),
     /// The job queue has reached its bound.
     #[error("the refinement queue is full: it holds {limit} jobs (jobs.queue)")]

@@ -30,8 +30,10 @@ pub struct IndexState {
     pub graph: bool,
     /// Whether some images are not in the graph yet. Until they are, they are searched exactly.
     pub behind: bool,
-    /// Number of additions and removals since the store was opened.
+    /// Number of additions, removals and changed poses since the store was opened.
     pub changes: u64,
+    /// How often poses of images were changed since the map was created.
+    pub moved: u64,
 }
 
 /// The hard negatives of one image: images of other places that resemble it most.
@@ -47,8 +49,8 @@ pub struct HardNegatives {
 #[async_trait]
 pub trait MapStore: Send + Sync {
     /// Creates a map, or changes the map of the same name. Scene and description can always be
-    /// changed; model, descriptor and frame only while the map has no images
-    /// ([`StoreError::Conflict`] afterwards).
+    /// changed; the coordinate frame while no image has a pose; model and descriptor only while the map
+    /// has no images ([`StoreError::Conflict`] afterwards).
     ///
     /// Returns the map as stored, and whether it is new.
     async fn put_map(&self, map: Map) -> Result<(Map, bool), StoreError>;
@@ -65,7 +67,8 @@ pub trait MapStore: Send + Sync {
     ///
     /// # Errors
     /// [`StoreError::Conflict`] if an image with this id has other bytes;
-    /// [`StoreError::Superseded`] if the descriptor belongs to another revision of the map.
+    /// [`StoreError::Superseded`] if the descriptor belongs to another revision of the map, or the pose to
+    /// another coordinate frame.
     ///
     /// [`BlobStore::put_blob`]: super::BlobStore::put_blob
     async fn add_image(
@@ -74,6 +77,17 @@ pub trait MapStore: Send + Sync {
         image: Image,
         descriptor: Descriptor,
     ) -> Result<Added, StoreError>;
+    /// Replaces the record of an image, `current`, by `next`, which has the same id and bytes and another
+    /// pose, time or tags. Returns `false`, and changes nothing, if `current` is not what is stored.
+    ///
+    /// # Errors
+    /// [`StoreError::Superseded`] if the pose belongs to another coordinate frame than the map's.
+    async fn replace_image(
+        &self,
+        map: &Map,
+        current: &Image,
+        next: Image,
+    ) -> Result<bool, StoreError>;
     /// Returns one image.
     async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError>;
     /// Returns the images with these ids: one entry for each id, in the order of `ids`, and `None` for an

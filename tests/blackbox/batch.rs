@@ -127,6 +127,7 @@ async fn an_archive_holds_pictures_and_their_metadata_in_sidecar_files() {
         server.get(&format!("/maps/{map}/images/b")).await.expect(200)["tags"],
         json!(["gate"])
     );
+    assert_eq!(answer["updated"], 0);
     let again = send_tar(server, &map, sent).await.expect(200);
     assert_eq!((again["stored"].as_u64(), again["present"].as_u64()), (Some(0), Some(4)));
 }

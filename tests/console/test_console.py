@@ -330,6 +330,28 @@ class Maps(Console):
         self.assertLess(drawing, 8 * load_factor())
 
 
+class Correction(Console):
+    def test_the_pose_and_tags_of_an_image_are_corrected(self):
+        call("PUT", "/maps/moved", {})
+        call("POST", "/maps/moved/images?id=a&lat=1&lon=2&heading=90&tags=x", frame(3).read_bytes(), "image/jpeg")
+        page = self.page("#/maps/moved?image=a")
+        page.get_by_text("Correct the pose, time or tags").click()
+        card = page.locator(".chosen-image")
+        card.get_by_label("Latitude, degrees").fill("91")
+        card.get_by_role("button", name="Save").click()
+        expect(card.locator("[role=alert]")).to_contain_text("lat is 91")
+        self.errors.clear()
+        card.get_by_label("Latitude, degrees").fill("48.5")
+        card.get_by_label("Heading, degrees").fill("")
+        card.get_by_label("Tags, separated by commas").fill("north, gate")
+        card.get_by_role("button", name="Save").click()
+        expect(card.locator(".facts")).to_contain_text("48.5")
+        expect(card.locator(".facts")).to_contain_text("gate")
+        image = call("GET", "/maps/moved/images/a")
+        self.assertEqual((image["pose"], image["tags"]), ({"lat": 48.5, "lon": 2.0}, ["north", "gate"]))
+        call("DELETE", "/maps/moved")
+
+
 class Health(Console):
     def test_health_shows_the_last_hour_and_the_configuration(self):
         localize(6, "off")

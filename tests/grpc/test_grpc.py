@@ -166,6 +166,44 @@ class Contract(unittest.TestCase):
         self.assertIn("lat is 91", by_place[7].problem.detail)
         self.assertEqual(over_http("GET", "/maps/town")["images"], len(names))
 
+    def test_an_image_is_corrected_by_an_update_or_by_adding_it_again(self) -> None:
+        call, message = self.call, self.message
+        name, picture = pictures("map")[0]
+        call("MapService", "PutMap", message("PutMapRequest", map="moved", frame=2))
+
+        def metric(x: float) -> Any:
+            return message("Pose", metric=message("MetricPose", x=x, y=2))
+
+        def add(**fields: Any) -> Any:
+            request = message("AddImagesRequest", map="moved", id="a", image=picture, **fields)
+            return call("MapService", "AddImages", iter([request])).results[0].stored
+
+        def update(**fields: Any) -> Any:
+            request = message("UpdateImageRequest", map="moved", id="a", **fields)
+            return call("MapService", "UpdateImage", request)
+
+        self.assertEqual((add(pose=metric(1)).present, list(add().changed)), (False, []))
+        again = add(pose=metric(3), tags=["x"])
+        self.assertEqual((again.present, list(again.changed)), (True, ["pose", "tags"]))
+        moved = update(pose=metric(5))
+        self.assertEqual((list(moved.changed), moved.image.pose.metric.x), (["pose"], 5))
+        self.assertEqual((moved.image.id, list(moved.image.tags)), ("a", ["x"]))
+        mask = {"update_mask": {"paths": ["pose", "tags"]}}
+        bare = update(**mask)
+        self.assertEqual(list(bare.changed), ["pose", "tags"])
+        self.assertFalse(bare.image.HasField("pose") or bare.image.tags)
+        self.assertEqual(over_http("GET", "/maps/moved/images/a")["pose"], None)
+        # Without poses, the map can change its coordinate frame.
+        call("MapService", "PutMap", message("PutMapRequest", map="moved", frame=1))
+        wrong = message("UpdateImageRequest", map="moved", id="a", pose=metric(1))
+        refusal = self.refused(
+            grpc.StatusCode.INVALID_ARGUMENT, lambda: call("MapService", "UpdateImage", wrong)
+        )
+        self.assertIn("unknown field `x`", refusal.details())
+        missing = message("UpdateImageRequest", map="moved", id="b")
+        self.refused(grpc.StatusCode.NOT_FOUND, lambda: call("MapService", "UpdateImage", missing))
+        call("MapService", "DeleteMap", message("DeleteMapRequest", map="moved"))
+
     def test_a_frame_gets_the_same_answer_as_over_http(self) -> None:
         frame = pictures("frames")[0][1]
         request = self.message("LocalizeRequest", map="town", image=frame, k=5, refine=3)

@@ -11,6 +11,7 @@ mod support;
 
 mod answers;
 mod blobs;
+mod corrections;
 mod descriptions;
 mod drafts;
 mod images;

@@ -165,6 +165,10 @@ impl Server {
         Answer::of(self.request(Method::PUT, path).json(&body)).await
     }
 
+    pub async fn patch(&self, path: &str, body: Value) -> Answer {
+        Answer::of(self.request(Method::PATCH, path).json(&body)).await
+    }
+
     /// Posts a body of a media type.
     pub async fn post(&self, path: &str, media_type: &str, body: Vec<u8>) -> Answer {
         let request = self.request(Method::POST, path).header("content-type", media_type);

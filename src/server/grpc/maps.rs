@@ -1,4 +1,4 @@
-//! `MapService`: list, get, put, delete, add images.
+//! `MapService`: list, get, put and delete maps; add and change images.
 
 use futures_util::{StreamExt, TryStreamExt, stream};
 use tokio::sync::OwnedSemaphorePermit;
@@ -9,13 +9,12 @@ use super::proto::map_service_server::MapService;
 use super::proto::{
     AddImageResult, AddImagesRequest, AddImagesResponse, DeleteMapRequest, DeleteMapResponse,
     GetMapRequest, GetMapResponse, ListMapsRequest, ListMapsResponse, PutMapRequest,
-    PutMapResponse, Stored,
+    PutMapResponse, Stored, UpdateImageRequest, UpdateImageResponse,
 };
 use super::{Api, CallContext, convert, status};
-use whereabouts_api::{ImageMeta, MapChange};
-use whereabouts_core::MapName;
+use whereabouts_api::{ImageAnswer, ImageMeta, ImagePatch, MapChange};
+use whereabouts_core::{ImageField, MapName};
 use whereabouts_service::{BulkImage, BulkResult, ServiceError};
-use whereabouts_store::Added;
 
 #[tonic::async_trait]
 impl MapService for Api {
@@ -76,9 +75,28 @@ impl MapService for Api {
         let results = context.service.images.add_many(&map, &context.caller, images, until).await?;
         Ok(Response::new(AddImagesResponse { results: results.into_iter().map(result).collect() }))
     }
+
+    async fn update_image(
+        &self,
+        request: Request<UpdateImageRequest>,
+    ) -> Result<Response<UpdateImageResponse>, Status> {
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let answer = context.update_image(request.into_inner()).await.map_err(status::of)?;
+        Ok(Response::new(answer))
+    }
 }
 
 impl CallContext {
+    async fn update_image(
+        &self,
+        request: UpdateImageRequest,
+    ) -> Result<UpdateImageResponse, ServiceError> {
+        let (map, id) = (self.map(&request.map)?, request.id.parse()?);
+        let answer = self.service.images.update(&map, &id, &patch(request)?).await?;
+        let changed = names(&answer.changed);
+        Ok(UpdateImageResponse { image: Some(answer.image.into()), changed })
+    }
+
     async fn put_map(&self, request: PutMapRequest) -> Result<PutMapResponse, ServiceError> {
         let PutMapRequest { map, scene, descriptor, frame, model, description } = request;
         let change = MapChange {
@@ -115,9 +133,8 @@ fn image(
 }
 
 fn result(result: BulkResult) -> AddImageResult {
-    let (image, present) = match result {
-        Ok(Added::Created(image)) => (image, false),
-        Ok(Added::Present(image)) => (image, true),
+    let (ImageAnswer { image, changed }, new) = match result {
+        Ok(answer) => answer,
         Err((id, error)) => {
             let outcome = Some(Outcome::Problem(convert::problem(error)));
             let id = id.map(Into::into).unwrap_or_default();
@@ -125,10 +142,71 @@ fn result(result: BulkResult) -> AddImageResult {
         }
     };
     let stored = Stored {
-        present,
+        present: !new,
         digest: image.digest.to_string(),
         width: image.width,
         height: image.height,
+        changed: names(&changed),
     };
     AddImageResult { id: image.id.to_string(), outcome: Some(Outcome::Stored(stored)) }
+}
+
+fn names(fields: &[ImageField]) -> Vec<String> {
+    fields.iter().map(|field| field.as_str().to_owned()).collect()
+}
+
+/// Converts a request whose mask names the fields to change; without one, those that are set are changed.
+fn patch(request: UpdateImageRequest) -> Result<ImagePatch, ServiceError> {
+    let UpdateImageRequest { pose, captured_at, tags, update_mask, .. } = request;
+    let pose = pose.map(|pose| convert::pose(pose).into());
+    let captured_at = captured_at.map(convert::moment).transpose()?;
+    let tags = (!tags.is_empty()).then_some(tags);
+    let Some(mask) = update_mask.filter(|mask| !mask.paths.is_empty()) else {
+        return Ok(ImagePatch {
+            pose: pose.map(Some),
+            captured_at: captured_at.map(Some),
+            tags: tags.map(Some),
+        });
+    };
+    let mut patch = ImagePatch::default();
+    for path in &mask.paths {
+        match path.as_str() {
+            "pose" => patch.pose = Some(pose),
+            "captured_at" => patch.captured_at = Some(captured_at),
+            "tags" => patch.tags = Some(tags.clone()),
+            other => {
+                return Err(ServiceError::malformed(format!(
+                    "update_mask names {other:?}; it may name pose, captured_at and tags"
+                )));
+            }
+        }
+    }
+    Ok(patch)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn request(paths: &[&str]) -> UpdateImageRequest {
+        let paths = paths.iter().map(|path| (*path).to_owned()).collect();
+        UpdateImageRequest {
+            tags: vec!["a".into()],
+            update_mask: Some(prost_types::FieldMask { paths }),
+            ..UpdateImageRequest::default()
+        }
+    }
+
+    #[test]
+    fn a_mask_removes_the_fields_that_are_not_set_and_keeps_those_it_does_not_name() {
+        let tags = Some(Some(vec!["a".to_owned()]));
+        let set = ImagePatch { tags: tags.clone(), ..ImagePatch::default() };
+        assert_eq!(patch(request(&[])).unwrap(), set);
+        let removed = ImagePatch { pose: Some(None), ..ImagePatch::default() };
+        assert_eq!(patch(request(&["pose"])).unwrap(), removed);
+        let both = ImagePatch { captured_at: Some(None), tags, pose: None };
+        assert_eq!(patch(request(&["tags", "captured_at"])).unwrap(), both);
+        let refused = patch(request(&["pose.lat"])).unwrap_err();
+        assert!(refused.detail.contains("pose.lat"), "{refused}");
+    }
 }

@@ -63,7 +63,12 @@ pub(crate) fn routes<S: Clone + Send + Sync + 'static>(gate: &Gate) -> Routes<S>
         .call("/whereabouts.v1.MapService/GetMap", robot, maps.clone())
         .call("/whereabouts.v1.MapService/PutMap", admin.changes(), maps.clone())
         .call("/whereabouts.v1.MapService/DeleteMap", admin.changes(), maps.clone())
-        .call("/whereabouts.v1.MapService/AddImages", operator.pictures().bulk().changes(), maps)
+        .call(
+            "/whereabouts.v1.MapService/AddImages",
+            operator.pictures().bulk().changes(),
+            maps.clone(),
+        )
+        .call("/whereabouts.v1.MapService/UpdateImage", operator.changes(), maps)
         .call("/whereabouts.v1.JobService/GetJob", robot.waits(Waits::Always), jobs.clone())
         .call("/whereabouts.v1.JobService/WatchJob", robot.streams(), jobs.clone())
         .call("/whereabouts.v1.JobService/ListJobs", operator, jobs.clone())

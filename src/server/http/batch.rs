@@ -19,9 +19,8 @@ use super::maps::map_name;
 use super::state::AppState;
 use crate::gate::{BodyPaused, GateSettings, Problem, Ready, no_bulk_memory, too_large};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
-use whereabouts_api::{ErrorKind, ImageMeta};
+use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta};
 use whereabouts_service::{BulkImage, BulkResult, Deadline, Principal, ServiceError};
-use whereabouts_store::Added;
 
 /// Largest `meta` of an image, in bytes.
 const LARGEST_META: usize = 64 << 10;
@@ -139,6 +138,7 @@ pub(super) async fn add_images(
     Ok(Json(BatchAnswer {
         stored: count(BatchOutcome::Stored),
         present: count(BatchOutcome::Present),
+        updated: results.iter().filter(|result| !result.changed.is_empty()).count(),
         failed: count(BatchOutcome::Failed),
         results,
     }))
@@ -186,15 +186,17 @@ fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, Servi
 }
 
 fn batch_result(result: BulkResult) -> BatchResult {
-    let (id, outcome, problem) = match result {
-        Ok(Added::Created(image)) => (Some(image.id.into()), BatchOutcome::Stored, None),
-        Ok(Added::Present(image)) => (Some(image.id.into()), BatchOutcome::Present, None),
+    let (id, outcome, changed, problem) = match result {
+        Ok((ImageAnswer { image, changed }, new)) => {
+            let outcome = if new { BatchOutcome::Stored } else { BatchOutcome::Present };
+            (Some(image.id.into()), outcome, changed, None)
+        }
         Err((id, error)) => {
             let kind = error.kind.word().to_owned();
             let retry_after_s = error.retry_after.map(|pause| pause.as_secs_f64());
             let problem = BatchProblem { kind, detail: error.detail, retry_after_s };
-            (id.map(Into::into), BatchOutcome::Failed, Some(problem))
+            (id.map(Into::into), BatchOutcome::Failed, Vec::new(), Some(problem))
         }
     };
-    BatchResult { id, outcome, problem }
+    BatchResult { id, outcome, changed, problem }
 }

@@ -10,15 +10,14 @@ use jiff::Timestamp;
 use serde::Deserialize;
 use utoipa::IntoParams;
 
-use super::body::{Params, PictureBody, Segments};
+use super::body::{JsonBody, Params, PictureBody, Segments};
 use super::maps::map_name;
 use super::state::AppState;
 use crate::gate::Problem;
 use crate::gate::Ready;
-use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
-use whereabouts_core::{Image, ImageId, MediaType, PoseInput};
+use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage, ImagePatch};
+use whereabouts_core::{Image, ImageId, MediaType, PoseInput, moment};
 use whereabouts_service::{Deadline, NewImage, ServiceError};
-use whereabouts_store::Added;
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 /// What is known about a raw image, in the query string; a form has it in its part `meta`.
@@ -28,8 +27,9 @@ use whereabouts_vision::{AdmissionRequest, WorkClass};
 pub(super) struct MetaParams {
     /// The id; by default, the beginning of the digest of the bytes.
     id: Option<String>,
-    /// When it was taken (RFC 3339).
-    #[param(value_type = Option<String>, format = DateTime)]
+    /// When it was taken: RFC 3339 with an offset, or seconds since 1970.
+    #[param(value_type = Option<String>)]
+    #[serde(default, deserialize_with = "moment::optional")]
     captured_at: Option<Timestamp>,
     /// Tags, separated by commas.
     tags: Option<String>,
@@ -86,7 +86,8 @@ impl MetaParams {
 /// Add an image
 ///
 /// Send either a raw picture, with what is known about it in the query string, or a form with the parts
-/// `image` (the picture) and `meta` (JSON). Sending the same id with the same bytes again is answered 200.
+/// `image` (the picture) and `meta` (JSON). Sending the same id with the same bytes again is answered 200; a
+/// pose, time or tags that differ from what is stored replace it, and what is omitted stays.
 #[utoipa::path(post, path = "/maps/{map}/images", tag = "images",
     params(("map" = String, Path), MetaParams,
         ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,
@@ -97,8 +98,8 @@ impl MetaParams {
         (ImageForm = "multipart/form-data"),
     )),
     responses(
-        (status = 200, body = Image, description = "Already stored"),
-        (status = 201, body = Image, description = "Stored"),
+        (status = 200, body = ImageAnswer, description = "Already stored; `changed` names what was updated"),
+        (status = 201, body = ImageAnswer, description = "Stored"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
         (status = 409, body = Problem, description = "The id exists with other bytes", content_type = "application/problem+json"),
@@ -117,7 +118,7 @@ pub(super) async fn add_image(
     Params(params): Params<MetaParams>,
     Deadline(deadline): Deadline,
     request: Request,
-) -> Result<(StatusCode, Json<Image>), Problem> {
+) -> Result<(StatusCode, Json<ImageAnswer>), Problem> {
     let demand = AdmissionRequest { class: WorkClass::Index, deadline };
     let body = PictureBody::read(request, &state, &service, demand).await?;
     let meta = match body.meta {
@@ -130,10 +131,8 @@ pub(super) async fn add_image(
         None => params.into_meta(),
     };
     let new = NewImage { bytes: body.picture, meta, demand };
-    Ok(match service.images.add(&map_name(&map)?, new).await? {
-        Added::Created(image) => (StatusCode::CREATED, Json(image)),
-        Added::Present(image) => (StatusCode::OK, Json(image)),
-    })
+    let (answer, new) = service.images.add(&map_name(&map)?, new).await?;
+    Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(answer)))
 }
 
 /// The form of an upload.
@@ -223,6 +222,31 @@ pub(super) async fn image_content(
 pub(super) fn picture(media_type: MediaType, bytes: Bytes) -> impl IntoResponse {
     let headers = [(CONTENT_TYPE, media_type.as_str()), (CACHE_CONTROL, "private, max-age=3600")];
     (headers, bytes)
+}
+
+/// Change the pose, time or tags of an image
+///
+/// The body is a JSON merge patch (RFC 7396): an omitted field keeps its value, and null removes it. The picture
+/// and its descriptor stay; a calibration of the map follows later.
+#[utoipa::path(patch, path = "/maps/{map}/images/{id}", tag = "images",
+    params(("map" = String, Path), ("id" = String, Path)),
+    request_body(content(
+        (ImagePatch = "application/merge-patch+json"), (ImagePatch = "application/json"),
+    )),
+    responses(
+        (status = 200, body = ImageAnswer, description = "`changed` names what was changed"),
+        (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "Other requests are changing the image; try again", content_type = "application/problem+json"),
+        (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
+        (status = 422, body = Problem, description = "A pose that does not fit the map or is out of range, or invalid tags", content_type = "application/problem+json"),
+    ))]
+pub(super) async fn update_image(
+    Ready(service): Ready,
+    Segments((map, id)): Segments<(String, String)>,
+    JsonBody(patch): JsonBody<ImagePatch>,
+) -> Result<Json<ImageAnswer>, Problem> {
+    Ok(Json(service.images.update(&map_name(&map)?, &image_id(&id)?, &patch).await?))
 }
 
 /// Remove an image

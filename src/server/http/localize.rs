@@ -13,7 +13,7 @@ use crate::gate::IdempotencyId;
 use crate::gate::Problem;
 use crate::gate::Ready;
 use whereabouts_api::{Answer, RefineMode};
-use whereabouts_core::Priority;
+use whereabouts_core::{Priority, moment};
 use whereabouts_service::{Deadline, LocalizeRequest, Principal, ServiceError, TrackStep};
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
@@ -37,7 +37,10 @@ pub(super) struct LocalizeParams {
     /// `_`, `.` and `:`. The field `track` of the answer then estimates where the robot is, given all its
     /// frames. The images of the map need poses. A track expires when no frame arrives for a while.
     track: Option<String>,
-    /// When the frame was taken (RFC 3339), for a frame with `track`; by default now.
+    /// When the frame was taken, for a frame with `track`: RFC 3339 with an offset, or seconds since 1970; by
+    /// default now.
+    #[param(value_type = Option<String>)]
+    #[serde(default, deserialize_with = "moment::optional")]
     captured_at: Option<Timestamp>,
     /// Metres that the robot has moved since the previous frame, by its odometry, for a frame with
     /// `track`; by default, any distance up to the maximum speed (`track.max_speed_m_s`) is possible.

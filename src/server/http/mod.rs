@@ -74,6 +74,7 @@ impl Described {
                 (Method::GET, &item.get),
                 (Method::PUT, &item.put),
                 (Method::POST, &item.post),
+                (Method::PATCH, &item.patch),
                 (Method::DELETE, &item.delete),
             ];
             for (method, operation) in operations {
@@ -108,6 +109,7 @@ fn described() -> Described {
     .route(operator.map(MapSource::Path).changes().idempotent(), routes!(images::add_image))
     .route(operator.map(MapSource::Path).changes().bulk(), batch)
     .route(operator.map(MapSource::Path), routes!(images::get_image))
+    .route(operator.map(MapSource::Path).changes(), routes!(images::update_image))
     .route(operator.map(MapSource::Path).changes(), routes!(images::delete_image))
     .route(operator.map(MapSource::Path), routes!(images::image_content))
     .route(

@@ -128,9 +128,9 @@ impl Draft for EmbeddedDraft {
                     if reading.next_slot() != done {
                         return Ok(None);
                     }
-                    // Scene and description may have changed meanwhile.
-                    let map =
-                        Map { scene: stored.scene, description: stored.description, ..new_map };
+                    // Scene, coordinate frame and description may have changed meanwhile.
+                    let Map { scene, frame, description, .. } = stored;
+                    let map = Map { scene, frame, description, ..new_map };
                     put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
                     // The descriptors of described frames belong to the old revision.
                     trees.forget_frames(map.uid)?;
@@ -139,7 +139,7 @@ impl Draft for EmbeddedDraft {
                 move |map| {
                     let Some(map) = map else { return };
                     next.set_map(map.clone());
-                    next.continue_slots_of(&current);
+                    next.continue_from(&current);
                     inner.indexer.notify(&next);
                     let mut maps = inner.maps.write();
                     maps.insert(map.name.clone(), next);

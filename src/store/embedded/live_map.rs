@@ -23,8 +23,10 @@ pub(super) struct LiveMap {
     entries: RwLock<Vec<Option<Entry>>>,
     /// The slot of the next image. Only the writer thread changes it.
     next_slot: AtomicUsize,
-    /// Number of additions and removals since the map was loaded.
+    /// Number of additions, removals and changed poses since the map was loaded.
     changes: AtomicU64,
+    /// How often poses were changed since the map was created.
+    moved: AtomicU64,
 }
 
 /// The fields of an image that a candidate needs, kept in memory so that a search reads no records.
@@ -44,6 +46,7 @@ impl LiveMap {
         let uid = map.uid;
         let live = Self::open(map, descriptors, index)?;
         live.restore_graph(index);
+        live.moved.store(trees.moved(uid)?, Ordering::Relaxed);
         for stored in trees.images_of(uid) {
             let stored = stored?;
             live.next_slot.fetch_max(stored.slot + 1, Ordering::Relaxed);
@@ -73,6 +76,7 @@ impl LiveMap {
             entries: RwLock::default(),
             next_slot: AtomicUsize::new(0),
             changes: AtomicU64::new(0),
+            moved: AtomicU64::new(0),
         })
     }
 
@@ -131,9 +135,10 @@ impl LiveMap {
         self.next_slot.load(Ordering::Relaxed)
     }
 
-    /// Continues the slot numbers of `other`, which this map replaces.
-    pub fn continue_slots_of(&self, other: &Self) {
+    /// Continues the slot numbers and the count of changed poses of `other`, which this map replaces.
+    pub fn continue_from(&self, other: &Self) {
         self.next_slot.store(other.next_slot(), Ordering::Relaxed);
+        self.moved.store(other.moved(), Ordering::Relaxed);
     }
 
     /// Makes a stored image visible to searches.
@@ -146,6 +151,18 @@ impl LiveMap {
         drop(entries);
         self.changes.fetch_add(1, Ordering::Relaxed);
         self.index.add(stored.slot);
+    }
+
+    /// Makes the changed pose of an image visible to searches.
+    pub fn move_image(&self, stored: &StoredImage) {
+        let mut entries = self.entries.write();
+        // An image with a damaged descriptor has no entry, and one that the draft lacks will be published.
+        if let Some(Some(entry)) = entries.get_mut(stored.slot) {
+            entry.pose = stored.image.pose;
+        }
+        drop(entries);
+        self.changes.fetch_add(1, Ordering::Relaxed);
+        self.moved.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Hides an image from searches.
@@ -163,9 +180,14 @@ impl LiveMap {
         self.vectors.bytes_of(self.next_slot()) + self.index.sealed_bytes() as u64
     }
 
-    /// Returns the number of additions and removals since the map was loaded.
+    /// Returns the number of additions, removals and changed poses since the map was loaded.
     pub fn changes(&self) -> u64 {
         self.changes.load(Ordering::Relaxed)
+    }
+
+    /// Returns how often poses were changed since the map was created.
+    pub fn moved(&self) -> u64 {
+        self.moved.load(Ordering::Relaxed)
     }
 
     /// Returns the images that have a pose, in insertion order.

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use sled::Transactional;
 use uuid::Uuid;
 
-use super::super::changes::{changed_map, check_dim, removed, same_bytes};
+use super::super::changes::{MapContent, changed_map, check_dim, check_frame, removed, same_bytes};
 use super::super::{Added, BlobPin, BlobStore, HardNegatives, IndexState, MapStore, StoreError};
 use super::blobs::Blobs;
 use super::live_map::{LiveMap, folder_of};
@@ -57,6 +57,19 @@ impl Inner {
         }
     }
 
+    /// Makes the changed pose of an image visible, also in the map's draft. Call it on the writer thread.
+    fn publish_pose(&self, map_uid: Uuid, stored: &StoredImage) {
+        let maps = self.maps.read();
+        if let Some(live) = maps.values().find(|live| live.map().uid == map_uid) {
+            live.move_image(stored);
+        }
+        drop(maps);
+        let drafts = self.drafts.read();
+        if let Some(draft) = drafts.get(&map_uid) {
+            draft.move_image(stored);
+        }
+    }
+
     /// Stores the map's record. Call it on the writer thread.
     fn apply_put(&self, trees: &Trees, requested: Map) -> Result<(Map, bool), StoreError> {
         let stored: Option<Map> = get(&trees.maps, requested.name.as_str().as_bytes())?;
@@ -64,8 +77,7 @@ impl Inner {
             None => (requested, true),
             Some(stored) => {
                 let uid = stored.uid;
-                let has_images = || trees.images.scan_prefix(uid.as_bytes()).next().is_some();
-                (changed_map(stored, requested, has_images)?, false)
+                (changed_map(stored, requested, || content(trees, uid))?, false)
             }
         };
         put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
@@ -146,6 +158,7 @@ impl MapStore for EmbeddedStore {
             graph: live.index.graphed() > 0,
             behind: live.index.is_behind(),
             changes: live.changes(),
+            moved: live.moved(),
         })
     }
 
@@ -168,7 +181,7 @@ impl MapStore for EmbeddedStore {
                         let image = same_bytes(present.image, &image)?;
                         return Ok((StoredImage { image, slot }, false));
                     }
-                    check_revision(trees, &map)?;
+                    check_frame(&check_revision(trees, &map)?, &image)?;
                     let slot = writing.allocate_slot();
                     writing.vectors.write(slot, descriptor.as_slice())?;
                     touched.vectors.push(Arc::clone(&writing.vectors));
@@ -185,6 +198,40 @@ impl MapStore for EmbeddedStore {
             )
             .await?;
         Ok(if new { Added::Created(stored.image) } else { Added::Present(stored.image) })
+    }
+
+    async fn replace_image(
+        &self,
+        map: &Map,
+        current: &Image,
+        next: Image,
+    ) -> Result<bool, StoreError> {
+        self.inner.live(map)?;
+        let (map, uid, current) = (map.clone(), map.uid, current.clone());
+        let inner = Arc::clone(&self.inner);
+        let replaced = self
+            .inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    check_frame(&stored_map(trees, &map)?, &next)?;
+                    let Some(stored) = trees.image(uid, &current.id)? else { return Ok(None) };
+                    if stored.image != current {
+                        return Ok(None);
+                    }
+                    let moved = current.pose != next.pose;
+                    let stored = StoredImage { image: next, slot: stored.slot };
+                    replace_record(trees, uid, &stored, moved)?;
+                    Ok(Some((stored, moved)))
+                },
+                move |replaced| {
+                    if let Some((stored, true)) = replaced {
+                        inner.publish_pose(uid, stored);
+                    }
+                },
+            )
+            .await?;
+        Ok(replaced.is_some())
     }
 
     async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
@@ -299,13 +346,52 @@ impl BlobStore for EmbeddedStore {
     }
 }
 
+/// Returns what a map contains.
+fn content(trees: &Trees, uid: Uuid) -> Result<MapContent, StoreError> {
+    let mut content = MapContent::Empty;
+    for stored in trees.images_of(uid) {
+        if stored?.image.pose.is_some() {
+            return Ok(MapContent::WithPoses);
+        }
+        content = MapContent::WithoutPoses;
+    }
+    Ok(content)
+}
+
+/// Returns the stored map, whatever its revision.
+fn stored_map(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
+    let stored: Option<Map> = get(&trees.maps, map.name.as_str().as_bytes())?;
+    stored.filter(|stored| stored.uid == map.uid).ok_or_else(|| removed(map))
+}
+
 /// Returns the stored map, if it still has the revision that the caller knows.
 pub(super) fn check_revision(trees: &Trees, map: &Map) -> Result<Map, StoreError> {
-    match get::<Map>(&trees.maps, map.name.as_str().as_bytes())? {
-        Some(stored) if stored.uid == map.uid && stored.revision == map.revision => Ok(stored),
-        Some(stored) if stored.uid == map.uid => Err(StoreError::Superseded(stored.name)),
-        _ => Err(removed(map)),
+    let stored = stored_map(trees, map)?;
+    match stored.revision == map.revision {
+        true => Ok(stored),
+        false => Err(StoreError::Superseded(stored.name)),
     }
+}
+
+/// Replaces the record of an image, whose bytes stay the same, and counts a changed pose.
+fn replace_record(
+    trees: &Trees,
+    uid: Uuid,
+    stored: &StoredImage,
+    moved: bool,
+) -> Result<(), StoreError> {
+    let key = image_key(uid, &stored.image.id);
+    let value = encode(stored)?;
+    let count = encode(&(trees.moved(uid)? + u64::from(moved)))?;
+    (&trees.images, &trees.moves)
+        .transaction(|(images, moves)| {
+            images.insert(key.as_slice(), value.as_slice())?;
+            if moved {
+                moves.insert(uid.as_bytes().as_slice(), count.as_slice())?;
+            }
+            Ok(())
+        })
+        .map_err(transaction_failed)
 }
 
 fn insert_image(trees: &Trees, uid: Uuid, stored: &StoredImage) -> Result<(), StoreError> {
@@ -370,6 +456,7 @@ pub(super) fn collect_orphans(
 /// Removes the frames, images, references and bytes of a deleted map.
 fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs) -> Result<(), StoreError> {
     trees.forget_frames(uid)?;
+    trees.moves.remove(uid.as_bytes()).map_err(failed)?;
     loop {
         let batch: Vec<StoredImage> =
             trees.images_of(uid).take(SWEEP_BATCH).collect::<Result<_, _>>()?;

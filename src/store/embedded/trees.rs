@@ -22,6 +22,8 @@ pub(super) struct Trees {
     pub maps: sled::Tree,
     /// Map uid, image id → [`StoredImage`].
     pub images: sled::Tree,
+    /// Map uid → how often poses of its images were changed.
+    pub moves: sled::Tree,
     /// Digest, owner → nothing: the references to image bytes.
     pub blob_refs: sled::Tree,
     /// Job id → [`JobRecord`].
@@ -101,6 +103,7 @@ impl Trees {
         Ok(Self {
             maps: tree("maps")?,
             images: tree("images")?,
+            moves: tree("moves")?,
             blob_refs: tree("blob_refs")?,
             jobs: tree("jobs")?,
             queue: tree("queue")?,
@@ -146,6 +149,11 @@ impl Trees {
 
     pub fn image(&self, map_uid: Uuid, id: &ImageId) -> Result<Option<StoredImage>, StoreError> {
         get(&self.images, &image_key(map_uid, id))
+    }
+
+    /// Returns how often poses of a map's images were changed.
+    pub fn moved(&self, map_uid: Uuid) -> Result<u64, StoreError> {
+        Ok(get(&self.moves, map_uid.as_bytes())?.unwrap_or(0))
     }
 
     /// Iterates over the images of a map, by id.

@@ -194,8 +194,9 @@ impl PostgresDraft {
                  SELECT FROM images WHERE map_uid = $1 AND slot = d.slot)"
         );
         sqlx::query(AssertSqlSafe(removed)).bind(uid).execute(&mut *tx).await?;
-        // Scene and description may have changed meanwhile.
-        let map = Map { scene: stored.scene, description: stored.description, ..self.next.clone() };
+        // Scene, coordinate frame and description may have changed meanwhile.
+        let Map { scene, frame, description, .. } = stored;
+        let map = Map { scene, frame, description, ..self.next.clone() };
         sqlx::query(
             "UPDATE maps SET revision = $2, record = $3::json, graph = $4, calibration = NULL,
                  measured_by = NULL WHERE uid = $1",

@@ -10,7 +10,7 @@ use sqlx::Row;
 use sqlx::types::Json;
 use uuid::Uuid;
 
-use super::super::changes::{removed, same_bytes};
+use super::super::changes::{check_frame, removed, same_bytes};
 use super::super::{Added, ExportStore, StoreError};
 use super::descriptors::{descriptor_of, image_id, table};
 use super::{Inner, PostgresStore, blobs, count, is_missing_table, record};
@@ -33,7 +33,7 @@ impl Inner {
         let table = table(map.uid, map.revision);
         let sql = format!(
             "WITH map AS (
-                 SELECT uid FROM maps WHERE uid = $1 AND revision = $2 FOR SHARE),
+                 SELECT uid, record FROM maps WHERE uid = $1 AND revision = $2 FOR SHARE),
              added AS (
                  INSERT INTO images (map_uid, id, digest, record, pose)
                  SELECT uid, $3, $4, $5::json, $8::json FROM map
@@ -47,7 +47,8 @@ impl Inner {
              needed AS (
                  UPDATE blobs SET needed = needed + 1
                  WHERE digest = $4 AND EXISTS (SELECT FROM added) RETURNING digest)
-             SELECT (SELECT count(*) FROM added) AS added, (SELECT count(*) FROM needed) AS needed"
+             SELECT (SELECT count(*) FROM added) AS added, (SELECT count(*) FROM needed) AS needed,
+                 (SELECT record FROM map) AS map"
         );
         let (text, pose) = (record(&image)?, image.pose.as_ref().map(record).transpose()?);
         for _ in 0..MAX_ATTEMPTS {
@@ -75,6 +76,8 @@ impl Inner {
                 (0, _) => {}
                 (_, 0) => return Err(blobs::not_stored(&image.digest)),
                 _ => {
+                    let stored: Option<Json<Map>> = row.try_get("map")?;
+                    check_frame(stored.as_deref().unwrap_or(map), &image)?;
                     tx.commit().await?;
                     return Ok(Added::Created(image));
                 }
@@ -87,6 +90,50 @@ impl Inner {
             // The image existed and was removed just now, so try again.
         }
         Err(super::unavailable("other processes are changing the same image"))
+    }
+
+    pub(super) async fn replace_image(
+        &self,
+        map: &Map,
+        current: &Image,
+        next: &Image,
+    ) -> Result<bool, StoreError> {
+        let mut tx = self.begin().await?;
+        // A change of the coordinate frame waits.
+        let stored = sqlx::query_scalar("SELECT record FROM maps WHERE uid = $1 FOR SHARE");
+        let stored: Option<Json<Map>> = stored.bind(map.uid).fetch_optional(&mut *tx).await?;
+        let Json(stored) = stored.ok_or_else(|| removed(map))?;
+        check_frame(&stored, next)?;
+        let image = sqlx::query_scalar(
+            "SELECT record FROM images WHERE map_uid = $1 AND id = $2 FOR UPDATE",
+        );
+        let image: Option<Json<Image>> =
+            image.bind(map.uid).bind(current.id.as_str()).fetch_optional(&mut *tx).await?;
+        if image.is_none_or(|Json(image)| image != *current) {
+            return Ok(false);
+        }
+        sqlx::query(
+            "UPDATE images SET record = $3::json, pose = $4::json WHERE map_uid = $1 AND id = $2",
+        )
+        .bind(map.uid)
+        .bind(current.id.as_str())
+        .bind(record(next)?)
+        .bind(next.pose.as_ref().map(record).transpose()?)
+        .execute(&mut *tx)
+        .await?;
+        if current.pose != next.pose {
+            sqlx::query(
+                "INSERT INTO image_counts (map_uid, part, images, changes, moved)
+                 VALUES ($1, $2, 0, 1, 1) ON CONFLICT (map_uid, part) DO UPDATE
+                 SET changes = image_counts.changes + 1, moved = image_counts.moved + 1",
+            )
+            .bind(map.uid)
+            .bind(part())
+            .execute(&mut *tx)
+            .await?;
+        }
+        tx.commit().await?;
+        Ok(true)
     }
 
     pub(super) async fn image(

@@ -7,7 +7,7 @@ use sqlx::types::Json;
 use sqlx::{PgConnection, Row};
 use uuid::Uuid;
 
-use super::super::changes::{changed_map, check_dim, removed};
+use super::super::changes::{MapContent, changed_map, check_dim, removed};
 use super::super::{Added, HardNegatives, IndexState, MapStore, StoreError};
 use super::descriptors::create_table;
 use super::{Inner, PostgresStore, counted, record};
@@ -46,7 +46,8 @@ impl MapStore for PostgresStore {
         let inner = &self.inner;
         let query = sqlx::query(
             "SELECT m.graph, coalesce(sum(c.images), 0)::bigint AS images,
-                 coalesce(sum(c.changes), 0)::bigint AS changes
+                 coalesce(sum(c.changes), 0)::bigint AS changes,
+                 coalesce(sum(c.moved), 0)::bigint AS moved
              FROM maps m LEFT JOIN image_counts c ON c.map_uid = m.uid
              WHERE m.uid = $1 GROUP BY m.uid",
         )
@@ -60,6 +61,7 @@ impl MapStore for PostgresStore {
                     // PostgreSQL's index contains every image as soon as it is stored.
                     behind: false,
                     changes: row.try_get::<i64, _>("changes")?.unsigned_abs(),
+                    moved: row.try_get::<i64, _>("moved")?.unsigned_abs(),
                 })
             })
             .await
@@ -72,6 +74,15 @@ impl MapStore for PostgresStore {
         descriptor: Descriptor,
     ) -> Result<Added, StoreError> {
         self.inner.call(self.inner.add_image(map, image, &descriptor)).await
+    }
+
+    async fn replace_image(
+        &self,
+        map: &Map,
+        current: &Image,
+        next: Image,
+    ) -> Result<bool, StoreError> {
+        self.inner.call(self.inner.replace_image(map, current, &next)).await
     }
 
     async fn image(&self, map: &Map, id: &ImageId) -> Result<Option<Image>, StoreError> {
@@ -192,8 +203,9 @@ impl Inner {
             Some(Json(stored)) => {
                 let stored: Map = stored;
                 let before = stored.uid;
-                let has_images = has_images(&mut tx, before).await?;
-                let map = changed_map(stored, requested, || has_images)?;
+                let reframed = stored.frame != requested.frame;
+                let content = content(&mut tx, before, reframed).await?;
+                let map = changed_map(stored, requested, || Ok(content))?;
                 if map.uid != before {
                     add_tombstone(&mut tx, before).await?;
                     create_table(&mut tx, &map).await?;
@@ -304,7 +316,19 @@ async fn add_tombstone(connection: &mut PgConnection, uid: Uuid) -> Result<(), S
     Ok(())
 }
 
-async fn has_images(connection: &mut PgConnection, uid: Uuid) -> Result<bool, StoreError> {
-    let exists = sqlx::query_scalar("SELECT EXISTS (SELECT FROM images WHERE map_uid = $1)");
-    Ok(exists.bind(uid).fetch_one(connection).await?)
+/// Returns what a map contains. Poses are looked for only if `poses` says so, as all images may have to be read.
+async fn content(
+    connection: &mut PgConnection,
+    uid: Uuid,
+    poses: bool,
+) -> Result<MapContent, StoreError> {
+    let content = sqlx::query_as(
+        "SELECT EXISTS (SELECT FROM images WHERE map_uid = $1),
+             $2 AND EXISTS (SELECT FROM images WHERE map_uid = $1 AND pose IS NOT NULL)",
+    );
+    Ok(match content.bind(uid).bind(poses).fetch_one(connection).await? {
+        (false, _) => MapContent::Empty,
+        (true, false) => MapContent::WithoutPoses,
+        (true, true) => MapContent::WithPoses,
+    })
 }

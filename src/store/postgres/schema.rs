@@ -30,7 +30,10 @@ fn migrations() -> Vec<Migration> {
         let sql = sql.into_sql_str();
         Migration::new(version, Cow::Borrowed(name), MigrationType::Simple, sql, false)
     };
-    vec![migration(1, "first", include_str!("../../../migrations/0001_first.sql"))]
+    vec![
+        migration(1, "first", include_str!("../../../migrations/0001_first.sql")),
+        migration(2, "moved", include_str!("../../../migrations/0002_moved.sql")),
+    ]
 }
 
 /// Applies the missing migrations and returns their number. Concurrent calls wait for each other.

@@ -196,6 +196,10 @@ impl MapStore for Shelf {
         unused()
     }
 
+    async fn replace_image(&self, _: &Map, _: &Image, _: Image) -> Result<bool, StoreError> {
+        unused()
+    }
+
     async fn images(
         &self,
         _: &Map,

@@ -1,10 +1,10 @@
-// One image of a map: its picture and metadata, deleting it, and adding another.
+// One image of a map: its picture and metadata, correcting and deleting it, and adding another.
 
 import { address, call, contentOf, isAbort, picture } from "./api.js";
 import { announce, confirm, facts, failure, fill, h } from "./dom.js";
 import { ago, moment, pose } from "./format.js";
 
-export function imageCard(map, image, { signal, removed, close }) {
+export function imageCard(map, image, { signal, removed, close, corrected }) {
   const said = h("div");
   const remove = async () => {
     const sure = await confirm({ title: "Delete this image?", text: `${image.id} will be removed from the map ${map.name}. Jobs that compared it keep their texts.`, action: "Delete the image" });
@@ -22,8 +22,44 @@ export function imageCard(map, image, { signal, removed, close }) {
     facts(["Pose", pose(image.pose)], ["Taken", time(image.captured_at)], ["Stored", time(image.created_at)],
       ["Size", `${image.width} × ${image.height} pixels`],
       ["Tags", image.tags?.length ? h("span", { class: "tags" }, image.tags.map((tag) => h("span", { class: "tag" }, tag))) : null]),
-    said, h("button", { type: "button", class: "danger", onclick: remove }, "Delete the image…"),
+    said, correction(map, image, { signal, corrected }),
+    h("button", { type: "button", class: "danger", onclick: remove }, "Delete the image…"),
   ];
+}
+
+const POSE = {
+  wgs84: [["lat", "Latitude, degrees"], ["lon", "Longitude, degrees"], ["alt", "Height, metres"], ["heading", "Heading, degrees"]],
+  metric: [["x", "x, metres"], ["y", "y, metres"], ["z", "z, metres"]],
+};
+
+// A merge patch: a number that is emptied is removed, and so is the pose once all are. An orientation that the form
+// does not show stays.
+function correction(map, image, { signal, corrected }) {
+  const fields = POSE[map.frame] ?? [];
+  const said = h("div", { role: "status" });
+  const input = (name, label, value, attributes = {}) =>
+    h("label", { for: `edit-${name}` }, label, h("input", { type: "text", id: `edit-${name}`, name, autocomplete: "off", value: value ?? "", ...attributes }));
+  const save = h("button", { type: "submit", class: "primary" }, "Save");
+  const form = h("form", {},
+    h("div", { class: "grid-2" }, fields.map(([name, label]) => input(name, label, image.pose?.[name], { type: "number", step: "any", inputmode: "decimal" }))),
+    input("captured_at", "Taken", image.captured_at, { placeholder: "2026-05-01T12:00:00Z" }),
+    input("tags", "Tags, separated by commas", image.tags?.join(", ")),
+    h("div", { class: "actions" }, save), said);
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const typed = (name) => form.elements[name].value.trim();
+    const numbers = fields.map(([name]) => [name, typed(name) === "" ? null : Number(typed(name))]);
+    const pose = numbers.every(([, value]) => value === null) ? null : Object.fromEntries(numbers);
+    const tags = typed("tags").split(",").map((tag) => tag.trim()).filter(Boolean);
+    save.disabled = true;
+    try {
+      const changed = await call(address(["maps", map.name, "images", image.id]), { method: "PATCH", json: { pose, captured_at: typed("captured_at") || null, tags }, signal });
+      announce(changed.changed.length ? "The image is changed." : "Nothing to change.");
+      corrected(changed);
+    } catch (problem) { if (!isAbort(problem)) fill(said, failure(problem)); }
+    save.disabled = false;
+  });
+  return h("details", {}, h("summary", {}, "Correct the pose, time or tags"), form);
 }
 
 export function uploadCard(map, { signal, added, centre }) {

@@ -80,7 +80,11 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
     for (const button of list.querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.dataset.id === image?.id));
     if (!image) return;
     if (image.pose) plan.goTo(image.pose);
-    fill(single, imageCard(map, image, { signal, close: () => { choose(null); canvas.focus(); }, removed() {
+    fill(single, imageCard(map, image, { signal, close: () => { choose(null); canvas.focus(); }, corrected(next) {
+      images = images.map((one) => (one.id === image.id ? next : one));
+      changed();
+      choose(next);
+    }, removed() {
       images = images.filter((one) => one.id !== image.id);
       choose(null);
       changed();
