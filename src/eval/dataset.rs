@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::path::PathBuf;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::account::{bounded, skipped_lines, warning_lines};
 use super::resample::sample;
@@ -57,7 +57,7 @@ pub struct EvaluatedQuery {
 }
 
 /// What of the folders is not evaluated, and why. Every picture that is not in the data set is here once.
-#[derive(Debug, Clone, Default, Serialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct LeftOut {
     /// Files that cannot be taken.
     pub skipped: Vec<SkippedFile>,

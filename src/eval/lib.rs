@@ -37,7 +37,7 @@ pub use dataset::{Dataset, EvaluatedQuery, Folders, LeftOut, QueryKind, Sampling
 pub use folder::{Folder, PictureFile, SkippedFile};
 pub use outcome::{MethodOutcomes, Prediction, QueryOutcome, StageTimes};
 pub use poses::{
-    FolderPoses, FoundPose, LooseRow, MatchKind, PoseSource, RowAccount, UnmatchedRow,
+    FolderPoses, FoundPose, LooseRow, MatchKind, PoseSource, RowAccount, UnmatchedRow, zone_in_name,
 };
 pub use run::{Evaluator, Method, Observer, RunSettings};
 pub use summary::{MethodSummary, RunConditions, Summary};

@@ -248,3 +248,9 @@ pub(crate) fn match_names<'a>(names: &[&str], folder: &'a Folder) -> Vec<Option<
         |found: Result<(usize, MatchKind), String>| Some(&folder.pictures[found.ok()?.0].id);
     matches.into_iter().map(image).collect()
 }
+
+/// The UTM zone in the name of an image, if it has a position in metres.
+pub fn zone_in_name(id: &str) -> Option<UtmZone> {
+    let name = id.rsplit('/').next()?;
+    names::place_in_name(name).ok()??.zone
+}

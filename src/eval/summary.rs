@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::open_set::{OpenSetMetrics, Thresholds, TopPrediction};
 use super::recall::{AtK, Change, FirstCorrectRank, change, first_correct_rank, recall};
-use super::{Dataset, EvaluatedQuery, MethodOutcomes, QueryKind, QueryOutcome};
+use super::{Dataset, EvaluatedQuery, LeftOut, MethodOutcomes, QueryKind, QueryOutcome};
 use whereabouts_core::Usage;
 
 /// The results of an evaluation and the conditions under which they were measured.
@@ -18,6 +18,9 @@ pub struct Summary {
     pub unknown: usize,
     /// Images in the map.
     pub references: usize,
+    /// What of the folders is not evaluated, and why.
+    #[serde(default)]
+    pub left_out: LeftOut,
     /// The conditions.
     #[serde(flatten)]
     pub conditions: RunConditions,
@@ -118,6 +121,7 @@ impl Summary {
             skipped: data.count(QueryKind::Skipped) + data.left_out.queries.len(),
             unknown: data.count(QueryKind::Unknown),
             references: data.references.len(),
+            left_out: data.left_out.clone(),
             conditions,
             methods,
         }

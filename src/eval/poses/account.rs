@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use anyhow::bail;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::matching::{MatchKind, match_rows};
 use super::rows::PoseRows;
@@ -13,7 +13,7 @@ use crate::account::bounded;
 use whereabouts_core::ImageId;
 
 /// What became of the rows of a table of poses. Every row is counted once.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct RowAccount {
     /// The table.
     pub table: String,
@@ -36,7 +36,7 @@ pub struct RowAccount {
 }
 
 /// A row that matches no image.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct UnmatchedRow {
     /// Its line in the file, from 1.
     pub line: u64,
@@ -47,7 +47,7 @@ pub struct UnmatchedRow {
 }
 
 /// A row that names its image other than by its exact path.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct LooseRow {
     /// Its line in the file, from 1.
     pub line: u64,

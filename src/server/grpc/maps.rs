@@ -133,7 +133,7 @@ fn image(
 }
 
 fn result(result: BulkResult) -> AddImageResult {
-    let (ImageAnswer { image, changed }, new) = match result {
+    let (ImageAnswer { image, changed, .. }, new) = match result {
         Ok(answer) => answer,
         Err((id, error)) => {
             let outcome = Some(Outcome::Problem(convert::problem(error)));

@@ -186,17 +186,17 @@ fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, Servi
 }
 
 fn batch_result(result: BulkResult) -> BatchResult {
-    let (id, outcome, changed, problem) = match result {
-        Ok((ImageAnswer { image, changed }, new)) => {
+    let (id, outcome, changed, problem, warnings) = match result {
+        Ok((ImageAnswer { image, changed, warnings }, new)) => {
             let outcome = if new { BatchOutcome::Stored } else { BatchOutcome::Present };
-            (Some(image.id.into()), outcome, changed, None)
+            (Some(image.id.into()), outcome, changed, None, warnings)
         }
         Err((id, error)) => {
             let kind = error.kind.word().to_owned();
             let retry_after_s = error.retry_after.map(|pause| pause.as_secs_f64());
             let problem = BatchProblem { kind, detail: error.detail, retry_after_s };
-            (id.map(Into::into), BatchOutcome::Failed, Vec::new(), Some(problem))
+            (id.map(Into::into), BatchOutcome::Failed, Vec::new(), Some(problem), Vec::new())
         }
     };
-    BatchResult { id, outcome, changed, problem }
+    BatchResult { id, outcome, changed, problem, warnings }
 }

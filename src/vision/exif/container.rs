@@ -19,8 +19,10 @@ pub(super) fn exif_blocks(bytes: &[u8]) -> Vec<Cow<'_, [u8]>> {
         webp(bytes)
     } else if is_tiff(bytes) {
         vec![Cow::Borrowed(bytes)]
-    } else {
+    } else if bytes.get(4..8) == Some(b"ftyp") {
         marked(bytes)
+    } else {
+        Vec::new()
     }
 }
 
@@ -102,7 +104,7 @@ fn webp(bytes: &[u8]) -> Vec<Cow<'_, [u8]>> {
     blocks
 }
 
-/// Blocks that are marked as EXIF in any other container, such as HEIF and AVIF.
+/// Blocks that are marked as EXIF in an ISO media file: HEIF and AVIF.
 fn marked(bytes: &[u8]) -> Vec<Cow<'_, [u8]>> {
     let mut blocks = Vec::new();
     let mut rest = bytes;
