@@ -32,11 +32,11 @@ pub fn warning_lines(warnings: &[(ImageId, String)], most: usize) -> Vec<String>
         }
     }
     let line = |(text, ids): &(&str, Vec<&ImageId>)| {
-        format!("{} images: {text}: {}", ids.len(), bounded(ids, most, |id| id.to_string()))
+        format!("{text} ({}): {}", ids.len(), bounded(ids, most, |id| id.to_string()))
     };
     let mut lines: Vec<String> = by_text.iter().take(most).map(line).collect();
     if by_text.len() > most {
-        lines.push(format!("{} other warnings", by_text.len() - most));
+        lines.push(format!("other warnings ({})", by_text.len() - most));
     }
     lines
 }
@@ -55,6 +55,6 @@ mod tests {
         assert_eq!(lines, ["skipped a: cut", "skipped 1 more"]);
         let warning = |id: &str, text: &str| (id.parse().unwrap(), text.to_owned());
         let lines = warning_lines(&[warning("a", "x"), warning("b", "y"), warning("c", "x")], 1);
-        assert_eq!(lines, ["2 images: x: a and 1 more", "1 other warnings"]);
+        assert_eq!(lines, ["x (2): a and 1 more", "other warnings (1)"]);
     }
 }

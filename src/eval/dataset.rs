@@ -167,7 +167,7 @@ impl LeftOut {
         for (what, ids) in [("references", &self.references), ("queries", &self.queries)] {
             if !ids.is_empty() {
                 lines.push(format!(
-                    "{} {what} have no position and are left out: {}",
+                    "{what} left out, without a position ({}): {}",
                     ids.len(),
                     list(ids)
                 ));

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use walkdir::{DirEntry, WalkDir};
 
 use super::natural;
+use super::poses::POSES_FILE;
 use whereabouts_core::{ImageId, InvalidName, MediaType};
 
 /// An image file in a folder.
@@ -44,13 +45,11 @@ pub struct Folder {
 }
 
 /// Folders in which other programs keep copies and leftovers.
-const FOREIGN_FOLDERS: [&str; 12] = [
+const FOREIGN_FOLDERS: [&str; 10] = [
     ".thumbnails",
     "@eadir",
     "__macosx",
     ".appledouble",
-    ".trashes",
-    ".trash",
     ".spotlight-v100",
     ".fseventsd",
     "$recycle.bin",
@@ -149,6 +148,11 @@ impl Folder {
         if is_raw_name(path) {
             return self.add_raw(path);
         }
+        if lower == POSES_FILE && entry.depth() > 1 {
+            let why = "only the poses.csv of the folder itself is read; name this one with --poses, or index its folder";
+            self.skip(path, why, false);
+            return;
+        }
         if !entry.file_type().is_file() {
             if is_picture_name(path) {
                 self.skip(path, "neither a file nor a folder", true);
@@ -205,7 +209,8 @@ impl Folder {
 
 fn is_foreign_folder(entry: &DirEntry) -> bool {
     let name = entry.file_name().to_string_lossy().to_ascii_lowercase();
-    entry.file_type().is_dir() && FOREIGN_FOLDERS.contains(&name.as_str())
+    let is_foreign = FOREIGN_FOLDERS.contains(&name.as_str()) || name.starts_with(".trash");
+    entry.file_type().is_dir() && is_foreign
 }
 
 /// Describes a folder of another program, and counts the pictures in it.
@@ -293,10 +298,12 @@ mod tests {
             "s/@eaDir/a.jpg/SYNOPHOTO_THUMB_M.jpg",
             "__MACOSX/._a.jpg",
             "a.dng",
+            "s/poses.csv",
         ]);
         let folder = Folder::read(dir.path()).unwrap();
         assert_eq!(ids(&folder), ["a.jpg"]);
-        let expected = ["._a.jpg", ".thumbnails", "Thumbs.db", "__MACOSX", "a.dng", "s/@eaDir"];
+        let expected =
+            ["._a.jpg", ".thumbnails", "Thumbs.db", "__MACOSX", "a.dng", "s/@eaDir", "s/poses.csv"];
         assert_eq!(skipped(dir.path(), &folder), expected.map(|name| (name, false)));
         assert!(folder.skipped[1].why.contains("1 pictures"), "{:?}", folder.skipped[1]);
     }

@@ -26,7 +26,7 @@ use whereabouts_core::{CoordinateFrame, ImageId, Pose, UtmZone};
 use whereabouts_vision::exif;
 
 /// Name of a table of poses that is found by itself.
-const POSES_FILE: &str = "poses.csv";
+pub(crate) const POSES_FILE: &str = "poses.csv";
 
 /// Where the pose of an image comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]

@@ -129,42 +129,32 @@ impl RowAccount {
     pub fn lines(&self, most: usize) -> Vec<String> {
         let Self { table, rows, matched, repeated, without_position, unmatched, .. } = self;
         let mut lines = vec![format!(
-            "{table}: {rows} rows, {matched} matched, {} without an image, {without_position} without a position, \
-             {repeated} repeated",
+            "rows of {table}: {rows} in all, {matched} matched, {} without an image, {without_position} without a \
+             position, {repeated} repeated",
             unmatched.len()
         )];
-        if !unmatched.is_empty() {
-            let of =
-                |row: &UnmatchedRow| format!("{:?} (line {}: {})", row.name, row.line, row.why);
-            lines.push(format!("rows without an image: {}", bounded(unmatched, most, of)));
-        }
-        if !self.images_without_row.is_empty() {
-            let count = self.images_without_row.len();
-            let names = bounded(&self.images_without_row, most, ImageId::to_string);
-            lines.push(format!("{count} images without a row: {names}"));
-        }
+        let mut list = |what: &str, count: usize, names: String| {
+            if count > 0 {
+                lines.push(format!("{what} ({count}): {names}"));
+            }
+        };
+        let of = |row: &UnmatchedRow| format!("{:?} (line {}: {})", row.name, row.line, row.why);
+        list("rows without an image", unmatched.len(), bounded(unmatched, most, of));
+        let images = &self.images_without_row;
+        list("images without a row", images.len(), bounded(images, most, ImageId::to_string));
         for kind in
             [MatchKind::OtherCase, MatchKind::NoExtension, MatchKind::Folder, MatchKind::BaseName]
         {
             let rows: Vec<&LooseRow> = self.loose.iter().filter(|row| row.by == kind).collect();
-            if !rows.is_empty() {
-                let of = |row: &&LooseRow| {
-                    format!("{:?} (line {}) for {}", row.name, row.line, row.image)
-                };
-                lines.push(format!(
-                    "{} rows name their images {}: {}",
-                    rows.len(),
-                    kind.how(),
-                    bounded(&rows, most.min(3), of)
-                ));
-            }
+            let of =
+                |row: &&LooseRow| format!("{:?} (line {}) for {}", row.name, row.line, row.image);
+            let what = format!("rows that name their images {}", kind.how());
+            list(&what, rows.len(), bounded(&rows, most.min(3), of));
         }
-        if !self.unused_columns.is_empty() {
-            let names = bounded(&self.unused_columns, most, |name| format!("{name:?}"));
-            lines.push(format!(
-                "columns that are not used: {names}; a direction is read from heading, in degrees clockwise from north"
-            ));
-        }
+        let columns = &self.unused_columns;
+        let names = bounded(columns, most, |name| format!("{name:?}"));
+        let hint = "a direction is read from heading, in degrees clockwise from north";
+        list("columns that are not used", columns.len(), format!("{names}; {hint}"));
         lines
     }
 }
