@@ -162,6 +162,11 @@ impl Folder {
         if !is_picture_name(path) && !(path.extension().is_none() && has_picture_bytes(path)) {
             return;
         }
+        if let Some(target) = link_as_text(path) {
+            let why =
+                format!("a link to {target:?} that was copied as text; put the picture there");
+            return self.skip(path, why, true);
+        }
         match image_id(&self.dir, path) {
             Ok(id) => self.pictures.push(PictureFile { file: path.to_owned(), id }),
             Err(why) => self.skip(path, why, true),
@@ -240,6 +245,20 @@ fn has_picture_bytes(path: &Path) -> bool {
     let mut head = Vec::with_capacity(32);
     let read = std::fs::File::open(path).and_then(|file| file.take(32).read_to_end(&mut head));
     read.is_ok() && MediaType::sniff(&head).is_some()
+}
+
+/// The target of a link that a version control system or an archive stored as a file with its path.
+fn link_as_text(path: &Path) -> Option<String> {
+    /// Longest path of common systems.
+    const MOST: u64 = 4096;
+    let length = path.metadata().ok()?.len();
+    if !(1..=MOST).contains(&length) {
+        return None;
+    }
+    let text = std::fs::read_to_string(path).ok()?;
+    let target = text.trim_end();
+    let is_path = is_picture_name(Path::new(target)) && !target.contains(char::is_control);
+    is_path.then(|| target.to_owned())
 }
 
 fn image_id(dir: &Path, file: &Path) -> Result<ImageId, String> {
@@ -321,10 +340,12 @@ mod tests {
         symlink("a.jpg", dir.path().join("link.jpg")).unwrap();
         std::fs::write(dir.path().join(OsStr::from_bytes(b"caf\xE9.jpg")), PNG).unwrap();
         std::fs::write(dir.path().join("tab\there.jpg"), PNG).unwrap();
+        std::fs::write(dir.path().join("y.jpg"), "../other/y.jpg").unwrap();
         let folder = Folder::read(dir.path()).unwrap();
         assert_eq!(ids(&folder), ["a.jpg", "link.jpg", "sub/c.jpg"]);
         let skipped = skipped(dir.path(), &folder);
-        let lost = [" b.jpg", "caf\u{FFFD}.jpg", &long, "only.nef", "tab\there.jpg", "z.jpg"];
+        let lost =
+            [" b.jpg", "caf\u{FFFD}.jpg", &long, "only.nef", "tab\there.jpg", "y.jpg", "z.jpg"];
         for name in lost {
             assert!(skipped.contains(&(name, true)), "{name}: {skipped:?}");
         }

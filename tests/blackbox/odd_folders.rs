@@ -140,7 +140,7 @@ async fn every_file_and_every_row_is_in_the_account() {
         "skipped",
         "._0001.jpg",
         "\"gone.jpg\" (line 4",
-        "1 images have no pose: cam1/0001.jpg",
+        "no pose (1): cam1/0001.jpg",
         "\"yaw\"",
     ] {
         assert!(text.contains(part), "{part}: {text}");

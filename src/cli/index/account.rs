@@ -162,17 +162,13 @@ impl IndexReport {
                 let fields: Vec<&str> = entry.changed.iter().map(|field| field.as_str()).collect();
                 format!("{} ({})", entry.file, fields.join(", "))
             };
-            lines.push(format!(
-                "{} images changed: {}",
-                changed.len(),
-                bounded(&changed, MOST, of)
-            ));
+            lines.push(format!("changed ({}): {}", changed.len(), bounded(&changed, MOST, of)));
         }
         let is_unposed = |entry: &&&Entry| entry.outcome != Outcome::Failed && entry.pose.is_none();
         let unposed: Vec<&&Entry> = images.iter().filter(is_unposed).collect();
         if !unposed.is_empty() {
             let names = bounded(&unposed, MOST, |entry| entry.file.clone());
-            lines.push(format!("{} images have no pose: {names}", unposed.len()));
+            lines.push(format!("no pose ({}): {names}", unposed.len()));
         }
         lines.extend(self.rows.iter().flat_map(|rows| rows.lines(MOST)));
         let warnings: Vec<(ImageId, String)> = images

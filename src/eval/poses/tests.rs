@@ -179,9 +179,9 @@ fn every_row_and_every_image_is_in_the_account() {
     assert_eq!(account.images_without_row.len(), 2);
     let text = account.lines(1).join("\n");
     for part in [
-        "7 rows, 3 matched, 2 without an image",
+        "7 in all, 3 matched, 2 without an image",
         "\"gone.jpg\" (line 6: no picture has this name) and 1 more",
-        "2 images without a row: s/1.jpg and 1 more",
+        "images without a row (2): s/1.jpg and 1 more",
         "\"yaw\"",
     ] {
         assert!(text.contains(part), "{part}: {text}");

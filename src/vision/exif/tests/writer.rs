@@ -37,7 +37,7 @@ pub(super) enum Next {
 pub(super) struct Writer {
     pub(super) is_big_endian: bool,
     pub(super) next: Next,
-    gps: Vec<(u16, Raw)>,
+    pub(super) gps: Vec<(u16, Raw)>,
 }
 
 impl Writer {
