@@ -127,6 +127,8 @@ class ImageAnswer(Image):
 
     changed: tuple[Literal["pose", "captured_at", "tags"], ...] = ()
     """Fields of an image stored before that the call changed. Empty if the image is new or stayed as it was."""
+    warnings: tuple[str, ...] = ()
+    """What the sender should know about the picture, such as a position that was not taken."""
 
 
 class Keep:

@@ -159,7 +159,7 @@ impl FolderPoses {
     /// Converts the poses to another coordinate frame.
     ///
     /// # Errors
-    /// The table or a sidecar has a pose that cannot be converted.
+    /// The table or a sidecar has a pose that cannot be converted, or no pose in a name can be.
     pub fn convert_to(&mut self, frame: CoordinateFrame) -> anyhow::Result<()> {
         if self.grid.map(Grid::frame) == Some(frame) {
             return Ok(());
@@ -169,17 +169,26 @@ impl FolderPoses {
             CoordinateFrame::Wgs84 => Grid::Wgs84,
             CoordinateFrame::Metric => Grid::Metric(zones()),
         };
+        let mut misfits = Vec::new();
+        let mut fitting = 0;
         for (id, image) in &self.known {
-            if let Some((source @ (PoseSource::Table | PoseSource::Sidecar), place)) = &image.place
-            {
-                if let Err(why) = place.in_grid(grid) {
-                    let source = match source {
-                        PoseSource::Table => "the table of poses",
-                        _ => "the file next to it",
-                    };
-                    bail!("the pose of {id} in {source} cannot be stored: {why}");
+            match image.place.map(|(source, place)| (source, place.in_grid(grid))) {
+                None => {}
+                Some((_, Ok(_))) => fitting += 1,
+                Some((PoseSource::Table, Err(why))) => {
+                    bail!("the pose of {id} in the table of poses cannot be used: {why}")
                 }
+                Some((PoseSource::Sidecar, Err(why))) => {
+                    bail!("the pose of {id} in the file next to it cannot be used: {why}")
+                }
+                Some((_, Err(why))) => misfits.push((id, why)),
             }
+        }
+        // One odd name is a warning, all of them are not.
+        if let (Some((id, why)), 0) = (misfits.iter().min(), fitting) {
+            bail!(
+                "no position in the names of the images can be used, such as that of {id}: {why}"
+            );
         }
         self.is_local &= frame == CoordinateFrame::Metric;
         self.grid = Some(grid);

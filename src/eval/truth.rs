@@ -11,7 +11,7 @@ mod listed;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 
 use super::{Folder, FolderPoses, PictureFile, RowAccount};
 use whereabouts_core::{CoordinateFrame, ImageId, Pose};
@@ -174,7 +174,10 @@ fn within_distance(
         .is_some_and(|(of_database, of_queries)| of_database != of_queries);
     if !is_one_frame || spans_zones {
         for poses in [&mut poses, &mut query_poses] {
-            poses.convert_to(CoordinateFrame::Wgs84)?;
+            poses.convert_to(CoordinateFrame::Wgs84).context(
+                "the positions of the references and of the queries are in different coordinate frames; give \
+                 both in the same one",
+            )?;
         }
     }
     let mut truth = GroundTruth::default();

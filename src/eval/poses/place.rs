@@ -42,11 +42,11 @@ impl Place {
             Grid::Wgs84 => self
                 .degrees()
                 .map(Pose::Geographic)
-                .ok_or("its position is in metres without a UTM zone, and the map is in degrees"),
+                .ok_or("its position is in metres without a UTM zone, not in degrees"),
             Grid::Metric(zone) => self
                 .metres(zone)
                 .map(Pose::Metric)
-                .ok_or("its position is in degrees, and the map is in metres"),
+                .ok_or("its position is in degrees, not in metres"),
         }
     }
 

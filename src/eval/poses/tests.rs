@@ -206,6 +206,8 @@ fn a_pose_of_the_table_that_does_not_fit_the_map_is_an_error() {
     let error = poses.convert_to(CoordinateFrame::Wgs84).unwrap_err().to_string();
     assert!(error.contains("a.jpg") && error.contains("without a UTM zone"), "{error}");
     assert!(poses.convert_to(CoordinateFrame::Metric).is_ok());
+    let mut named = Files::new(&[("@1.0@2.0@.jpg", ""), ("overview.jpg", "")]).poses();
+    assert!(named.convert_to(CoordinateFrame::Wgs84).is_err());
     let zoned = "file,easting,northing,zone\na.jpg,500000,4000000,31S\nb.jpg,500000,4000000,32S\n";
     let files = Files::new(&[("poses.csv", zoned), ("a.jpg", ""), ("b.jpg", "")]);
     assert_eq!(files.poses().frame(), Some(CoordinateFrame::Wgs84));
