@@ -159,7 +159,8 @@ impl Folder {
             }
             return;
         }
-        if !is_picture_name(path) && !(path.extension().is_none() && has_picture_bytes(path)) {
+        let has_picture = || path.extension().is_none() && has_picture_bytes(path);
+        if !is_picture_name(path) && !has_picture() {
             return;
         }
         if let Some(target) = link_as_text(path) {
