@@ -41,6 +41,9 @@ fn set(tag: u16, raw: Raw) -> (u16, Option<Raw>) {
     (tag, Some(raw))
 }
 
+/// What a habit is called, the fields that are written, the expected pose, and a part of the warning.
+type Habit = (&'static str, Vec<(u16, Raw)>, Expected, &'static str);
+
 /// The expected latitude, longitude, altitude and heading.
 type Expected = Option<(f64, f64, Option<f64>, Option<f64>)>;
 
@@ -82,7 +85,7 @@ fn every_habit_of_coordinates_is_read_or_warned_about() {
     let lat = |raw: Raw| with(&[set(2, raw)]);
     let (no_fix, zero) = ([(0, 0), (0, 0), (0, 0)], [(0, 1), (0, 1), (0, 1)]);
     let at = |lat: f64| Some((lat, LON, None, None));
-    let rows: Vec<(&str, Vec<(u16, Raw)>, Expected, &str)> = vec![
+    let rows: Vec<Habit> = vec![
         ("degrees, minutes, seconds", usual(), PLACE, ""),
         ("no GPS at all", vec![], None, ""),
         ("only a GPS version", vec![(0, Raw::Bytes(BYTE, vec![2, 3, 0, 0]))], None, ""),
@@ -232,7 +235,7 @@ fn every_habit_of_altitudes_and_headings_keeps_the_position() {
     let alt = |raw: Raw| with(&[set(6, raw)]);
     let below = |reference: Raw| with(&[set(5, reference), set(6, dms(&[(2405, 10)]))]);
     let heading = |raw: Raw| with(&[set(17, raw)]);
-    let rows: Vec<(&str, Vec<(u16, Raw)>, Expected, &str)> = vec![
+    let rows: Vec<Habit> = vec![
         ("an altitude", alt(dms(&[(2405, 10)])), raised(240.5), ""),
         ("above the sea", below(Raw::Bytes(BYTE, vec![0])), raised(240.5), ""),
         ("below the sea", below(Raw::Bytes(BYTE, vec![1])), raised(-240.5), ""),
@@ -300,7 +303,7 @@ fn exif_is_found_in_every_container() {
     let odd = [&tiff[..], &[0]].concat();
     let raw = [b"IIRO", &tiff[4..]].concat();
     let rows: Vec<(&str, Vec<u8>)> = vec![
-        ("JPEG, EXIF first", jpeg(&[exif.clone()])),
+        ("JPEG, EXIF first", jpeg(std::slice::from_ref(&exif))),
         (
             "JPEG, EXIF after JFIF, XMP and FLIR segments",
             jpeg(&[jfif.clone(), xmp.clone(), flir, exif.clone()]),
@@ -318,7 +321,7 @@ fn exif_is_found_in_every_container() {
             "JPEG, EXIF with 0xFF in its header",
             jpeg(&[segment(0xE1, &[b"Exif\0\xFF", &tiff[..]].concat())]),
         ),
-        ("JPEG, cut behind its EXIF", jpeg(&[exif.clone()])[..2 + exif.len()].to_vec()),
+        ("JPEG, cut behind its EXIF", jpeg(std::slice::from_ref(&exif))[..2 + exif.len()].to_vec()),
         (
             "PNG, eXIf before the pixels",
             png(&[ihdr.clone(), chunk(b"eXIf", &tiff), idat.clone(), iend.clone()]),
