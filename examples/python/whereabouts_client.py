@@ -126,7 +126,9 @@ class ImageAnswer(Image):
     """An image as it is stored now, and what the call changed of it."""
 
     changed: tuple[Literal["pose", "captured_at", "tags"], ...] = ()
-    """Fields of an image stored before that the call changed; empty if it is new or stayed as it was."""
+    """Fields of an image stored before that the call changed. Empty if the image is new or stayed as it was."""
+    warnings: tuple[str, ...] = ()
+    """What the sender should know about the picture, such as a position that was not taken."""
 
 
 class Keep:

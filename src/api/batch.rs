@@ -37,6 +37,9 @@ pub struct BatchResult {
     /// Why the image could not be stored, or the file was skipped; null if the image was stored.
     #[schema(nullable)]
     pub problem: Option<BatchProblem>,
+    /// What the sender should know about the picture, such as a position that was not taken; usually empty.
+    #[serde(default)]
+    pub warnings: Vec<String>,
 }
 
 /// Whether an image of a bulk upload was stored.

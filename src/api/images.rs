@@ -65,6 +65,9 @@ pub struct ImageAnswer {
     /// that is new or stayed as it was.
     #[serde(default)]
     pub changed: Vec<ImageField>,
+    /// What the sender should know about the picture, such as a position that was not taken; usually empty.
+    #[serde(default)]
+    pub warnings: Vec<String>,
 }
 
 /// A page of images, sorted by id.

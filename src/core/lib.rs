@@ -19,6 +19,7 @@ mod secret;
 mod service_time;
 mod spend;
 pub mod units;
+mod utm;
 mod webhook;
 
 pub use self::image::{ExportedImage, Image, ImageField, ImageId, MediaType};
@@ -37,6 +38,7 @@ pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, Pose
 pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;
+pub use utm::UtmZone;
 pub use webhook::{
     Attempt, Delivery, DeliveryState, Disposition, Message, StoredWebhook, Webhook, WebhookEvent,
     WebhookSecret,

@@ -1,10 +1,13 @@
 //! The references, the queries, and the correct references of each query.
 
 use std::collections::HashSet;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
+use serde::{Deserialize, Serialize};
+
+use super::account::{bounded, skipped_lines, warning_lines};
 use super::resample::sample;
-use super::{PictureFile, TruthSource, pictures};
+use super::{Folder, PictureFile, RowAccount, SkippedFile, TruthSource};
 use whereabouts_core::ImageId;
 
 /// The folders of a data set.
@@ -53,13 +56,30 @@ pub struct EvaluatedQuery {
     pub truth: HashSet<ImageId>,
 }
 
+/// What of the folders is not evaluated, and why. Every picture that is not in the data set is here once.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct LeftOut {
+    /// Files that cannot be taken.
+    pub skipped: Vec<SkippedFile>,
+    /// References without a position: it is not known for which queries they are correct.
+    pub references: Vec<ImageId>,
+    /// Queries without a position; they count as skipped.
+    pub queries: Vec<ImageId>,
+    /// What became of the rows of the tables of positions.
+    pub tables: Vec<RowAccount>,
+    /// Images with the warnings about their positions.
+    pub warnings: Vec<(ImageId, String)>,
+}
+
 /// References and queries.
 #[derive(Debug, Clone)]
 pub struct Dataset {
-    /// The references, sorted by name.
+    /// The references, in the natural order of their names.
     pub references: Vec<PictureFile>,
-    /// The queries to evaluate, sorted by name, those of the folder of unknown places last.
+    /// The queries to evaluate, in the natural order of their names, those of the folder of unknown places last.
     pub queries: Vec<EvaluatedQuery>,
+    /// What is not evaluated.
+    pub left_out: LeftOut,
 }
 
 impl Dataset {
@@ -72,10 +92,30 @@ impl Dataset {
         source: &TruthSource,
         sampling: Sampling,
     ) -> anyhow::Result<Self> {
-        let mut references = pictures(&folders.database)?;
-        let all = pictures(&folders.queries)?;
-        let truth =
-            source.read((&folders.database, &references), (&folders.queries, all.as_slice()))?;
+        let (database, all) = (Folder::read(&folders.database)?, Folder::read(&folders.queries)?);
+        let truth = source.read(&database, &all)?;
+        let mut left_out = LeftOut {
+            skipped: [&database.skipped[..], &all.skipped].concat(),
+            tables: truth.tables,
+            warnings: truth.warnings,
+            ..LeftOut::default()
+        };
+        let (mut references, unknown): (Vec<PictureFile>, Vec<PictureFile>) = database
+            .pictures
+            .into_iter()
+            .partition(|picture| !truth.unknown_references.contains(&picture.id));
+        left_out.references = unknown.into_iter().map(|picture| picture.id).collect();
+        let (mut known, mut correct) = (Vec::new(), Vec::new());
+        for (picture, truth) in all.pictures.into_iter().zip(truth.correct) {
+            match truth {
+                Some(truth) => {
+                    known.push(picture);
+                    correct.push(truth);
+                }
+                None => left_out.queries.push(picture.id),
+            }
+        }
+        let all = known;
         let kept = (references.len() as f64 * (1.0 - folders.hold_out)).round() as usize;
         let held_out: HashSet<ImageId> =
             references.drain(kept.min(references.len())..).map(|picture| picture.id).collect();
@@ -83,7 +123,7 @@ impl Dataset {
         let sampled: HashSet<usize> = sample(all.len(), size, sampling.seed).into_iter().collect();
         let mut queries: Vec<EvaluatedQuery> = all
             .into_iter()
-            .zip(truth)
+            .zip(correct)
             .enumerate()
             .filter(|(index, _)| sampled.contains(index))
             .map(|(_, (picture, mut truth))| {
@@ -98,7 +138,9 @@ impl Dataset {
             })
             .collect();
         if let Some(folder) = &folders.unknown {
-            queries.extend(unknown_places(folder)?);
+            let unknown = Folder::read(folder)?;
+            left_out.skipped.extend(unknown.skipped);
+            queries.extend(unknown_places(unknown.pictures)?);
         }
         if !queries.iter().any(|query| query.kind == QueryKind::InMap) {
             anyhow::bail!(
@@ -108,7 +150,7 @@ impl Dataset {
                 source.criterion()
             );
         }
-        Ok(Self { references, queries })
+        Ok(Self { references, queries, left_out })
     }
 
     /// Counts the queries of a kind.
@@ -117,9 +159,29 @@ impl Dataset {
     }
 }
 
-fn unknown_places(folder: &Path) -> anyhow::Result<Vec<EvaluatedQuery>> {
+impl LeftOut {
+    /// What is left out in lines for people, each list bounded to `most` names.
+    pub fn lines(&self, most: usize) -> Vec<String> {
+        let mut lines = skipped_lines(&self.skipped, most);
+        let list = |ids: &[ImageId]| bounded(ids, most, ImageId::to_string);
+        for (what, ids) in [("references", &self.references), ("queries", &self.queries)] {
+            if !ids.is_empty() {
+                lines.push(format!(
+                    "{what} left out, without a position ({}): {}",
+                    ids.len(),
+                    list(ids)
+                ));
+            }
+        }
+        lines.extend(self.tables.iter().flat_map(|table| table.lines(most)));
+        lines.extend(warning_lines(&self.warnings, most));
+        lines
+    }
+}
+
+fn unknown_places(pictures: Vec<PictureFile>) -> anyhow::Result<Vec<EvaluatedQuery>> {
     let kind = QueryKind::Unknown;
-    pictures(folder)?
+    pictures
         .into_iter()
         .map(|PictureFile { file, id }| {
             let picture = PictureFile { file, id: format!("unknown:{id}").parse()? };

@@ -2,7 +2,7 @@
 //!
 //! | module | purpose |
 //! |---|---|
-//! | `folder`, `poses`, `truth`, `dataset` | the images, and the correct references of each query |
+//! | `folder`, `table_file`, `account`, `poses`, `truth`, `dataset` | the images, and the correct references of each query |
 //! | `map`, `run`, `outcome` | index, retrieve and refine with the service, and cache the outcomes |
 //! | `recall`, `resample`, `open_set` | Recall@K, bootstrap intervals, open-set metrics |
 //! | `summary`, `table`, `predictions` | the results as JSON, as a table, as CSV |
@@ -11,10 +11,12 @@
 //! There is no second pipeline: descriptors, search, refiners and the cache of descriptions are those
 //! of [`whereabouts_service`], on a data folder that a server could serve.
 
+pub mod account;
 mod cache_key;
 mod dataset;
 mod folder;
 mod map;
+mod natural;
 pub mod open_set;
 mod outcome;
 mod poses;
@@ -25,16 +27,19 @@ pub mod resample;
 mod run;
 mod summary;
 mod table;
+mod table_file;
 mod truth;
 
 #[cfg(test)]
 mod tests;
 
-pub use dataset::{Dataset, EvaluatedQuery, Folders, QueryKind, Sampling};
-pub use folder::{PictureFile, pictures};
+pub use dataset::{Dataset, EvaluatedQuery, Folders, LeftOut, QueryKind, Sampling};
+pub use folder::{Folder, PictureFile, SkippedFile};
 pub use outcome::{MethodOutcomes, Prediction, QueryOutcome, StageTimes};
-pub use poses::PoseSource;
+pub use poses::{
+    FolderPoses, FoundPose, LooseRow, MatchKind, PoseSource, RowAccount, UnmatchedRow, zone_in_name,
+};
 pub use run::{Evaluator, Method, Observer, RunSettings};
 pub use summary::{MethodSummary, RunConditions, Summary};
 pub use table::table;
-pub use truth::TruthSource;
+pub use truth::{GroundTruth, TruthSource};

@@ -1,228 +1,265 @@
-//! Reads the poses of the images in a folder from a CSV file, from their names, or from EXIF GPS.
+//! Finds the pose of each image in a folder: in a table, in a file next to it, in its name, or in its EXIF data.
+//! Each image has its own source, so that one odd file does not cost the others their poses.
 
-use std::collections::HashMap;
-use std::io::Cursor;
+mod account;
+mod matching;
+mod names;
+mod place;
+mod rows;
+mod sidecar;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
 
 use anyhow::{Context, bail};
-use exif::{In, Rational, Tag, Value};
-use serde::Deserialize;
+use jiff::Timestamp;
+use serde::Serialize;
 
-use super::PictureFile;
-use whereabouts_core::{CoordinateFrame, GeographicPose, MetricPose, Pose, PoseInput};
+pub use self::account::{LooseRow, RowAccount, UnmatchedRow};
+pub use self::matching::MatchKind;
+use self::place::{Grid, Place};
+use self::rows::PoseRows;
+use super::Folder;
+use whereabouts_core::{CoordinateFrame, ImageId, Pose, UtmZone};
+use whereabouts_vision::exif;
 
-/// Source of the poses of a whole folder.
-#[derive(Debug)]
+/// Name of a table of poses that is found by itself.
+pub(crate) const POSES_FILE: &str = "poses.csv";
+
+/// Where the pose of an image comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum PoseSource {
-    /// A CSV file.
-    Csv {
-        /// Coordinate frame of all poses.
-        frame: CoordinateFrame,
-        /// Poses by path relative to the folder, or by file name.
-        poses: HashMap<String, Pose>,
-    },
-    /// File names of the form `@easting@northing@…`, in metres of a UTM zone.
-    Names,
-    /// EXIF GPS of each file.
+    /// A row of a table.
+    Table,
+    /// The file `NAME.json` next to the image `NAME`.
+    Sidecar,
+    /// The name of the file, of the form `@easting@northing@…`.
+    Name,
+    /// EXIF GPS.
     Exif,
 }
 
-impl PoseSource {
-    /// Finds the source: the given CSV file, otherwise `poses.csv` in the folder, otherwise the file names if all of
-    /// them have positions, otherwise EXIF.
+/// The poses of the images in a folder.
+#[derive(Debug)]
+pub struct FolderPoses {
+    known: HashMap<ImageId, KnownImage>,
+    /// Coordinates of all poses; `None` if only EXIF can have any.
+    grid: Option<Grid>,
+    /// Whether the metres have an origin that only the table or the sidecars know.
+    is_local: bool,
+    account: Option<RowAccount>,
+}
+
+/// What is known about an image before its bytes are read.
+#[derive(Debug, Default)]
+struct KnownImage {
+    /// The place of the first source that has one.
+    place: Option<(PoseSource, Place)>,
+    /// Why its name has none.
+    without_place: Option<&'static str>,
+    captured_at: Option<Timestamp>,
+    tags: Vec<String>,
+    warnings: Vec<String>,
+}
+
+/// What is known about an image.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct FoundPose {
+    /// Its pose, in the frame of the folder.
+    pub pose: Option<Pose>,
+    /// Where the pose comes from.
+    pub source: Option<PoseSource>,
+    /// When it was taken, if a file next to it says so.
+    pub captured_at: Option<Timestamp>,
+    /// Its tags, if a file next to it has any.
+    pub tags: Vec<String>,
+    /// What was not taken, and why.
+    pub warnings: Vec<String>,
+}
+
+impl FolderPoses {
+    /// Reads the sources of a folder, except for EXIF: the given table, or `poses.csv` in the folder; the files
+    /// next to the images; and their names.
     ///
     /// # Errors
-    /// The CSV file cannot be read, or a row is not a pose.
-    pub fn find(dir: &Path, csv: Option<&Path>, files: &[PictureFile]) -> anyhow::Result<Self> {
-        let default = dir.join("poses.csv");
-        match csv.or(default.is_file().then_some(default.as_path())) {
-            Some(file) => Self::from_csv(file),
-            None if files
-                .iter()
-                .all(|file| pose_in_name(file_name(file.id.as_str())).is_some()) =>
-            {
-                Ok(Self::Names)
+    /// The table cannot be read, a row is not a pose, two rows contradict each other, or no row matches an image.
+    pub fn read(folder: &Folder, table: Option<&Path>) -> anyhow::Result<Self> {
+        let default = folder.dir.join(POSES_FILE);
+        let table = table.or(default.is_file().then_some(default.as_path()));
+        let rows = table.map(PoseRows::read).transpose()?;
+        let mut known: HashMap<ImageId, KnownImage> = HashMap::new();
+        for picture in &folder.pictures {
+            let mut image = sidecar::read(&picture.file);
+            let name = picture.id.as_str().rsplit('/').next().unwrap_or_default();
+            match names::place_in_name(name) {
+                Ok(place) => {
+                    image.place = image.place.or(place.map(|place| (PoseSource::Name, place)));
+                }
+                Err(why) => image.without_place = Some(why),
             }
-            None => Ok(Self::Exif),
+            known.insert(picture.id.clone(), image);
         }
+        let account = match rows {
+            Some(rows) => Some(account::apply(rows, folder, &mut known)?),
+            None => None,
+        };
+        let mut poses = Self { known, grid: None, is_local: false, account };
+        poses.grid = poses.natural_grid();
+        Ok(poses)
     }
 
-    fn from_csv(file: &Path) -> anyhow::Result<Self> {
-        let mut reader = csv::ReaderBuilder::new()
-            .trim(csv::Trim::All)
-            .from_path(file)
-            .with_context(|| format!("cannot read {}", file.display()))?;
-        let mut poses = HashMap::new();
-        let mut frame = None;
-        for (index, row) in reader.deserialize::<Row>().enumerate() {
-            // The header is line 1.
-            let line = index + 2;
-            let row = row.with_context(|| format!("{} line {line}", file.display()))?;
-            let name = row.file.clone();
-            let pose = row.pose().with_context(|| format!("{} line {line}", file.display()))?;
-            if *frame.get_or_insert(pose.frame()) != pose.frame() {
-                bail!(
-                    "{} line {line} mixes lat,lon and x,y with other rows; use one frame per file",
-                    file.display()
-                );
-            }
-            poses.insert(name, pose);
-        }
-        let frame =
-            frame.with_context(|| format!("{} has no rows; add one per image", file.display()))?;
-        Ok(Self::Csv { frame, poses })
+    /// What became of the rows of the table; `None` if there is none.
+    pub fn account(&self) -> Option<&RowAccount> {
+        self.account.as_ref()
     }
 
-    /// Names the source for an error message.
-    pub fn name(&self) -> &'static str {
-        match self {
-            Self::Csv { .. } => "the CSV file of poses",
-            Self::Names => "their file names",
-            Self::Exif => "their EXIF data",
-        }
-    }
-
-    /// Returns the coordinate frame of the poses, unless it differs from file to file.
+    /// The coordinate frame of the poses, unless only EXIF can have any.
     pub fn frame(&self) -> Option<CoordinateFrame> {
-        match self {
-            Self::Csv { frame, .. } => Some(*frame),
-            Self::Names => Some(CoordinateFrame::Metric),
-            Self::Exif => None,
+        self.grid.map(Grid::frame)
+    }
+
+    /// The UTM zone of the poses, if they are metres in one.
+    pub fn zone(&self) -> Option<UtmZone> {
+        match self.grid {
+            Some(Grid::Metric(zone)) if !self.is_local => zone,
+            _ => None,
         }
     }
 
-    /// Returns the pose of one image; `None` if the source has none. Only EXIF reads `bytes`.
+    /// The coordinates that suit the most explicit source: those of the table, else of the sidecars, else of the
+    /// names. UTM coordinates stay metres unless they span zones, where equal numbers are different places.
+    fn natural_grid(&mut self) -> Option<Grid> {
+        let of = |wanted: PoseSource| -> Vec<&Place> {
+            let places = self.known.values().filter_map(|image| image.place.as_ref());
+            places.filter(|(source, _)| *source == wanted).map(|(_, place)| place).collect()
+        };
+        let sources = [PoseSource::Table, PoseSource::Sidecar, PoseSource::Name];
+        let (source, places) = sources
+            .into_iter()
+            .map(|source| (source, of(source)))
+            .find(|(_, places)| !places.is_empty())?;
+        let zones: BTreeSet<UtmZone> = places.iter().filter_map(|place| place.zone).collect();
+        let has_metres = places.iter().any(|place| place.metric.is_some());
+        let has_degrees = places.iter().any(|place| place.geographic.is_some());
+        let prefers_degrees = source != PoseSource::Name && has_degrees;
+        let grid = match (zones.len(), has_metres) {
+            _ if prefers_degrees => Grid::Wgs84,
+            (0, false) => Grid::Wgs84,
+            (0, true) => Grid::Metric(None),
+            (1, _) => Grid::Metric(zones.first().copied()),
+            _ => Grid::Wgs84,
+        };
+        self.is_local = source != PoseSource::Name && grid == Grid::Metric(None);
+        Some(grid)
+    }
+
+    /// Converts the poses to another coordinate frame.
     ///
     /// # Errors
-    /// The EXIF position is out of range.
-    pub fn pose(&self, id: &str, bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
-        match self {
-            Self::Csv { poses, .. } => {
-                Ok(poses.get(id).or_else(|| poses.get(file_name(id))).copied())
+    /// The table or a sidecar has a pose that cannot be converted, or no pose in a name can be.
+    pub fn convert_to(&mut self, frame: CoordinateFrame) -> anyhow::Result<()> {
+        if self.grid.map(Grid::frame) == Some(frame) {
+            return Ok(());
+        }
+        let zones = || self.known.values().filter_map(|image| image.place?.1.zone).min();
+        let grid = match frame {
+            CoordinateFrame::Wgs84 => Grid::Wgs84,
+            CoordinateFrame::Metric => Grid::Metric(zones()),
+        };
+        let mut misfits = Vec::new();
+        let mut fitting = 0;
+        for (id, image) in &self.known {
+            match image.place.map(|(source, place)| (source, place.in_grid(grid))) {
+                None => {}
+                Some((_, Ok(_))) => fitting += 1,
+                Some((PoseSource::Table, Err(why))) => {
+                    bail!("the pose of {id} in the table of poses cannot be used: {why}")
+                }
+                Some((PoseSource::Sidecar, Err(why))) => {
+                    bail!("the pose of {id} in the file next to it cannot be used: {why}")
+                }
+                Some((_, Err(why))) => misfits.push((id, why)),
             }
-            Self::Names => Ok(pose_in_name(file_name(id))),
-            Self::Exif => pose_in_exif(bytes),
         }
+        // One odd name is a warning, all of them are not.
+        if let (Some((id, why)), 0) = (misfits.iter().min(), fitting) {
+            bail!(
+                "no position in the names of the images can be used, such as that of {id}: {why}"
+            );
+        }
+        self.is_local &= frame == CoordinateFrame::Metric;
+        self.grid = Some(grid);
+        Ok(())
     }
-}
 
-#[derive(Debug, Deserialize)]
-struct Row {
-    #[serde(alias = "image", alias = "id", alias = "name", alias = "filename")]
-    file: String,
-    lat: Option<f64>,
-    lon: Option<f64>,
-    alt: Option<f64>,
-    heading: Option<f64>,
-    x: Option<f64>,
-    y: Option<f64>,
-    z: Option<f64>,
-    qx: Option<f64>,
-    qy: Option<f64>,
-    qz: Option<f64>,
-    qw: Option<f64>,
-}
-
-impl Row {
-    fn pose(self) -> anyhow::Result<Pose> {
-        let Self { lat, lon, alt, heading, x, y, z, qx, qy, qz, qw, .. } = self;
-        let position = PoseInput { lat, lon, x, y, ..PoseInput::default() };
-        let frame = position.frame().context("a row needs either lat and lon, or x and y")?;
-        // Columns of the other frame are ignored: tables often have more of them than a pose needs.
-        let pose = match frame {
-            CoordinateFrame::Wgs84 => PoseInput { alt, heading, ..position },
-            CoordinateFrame::Metric => PoseInput { z, qx, qy, qz, qw, ..position },
+    /// Returns the pose of an image. EXIF data are read from `bytes` if no other source has a pose.
+    pub fn find(&self, id: &ImageId, bytes: &[u8]) -> FoundPose {
+        let empty = KnownImage::default();
+        let image = self.known.get(id).unwrap_or(&empty);
+        let mut found = FoundPose {
+            captured_at: image.captured_at,
+            tags: image.tags.clone(),
+            warnings: image.warnings.clone(),
+            ..FoundPose::default()
         };
-        Ok(pose.check(frame)?)
-    }
-}
-
-fn file_name(id: &str) -> &str {
-    id.rsplit('/').next().unwrap_or(id)
-}
-
-/// Parses the first two fields of `@easting@northing@…`, the naming convention of VPR data sets.
-fn pose_in_name(name: &str) -> Option<Pose> {
-    let mut fields = name.strip_prefix('@')?.split('@');
-    let (x, y) = (fields.next()?.parse().ok()?, fields.next()?.parse().ok()?);
-    let pose = MetricPose { x, y, z: None, qx: None, qy: None, qz: None, qw: None };
-    Pose::Metric(pose).checked().ok()
-}
-
-fn pose_in_exif(bytes: &[u8]) -> anyhow::Result<Option<Pose>> {
-    let Ok(exif) = exif::Reader::new().read_from_container(&mut Cursor::new(bytes)) else {
-        return Ok(None);
-    };
-    let rationals = |tag: Tag| match exif.get_field(tag, In::PRIMARY).map(|field| &field.value) {
-        Some(Value::Rational(values)) => values.iter().map(Rational::to_f64).collect(),
-        _ => Vec::new(),
-    };
-    let starts_with = |tag: Tag, prefix: &str| {
-        exif.get_field(tag, In::PRIMARY)
-            .is_some_and(|field| field.display_value().to_string().starts_with(prefix))
-    };
-    let degrees = |tag: Tag| match rationals(tag)[..] {
-        [degrees, minutes, seconds] => Some(degrees + minutes / 60.0 + seconds / 3600.0),
-        _ => None,
-    };
-    let (Some(lat), Some(lon)) = (degrees(Tag::GPSLatitude), degrees(Tag::GPSLongitude)) else {
-        return Ok(None);
-    };
-    let below_sea = exif
-        .get_field(Tag::GPSAltitudeRef, In::PRIMARY)
-        .and_then(|field| field.value.get_uint(0))
-        .is_some_and(|reference| reference == 1);
-    let alt = rationals(Tag::GPSAltitude).first().map(|&alt| if below_sea { -alt } else { alt });
-    let heading = rationals(Tag::GPSImgDirection).first().copied();
-    let pose = Pose::Geographic(GeographicPose {
-        lat: if starts_with(Tag::GPSLatitudeRef, "S") { -lat } else { lat },
-        lon: if starts_with(Tag::GPSLongitudeRef, "W") { -lon } else { lon },
-        alt: alt.filter(|alt| alt.is_finite()),
-        heading: heading.filter(|heading| heading.is_finite()),
-    });
-    Ok(Some(pose.checked().context("the EXIF GPS position is out of range")?))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn csv(text: &str) -> anyhow::Result<PoseSource> {
-        let file = tempfile::NamedTempFile::new().unwrap();
-        std::fs::write(file.path(), text).unwrap();
-        PoseSource::from_csv(file.path())
+        let grid = self.grid.unwrap_or(Grid::Wgs84);
+        match &image.place {
+            Some((PoseSource::Name, place)) if self.is_local && place.metric.is_some() => {
+                let why = "its name has a position, but the metres of the table have an origin of their own";
+                found.warnings.push(why.to_owned());
+            }
+            Some((source, place)) => match place.in_grid(grid) {
+                Ok(pose) => {
+                    (found.pose, found.source) = (Some(pose), Some(*source));
+                    return found;
+                }
+                Err(why) => found.warnings.push(why.to_owned()),
+            },
+            None => found.warnings.extend(image.without_place.map(str::to_owned)),
+        }
+        let exif::GpsReading { pose, warnings } = exif::gps(bytes);
+        found.warnings.extend(warnings);
+        if let Some(pose) = pose {
+            match Place::of(Pose::Geographic(pose)).in_grid(grid) {
+                Ok(pose) => (found.pose, found.source) = (Some(pose), Some(PoseSource::Exif)),
+                Err(why) => found.warnings.push(format!("{why}: its EXIF GPS is not taken")),
+            }
+        }
+        found
     }
 
-    #[test]
-    fn easting_and_northing_are_read_from_file_names() {
-        let Some(Pose::Metric(pose)) = pose_in_name("@0584522.50@4477231.25@17@T@40.4@-80.0@.jpg")
-        else {
-            panic!("no pose");
+    /// Returns the poses of all images of a folder, reading their bytes only for EXIF.
+    ///
+    /// # Errors
+    /// An image cannot be read.
+    pub fn find_all(&self, folder: &Folder) -> anyhow::Result<Vec<FoundPose>> {
+        let find = |picture: &super::PictureFile| {
+            let is_known = self.known.get(&picture.id).is_some_and(|image| image.place.is_some());
+            let bytes = match is_known {
+                true => Vec::new(),
+                false => std::fs::read(&picture.file)
+                    .with_context(|| format!("cannot read {}", picture.file.display()))?,
+            };
+            Ok(self.find(&picture.id, &bytes))
         };
-        assert_eq!((pose.x, pose.y), (584522.5, 4477231.25));
-        for name in ["a.jpg", "@.jpg", "@1@.jpg", "@x@y@.jpg", "@nan@1@.jpg", "@1e30@1@.jpg"] {
-            assert!(pose_in_name(name).is_none(), "{name}");
-        }
+        folder.pictures.iter().map(find).collect()
     }
+}
 
-    #[test]
-    fn a_csv_refers_to_files_by_path_or_by_name() {
-        let source =
-            csv("file, lat, lon, heading\na/1.jpg, 35.5, 139.5, 90\n2.jpg,1,2,\n").unwrap();
-        assert_eq!(source.frame(), Some(CoordinateFrame::Wgs84));
-        assert!(source.pose("a/1.jpg", b"").unwrap().is_some());
-        assert!(source.pose("b/2.jpg", b"").unwrap().is_some());
-        assert!(source.pose("3.jpg", b"").unwrap().is_none());
-    }
+/// Finds the image that each of these distinct names means, if it is clear.
+pub(crate) fn match_names<'a>(names: &[&str], folder: &'a Folder) -> Vec<Option<&'a ImageId>> {
+    let ids: Vec<&str> = folder.pictures.iter().map(|picture| picture.id.as_str()).collect();
+    let matches = matching::match_rows(names, &ids, &folder.dir);
+    let image =
+        |found: Result<(usize, MatchKind), String>| Some(&folder.pictures[found.ok()?.0].id);
+    matches.into_iter().map(image).collect()
+}
 
-    #[test]
-    fn an_invalid_row_is_reported_with_its_line() {
-        for text in
-            ["file,lat,lon\na,1,2\nb,95,2", "file,x,y\na,1,2\nb,,2", "file,x,y\na,1,2\nb,q,2"]
-        {
-            let error = format!("{:#}", csv(text).unwrap_err());
-            assert!(error.contains("line 3"), "{error}");
-        }
-        assert!(csv("file,lat,lon\n").is_err());
-    }
+/// The UTM zone in the name of an image, if it has a position in metres.
+pub fn zone_in_name(id: &str) -> Option<UtmZone> {
+    let name = id.rsplit('/').next()?;
+    names::place_in_name(name).ok()??.zone
 }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::open_set::{OpenSetMetrics, Thresholds, TopPrediction};
 use super::recall::{AtK, Change, FirstCorrectRank, change, first_correct_rank, recall};
-use super::{Dataset, EvaluatedQuery, MethodOutcomes, QueryKind, QueryOutcome};
+use super::{Dataset, EvaluatedQuery, LeftOut, MethodOutcomes, QueryKind, QueryOutcome};
 use whereabouts_core::Usage;
 
 /// The results of an evaluation and the conditions under which they were measured.
@@ -12,12 +12,15 @@ use whereabouts_core::Usage;
 pub struct Summary {
     /// Queries that count in the recall.
     pub queries: usize,
-    /// Queries without a correct reference, left out of the recall.
+    /// Queries without a correct reference or without a position, left out of the recall.
     pub skipped: usize,
     /// Queries of places outside the map.
     pub unknown: usize,
     /// Images in the map.
     pub references: usize,
+    /// What of the folders is not evaluated, and why.
+    #[serde(default)]
+    pub left_out: LeftOut,
     /// The conditions.
     #[serde(flatten)]
     pub conditions: RunConditions,
@@ -115,9 +118,10 @@ impl Summary {
         }
         Self {
             queries: data.count(QueryKind::InMap),
-            skipped: data.count(QueryKind::Skipped),
+            skipped: data.count(QueryKind::Skipped) + data.left_out.queries.len(),
             unknown: data.count(QueryKind::Unknown),
             references: data.references.len(),
+            left_out: data.left_out.clone(),
             conditions,
             methods,
         }

@@ -14,7 +14,7 @@ pub fn table(summary: &Summary) -> String {
 }
 
 fn write(summary: &Summary, out: &mut String) -> fmt::Result {
-    let Summary { queries, skipped, unknown, references, conditions, methods } = summary;
+    let Summary { queries, skipped, unknown, references, left_out, conditions, methods } = summary;
     writeln!(
         out,
         "{queries} queries, {references} references; model {} ({})",
@@ -23,6 +23,16 @@ fn write(summary: &Summary, out: &mut String) -> fmt::Result {
     writeln!(out, "a reference is correct if it is {}", conditions.truth)?;
     if *skipped > 0 {
         writeln!(out, "{skipped} more queries have no correct reference and are left out")?;
+    }
+    if !left_out.queries.is_empty() {
+        writeln!(out, "{} of them have no position", left_out.queries.len())?;
+    }
+    if !left_out.references.is_empty() {
+        writeln!(
+            out,
+            "{} references have no position and are left out",
+            left_out.references.len()
+        )?;
     }
     if *unknown > 0 {
         writeln!(out, "{unknown} more queries show places that are not in the map")?;
@@ -139,6 +149,7 @@ fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
+    use crate::LeftOut;
     use crate::open_set::{KnownRates, OpenSetMetrics, OperatingPoint};
     use crate::recall::AtK;
     use crate::summary::{Quantiles, RunConditions, Timing};
@@ -242,6 +253,7 @@ pub(super) mod tests {
             skipped: 2,
             unknown: 8,
             references: 20,
+            left_out: LeftOut::default(),
             conditions,
             methods: vec![coarse(), refined()],
         }

@@ -105,6 +105,7 @@ fn dataset() -> Dataset {
     Dataset {
         references: (0..REFERENCES).map(|index| picture(id(index))).collect(),
         queries: (0..QUERIES).map(query).collect(),
+        left_out: LeftOut::default(),
     }
 }
 

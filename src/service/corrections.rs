@@ -44,10 +44,12 @@ impl Images {
             let next = corrected(&image, &map)?;
             let changed = next.differences(&image);
             if changed.is_empty() {
-                return Ok(ImageAnswer { image, changed });
+                return Ok(ImageAnswer { image, changed, warnings: Vec::new() });
             }
             match self.maps.store.replace_image(&map, &image, next.clone()).await {
-                Ok(true) => return Ok(ImageAnswer { image: next, changed }),
+                Ok(true) => {
+                    return Ok(ImageAnswer { image: next, changed, warnings: Vec::new() });
+                }
                 Ok(false) => {}
                 // The coordinate frame of the map was changed meanwhile.
                 Err(StoreError::Superseded(_)) if superseded > 0 => superseded -= 1,

@@ -8,9 +8,9 @@ use jiff::Timestamp;
 
 use super::{BulkSettings, Keys, Maps, SUPERSEDED_RETRIES, ServiceError};
 use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage};
-use whereabouts_core::{Image, ImageId, Map, MapName, MediaType, Pose, PoseInput};
+use whereabouts_core::{CoordinateFrame, Image, ImageId, Map, MapName, MediaType, Pose, PoseInput};
 use whereabouts_store::{Added, BlobStore, StoreError};
-use whereabouts_vision::{AdmissionRequest, FeatureSet};
+use whereabouts_vision::{AdmissionRequest, FeatureSet, exif};
 
 /// An image to add.
 #[derive(Debug)]
@@ -37,7 +37,8 @@ pub struct Images {
 }
 
 impl Images {
-    /// Extracts the descriptor of an image and stores both. If the image is stored already, its pose, time and
+    /// Extracts the descriptor of an image and stores both. A new image without a pose in a `wgs84` map gets that
+    /// of its EXIF data. If the image is stored already, its pose, time and
     /// tags become those that `new` states. Returns the image, and whether it is new.
     pub async fn add(
         &self,
@@ -51,13 +52,18 @@ impl Images {
         let (mut pin, mut retries) = (None, SUPERSEDED_RETRIES);
         loop {
             let (map, extractor) = self.maps.usable(name).await?;
-            let pose = stated.pose(&map)?;
+            let stated_pose = stated.pose(&map)?;
             let bytes = new.bytes.clone();
             let (kind, features) = (map.descriptor, FeatureSet::DescriptorOnly);
             let imaging = &self.maps.imaging;
             let extraction = imaging.extract(&extractor, bytes, kind, features, new.demand).await?;
             imaging.metrics.observe_extraction(&extraction);
             let digest = extraction.digest;
+            let (pose, warnings) = match (stated_pose, map.frame) {
+                (Some(pose), _) => (Some(pose), Vec::new()),
+                (None, CoordinateFrame::Wgs84) => pose_in(&new.bytes),
+                (None, CoordinateFrame::Metric) => (None, Vec::new()),
+            };
             let image = Image {
                 id: stated.id.clone().unwrap_or_else(|| ImageId::from_digest(&digest)),
                 digest,
@@ -79,10 +85,14 @@ impl Images {
                 added => {
                     return match added? {
                         Added::Created(image) => {
-                            Ok((ImageAnswer { image, changed: Vec::new() }, true))
+                            Ok((ImageAnswer { image, changed: Vec::new(), warnings }, true))
                         }
                         Added::Present(image) => {
-                            Ok((self.restate(name, &image.id, &stated).await?, false))
+                            let answer = self.restate(name, &image.id, &stated).await?;
+                            // A pose that was corrected needs no advice.
+                            let warnings =
+                                if answer.image.pose.is_none() { warnings } else { Vec::new() };
+                            Ok((ImageAnswer { warnings, ..answer }, false))
                         }
                     };
                 }
@@ -169,6 +179,12 @@ impl StatedMeta {
             ..image.clone()
         })
     }
+}
+
+/// The position in the EXIF data of a picture, and what was not taken of it.
+fn pose_in(bytes: &[u8]) -> (Option<Pose>, Vec<String>) {
+    let exif::GpsReading { pose, warnings } = exif::gps(bytes);
+    (pose.map(Pose::Geographic), warnings)
 }
 
 pub(super) fn check_tags(tags: &[String]) -> Result<(), ServiceError> {

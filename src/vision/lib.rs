@@ -10,6 +10,7 @@ mod batcher;
 mod bench;
 pub mod decode;
 mod execution;
+pub mod exif;
 mod extractor;
 mod jpeg;
 mod loaded;

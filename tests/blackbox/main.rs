@@ -29,6 +29,7 @@ mod keys;
 mod localize;
 mod maps;
 mod mllm;
+mod odd_folders;
 mod reindex;
 mod retention;
 mod scale_out;

@@ -161,6 +161,7 @@ pub fn poses() -> Vec<Vec<u8>> {
     texts(&[
         "file,lat,lon,alt,heading\na.jpg,45.1,7.2,240.5,359.9\nb.jpg,-45,179.999,,\n",
         "file,x,y,z,qx,qy,qz,qw\na.jpg,1.5,-2,0,0,0,0.7071068,0.7071068\nb.jpg,1e3,2,,,,,\n",
+        "sep=;\n# by hand\nName;Easting;Northing;Zone\nA;543250,96;4178900,7;10S\nx\\b.jpg;1;2;11N\n",
         r#"{"lat": 45.0, "lon": 7.0, "alt": 240.0, "heading": 90.0}"#,
         r#"{"x": 1.0, "y": -2.5, "z": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}"#,
     ])
@@ -170,6 +171,7 @@ pub fn truths() -> Vec<Vec<u8>> {
     texts(&[
         "query,references\na.jpg,a.jpg b.jpg\nb.jpg,\nc.jpg,c.jpg\n",
         "query,references\n\"a.jpg\",\"b.jpg\"\n",
+        "query;references\na;[\"d/a b.jpg\"]\nb.jpg;d/a b.jpg \"c.jpg\"\n",
     ])
 }
 

@@ -10,12 +10,13 @@ use axum::http::Request;
 use tokio::runtime::{Builder, Runtime};
 use whereabouts_archive::{Item, Reader};
 use whereabouts_core::{CoordinateFrame, Pose, PoseInput};
-use whereabouts_eval::{PictureFile, PoseSource, TruthSource};
+use whereabouts_eval::{Folder, FolderPoses, PictureFile, TruthSource};
 use whereabouts_index::SealedGraph;
 use whereabouts_refine::mllm::Labels;
 use whereabouts_server::http::is_picture_form;
 use whereabouts_vision::ImageLimits;
 use whereabouts_vision::decode::{Needed, decode};
+use whereabouts_vision::exif::gps;
 use whereabouts_vision::manifest::Manifest;
 
 const LIMITS: ImageLimits = ImageLimits { max_pixels: 1 << 16 };
@@ -55,9 +56,10 @@ pub fn archive(bytes: &[u8]) -> bool {
     }
 }
 
-fn pictures() -> Vec<PictureFile> {
-    let names = ["a.jpg", "b.jpg", "c.jpg"];
-    names.map(|name| PictureFile { file: name.into(), id: name.parse().unwrap() }).into()
+fn folder() -> Folder {
+    let names = ["a.jpg", "b.jpg", "c.jpg", "d/a b.jpg"];
+    let pictures = names.map(|name| PictureFile { file: name.into(), id: name.parse().unwrap() });
+    Folder { dir: ".".into(), pictures: pictures.into(), skipped: Vec::new() }
 }
 
 /// A file for a parser that takes a path.
@@ -76,13 +78,18 @@ pub fn poses(bytes: &[u8]) -> bool {
         return !posed.is_empty();
     }
     let file = file(bytes);
-    match PoseSource::find(Path::new("."), Some(file.path()), &pictures()) {
-        Ok(PoseSource::Csv { poses, .. }) => {
-            poses.values().for_each(usable);
-            true
+    let folder = folder();
+    let Ok(mut poses) = FolderPoses::read(&folder, Some(file.path())) else { return false };
+    let account = poses.account().unwrap();
+    let counted = account.matched + account.repeated + account.without_position;
+    assert_eq!(counted + account.unmatched.len(), account.rows);
+    for frame in [None, Some(CoordinateFrame::Wgs84), Some(CoordinateFrame::Metric)] {
+        if frame.is_none_or(|frame| poses.convert_to(frame).is_ok()) {
+            let found = folder.pictures.iter().filter_map(|one| poses.find(&one.id, b"").pose);
+            found.for_each(|pose| usable(&pose));
         }
-        Ok(_) | Err(_) => false,
     }
+    true
 }
 
 /// Asserts that a pose is in range, so that distances from it are finite.
@@ -91,19 +98,14 @@ fn usable(pose: &Pose) {
 }
 
 pub fn exif(bytes: &[u8]) -> bool {
-    match PoseSource::Exif.pose("a", bytes) {
-        Ok(Some(pose)) => {
-            usable(&pose);
-            true
-        }
-        Ok(None) | Err(_) => false,
-    }
+    let Some(pose) = gps(bytes).pose else { return false };
+    usable(&Pose::Geographic(pose));
+    true
 }
 
 pub fn truth(bytes: &[u8]) -> bool {
-    let (file, pictures) = (file(bytes), pictures());
-    let folder = (Path::new("."), pictures.as_slice());
-    TruthSource::Csv(file.path().to_owned()).read(folder, folder).is_ok()
+    let (file, folder) = (file(bytes), folder());
+    TruthSource::Listed(file.path().to_owned()).read(&folder, &folder).is_ok()
 }
 
 pub fn answer(bytes: &[u8]) -> bool {

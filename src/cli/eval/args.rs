@@ -14,9 +14,10 @@ use whereabouts_server::config::{Config, Overrides, RefinerChoice};
 ///
 /// Indexes the references, localizes every query, and prints Recall@1, 5 and 10 before and after refinement.
 /// The correct references of a query are taken from the first of these that exists: --ground-truth,
-/// --frame-tolerance, a ground_truth.csv in or next to the folder of queries, and positions. Positions are
-/// read from --database-poses and --queries-poses or a poses.csv in each folder, from file names
-/// @easting@northing@..., or from EXIF GPS. To resume an interrupted run, run the same command again.
+/// --frame-tolerance, a ground_truth.csv or .json in or next to the folder of queries, and positions. The position
+/// of each image is read from the first source that has one: --database-poses and --queries-poses or a poses.csv
+/// in each folder, a file NAME.json next to the image NAME, a file name @easting@northing@..., or EXIF GPS. Images
+/// without one are left out. The exit code is 1 if a file could not be taken. To resume an interrupted run, run the same command again.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Folder of references; subfolders are included
@@ -32,16 +33,18 @@ pub struct Args {
     /// unknown places
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0, value_parser = fraction)]
     pub hold_out: f64,
-    /// CSV file with the columns query,references; the references are separated by spaces
+    /// CSV file with the columns query,references, the references separated by spaces; or JSON:
+    /// {"query.jpg": ["reference.jpg"]}
     #[arg(long, value_name = "FILE", conflicts_with = "frame_tolerance")]
     ground_truth: Option<PathBuf>,
-    /// Treat both folders as recordings of the same route, where correct references are at most N frames away
+    /// Treat both folders as recordings of the same route, in the natural order of their names (2.jpg before
+    /// 10.jpg), where correct references are at most N frames away
     #[arg(long, value_name = "N")]
     frame_tolerance: Option<usize>,
-    /// CSV file with the positions of the references: file, and lat,lon or x,y
+    /// Table (CSV) with the positions of the references: file, and lat,lon or x,y
     #[arg(long, value_name = "FILE")]
     database_poses: Option<PathBuf>,
-    /// CSV file with the positions of the queries
+    /// Table (CSV) with the positions of the queries
     #[arg(long, value_name = "FILE")]
     queries_poses: Option<PathBuf>,
     /// Largest distance of a correct reference, in metres
@@ -119,9 +122,10 @@ impl Args {
             bail!("--threshold-m must be 0 or more metres");
         }
         let has_poses = self.database_poses.is_some() || self.queries_poses.is_some();
-        let found = || TruthSource::find_csv(&self.database, &self.queries).filter(|_| !has_poses);
+        let found =
+            || TruthSource::find_listed(&self.database, &self.queries).filter(|_| !has_poses);
         Ok(match (&self.ground_truth, self.frame_tolerance) {
-            (Some(file), _) => TruthSource::Csv(file.clone()),
+            (Some(file), _) => TruthSource::Listed(file.clone()),
             (None, Some(tolerance)) => TruthSource::Frames { tolerance },
             (None, None) => found().unwrap_or_else(|| TruthSource::Positions {
                 database: self.database_poses.clone(),

@@ -5,7 +5,7 @@ mod args;
 use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use parking_lot::Mutex;
 
 pub use self::args::Args;
@@ -21,6 +21,9 @@ use whereabouts_server::startup;
 use whereabouts_server::startup::Parts;
 use whereabouts_service::Service;
 
+/// Most names in one line of what is left out, and lines of one kind.
+const MOST_NAMES: usize = 20;
+
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let folders = Folders {
         database: args.database.clone(),
@@ -31,6 +34,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let truth = args.truth()?;
     let sampling = Sampling { size: args.sample.map(|size| size as usize), seed: args.seed };
     let data = Dataset::read(&folders, &truth, sampling)?;
+    data.left_out.lines(MOST_NAMES).iter().for_each(|line| eprintln!("{line}"));
     if let Some(out) = &args.out {
         std::fs::create_dir_all(out)
             .with_context(|| format!("cannot create the folder {}", out.display()))?;
@@ -78,6 +82,12 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         println!("{}", serde_json::to_string(&summary)?);
     } else {
         print!("{}", table(&summary));
+    }
+    let lost = data.left_out.skipped.iter().filter(|skipped| skipped.is_lost).count();
+    if lost > 0 {
+        bail!(
+            "{lost} files were not evaluated; repair or remove them, then run the same command again"
+        );
     }
     Ok(())
 }

@@ -1,23 +1,27 @@
 //! `whereabouts index`: adds a folder of images to a map, or computes a map's descriptors again with another
 //! model, over HTTP.
 
+mod account;
+mod map;
 mod reindex;
 mod upload;
 
 use std::path::PathBuf;
 
-use anyhow::bail;
-use serde::Serialize;
-
+pub use self::account::IndexReport;
 pub use self::upload::add_folder;
 use super::client::ServerArg;
 use whereabouts_core::{CoordinateFrame, DescriptorKind, MapName, Scene};
 
 /// Add a folder of images to a map on a server
 ///
-/// Poses are read from a CSV file (--poses, or poses.csv in the folder), from file names of the form
-/// @easting@northing@..., or from EXIF GPS. It is safe to run this again: images that the map already has are
-/// skipped.
+/// The pose of each image is taken from the first source that has one: a table (--poses, or poses.csv in the
+/// folder), a file NAME.json next to the image NAME, a file name of the form @easting@northing@..., or EXIF GPS.
+/// It is safe to run this again: images that the map already has stay, and get the pose, time and tags that the
+/// folder has for them now.
+///
+/// The result accounts for every picture (added, already present, changed, skipped, failed) and for every row of
+/// the table. The exit code is 1 if a picture was not added.
 ///
 /// With --reindex, the server computes new descriptors for all images of the map, with another model or with
 /// the version that is installed now. Until that is done, the map keeps answering with the old ones.
@@ -32,7 +36,7 @@ pub struct Args {
     /// Map to add to; created if it does not exist
     #[arg(long)]
     pub map: MapName,
-    /// CSV file of poses, with the header file,lat,lon[,alt,heading] or file,x,y[,z,qx,qy,qz,qw]
+    /// Table of poses (CSV), with the header file,lat,lon[,alt,heading] or file,x,y[,z,qx,qy,qz,qw]
     #[arg(long, value_name = "FILE")]
     pub poses: Option<PathBuf>,
     /// Kind of place that the map shows
@@ -58,57 +62,10 @@ pub struct Args {
     pub server: ServerArg,
 }
 
-/// What was added to the map, and what could not be.
-#[derive(Debug, Serialize)]
-pub struct IndexReport {
-    map: MapName,
-    /// Images in the folder.
-    pub images: usize,
-    added: usize,
-    present: usize,
-    without_pose: usize,
-    failed: Vec<FailedImage>,
-    /// Duration of the upload.
-    pub seconds: f64,
-    images_per_second: f64,
-}
-
-#[derive(Debug, Serialize)]
-struct FailedImage {
-    file: PathBuf,
-    error: String,
-}
-
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let client = args.server.client()?;
     match &args.dir {
-        Some(dir) => print(&add_folder(&client, dir, &args).await?, args.json),
+        Some(dir) => add_folder(&client, dir, &args).await?.print(args.json),
         None => reindex::run(&client, &args).await,
     }
-}
-
-/// Prints the report. Images that were not added are an error.
-fn print(report: &IndexReport, json: bool) -> anyhow::Result<()> {
-    if json {
-        println!("{}", serde_json::to_string(report)?);
-    } else {
-        println!(
-            "{}: {} added, {} already present, {} failed, {} without a pose; {:.1} s, {:.1} images/s",
-            report.map,
-            report.added,
-            report.present,
-            report.failed.len(),
-            report.without_pose,
-            report.seconds,
-            report.images_per_second
-        );
-    }
-    if !report.failed.is_empty() {
-        bail!(
-            "{} of {} images were not added; repair or remove them, then run the same command again",
-            report.failed.len(),
-            report.images
-        );
-    }
-    Ok(())
 }

@@ -1,6 +1,7 @@
 //! Uploads a folder of images in batches.
 
-use std::path::{Path, PathBuf};
+use std::collections::HashMap;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, ensure};
@@ -8,13 +9,14 @@ use bytes::Bytes;
 use futures_util::StreamExt;
 use reqwest::multipart::{Form, Part};
 
-use super::super::client::{Client, MAX_ATTEMPTS, MAX_PAUSE, segment};
+use super::super::client::{Client, MAX_ATTEMPTS, MAX_PAUSE};
 use super::super::progress::ProgressMeter;
-use super::{Args, FailedImage, IndexReport};
+use super::account::{Entry, FailedImage, IndexReport, Outcome};
+use super::{Args, map};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
-use whereabouts_api::{ErrorKind, ImageMeta, MapChange};
-use whereabouts_core::MediaType;
-use whereabouts_eval::{PictureFile, PoseSource, pictures};
+use whereabouts_api::{ErrorKind, ImageMeta};
+use whereabouts_core::{ImageField, ImageId, MediaType};
+use whereabouts_eval::{Folder, FolderPoses, FoundPose, PictureFile, PoseSource};
 
 /// Images in one request. Several requests at a time keep the server busy while one of them completes.
 const BATCH_IMAGES: usize = 16;
@@ -27,55 +29,46 @@ const BATCH_TIMEOUT: Duration = Duration::from_secs(1800);
 
 /// Adds a folder to a map. An image that cannot be added is in the report; the others are added all the same.
 pub async fn add_folder(client: &Client, dir: &Path, args: &Args) -> anyhow::Result<IndexReport> {
-    let files = pictures(dir)?;
-    let source = PoseSource::find(dir, args.poses.as_deref(), &files)?;
-    let change = MapChange {
-        model: args.model.clone(),
-        scene: args.scene,
-        descriptor: args.descriptor,
-        frame: args.frame.or(source.frame()),
-        ..MapChange::default()
-    };
-    let path = format!("/maps/{}", segment(args.map.as_str()));
-    client.send(client.put(&path).json(&change)).await?;
+    let folder = Folder::read(dir)?;
+    let mut poses = FolderPoses::read(&folder, args.poses.as_deref())?;
+    let path = map::prepare(client, args, &folder, &mut poses).await?;
 
     let start = Instant::now();
-    let progress = ProgressMeter::new("images", files.len());
-    let uploader = Uploader { client, path: format!("{path}/images:batch"), source: &source };
-    let mut uploads = futures_util::stream::iter(batches(files.clone()))
+    let progress = ProgressMeter::new("images", folder.pictures.len());
+    let uploader = Uploader { client, path: format!("{path}/images:batch"), poses: &poses };
+    let mut uploads = futures_util::stream::iter(batches(folder.pictures.clone()))
         .map(|batch| uploader.upload(batch))
         .buffer_unordered(usize::from(args.concurrency));
-    let mut report = IndexReport {
-        map: args.map.clone(),
-        images: files.len(),
-        added: 0,
-        present: 0,
-        without_pose: 0,
-        failed: Vec::new(),
-        seconds: 0.0,
-        images_per_second: 0.0,
-    };
+    let mut entries: HashMap<ImageId, Entry> = HashMap::with_capacity(folder.pictures.len());
+    let mut failed = Vec::new();
     while let Some(batch) = uploads.next().await {
-        for (file, result) in batch {
-            match result {
-                Ok(Uploaded { is_new, has_pose }) => {
-                    report.added += usize::from(is_new);
-                    report.present += usize::from(!is_new);
-                    report.without_pose += usize::from(!has_pose);
-                }
+        for (picture, result) in batch {
+            let entry = match result {
+                Ok(uploaded) => uploaded.entry(&picture.id),
                 Err(error) => {
-                    progress.println(&format!("{}: {error:#}", file.display()));
-                    report.failed.push(FailedImage { file, error: format!("{error:#}") });
+                    let error = format!("{error:#}");
+                    progress.println(&format!("{}: {error}", picture.file.display()));
+                    failed.push(FailedImage { file: picture.file, error: error.clone() });
+                    Entry {
+                        file: picture.id.to_string(),
+                        outcome: Outcome::Failed,
+                        pose: None,
+                        changed: Vec::new(),
+                        why: Some(error),
+                        warnings: Vec::new(),
+                    }
                 }
-            }
+            };
+            entries.insert(picture.id, entry);
             progress.step();
         }
     }
     progress.finish();
-    report.failed.sort_by(|a, b| a.file.cmp(&b.file));
-    report.seconds = start.elapsed().as_secs_f64();
-    report.images_per_second = files.len() as f64 / report.seconds.max(1e-9);
-    Ok(report)
+    failed.sort_by(|a, b| a.file.cmp(&b.file));
+    let account =
+        folder.pictures.iter().filter_map(|picture| entries.remove(&picture.id)).collect();
+    let (rows, seconds) = (poses.account().cloned(), start.elapsed().as_secs_f64());
+    Ok(IndexReport::new(args.map.clone(), account, failed, folder.skipped, rows, seconds))
 }
 
 fn batches(files: Vec<PictureFile>) -> Vec<Vec<PictureFile>> {
@@ -100,33 +93,51 @@ fn batches(files: Vec<PictureFile>) -> Vec<Vec<PictureFile>> {
 /// An image that the server has stored, now or before.
 struct Uploaded {
     is_new: bool,
-    has_pose: bool,
+    changed: Vec<ImageField>,
+    source: Option<PoseSource>,
+    warnings: Vec<String>,
+}
+
+impl Uploaded {
+    fn entry(self, id: &ImageId) -> Entry {
+        let Self { is_new, changed, source, warnings } = self;
+        let outcome = match (is_new, changed.is_empty()) {
+            (true, _) => Outcome::Added,
+            (false, true) => Outcome::Present,
+            (false, false) => Outcome::Changed,
+        };
+        Entry { file: id.to_string(), outcome, pose: source, changed, why: None, warnings }
+    }
 }
 
 /// An image that was read and is to be sent.
 struct PendingImage {
-    file: PathBuf,
+    picture: PictureFile,
     bytes: Bytes,
-    media_type: MediaType,
+    media_type: Option<MediaType>,
     meta: String,
-    has_pose: bool,
+    source: Option<PoseSource>,
+    warnings: Vec<String>,
 }
 
 struct Uploader<'a> {
     client: &'a Client,
     path: String,
-    source: &'a PoseSource,
+    poses: &'a FolderPoses,
 }
 
 impl Uploader<'_> {
     /// Uploads a batch. Images that the server rejects because it is overloaded are sent again after the pause
     /// that it asks for.
-    async fn upload(&self, batch: Vec<PictureFile>) -> Vec<(PathBuf, anyhow::Result<Uploaded>)> {
+    async fn upload(
+        &self,
+        batch: Vec<PictureFile>,
+    ) -> Vec<(PictureFile, anyhow::Result<Uploaded>)> {
         let (mut pending, mut done) = (Vec::new(), Vec::new());
         for picture in batch {
             match self.read(&picture).await {
                 Ok(image) => pending.push(image),
-                Err(error) => done.push((picture.file, Err(error))),
+                Err(error) => done.push((picture, Err(error))),
             }
         }
         for retries_left in (0..MAX_ATTEMPTS).rev() {
@@ -137,20 +148,24 @@ impl Uploader<'_> {
                 Ok(answer) => answer,
                 Err(error) => {
                     let error = format!("{error:#}");
-                    let fail = |image: PendingImage| (image.file, Err(anyhow!("{error}")));
+                    let fail = |image: PendingImage| (image.picture, Err(anyhow!("{error}")));
                     done.extend(pending.into_iter().map(fail));
                     return done;
                 }
             };
             let mut pause = None;
             let mut overloaded = Vec::new();
-            for (image, BatchResult { outcome, problem, .. }) in
-                pending.into_iter().zip(answer.results)
-            {
-                let is_new = outcome == BatchOutcome::Stored;
+            for (image, result) in pending.into_iter().zip(answer.results) {
+                let BatchResult { outcome, changed, problem, warnings, .. } = result;
                 match problem {
                     None => {
-                        done.push((image.file, Ok(Uploaded { is_new, has_pose: image.has_pose })));
+                        let uploaded = Uploaded {
+                            is_new: outcome == BatchOutcome::Stored,
+                            changed,
+                            source: image.source,
+                            warnings: united(image.warnings, warnings),
+                        };
+                        done.push((image.picture, Ok(uploaded)));
                     }
                     Some(BatchProblem { kind, retry_after_s, .. })
                         if kind == ErrorKind::Overloaded.word() && retries_left > 0 =>
@@ -159,7 +174,7 @@ impl Uploader<'_> {
                         pause = pause.max(requested.ok());
                         overloaded.push(image);
                     }
-                    Some(problem) => done.push((image.file, Err(anyhow!("{}", problem.detail)))),
+                    Some(problem) => done.push((image.picture, Err(anyhow!("{}", problem.detail)))),
                 }
             }
             if let Some(pause) = pause {
@@ -173,16 +188,18 @@ impl Uploader<'_> {
     async fn read(&self, picture: &PictureFile) -> anyhow::Result<PendingImage> {
         let bytes: Bytes =
             tokio::fs::read(&picture.file).await.context("cannot read the file")?.into();
-        let media_type = MediaType::sniff(&bytes).context("is not a JPEG, PNG or WebP image")?;
-        let pose = self.source.pose(picture.id.as_str(), &bytes)?;
-        let has_pose = pose.is_some();
+        ensure!(!bytes.is_empty(), "the file is empty");
+        let media_type = MediaType::sniff(&bytes);
+        let FoundPose { pose, source, captured_at, tags, warnings } =
+            self.poses.find(&picture.id, &bytes);
         let meta = ImageMeta {
             id: Some(picture.id.to_string()),
             pose: pose.map(Into::into),
-            ..ImageMeta::default()
+            captured_at,
+            tags,
         };
         let meta = serde_json::to_string(&meta)?;
-        Ok(PendingImage { file: picture.file.clone(), bytes, media_type, meta, has_pose })
+        Ok(PendingImage { picture: picture.clone(), bytes, media_type, meta, source, warnings })
     }
 
     async fn post(&self, images: &[PendingImage]) -> anyhow::Result<BatchAnswer> {
@@ -192,7 +209,7 @@ impl Uploader<'_> {
                 let part = Part::stream(image.bytes.clone());
                 form = form
                     .text("meta", image.meta.clone())
-                    .part("image", part.mime_str(image.media_type.as_str())?);
+                    .part("image", part.mime_str(content_type(image.media_type))?);
             }
             Ok(self.client.post(&self.path).timeout(BATCH_TIMEOUT).multipart(form))
         };
@@ -207,6 +224,18 @@ impl Uploader<'_> {
         );
         Ok(answer)
     }
+}
+
+/// The `Content-Type` of a picture; the server decides about bytes of an unknown format.
+fn content_type(media_type: Option<MediaType>) -> &'static str {
+    media_type.map_or("application/octet-stream", MediaType::as_str)
+}
+
+/// The warnings of both sides, each once.
+fn united(mut ours: Vec<String>, of_server: Vec<String>) -> Vec<String> {
+    let new: Vec<String> = of_server.into_iter().filter(|text| !ours.contains(text)).collect();
+    ours.extend(new);
+    ours
 }
 
 #[cfg(test)]

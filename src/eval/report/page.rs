@@ -49,7 +49,7 @@ pub fn page(
 }
 
 fn introduction(summary: &Summary) -> Markup {
-    let Summary { queries, skipped, unknown, references, conditions, methods } = summary;
+    let Summary { queries, skipped, unknown, references, left_out, conditions, methods } = summary;
     html! {
         h1 { "How often the first answer is correct" }
         p {
@@ -58,6 +58,12 @@ fn introduction(summary: &Summary) -> Markup {
             " (" (conditions.execution) "). A reference is correct if it is " (conditions.truth) "."
             @if *skipped > 0 {
                 " " (skipped) " more queries have no correct reference and are left out."
+            }
+            @if !left_out.queries.is_empty() {
+                " " (left_out.queries.len()) " of them have no position."
+            }
+            @if !left_out.references.is_empty() {
+                " " (left_out.references.len()) " references have no position and are left out."
             }
             @if *unknown > 0 { " " (unknown) " more queries show places that are not in the map." }
         }

@@ -142,7 +142,7 @@ fn result(result: BulkResult) -> AddImageResult {
         outcome: Some(Outcome::Problem(convert::problem(error))),
     };
     match result {
-        BulkResult::Saved(ImageAnswer { image, changed }, new) => {
+        BulkResult::Saved(ImageAnswer { image, changed, .. }, new) => {
             let stored = Stored {
                 present: !new,
                 digest: image.digest.to_string(),

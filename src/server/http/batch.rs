@@ -217,22 +217,22 @@ fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, Servi
 }
 
 fn batch_result(result: BulkResult) -> BatchResult {
-    let (id, outcome, changed, problem) = match result {
-        BulkResult::Saved(ImageAnswer { image, changed }, new) => {
+    let (id, outcome, changed, problem, warnings) = match result {
+        BulkResult::Saved(ImageAnswer { image, changed, warnings }, new) => {
             let outcome = if new { BatchOutcome::Stored } else { BatchOutcome::Present };
-            (Some(image.id.into()), outcome, changed, None)
+            (Some(image.id.into()), outcome, changed, None, warnings)
         }
         BulkResult::Failed(id, error) => {
             let kind = error.kind.word().to_owned();
             let retry_after_s = error.retry_after.map(|pause| pause.as_secs_f64());
             let problem = BatchProblem { kind, detail: error.detail, retry_after_s };
-            (id.map(Into::into), BatchOutcome::Failed, Vec::new(), Some(problem))
+            (id.map(Into::into), BatchOutcome::Failed, Vec::new(), Some(problem), Vec::new())
         }
         BulkResult::Skipped(name, why) => {
             let detail = format!("{name:?} was skipped: {why}");
             let problem = BatchProblem { kind: "skipped".into(), detail, retry_after_s: None };
-            (Some(name), BatchOutcome::Skipped, Vec::new(), Some(problem))
+            (Some(name), BatchOutcome::Skipped, Vec::new(), Some(problem), Vec::new())
         }
     };
-    BatchResult { id, outcome, changed, problem }
+    BatchResult { id, outcome, changed, problem, warnings }
 }

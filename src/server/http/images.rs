@@ -101,8 +101,9 @@ impl MetaParams {
 /// Add an image
 ///
 /// Send either a raw picture, with what is known about it in the query string, or a form with the parts
-/// `image` (the picture) and `meta` (JSON). Sending the same id with the same bytes again is answered 200; a
-/// pose, time or tags that differ from what is stored replace it, and what is omitted stays.
+/// `image` (the picture) and `meta` (JSON). In a `wgs84` map, a new image without a pose gets that of its EXIF
+/// data; what of them cannot be trusted is in `warnings`. Sending the same id with the same bytes again is
+/// answered 200; a pose, time or tags that differ from what is stored replace it, and what is omitted stays.
 #[utoipa::path(post, path = "/maps/{map}/images", tag = "images",
     params(("map" = String, Path), MetaParams,
         ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,

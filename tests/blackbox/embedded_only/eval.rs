@@ -314,3 +314,36 @@ fn held_out_references_are_unknown_places() {
     assert_eq!(refused.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&refused.stderr).contains("from 0 to below 1"));
 }
+
+#[test]
+fn frames_are_in_natural_order() {
+    let folders = Folders::new();
+    for place in 0..11 {
+        folders.write(&format!("database/{place}.jpg"), reference(place));
+        folders.write(&format!("queries/{:02}.jpg", place), frame(place, 0));
+    }
+    let summary = folders.eval(&["--refine", "off", "--frame-tolerance", "0"]);
+    assert!(recalls(&summary)[0][0] >= 70.0, "{summary}");
+    assert!(summary["truth"].as_str().unwrap().contains("natural order"), "{summary}");
+    // A missing frame would shift all after it.
+    std::os::unix::fs::symlink("/nowhere.jpg", folders.path("queries/05a.jpg")).unwrap();
+    let refused = folders.refused(&["--refine", "off", "--frame-tolerance", "0"]);
+    assert!(refused.contains("05a.jpg") && refused.contains("order"), "{refused}");
+}
+
+#[test]
+fn an_image_without_a_position_is_left_out_and_named() {
+    let folders = Folders::town(4);
+    folders.write("database/overview.jpg", reference(30));
+    folders.write("database/._@1000.0@5.0@.jpg", "of a Mac");
+    folders.write("queries/no-fix.jpg", frame(31, 0));
+    let output = folders.command(&["--refine", "off"]).output().unwrap();
+    let summary = json(&output);
+    let counts = ["queries", "skipped", "references"].map(|name| summary[name].clone());
+    assert_eq!(counts, [4, 1, 4].map(Value::from));
+    assert_eq!(summary["left_out"]["references"], serde_json::json!(["overview.jpg"]));
+    let text = String::from_utf8_lossy(&output.stderr);
+    for name in ["overview.jpg", "._@1000.0@5.0@.jpg", "no-fix.jpg"] {
+        assert!(text.contains(name), "{name}: {text}");
+    }
+}
