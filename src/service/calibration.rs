@@ -87,6 +87,7 @@ impl Calibrator {
     async fn is_due(&self, map: &Map, images: usize) -> Result<bool, ServiceError> {
         let Some(known) = self.store.calibration(map).await? else { return Ok(images > 1) };
         Ok(!known.complete
+            || known.evidence != Calibration::EVIDENCE
             || known.settings != self.settings
             || known.images.abs_diff(images) * CHANGED_SHARE > known.images)
     }
@@ -105,7 +106,9 @@ impl Calibrator {
         let similarity = NullDistribution::from(values(asked.iter().filter_map(|asked| {
             Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
         })));
-        let mut measured = Calibration { images, settings, similarity, ..Calibration::default() };
+        let evidence = Calibration::EVIDENCE;
+        let mut measured =
+            Calibration { images, settings, evidence, similarity, ..Calibration::default() };
         self.store.put_calibration(map, measured.clone()).await?;
         if let Some(refiner) = refiner {
             let step = asked.len().div_ceil(settings.refined.max(1)).max(1);
