@@ -27,6 +27,9 @@ pub struct BatchResult {
     /// Why the image could not be stored; null if it was.
     #[schema(nullable)]
     pub problem: Option<BatchProblem>,
+    /// What the sender should know about the picture, such as damage in transit; usually empty.
+    #[serde(default)]
+    pub warnings: Vec<String>,
 }
 
 /// Whether an image of a bulk upload was stored.

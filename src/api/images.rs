@@ -24,6 +24,17 @@ pub struct ImageMeta {
     pub tags: Vec<String>,
 }
 
+/// The response to an upload.
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
+pub struct UploadedImage {
+    /// The stored image.
+    #[serde(flatten)]
+    pub image: Image,
+    /// What the sender should know about the picture, such as damage in transit; usually empty.
+    #[serde(default)]
+    pub warnings: Vec<String>,
+}
+
 /// A page of images, sorted by id.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct ImagePage {

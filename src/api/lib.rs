@@ -20,7 +20,7 @@ pub use self::client::{Client, MAX_ATTEMPTS, MAX_PAUSE, explained, segment};
 #[cfg(feature = "grpc")]
 pub use self::convert::{job_state_to, moment_to};
 pub use self::error::ErrorKind;
-pub use self::images::{ExportPage, ImageMeta, ImagePage, ImportedImage};
+pub use self::images::{ExportPage, ImageMeta, ImagePage, ImportedImage, UploadedImage};
 pub use self::jobs::{JobChange, JobPage, JobStatus, Missed, PairDescribed, PairRegions};
 pub use self::keys::{MadeKey, NewKey};
 pub use self::localize::{

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use walkdir::WalkDir;
 
-use whereabouts_core::ImageId;
+use whereabouts_core::{ImageId, MediaType};
 
 /// An image file in a folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -32,8 +32,9 @@ pub fn pictures(dir: &Path) -> anyhow::Result<Vec<PictureFile>> {
     }
     if pictures.is_empty() {
         bail!(
-            "found no .jpg, .jpeg, .png or .webp file in {}; name a folder of images",
-            dir.display()
+            "found no picture in {} (a file named .{}); name a folder of images",
+            dir.display(),
+            MediaType::EXTENSIONS.join(", .")
         );
     }
     Ok(pictures)
@@ -41,7 +42,7 @@ pub fn pictures(dir: &Path) -> anyhow::Result<Vec<PictureFile>> {
 
 fn has_image_extension(path: &Path) -> bool {
     let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or("");
-    matches!(extension.to_ascii_lowercase().as_str(), "jpg" | "jpeg" | "png" | "webp")
+    MediaType::EXTENSIONS.contains(&extension.to_ascii_lowercase().as_str())
 }
 
 fn image_id(dir: &Path, file: &Path) -> anyhow::Result<ImageId> {

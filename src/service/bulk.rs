@@ -10,10 +10,9 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
 
-use super::{Images, NewImage, Principal, ServiceError};
+use super::{Images, NewImage, Principal, ServiceError, StoredImage};
 use whereabouts_api::{ErrorKind, ImageMeta};
 use whereabouts_core::{ImageId, MapName};
-use whereabouts_store::Added;
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 /// Bounds of bulk uploads.
@@ -33,7 +32,7 @@ pub struct BulkSettings {
 /// An image of an upload.
 #[derive(Debug)]
 pub struct BulkImage {
-    /// Its bytes: JPEG, PNG or WebP.
+    /// Its bytes, in any format of [`MediaType`](whereabouts_core::MediaType).
     pub bytes: Bytes,
     /// Its id, pose, time and tags.
     pub meta: ImageMeta,
@@ -43,7 +42,7 @@ pub struct BulkImage {
 
 /// The result of one image of an upload: the stored image, or the id that the caller gave it, if any, and the
 /// error.
-pub type BulkResult = Result<Added, (Option<ImageId>, ServiceError)>;
+pub type BulkResult = Result<StoredImage, (Option<ImageId>, ServiceError)>;
 
 impl Images {
     /// Stores images as they arrive and returns their results in the same order. The error of one image does not
@@ -118,7 +117,7 @@ impl Images {
         &self,
         map: &MapName,
         image: BulkImage,
-    ) -> Result<Added, ServiceError> {
+    ) -> Result<StoredImage, ServiceError> {
         const MAX_PAUSE: Duration = Duration::from_secs(1);
         let demand = AdmissionRequest { class: WorkClass::Index, deadline: None };
         let until = Instant::now() + Duration::from_secs(self.bulk.patience_s);

@@ -15,12 +15,21 @@ use whereabouts_vision::{AdmissionRequest, FeatureSet};
 /// An image to add.
 #[derive(Debug)]
 pub struct NewImage {
-    /// Its bytes: JPEG, PNG or WebP.
+    /// Its bytes, in any format of [`MediaType`].
     pub bytes: Bytes,
     /// Its id, pose, time and tags.
     pub meta: ImageMeta,
     /// Its priority and deadline in the admission queue.
     pub demand: AdmissionRequest,
+}
+
+/// An image that is stored, now or before.
+#[derive(Debug)]
+pub struct StoredImage {
+    /// The image, and whether it is new.
+    pub added: Added,
+    /// What the sender should know about the picture.
+    pub warnings: Vec<String>,
 }
 
 /// Reference images: add, list, show and delete. Clones share the store.
@@ -38,7 +47,7 @@ pub struct Images {
 
 impl Images {
     /// Extracts the descriptor of an image and stores both.
-    pub async fn add(&self, map: &MapName, new: NewImage) -> Result<Added, ServiceError> {
+    pub async fn add(&self, map: &MapName, new: NewImage) -> Result<StoredImage, ServiceError> {
         if new.bytes.is_empty() {
             return Err(empty_body());
         }
@@ -69,7 +78,9 @@ impl Images {
             match self.maps.store.add_image(&map, image, extraction.descriptor).await {
                 // A reindex ended meanwhile: the descriptor is of the model before it.
                 Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
-                added => return Ok(added?),
+                added => {
+                    return Ok(StoredImage { added: added?, warnings: extraction.warnings });
+                }
             }
         }
     }

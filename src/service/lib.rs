@@ -42,7 +42,7 @@ pub use self::cancellation::Deadline;
 pub use self::error::ServiceError;
 pub use self::events::{AnyJobEvent, JobEvent};
 pub use self::idempotency::{Idempotency, IdempotencyOutcome, IdempotencySettings};
-pub use self::images::{Images, NewImage};
+pub use self::images::{Images, NewImage, StoredImage};
 pub use self::imaging::Imaging;
 pub use self::jobs::{Jobs, parse_search_text, uuid};
 pub use self::keys::{Keys, Principal};

@@ -10,7 +10,7 @@ mod batcher;
 mod bench;
 pub mod decode;
 mod extractor;
-mod jpeg;
+mod information;
 mod loaded;
 pub mod manifest;
 mod pool;
@@ -27,10 +27,11 @@ pub use admission::{
 };
 pub use batcher::Layout;
 pub use bench::{Bench, BenchFigures, BenchRow, BenchSettings};
-pub use decode::{DecodeError, ImageLimits, Needed, Picture};
+pub use decode::{DecodeError, Foreign, ImageLimits, Needed, Picture};
 pub use extractor::{
     ExtractError, Extraction, Extractor, ExtractorSettings, PendingExtraction, StageTimes,
 };
+pub use information::{Information, Uninformative};
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};

@@ -13,12 +13,14 @@
 mod backup;
 mod bad_input;
 mod batch;
+mod blank_frames;
 mod cli;
 mod confidence;
 mod console;
 mod durability;
 mod embedded_only;
 mod events;
+mod formats;
 mod http2;
 mod idempotency;
 mod images;

@@ -67,6 +67,8 @@ pub struct IndexReport {
     added: usize,
     present: usize,
     without_pose: usize,
+    /// Images that the server took with a warning.
+    damaged: usize,
     failed: Vec<FailedImage>,
     /// Duration of the upload.
     pub seconds: f64,
@@ -102,6 +104,9 @@ fn print(report: &IndexReport, json: bool) -> anyhow::Result<()> {
             report.seconds,
             report.images_per_second
         );
+        if report.damaged > 0 {
+            println!("{} images are damaged; see the warnings above", report.damaged);
+        }
     }
     if !report.failed.is_empty() {
         bail!(

@@ -51,6 +51,7 @@ pub async fn add_folder(client: &Client, dir: &Path, args: &Args) -> anyhow::Res
         added: 0,
         present: 0,
         without_pose: 0,
+        damaged: 0,
         failed: Vec::new(),
         seconds: 0.0,
         images_per_second: 0.0,
@@ -58,7 +59,11 @@ pub async fn add_folder(client: &Client, dir: &Path, args: &Args) -> anyhow::Res
     while let Some(batch) = uploads.next().await {
         for (file, result) in batch {
             match result {
-                Ok(Uploaded { is_new, has_pose }) => {
+                Ok(Uploaded { is_new, has_pose, warnings }) => {
+                    for warning in &warnings {
+                        progress.println(&format!("{}: warning: {warning}", file.display()));
+                    }
+                    report.damaged += usize::from(!warnings.is_empty());
                     report.added += usize::from(is_new);
                     report.present += usize::from(!is_new);
                     report.without_pose += usize::from(!has_pose);
@@ -101,13 +106,14 @@ fn batches(files: Vec<PictureFile>) -> Vec<Vec<PictureFile>> {
 struct Uploaded {
     is_new: bool,
     has_pose: bool,
+    warnings: Vec<String>,
 }
 
 /// An image that was read and is to be sent.
 struct PendingImage {
     file: PathBuf,
     bytes: Bytes,
-    media_type: MediaType,
+    media_type: Option<MediaType>,
     meta: String,
     has_pose: bool,
 }
@@ -144,13 +150,14 @@ impl Uploader<'_> {
             };
             let mut pause = None;
             let mut overloaded = Vec::new();
-            for (image, BatchResult { outcome, problem, .. }) in
+            for (image, BatchResult { outcome, problem, warnings, .. }) in
                 pending.into_iter().zip(answer.results)
             {
                 let is_new = outcome == BatchOutcome::Stored;
                 match problem {
                     None => {
-                        done.push((image.file, Ok(Uploaded { is_new, has_pose: image.has_pose })));
+                        let has_pose = image.has_pose;
+                        done.push((image.file, Ok(Uploaded { is_new, has_pose, warnings })));
                     }
                     Some(BatchProblem { kind, retry_after_s, .. })
                         if kind == ErrorKind::Overloaded.word() && retries_left > 0 =>
@@ -173,7 +180,7 @@ impl Uploader<'_> {
     async fn read(&self, picture: &PictureFile) -> anyhow::Result<PendingImage> {
         let bytes: Bytes =
             tokio::fs::read(&picture.file).await.context("cannot read the file")?.into();
-        let media_type = MediaType::sniff(&bytes).context("is not a JPEG, PNG or WebP image")?;
+        let media_type = MediaType::sniff(&bytes);
         let pose = self.source.pose(picture.id.as_str(), &bytes)?;
         let has_pose = pose.is_some();
         let meta = ImageMeta {
@@ -192,7 +199,7 @@ impl Uploader<'_> {
                 let part = Part::stream(image.bytes.clone());
                 form = form
                     .text("meta", image.meta.clone())
-                    .part("image", part.mime_str(image.media_type.as_str())?);
+                    .part("image", part.mime_str(content_type(image.media_type))?);
             }
             Ok(self.client.post(&self.path).timeout(BATCH_TIMEOUT).multipart(form))
         };
@@ -207,6 +214,11 @@ impl Uploader<'_> {
         );
         Ok(answer)
     }
+}
+
+/// The `Content-Type` of a picture; the server decides about bytes of an unknown format.
+fn content_type(media_type: Option<MediaType>) -> &'static str {
+    media_type.map_or("application/octet-stream", MediaType::as_str)
 }
 
 #[cfg(test)]

@@ -14,7 +14,7 @@ use super::proto::{
 use super::{Api, CallContext, convert, status};
 use whereabouts_api::{ImageMeta, MapChange};
 use whereabouts_core::MapName;
-use whereabouts_service::{BulkImage, BulkResult, ServiceError};
+use whereabouts_service::{BulkImage, BulkResult, ServiceError, StoredImage};
 use whereabouts_store::Added;
 
 #[tonic::async_trait]
@@ -115,9 +115,9 @@ fn image(
 }
 
 fn result(result: BulkResult) -> AddImageResult {
-    let (image, present) = match result {
-        Ok(Added::Created(image)) => (image, false),
-        Ok(Added::Present(image)) => (image, true),
+    let (image, present, warnings) = match result {
+        Ok(StoredImage { added: Added::Created(image), warnings }) => (image, false, warnings),
+        Ok(StoredImage { added: Added::Present(image), warnings }) => (image, true, warnings),
         Err((id, error)) => {
             let outcome = Some(Outcome::Problem(convert::problem(error)));
             let id = id.map(Into::into).unwrap_or_default();
@@ -129,6 +129,7 @@ fn result(result: BulkResult) -> AddImageResult {
         digest: image.digest.to_string(),
         width: image.width,
         height: image.height,
+        warnings,
     };
     AddImageResult { id: image.id.to_string(), outcome: Some(Outcome::Stored(stored)) }
 }

@@ -20,7 +20,7 @@ use super::state::AppState;
 use crate::gate::{BodyPaused, GateSettings, Problem, Ready, no_bulk_memory, too_large};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 use whereabouts_api::{ErrorKind, ImageMeta};
-use whereabouts_service::{BulkImage, BulkResult, Deadline, Principal, ServiceError};
+use whereabouts_service::{BulkImage, BulkResult, Deadline, Principal, ServiceError, StoredImage};
 use whereabouts_store::Added;
 
 /// Largest `meta` of an image, in bytes.
@@ -186,15 +186,19 @@ fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, Servi
 }
 
 fn batch_result(result: BulkResult) -> BatchResult {
-    let (id, outcome, problem) = match result {
-        Ok(Added::Created(image)) => (Some(image.id.into()), BatchOutcome::Stored, None),
-        Ok(Added::Present(image)) => (Some(image.id.into()), BatchOutcome::Present, None),
+    let (id, outcome, problem, warnings) = match result {
+        Ok(StoredImage { added: Added::Created(image), warnings }) => {
+            (Some(image.id.into()), BatchOutcome::Stored, None, warnings)
+        }
+        Ok(StoredImage { added: Added::Present(image), warnings }) => {
+            (Some(image.id.into()), BatchOutcome::Present, None, warnings)
+        }
         Err((id, error)) => {
             let kind = error.kind.word().to_owned();
             let retry_after_s = error.retry_after.map(|pause| pause.as_secs_f64());
             let problem = BatchProblem { kind, detail: error.detail, retry_after_s };
-            (id.map(Into::into), BatchOutcome::Failed, Some(problem))
+            (id.map(Into::into), BatchOutcome::Failed, Some(problem), Vec::new())
         }
     };
-    BatchResult { id, outcome, problem }
+    BatchResult { id, outcome, problem, warnings }
 }

@@ -102,13 +102,15 @@ pub(super) fn content_type(headers: &HeaderMap) -> (&str, String) {
 fn body_type(headers: &HeaderMap) -> Result<BodyType, Problem> {
     let (header, media_type) = content_type(headers);
     match media_type.as_str() {
-        "image/jpeg" | "image/png" | "image/webp" | "application/octet-stream" => Ok(BodyType::Raw),
+        "application/octet-stream" => Ok(BodyType::Raw),
+        // The bytes decide which format it is.
+        image if image.starts_with("image/") => Ok(BodyType::Raw),
         "multipart/form-data" => Ok(BodyType::Form),
         _ => Err(Problem::new(
             ErrorKind::UnsupportedMedia,
             format!(
                 "the Content-Type is {header:?}; send a picture as image/jpeg, image/png or \
-                 image/webp (with curl: -H 'Content-Type: image/jpeg' --data-binary @frame.jpg), or \
+                 another image type (with curl: -H 'Content-Type: image/jpeg' --data-binary @frame.jpg), or \
                  multipart/form-data with a part \"image\" (-F image=@frame.jpg)"
             ),
         )),

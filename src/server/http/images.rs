@@ -15,9 +15,9 @@ use super::maps::map_name;
 use super::state::AppState;
 use crate::gate::Problem;
 use crate::gate::Ready;
-use whereabouts_api::{ErrorKind, ImageMeta, ImagePage};
+use whereabouts_api::{ErrorKind, ImageMeta, ImagePage, UploadedImage};
 use whereabouts_core::{Image, ImageId, MediaType, PoseInput};
-use whereabouts_service::{Deadline, NewImage, ServiceError};
+use whereabouts_service::{Deadline, NewImage, ServiceError, StoredImage};
 use whereabouts_store::Added;
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
@@ -93,12 +93,12 @@ impl MetaParams {
         description = "Milliseconds from arrival that the client waits for the answer. After 504 the \
                        image may or may not be stored; send it again.")),
     request_body(content(
-        (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"),
+        (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/*"),
         (ImageForm = "multipart/form-data"),
     )),
     responses(
-        (status = 200, body = Image, description = "Already stored"),
-        (status = 201, body = Image, description = "Stored"),
+        (status = 200, body = UploadedImage, description = "Already stored"),
+        (status = 201, body = UploadedImage, description = "Stored"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
         (status = 409, body = Problem, description = "The id exists with other bytes", content_type = "application/problem+json"),
@@ -117,7 +117,7 @@ pub(super) async fn add_image(
     Params(params): Params<MetaParams>,
     Deadline(deadline): Deadline,
     request: Request,
-) -> Result<(StatusCode, Json<Image>), Problem> {
+) -> Result<(StatusCode, Json<UploadedImage>), Problem> {
     let demand = AdmissionRequest { class: WorkClass::Index, deadline };
     let body = PictureBody::read(request, &state, &service, demand).await?;
     let meta = match body.meta {
@@ -130,10 +130,12 @@ pub(super) async fn add_image(
         None => params.into_meta(),
     };
     let new = NewImage { bytes: body.picture, meta, demand };
-    Ok(match service.images.add(&map_name(&map)?, new).await? {
-        Added::Created(image) => (StatusCode::CREATED, Json(image)),
-        Added::Present(image) => (StatusCode::OK, Json(image)),
-    })
+    let StoredImage { added, warnings } = service.images.add(&map_name(&map)?, new).await?;
+    let (status, image) = match added {
+        Added::Created(image) => (StatusCode::CREATED, image),
+        Added::Present(image) => (StatusCode::OK, image),
+    };
+    Ok((status, Json(UploadedImage { image, warnings })))
 }
 
 /// The form of an upload.
@@ -204,7 +206,7 @@ pub(super) struct ContentParams {
 /// The picture of an image
 #[utoipa::path(get, path = "/maps/{map}/images/{id}/content", tag = "images",
     params(("map" = String, Path), ("id" = String, Path), ContentParams), responses(
-    (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"))),
+    (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/*"))),
     (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
     (status = 422, body = Problem, description = "max_edge is out of range", content_type = "application/problem+json"),
     (status = 429, body = Problem, description = "Overloaded, and max_edge asks for a smaller picture", content_type = "application/problem+json"),
