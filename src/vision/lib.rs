@@ -20,6 +20,7 @@ mod provider;
 mod runtime;
 mod session;
 mod settings;
+mod trial;
 
 pub use admission::{
     Admission, AdmissionLevels, AdmissionRequest, AdmissionSettings, Permit, RejectReason,
@@ -33,9 +34,10 @@ pub use extractor::{
 };
 pub use information::{Information, Uninformative};
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
-pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
+pub use manifest::{DataFile, MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
 pub use pooling::FeatureSet;
 pub use provider::{Execution, MIN_SIMILARITY, Measurement, Provider, ProviderPreference, Trial};
 pub use runtime::{AUTO, Assets, BUILT_IN_MODEL, CHOSEN, PREFERRED_MODELS, RuntimeError, WhyModel};
 pub use settings::{ImageSettings, auto, threads_or_cores};
+pub use trial::{ModelFault, try_model};
