@@ -158,8 +158,14 @@ async fn one_job(store: &EmbeddedStore) -> Vec<f64> {
         .collect();
     let query = Uuid::now_v7();
     let job = Job::queued("m".parse().unwrap(), query, RefinerKind::Local, now);
-    let query =
-        Query { id: query, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
+    let query = Query {
+        id: query,
+        digest,
+        media_type: MediaType::Jpeg,
+        created_at: now,
+        descriptor: None,
+        uninformative: None,
+    };
     let record = JobRecord {
         job,
         map_uid: Uuid::nil(),

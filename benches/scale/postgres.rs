@@ -163,8 +163,14 @@ async fn jobs(store: &PostgresStore, map: &Map) -> anyhow::Result<usize> {
     let _pin = store.put_blob(digest, "frame".into()).await?;
     for _ in 0..JOBS {
         let id = Uuid::now_v7();
-        let query =
-            Query { id, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
+        let query = Query {
+            id,
+            digest,
+            media_type: MediaType::Jpeg,
+            created_at: now,
+            descriptor: None,
+            uninformative: None,
+        };
         let record = JobRecord {
             job: Job::queued(map.name.clone(), id, RefinerKind::Mllm, now),
             map_uid: map.uid,

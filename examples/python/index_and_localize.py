@@ -14,7 +14,10 @@ from pathlib import Path
 
 from whereabouts_client import Answer, Frame, GeographicPose, Job, MetricPose, Pose, Problem, Whereabouts
 
-PICTURES = {".jpg", ".jpeg", ".png", ".webp"}
+PICTURES = {
+    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif"),
+    *(".pbm", ".pgm", ".ppm", ".pnm", ".pam"),
+}
 
 
 class Failure(Exception):
@@ -55,10 +58,10 @@ def arguments(argv: Sequence[str] | None) -> argparse.Namespace:
 
 def pictures(folder: Path) -> list[Path]:
     if not folder.is_dir():
-        raise Failure(f"{folder} is not a folder; give one with JPEG, PNG or WebP pictures")
+        raise Failure(f"{folder} is not a folder; give one with pictures")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
     if not found:
-        raise Failure(f"{folder} has no JPEG, PNG or WebP pictures")
+        raise Failure(f"{folder} has no pictures")
     return found
 
 

@@ -267,8 +267,9 @@ class RealServer(unittest.TestCase):
         self.assertEqual(self.service.map("town").images, PLACES)
 
     def test_a_file_that_is_not_a_picture_is_refused(self) -> None:
-        with self.assertRaisesRegex(ValueError, "poses.csv is not a JPEG"):
+        with self.assertRaises(Problem) as raised:
             self.service.localize("town", self.town / "map" / "poses.csv")
+        self.assertEqual(raised.exception.status, 422)
 
     def test_health(self) -> None:
         health = self.service.health()

@@ -41,7 +41,7 @@ JobState: TypeAlias = Literal["queued", "running", "succeeded", "degraded", "fai
 T = TypeVar("T")
 
 Picture: TypeAlias = "bytes | str | os.PathLike[str]"
-"""A JPEG, PNG or WebP picture: its bytes or the path of a file."""
+"""A picture (JPEG, PNG, WebP, TIFF, BMP, GIF or PNM): its bytes or the path of a file."""
 
 
 class Problem(Exception):
@@ -119,6 +119,8 @@ class Image:
     pose: Pose | None = None
     captured_at: datetime | None = None
     tags: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """Of an upload: what the sender should know about the picture, such as damage in transit."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +211,8 @@ class Estimate:
     known: bool
     """Whether the confidence reaches the server's threshold; below it, the place may not be in the map."""
     pose: Pose | None = None
+    reason: str | None = None
+    """Why the place cannot be known from this frame, whatever it resembles."""
 
 
 @dataclass(frozen=True)
@@ -270,6 +274,8 @@ class Answer:
     no_job: NoJob | None = None
     track: TrackEstimate | None = None
     """None without a track."""
+    warnings: tuple[str, ...] = ()
+    """What the sender should know about the frame, such as damage in transit."""
 
 
 @dataclass(frozen=True)
@@ -791,4 +797,5 @@ def _load(picture: Picture) -> tuple[str, bytes, str]:
         return name, data, "image/png"
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         return name, data, "image/webp"
-    raise ValueError(f"{name} is not a JPEG, PNG or WebP picture")
+    # TIFF, BMP, GIF, PNM and whatever else: the server decides.
+    return name, data, "application/octet-stream"

@@ -333,7 +333,7 @@ class Shot(Generic[T]):
 
     stamp: T
     picture: Callable[[], bytes]
-    """Returns the bytes of a JPEG, PNG or WebP; called only if the frame is posted."""
+    """Returns the bytes of a picture file; called only if the frame is posted."""
     taken_at: datetime | None = None
     """When the frame was taken, with a time zone, if known."""
 

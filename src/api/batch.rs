@@ -37,7 +37,8 @@ pub struct BatchResult {
     /// Why the image could not be stored, or the file was skipped; null if the image was stored.
     #[schema(nullable)]
     pub problem: Option<BatchProblem>,
-    /// What the sender should know about the picture, such as a position that was not taken; usually empty.
+    /// What the sender should know about the picture, such as damage in transit or a position that was not taken;
+    /// usually empty.
     #[serde(default)]
     pub warnings: Vec<String>,
 }

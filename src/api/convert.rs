@@ -81,6 +81,7 @@ impl From<Estimate> for proto::Estimate {
             pose: estimate.pose.map(Into::into),
             confidence: estimate.confidence,
             known: estimate.known,
+            reason: estimate.reason.unwrap_or_default(),
         }
     }
 }
@@ -100,6 +101,7 @@ impl From<Answer> for proto::LocalizeResponse {
             }),
             no_job: answer.no_job.map(Into::into),
             timing: Some(answer.timing_ms.into()),
+            warnings: answer.warnings,
         }
     }
 }

@@ -43,6 +43,9 @@ pub struct Answer {
     #[serde(default)]
     #[schema(nullable)]
     pub no_job: Option<NoJob>,
+    /// What the sender should know about the frame, such as damage in transit; usually empty.
+    #[serde(default)]
+    pub warnings: Vec<String>,
     /// Durations of the stages.
     pub timing_ms: TimingMs,
 }

@@ -130,12 +130,7 @@ fn record_name(map: &MapName, digest: &Digest) -> String {
 }
 
 fn bytes_name(map: &MapName, digest: &Digest, media_type: MediaType) -> String {
-    let extension = match media_type {
-        MediaType::Jpeg => "jpg",
-        MediaType::Png => "png",
-        MediaType::Webp => "webp",
-    };
-    format!("maps/{map}/{}.{extension}", digest.hex())
+    format!("maps/{map}/{}.{}", digest.hex(), media_type.extension())
 }
 
 fn left_out_name(map: &MapName) -> String {

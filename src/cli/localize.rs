@@ -12,7 +12,7 @@ use whereabouts_core::{Job, MapName, MediaType, Pose};
 /// Localize an image on a server
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Image file: JPEG, PNG or WebP
+    /// Image file: JPEG, PNG, WebP, TIFF, BMP, GIF or PNM
     file: PathBuf,
     /// Map to search
     #[arg(long)]
@@ -34,11 +34,11 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let client = args.server.client()?;
     let frame = std::fs::read(&args.file)
         .with_context(|| format!("cannot read {}", args.file.display()))?;
-    let media_type = MediaType::sniff(&frame)
-        .with_context(|| format!("{} is not a JPEG, PNG or WebP image", args.file.display()))?;
+    // The server decides about bytes of an unknown format.
+    let media_type = MediaType::sniff(&frame).map_or("application/octet-stream", MediaType::as_str);
     let mode = if args.refine { "wait" } else { "off" };
     let path = format!("/localize?map={}&k={}&refine={mode}", segment(args.map.as_str()), args.k);
-    let request = client.post(&path).header("content-type", media_type.as_str()).body(frame);
+    let request = client.post(&path).header("content-type", media_type).body(frame);
     let answer: Value = client.json(request).await?;
     if args.json {
         println!("{answer}");
@@ -46,6 +46,9 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     }
     let answer: Answer = serde_json::from_value(answer)?;
     print_answer(&answer);
+    for warning in &answer.warnings {
+        eprintln!("warning: {warning}");
+    }
     if let Some(link) = &answer.job {
         print_job(&client.json(client.get(&link.href)).await?);
     } else if let Some(reason) = &answer.no_job {
@@ -71,7 +74,11 @@ fn print_answer(answer: &Answer) {
             estimate.image_id,
             format_pose(estimate.pose),
             estimate.confidence,
-            if estimate.known { "a known place" } else { "possibly not in the map" }
+            match (&estimate.reason, estimate.known) {
+                (Some(reason), _) => reason,
+                (None, true) => "a known place",
+                (None, false) => "possibly not in the map",
+            }
         ),
         None => println!("the map has no images yet; add some with `whereabouts index`"),
     }

@@ -23,13 +23,17 @@ use super::{Candidate, ImageId, Pose};
 /// Number of top candidates among which similarities are compared.
 pub const COMPARED: usize = 10;
 
+/// Share of a frame's regions that match a picture of another place by chance. It bounds the evidence of small counts:
+/// 11 of 1,200 regions against none would otherwise weigh as much as 600 against 50.
+pub const CHANCE_SHARE: f32 = 0.02;
+
 /// Evidence that a candidate shows the place of the frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Evidence {
     /// Similarity of the candidate minus the median similarity of the other candidates.
     Similarity(f32),
-    /// ln((a + 1) / (m + 1)), where a regions of the candidate match the frame and m is the median of that
-    /// count over the other candidates.
+    /// ln((a + c) / (m + c)), where a regions of the candidate match the frame, m is the median of that count over
+    /// the other candidates, and c is [`CHANCE_SHARE`] of the regions of the frame.
     Agreement(f32),
 }
 
@@ -45,12 +49,13 @@ impl Evidence {
     }
 
     /// Computes the evidence for the candidate at index `of` from the number of matching regions of every
-    /// candidate. Returns `None` if there is no other candidate.
-    pub fn agreement(matches: &[usize], of: usize) -> Option<Self> {
+    /// candidate, of the `regions` that the frame has. Returns `None` if there is no other candidate.
+    pub fn agreement(matches: &[usize], regions: usize, of: usize) -> Option<Self> {
         let one = *matches.get(of)?;
         let others = matches.iter().enumerate().filter(|(index, _)| *index != of);
         let median = median(others.map(|(_, &count)| count as f32).collect())?;
-        Some(Self::Agreement(((one as f32 + 1.0) / (median + 1.0)).ln()))
+        let chance = (CHANCE_SHARE * regions as f32).max(1.0);
+        Some(Self::Agreement(((one as f32 + chance) / (median + chance)).ln()))
     }
 }
 
@@ -114,6 +119,9 @@ pub struct Calibration {
     pub moved: u64,
     /// Settings of the calibration.
     pub settings: CalibrationSettings,
+    /// Version of the definition of the evidence. A calibration by another definition is measured again.
+    #[serde(default)]
+    pub evidence: u32,
     /// Whether the calibration is complete; `false` while it is running or after it was interrupted.
     pub complete: bool,
     /// Null distribution of [`Evidence::Similarity`].
@@ -165,6 +173,9 @@ impl CalibrationSettings {
 }
 
 impl Calibration {
+    /// The present definition of [`Evidence`].
+    pub const EVIDENCE: u32 = 1;
+
     /// Confidence that the image `of` shows the place of the frame. Uses the evidence of the refiner if
     /// there is any and agreement is calibrated, and similarity otherwise.
     pub fn refined_confidence(
@@ -199,13 +210,28 @@ pub struct Estimate {
     pub confidence: f32,
     /// Whether the confidence reaches the configured threshold. Below it, the place may not be in the map.
     pub known: bool,
+    /// Why the place cannot be known from this frame, whatever it resembles; otherwise null.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub reason: Option<String>,
 }
 
 impl Estimate {
     /// An estimate that counts as known if its confidence is at least `known_from`.
     pub fn new(image_id: &ImageId, pose: Option<Pose>, confidence: f32, known_from: f64) -> Self {
         let known = f64::from(confidence) >= known_from;
-        Self { image_id: image_id.clone(), pose, confidence, known }
+        Self { image_id: image_id.clone(), pose, confidence, known, reason: None }
+    }
+
+    /// The estimate for a frame that shows no place, if `reason` says why: what it resembles is chance, so the
+    /// confidence is 0.
+    pub fn unless(self, reason: Option<&str>) -> Self {
+        match reason {
+            Some(reason) => {
+                Self { confidence: 0.0, known: false, reason: Some(reason.to_owned()), ..self }
+            }
+            None => self,
+        }
     }
 }
 
@@ -238,12 +264,15 @@ mod tests {
 
     #[test]
     fn agreement_evidence_is_the_log_ratio_to_the_median_of_the_others() {
-        let Some(Evidence::Agreement(ratio)) = Evidence::agreement(&[3, 39, 1, 1, 5], 1) else {
-            panic!("there are others")
+        let ratio = |matches: &[usize], regions| match Evidence::agreement(matches, regions, 1) {
+            Some(Evidence::Agreement(ratio)) => ratio,
+            other => panic!("{other:?}"),
         };
-        assert!((ratio - (40.0_f32 / 3.0).ln()).abs() < 1e-6);
-        assert_eq!(Evidence::agreement(&[3], 0), None);
-        assert_eq!(Evidence::agreement(&[3, 4], 2), None);
+        assert!((ratio(&[3, 39, 1, 1, 5], 20) - (40.0_f32 / 3.0).ln()).abs() < 1e-6);
+        assert_eq!(Evidence::agreement(&[3], 20, 0), None);
+        assert_eq!(Evidence::agreement(&[3, 4], 20, 2), None);
+        // A few regions against none are less than many against some.
+        assert!(ratio(&[0, 11, 0], 1200) < 0.5 && ratio(&[50, 600, 50], 1200) > 2.0);
     }
 
     #[test]

@@ -84,28 +84,86 @@ pub enum MediaType {
     /// WebP (RFC 9649).
     #[serde(rename = "image/webp")]
     Webp,
+    /// The Netpbm formats PBM, PGM, PPM and PAM (`P1` to `P7`).
+    #[serde(rename = "image/x-portable-anymap")]
+    Pnm,
+    /// TIFF 6.0 and BigTIFF; the first picture of the file.
+    #[serde(rename = "image/tiff")]
+    Tiff,
+    /// Windows bitmap.
+    #[serde(rename = "image/bmp")]
+    Bmp,
+    /// GIF; the first picture of the file.
+    #[serde(rename = "image/gif")]
+    Gif,
 }
 
 impl MediaType {
+    /// The formats, for messages.
+    pub const NAMES: &str = "JPEG, PNG, WebP, TIFF, BMP, GIF or PNM (PBM, PGM, PPM, PAM)";
+
+    /// The usual extensions of file names, in lower case and without the dot.
+    pub const EXTENSIONS: [&str; 13] = [
+        "jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "gif", "pbm", "pgm", "ppm", "pnm",
+        "pam",
+    ];
+
     /// The value of a `Content-Type` header.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Jpeg => "image/jpeg",
             Self::Png => "image/png",
             Self::Webp => "image/webp",
+            Self::Pnm => "image/x-portable-anymap",
+            Self::Tiff => "image/tiff",
+            Self::Bmp => "image/bmp",
+            Self::Gif => "image/gif",
         }
     }
 
-    /// Detects the format from the magic bytes; `None` for anything but the three supported formats.
+    /// The format's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Jpeg => "JPEG",
+            Self::Png => "PNG",
+            Self::Webp => "WebP",
+            Self::Pnm => "PNM",
+            Self::Tiff => "TIFF",
+            Self::Bmp => "BMP",
+            Self::Gif => "GIF",
+        }
+    }
+
+    /// The usual extension of file names.
+    pub fn extension(self) -> &'static str {
+        match self {
+            Self::Jpeg => "jpg",
+            Self::Png => "png",
+            Self::Webp => "webp",
+            Self::Pnm => "pnm",
+            Self::Tiff => "tif",
+            Self::Bmp => "bmp",
+            Self::Gif => "gif",
+        }
+    }
+
+    /// Detects the format from the magic bytes; `None` for any other format.
     pub fn sniff(bytes: &[u8]) -> Option<Self> {
-        if bytes.starts_with(&[0xFF, 0xD8, 0xFF]) {
-            Some(Self::Jpeg)
-        } else if bytes.starts_with(b"\x89PNG\r\n\x1a\n") {
-            Some(Self::Png)
-        } else if bytes.len() >= 12 && &bytes[..4] == b"RIFF" && &bytes[8..12] == b"WEBP" {
-            Some(Self::Webp)
-        } else {
-            None
+        const TIFF: [&[u8]; 4] = [b"II*\0", b"MM\0*", b"II+\0\x08\0\0\0", b"MM\0+\0\x08\0\0"];
+        // The size of the header that follows tells a bitmap from text that begins with BM.
+        let is_bitmap = || {
+            let size = bytes.get(14..18).and_then(|size| size.try_into().ok());
+            size.map(u32::from_le_bytes).is_some_and(|size| matches!(size, 12 | 16 | 40..=124))
+        };
+        match bytes {
+            [0xFF, 0xD8, 0xFF, ..] => Some(Self::Jpeg),
+            [b'R', b'I', b'F', b'F', _, _, _, _, b'W', b'E', b'B', b'P', ..] => Some(Self::Webp),
+            [b'P', b'1'..=b'7', b' ' | b'\t' | b'\n' | b'\r' | b'#', ..] => Some(Self::Pnm),
+            [b'B', b'M', ..] if is_bitmap() => Some(Self::Bmp),
+            _ if bytes.starts_with(b"\x89PNG\r\n\x1a\n") => Some(Self::Png),
+            _ if TIFF.iter().any(|magic| bytes.starts_with(magic)) => Some(Self::Tiff),
+            _ if bytes.starts_with(b"GIF87a") || bytes.starts_with(b"GIF89a") => Some(Self::Gif),
+            _ => None,
         }
     }
 }
@@ -199,7 +257,15 @@ mod tests {
     fn the_format_is_detected_from_the_magic_bytes() {
         assert_eq!(MediaType::sniff(b"\xFF\xD8\xFF\xE0"), Some(MediaType::Jpeg));
         assert_eq!(MediaType::sniff(b"RIFF\0\0\0\0WEBPVP8 "), Some(MediaType::Webp));
-        assert_eq!(MediaType::sniff(b"GIF89a"), None);
+        assert_eq!(MediaType::sniff(b"P5\n2 2\n255\n"), Some(MediaType::Pnm));
+        assert_eq!(MediaType::sniff(b"II*\0"), Some(MediaType::Tiff));
+        assert_eq!(MediaType::sniff(b"MM\0+\0\x08\0\0"), Some(MediaType::Tiff));
+        assert_eq!(MediaType::sniff(b"GIF89a"), Some(MediaType::Gif));
+        let bitmap = [b"BM".as_slice(), &[0; 12], &[40, 0, 0, 0]].concat();
+        assert_eq!(MediaType::sniff(&bitmap), Some(MediaType::Bmp));
+        for other in [b"BMW, 40 of them".as_slice(), b"P8\n", b"Pf\n", b"II", b"GIF88a"] {
+            assert_eq!(MediaType::sniff(other), None);
+        }
         assert_eq!(MediaType::sniff(b""), None);
     }
 }

@@ -1,15 +1,19 @@
 //! The folder `ASSETS/models`: installing and verifying models.
 
+mod error;
+
 use std::fs::{self, File, TryLockError};
 use std::io;
-use std::iter;
 use std::path::{Path, PathBuf};
 
+pub use self::error::InstallError;
 use super::catalogue::Entry;
-use super::download::{Download, DownloadError, DownloadSettings, Progress};
+use super::download::{Download, DownloadSettings, Progress};
+use super::onnx::{ExternalFiles, external_files};
 use super::partial::remove_if_there;
 use whereabouts_core::Digest;
-use whereabouts_vision::{AUTO, CHOSEN, MANIFEST, Manifest, ManifestError, file_digest};
+use whereabouts_vision::{AUTO, Assets, CHOSEN, DataFile, MANIFEST, Manifest};
+use whereabouts_vision::{file_digest, try_model};
 
 /// The `models` folder of a writable assets folder.
 #[derive(Debug, Clone)]
@@ -32,6 +36,8 @@ pub enum Pulled {
         pinned: bool,
         /// Why the previously installed model was replaced, if there was one.
         replaced: Option<String>,
+        /// What works with restrictions.
+        notes: Vec<String>,
     },
 }
 
@@ -48,6 +54,8 @@ pub enum Added {
         name: String,
         /// Digests of the model's files, the ONNX file first.
         digests: Vec<Digest>,
+        /// What works with restrictions.
+        notes: Vec<String>,
     },
 }
 
@@ -62,59 +70,6 @@ pub struct VerifiedFiles {
     pub bytes: u64,
 }
 
-/// Why a model cannot be installed or verified.
-#[derive(Debug, thiserror::Error)]
-pub enum InstallError {
-    /// The name is not usable as a folder name.
-    #[error(
-        "{0:?} is not a valid model name: use up to 64 letters, digits, '-', '_' and '.', not \
-         beginning with '.', and neither \"auto\" nor \"chosen\""
-    )]
-    Name(String),
-    /// Another process is installing this model.
-    #[error("another process is installing {name} ({lock} is locked); wait until it has ended")]
-    Locked {
-        /// Name of the model.
-        name: String,
-        /// Path of the lock file.
-        lock: PathBuf,
-    },
-    /// The name is in use by another model.
-    #[error(
-        "another model is installed in {0}; give this one another name with --name, or remove \
-         that folder"
-    )]
-    Taken(PathBuf),
-    /// A file does not match the digest pinned in the manifest.
-    #[error("{file} has the digest {got}, but its manifest pins {pinned}; {remedy}")]
-    Damaged {
-        /// Path of the file.
-        file: PathBuf,
-        /// Digest of the file.
-        got: Digest,
-        /// Pinned digest.
-        pinned: Digest,
-        /// What the user can do.
-        remedy: String,
-    },
-    /// The manifest is invalid.
-    #[error(transparent)]
-    Manifest(#[from] ManifestError),
-    /// The download failed.
-    #[error(transparent)]
-    Download(#[from] DownloadError),
-    /// A file operation failed.
-    #[error("cannot {doing} {path}: {source}")]
-    Disk {
-        /// The operation.
-        doing: &'static str,
-        /// The file or folder.
-        path: PathBuf,
-        /// Cause.
-        source: io::Error,
-    },
-}
-
 impl ModelsFolder {
     /// Opens or creates `models` in an assets folder, and checks that it is writable.
     pub fn open(assets: &Path) -> Result<Self, InstallError> {
@@ -126,9 +81,11 @@ impl ModelsFolder {
         Ok(Self { models })
     }
 
-    /// Downloads a model of the catalogue from `hub`, unless it is installed and intact.
+    /// Downloads a model of the catalogue from `hub`, unless it is installed and intact. It is tried before it is
+    /// installed.
     pub async fn pull(
         &self,
+        assets: &Assets,
         entry: &Entry,
         hub: &str,
         settings: DownloadSettings,
@@ -146,22 +103,42 @@ impl ModelsFolder {
         };
         let mut manifest = entry.manifest.clone();
         let mut digests = Vec::new();
-        for (file, pinned) in entry.manifest.files() {
-            let url = entry.url(hub, file);
-            let to = self.partial(name, &file.display());
+        let mut external = ExternalFiles::new();
+        let mut next = 0;
+        // The ONNX file says which others there are.
+        let nth = |manifest: &Manifest, n| {
+            manifest.files().nth(n).map(|(file, pinned)| (file.to_owned(), pinned))
+        };
+        while let Some((file, pinned)) = nth(&manifest, next) {
+            let url = entry.url(hub, &file);
+            let to = self.partial(name, &file);
             let download = Download { url: &url, to: &to, pinned, settings };
             digests.push(download.run(&mut on_progress).await?);
+            let checked = match next {
+                0 => external_files(&to).map_err(InstallError::from).and_then(|found| {
+                    external = found;
+                    name_external(&mut manifest, &external)
+                }),
+                _ => check_weights(&to, external.get(&file).copied().unwrap_or(0)),
+            };
+            if let Err(error) = checked {
+                // Complete but wrong: it must not be resumed.
+                remove_if_there(&to).map_err(disk("remove", &to))?;
+                return Err(error);
+            }
+            next += 1;
         }
         let pinned = manifest.files().all(|(_, pinned)| pinned.is_some());
         manifest.pin(&digests);
-        let folder = self.place(&manifest, entry.licence_note.as_deref())?;
-        Ok(Pulled::Installed { folder, digests, pinned, replaced })
+        let (folder, notes) = self.place(assets, &manifest, entry.licence_note.as_deref())?;
+        Ok(Pulled::Installed { folder, digests, pinned, replaced, notes })
     }
 
-    /// Installs an ONNX file, its external weights if the manifest has any, and the manifest under `name`, or
-    /// under the name in the manifest. The digests are recorded in the installed manifest.
+    /// Installs an ONNX file, its external weights and the manifest under `name`, or under the name in the
+    /// manifest. The model is tried before it is installed. The digests are recorded in the installed manifest.
     pub fn add(
         &self,
+        assets: &Assets,
         file: &Path,
         manifest: &Path,
         name: Option<&str>,
@@ -173,8 +150,14 @@ impl ModelsFolder {
         }
         let name = manifest.name.clone();
         let _lock = self.lock(&name)?;
-        let data = manifest.data.as_ref().map(|data| file.with_file_name(&data.file));
-        let given: Vec<PathBuf> = iter::once(file.to_owned()).chain(data).collect();
+        let external = external_files(file)?;
+        name_external(&mut manifest, &external)?;
+        let mut given = vec![file.to_owned()];
+        for data in &manifest.data {
+            let path = file.with_file_name("").join(&data.file);
+            check_weights(&path, external.get(&data.file).copied().unwrap_or(0))?;
+            given.push(path);
+        }
         let mut digests = Vec::new();
         for (file, (_, pinned)) in given.iter().zip(manifest.files()) {
             let remedy = || format!("pass the file that {} describes", source.display());
@@ -189,15 +172,15 @@ impl ModelsFolder {
         }
         digests.clear();
         for (file, (installed, _)) in given.iter().zip(manifest.files()) {
-            let copy = self.partial(&name, &installed.display());
+            let copy = self.partial(&name, installed);
             fs::copy(file, &copy).map_err(disk("copy the model to", &copy))?;
             // Hash the copy, because the source may have changed since it was checked.
             digests.push(digest_of(&copy)?.0);
             File::open(&copy).and_then(|file| file.sync_all()).map_err(disk("sync", &copy))?;
         }
         manifest.pin(&digests);
-        let folder = self.place(&manifest, None)?;
-        Ok(Added::Installed { folder, name, digests })
+        let (folder, notes) = self.place(assets, &manifest, None)?;
+        Ok(Added::Installed { folder, name, digests, notes })
     }
 
     /// Chooses the model that `auto` resolves to; `None` removes the choice.
@@ -206,7 +189,7 @@ impl ModelsFolder {
         match name {
             None => remove_if_there(&chosen).map_err(disk("remove", &chosen)),
             Some(name) => {
-                let temporary = self.partial("", &CHOSEN);
+                let temporary = self.partial("", Path::new(CHOSEN));
                 write_durably(&temporary, &format!("{name}\n"))?;
                 fs::rename(&temporary, &chosen).map_err(disk("write", &chosen))?;
                 sync_folder(&self.models)
@@ -234,7 +217,7 @@ impl ModelsFolder {
         if !is_name(name) {
             return Err(InstallError::Name(name.to_owned()));
         }
-        let path = self.partial(name, &"lock");
+        let path = self.partial(name, Path::new("lock"));
         let file = File::create(&path).map_err(disk("write", &path))?;
         match file.try_lock() {
             Ok(()) => Ok(file),
@@ -247,18 +230,21 @@ impl ModelsFolder {
         }
     }
 
-    fn partial(&self, name: &str, what: &dyn std::fmt::Display) -> PathBuf {
+    fn partial(&self, name: &str, what: &Path) -> PathBuf {
+        let what = what.display().to_string().replace(std::path::MAIN_SEPARATOR, "-");
         self.models.join(".partial").join(format!("{name}-{what}"))
     }
 
-    /// Moves a model's finished files, which are already durable, and its manifest into place as one folder.
+    /// Moves a model's finished files, which are already durable, and its manifest into place as one folder, if the
+    /// model does what the manifest says. Returns the folder, and what works with restrictions.
     fn place(
         &self,
+        assets: &Assets,
         manifest: &Manifest,
         licence_note: Option<&str>,
-    ) -> Result<PathBuf, InstallError> {
-        let staged = self.partial(&manifest.name, &"new");
-        let old = self.partial(&manifest.name, &"old");
+    ) -> Result<(PathBuf, Vec<String>), InstallError> {
+        let staged = self.partial(&manifest.name, Path::new("new"));
+        let old = self.partial(&manifest.name, Path::new("old"));
         let target = self.models.join(&manifest.name);
         remove_folder(&staged)?;
         remove_folder(&old)?;
@@ -269,8 +255,21 @@ impl ModelsFolder {
             write_durably(&staged.join("LICENCE"), &text)?;
         }
         for (file, _) in manifest.files() {
-            let partial = self.partial(&manifest.name, &file.display());
-            fs::rename(&partial, staged.join(file)).map_err(disk("move", &partial))?;
+            let (partial, to) = (self.partial(&manifest.name, file), staged.join(file));
+            if let Some(folder) = to.parent() {
+                fs::create_dir_all(folder).map_err(disk("make", folder))?;
+            }
+            fs::rename(&partial, &to).map_err(disk("move", &partial))?;
+        }
+        let notes = match try_model(assets, &staged) {
+            Ok(notes) => notes,
+            Err(fault) => {
+                remove_folder(&staged)?;
+                return Err(fault.into());
+            }
+        };
+        for (file, _) in manifest.files() {
+            staged.join(file).parent().map_or(Ok(()), sync_folder)?;
         }
         sync_folder(&staged)?;
         if target.exists() {
@@ -279,11 +278,29 @@ impl ModelsFolder {
         fs::rename(&staged, &target).map_err(disk("move the finished model to", &target))?;
         sync_folder(&self.models)?;
         remove_folder(&old)?;
-        Ok(target)
+        Ok((target, notes))
     }
 }
 
-/// Hashes the files of an installed model and checks them against its manifest.
+/// Adds the files of external weights that the manifest does not name yet.
+fn name_external(manifest: &mut Manifest, external: &ExternalFiles) -> Result<(), InstallError> {
+    for file in external.keys() {
+        if !manifest.data.iter().any(|data| data.file == *file) {
+            manifest.data.push(DataFile { file: file.clone(), sha256: None });
+        }
+    }
+    Ok(manifest.check(Path::new(&manifest.name))?)
+}
+
+fn check_weights(file: &Path, needed: u64) -> Result<(), InstallError> {
+    let bytes = fs::metadata(file).ok().filter(fs::Metadata::is_file).map(|found| found.len());
+    match bytes {
+        Some(bytes) if bytes >= needed => Ok(()),
+        bytes => Err(InstallError::Weights { file: file.to_owned(), bytes, needed }),
+    }
+}
+
+/// Hashes the files of an installed model and checks them against its manifest, without running the model.
 pub fn verify(folder: &Path) -> Result<VerifiedFiles, InstallError> {
     let manifest = Manifest::read(&folder.join(MANIFEST))?;
     let (mut digests, mut bytes) = (Vec::new(), 0);
@@ -291,6 +308,11 @@ pub fn verify(folder: &Path) -> Result<VerifiedFiles, InstallError> {
         let (digest, size) = checked(&folder.join(file), pinned, || "install it again".into())?;
         digests.push(digest);
         bytes += size;
+    }
+    let external = external_files(&folder.join(&manifest.file))?;
+    let is_named = |file: &PathBuf| manifest.data.iter().any(|data| data.file == *file);
+    if let Some(unnamed) = external.into_keys().find(|file| !is_named(file)) {
+        return Err(InstallError::Unnamed(unnamed));
     }
     Ok(VerifiedFiles { manifest, digests, bytes })
 }

@@ -7,6 +7,7 @@
 mod catalogue;
 mod download;
 mod install;
+mod onnx;
 mod partial;
 
 pub use catalogue::{Catalogue, CatalogueError, Entry};

@@ -72,6 +72,7 @@ mod tests {
             media_type: MediaType::Jpeg,
             created_at: now,
             descriptor: Descriptor::normalised(vec![1.0]).ok(),
+            uninformative: None,
         };
         JobRecord {
             job: Job::queued(map.name.clone(), query.id, RefinerKind::Mllm, now),

@@ -177,7 +177,8 @@ impl Worker {
             refinement.evidence,
         );
         let known_from = self.known_confidence;
-        Some(Estimate::new(&first.image_id, first.pose, confidence, known_from))
+        let estimate = Estimate::new(&first.image_id, first.pose, confidence, known_from);
+        Some(estimate.unless(record.query.uninformative.as_deref()))
     }
 
     fn record_time(&self, took: Duration) {

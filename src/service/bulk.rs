@@ -36,7 +36,7 @@ pub struct BulkSettings {
 /// An image of an upload.
 #[derive(Debug)]
 pub struct BulkImage {
-    /// Its bytes: JPEG, PNG or WebP.
+    /// Its bytes, in any format of [`MediaType`](whereabouts_core::MediaType).
     pub bytes: Bytes,
     /// Its id, pose, time and tags.
     pub meta: ImageMeta,

@@ -112,6 +112,7 @@ impl Calibrator {
         let moved = usize::try_from(moved.abs_diff(known.moved)).unwrap_or(usize::MAX);
         let changed = known.images.abs_diff(images).saturating_add(moved);
         Ok(!known.complete
+            || known.evidence != Calibration::EVIDENCE
             || known.settings != self.settings
             || changed.saturating_mul(CHANGED_SHARE) > known.images)
     }
@@ -130,8 +131,9 @@ impl Calibrator {
         let similarity = NullDistribution::from(values(asked.iter().filter_map(|asked| {
             Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
         })));
+        let evidence = Calibration::EVIDENCE;
         let mut measured =
-            Calibration { images, moved, settings, similarity, ..Calibration::default() };
+            Calibration { images, moved, settings, evidence, similarity, ..Calibration::default() };
         self.store.put_calibration(map, measured.clone()).await?;
         if let Some(refiner) = refiner {
             let step = asked.len().div_ceil(settings.refined.max(1)).max(1);

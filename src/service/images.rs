@@ -15,7 +15,7 @@ use whereabouts_vision::{AdmissionRequest, FeatureSet, exif};
 /// An image to add.
 #[derive(Debug)]
 pub struct NewImage {
-    /// Its bytes: JPEG, PNG or WebP.
+    /// Its bytes, in any format of [`MediaType`].
     pub bytes: Bytes,
     /// Its id, pose, time and tags.
     pub meta: ImageMeta,
@@ -59,7 +59,7 @@ impl Images {
             let extraction = imaging.extract(&extractor, bytes, kind, features, new.demand).await?;
             imaging.metrics.observe_extraction(&extraction);
             let digest = extraction.digest;
-            let (pose, warnings) = match (stated_pose, map.frame) {
+            let (pose, advice) = match (stated_pose, map.frame) {
                 (Some(pose), _) => (Some(pose), Vec::new()),
                 (None, CoordinateFrame::Wgs84) => pose_in(&new.bytes),
                 (None, CoordinateFrame::Metric) => (None, Vec::new()),
@@ -83,15 +83,18 @@ impl Images {
                 // frame has changed.
                 Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
                 added => {
+                    let mut warnings = extraction.warnings;
                     return match added? {
                         Added::Created(image) => {
+                            warnings.extend(advice);
                             Ok((ImageAnswer { image, changed: Vec::new(), warnings }, true))
                         }
                         Added::Present(image) => {
                             let answer = self.restate(name, &image.id, &stated).await?;
                             // A pose that was corrected needs no advice.
-                            let warnings =
-                                if answer.image.pose.is_none() { warnings } else { Vec::new() };
+                            if answer.image.pose.is_none() {
+                                warnings.extend(advice);
+                            }
                             Ok((ImageAnswer { warnings, ..answer }, false))
                         }
                     };

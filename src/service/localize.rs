@@ -31,7 +31,7 @@ pub struct LocalizeRequest {
     pub refine: RefineMode,
     /// The priority of the refinement job.
     pub priority: Priority,
-    /// The bytes of the frame: JPEG, PNG or WebP.
+    /// The bytes of the frame, in any format of [`MediaType`](whereabouts_core::MediaType).
     pub frame: Bytes,
     /// Time after which the caller no longer wants the answer.
     pub deadline: Option<Instant>,
@@ -124,8 +124,17 @@ impl Localizer {
             self.retrieve(&request.map, &request.frame, search, features, admission).await?;
 
         let calibration = self.maps.store.calibration(&map).await?.unwrap_or_default();
+        let lack = extraction.information.lack();
+        if let Some(why) = lack {
+            self.maps.imaging.metrics.uninformative_frame(why);
+        }
+        let uninformative = lack.map(|why| why.to_string());
         let track = match request.track {
-            Some(step) => Some(self.tracks.follow(&map, step, &candidates, &calibration).await?),
+            Some(step) => {
+                // A frame that shows nothing moves the belief, but is no evidence.
+                let evidence = if lack.is_some() { &[] } else { candidates.as_slice() };
+                Some(self.tracks.follow(&map, step, evidence, &calibration).await?)
+            }
             None => None,
         };
         let query_id = Uuid::now_v7();
@@ -141,6 +150,7 @@ impl Localizer {
                 media_type: extraction.media_type,
                 descriptor: extraction.descriptor,
                 dense: extraction.dense,
+                uninformative: uninformative.clone(),
             };
             let id = request.idempotency_id.as_deref();
             let submit = self.submitter.submit(&map, frame, compared, request.priority, id);
@@ -154,7 +164,8 @@ impl Localizer {
                 Submission::Declined(why) => (None, Some(why)),
             }
         };
-        let mut estimate = self.estimate(&candidates, &calibration);
+        let estimate = self.estimate(&candidates, &calibration);
+        let mut estimate = estimate.map(|estimate| estimate.unless(uninformative.as_deref()));
         candidates.truncate(k);
         if request.refine == RefineMode::Wait
             && let Some(queued) = &mut job
@@ -177,6 +188,7 @@ impl Localizer {
                 state: job.state,
             }),
             no_job,
+            warnings: extraction.warnings,
             timing_ms: TimingMs {
                 decode: ms(extraction.times.decode),
                 extract: ms(extraction.times.extract),

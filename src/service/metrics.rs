@@ -9,7 +9,7 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use whereabouts_store::RemovedJobs;
 use whereabouts_telemetry::metrics::{Registry, latency, register};
-use whereabouts_vision::Extraction;
+use whereabouts_vision::{Extraction, Uninformative};
 
 use crate::rejections::Rejections;
 
@@ -24,6 +24,8 @@ pub struct ServiceMetrics {
     submitted_jobs: Counter,
     removed_jobs: Family<RemovedLabels, Counter>,
     removed_frame_bytes: Counter,
+    uninformative_frames: Family<WhyLabels, Counter>,
+    damaged_pictures: Counter,
     webhook_attempts: Family<OutcomeLabels, Counter>,
 }
 
@@ -52,6 +54,11 @@ struct RemovedLabels {
 struct CheckLabels {
     map: String,
     found: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct WhyLabels {
+    why: &'static str,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
@@ -96,6 +103,18 @@ impl ServiceMetrics {
                 "Bytes of frames removed with their jobs",
                 Counter::default(),
             ),
+            uninformative_frames: register(
+                registry,
+                "uninformative_frames",
+                "Frames that cannot show a known place, by reason: blank, noise or blurred",
+                Family::default(),
+            ),
+            damaged_pictures: register(
+                registry,
+                "damaged_pictures",
+                "Pictures that were decoded although bytes were missing or changed",
+                Counter::default(),
+            ),
             webhook_attempts: register(
                 registry,
                 "webhook_attempts",
@@ -109,6 +128,9 @@ impl ServiceMetrics {
     /// Observes the stages of an extraction.
     pub fn observe_extraction(&self, extraction: &Extraction) {
         self.batch_pictures.observe(extraction.batch as f64);
+        if !extraction.warnings.is_empty() {
+            self.damaged_pictures.inc();
+        }
         let times = extraction.times;
         for (stage, time) in [("decode", times.decode), ("extract", times.extract)] {
             self.stage_seconds.get_or_create(&StageLabels { stage }).observe(time.as_secs_f64());
@@ -127,6 +149,11 @@ impl ServiceMetrics {
             let labels = CheckLabels { map: map.to_owned(), found: word };
             self.neighbours_checked.get_or_create(&labels).inc_by(count as u64);
         }
+    }
+
+    /// Counts a frame that cannot show a known place.
+    pub fn uninformative_frame(&self, why: Uninformative) {
+        self.uninformative_frames.get_or_create(&WhyLabels { why: why.word() }).inc();
     }
 
     /// Counts a queued job.

@@ -33,6 +33,8 @@ pub(super) struct LocalizedFrame {
     pub media_type: MediaType,
     pub descriptor: Descriptor,
     pub dense: Option<DenseFeatures>,
+    /// Why the frame cannot show a known place, if it cannot.
+    pub uninformative: Option<String>,
 }
 
 /// Whether a frame got a refinement job.
@@ -101,6 +103,7 @@ impl Submitter {
             media_type: frame.media_type,
             created_at: Timestamp::now(),
             descriptor: refiner.wants_descriptor().then_some(frame.descriptor),
+            uninformative: frame.uninformative,
         };
         let key = DenseKey { model: frame.model, picture: query.digest };
         if let Some(dense) = frame.dense {

@@ -25,6 +25,9 @@ pub struct Query {
     /// The frame's descriptor, if the refiner needs it.
     #[serde(default)]
     pub descriptor: Option<Descriptor>,
+    /// Why the frame cannot show a known place, if it cannot.
+    #[serde(default)]
+    pub uninformative: Option<String>,
 }
 
 /// A job together with what its worker needs.

@@ -80,6 +80,7 @@ mod tests {
             media_type: MediaType::Jpeg,
             created_at: now,
             descriptor: None,
+            uninformative: None,
         };
         let image_id: whereabouts_core::ImageId = "Gate.jpg".parse().unwrap();
         let description = Description {

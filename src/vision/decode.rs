@@ -1,10 +1,16 @@
 //! Decoding of untrusted bytes to pixels.
 
+mod depth;
+mod foreign;
+mod jpeg;
+
 use std::io::Cursor;
 
-use image::{DynamicImage, ImageDecoder, ImageReader, Limits, RgbImage};
+use image::codecs::pnm::PnmDecoder;
+use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, Limits, RgbImage};
 
-use super::jpeg::{self, Malformed, Outline};
+pub use self::foreign::Foreign;
+use self::jpeg::{Decoded, Malformed, Outline};
 use whereabouts_core::MediaType;
 
 /// Limits on a picture, checked before its pixels are decoded.
@@ -25,6 +31,8 @@ pub struct Picture {
     pub height: u32,
     /// Format of the file.
     pub media_type: MediaType,
+    /// What the sender should know about the file although it was decoded.
+    pub warnings: Vec<String>,
 }
 
 /// The resolution that the caller needs. A JPEG with at least twice that resolution is decoded at a half, a quarter
@@ -42,9 +50,26 @@ pub enum Needed {
 /// Why bytes cannot be decoded.
 #[derive(Debug, thiserror::Error)]
 pub enum DecodeError {
-    /// The magic bytes are not those of JPEG, PNG or WebP.
-    #[error("the bytes are not a JPEG, PNG or WebP picture; send one of these formats")]
+    /// The magic bytes are not those of a supported format.
+    #[error("the bytes are not a picture of a known format; send {}", MediaType::NAMES)]
     UnknownFormat,
+    /// The format was recognised, but the service does not read it.
+    #[error("the file is {}, which the service does not read; {}", .0.name, .0.remedy)]
+    Foreign(Foreign),
+    /// The format is supported, but not this kind of it.
+    #[error(
+        "the {format} is of a kind that cannot be decoded ({reason}); save it with 8 or 16 bits in grey or RGB, or \
+         as PNG"
+    )]
+    Unsupported {
+        /// Format by the magic bytes.
+        format: &'static str,
+        /// Message of the decoder.
+        reason: String,
+    },
+    /// The picture has no pixels.
+    #[error("the {0} has no pixels; check what wrote it")]
+    Empty(&'static str),
     /// The picture exceeds the configured limit.
     #[error(
         "the picture has {width}×{height} pixels, more than the {max_pixels} that this server \
@@ -59,7 +84,7 @@ pub enum DecodeError {
         max_pixels: u64,
     },
     /// The file is truncated.
-    #[error("the JPEG is truncated: its data ends before the end-of-image marker; send it whole")]
+    #[error("the JPEG is truncated: its data ends before its last row; send it whole")]
     Truncated,
     /// The decoder failed.
     #[error("the {format} cannot be decoded: {reason}")]
@@ -71,16 +96,26 @@ pub enum DecodeError {
     },
 }
 
-/// Decodes a JPEG, PNG or WebP picture to upright RGB.
+/// Decodes a picture to upright RGB with 8 bits a sample.
 ///
 /// The size is checked in the header first, so that a small file that claims a huge picture is rejected at no cost.
 pub fn decode(bytes: &[u8], limits: ImageLimits, needed: Needed) -> Result<Picture, DecodeError> {
+    if let Some(foreign) = Foreign::sniff(bytes) {
+        return Err(DecodeError::Foreign(foreign));
+    }
     match MediaType::sniff(bytes).ok_or(DecodeError::UnknownFormat)? {
         MediaType::Jpeg => decode_jpeg(bytes, limits, needed),
-        MediaType::Png => decode_whole(bytes, limits, MediaType::Png),
-        MediaType::Webp => decode_whole(bytes, limits, MediaType::Webp),
+        MediaType::Tiff => match Foreign::in_tiff(bytes) {
+            Some(raw) => Err(DecodeError::Foreign(raw)),
+            None => decode_whole(bytes, limits, MediaType::Tiff),
+        },
+        other => decode_whole(bytes, limits, other),
     }
 }
+
+/// A truncated JPEG with at least this share of its rows is decoded, with a warning. Decoders fill the rest with
+/// grey; a frame that was truncated in transit must not be localized by its upper half.
+const ENOUGH_ROWS: f64 = 0.9;
 
 fn decode_jpeg(bytes: &[u8], limits: ImageLimits, needed: Needed) -> Result<Picture, DecodeError> {
     let damaged = |reason: &str| DecodeError::Damaged { format: "JPEG", reason: reason.to_owned() };
@@ -95,11 +130,34 @@ fn decode_jpeg(bytes: &[u8], limits: ImageLimits, needed: Needed) -> Result<Pict
         return decode_whole(bytes, limits, MediaType::Jpeg);
     }
     let (width, height) = outline.upright();
-    let pixels = jpeg::decode(bytes, outline, needed.eighths(width, height))
+    let with_end: Vec<u8>;
+    let bytes = if outline.is_ended {
+        bytes
+    } else {
+        // The decoder would warn of the missing marker as of missing data.
+        with_end = [bytes, jpeg::END].concat();
+        &with_end
+    };
+    let Decoded { pixels, intact } = jpeg::decode(bytes, outline, needed.eighths(width, height))
         .map_err(|reason| damaged(&reason))?;
+    if !outline.is_ended && intact < ENOUGH_ROWS {
+        return Err(DecodeError::Truncated);
+    }
+    let warnings = (intact < 1.0).then(|| damage(outline.is_ended)).into_iter().collect();
     let mut pixels = DynamicImage::ImageRgb8(pixels);
     pixels.apply_orientation(outline.orientation);
-    Ok(Picture { pixels: pixels.into_rgb8(), width, height, media_type: MediaType::Jpeg })
+    let pixels = pixels.into_rgb8();
+    Ok(Picture { pixels, width, height, media_type: MediaType::Jpeg, warnings })
+}
+
+fn damage(is_ended: bool) -> String {
+    let what = match is_ended {
+        true => "bytes in it are missing or changed, so a part of the picture is wrong",
+        false => "its last rows are missing",
+    };
+    format!(
+        "the JPEG is damaged: {what}, and the answer may be wrong too; check the transfer and send the picture again"
+    )
 }
 
 fn decode_whole(
@@ -107,24 +165,43 @@ fn decode_whole(
     limits: ImageLimits,
     media_type: MediaType,
 ) -> Result<Picture, DecodeError> {
-    let (format, name) = match media_type {
-        MediaType::Jpeg => (image::ImageFormat::Jpeg, "JPEG"),
-        MediaType::Png => (image::ImageFormat::Png, "PNG"),
-        MediaType::Webp => (image::ImageFormat::WebP, "WebP"),
+    let format = match media_type {
+        MediaType::Jpeg => image::ImageFormat::Jpeg,
+        MediaType::Png => image::ImageFormat::Png,
+        MediaType::Webp => image::ImageFormat::WebP,
+        MediaType::Pnm => image::ImageFormat::Pnm,
+        MediaType::Tiff => image::ImageFormat::Tiff,
+        MediaType::Bmp => image::ImageFormat::Bmp,
+        MediaType::Gif => image::ImageFormat::Gif,
     };
-    let damaged =
-        |error: image::ImageError| DecodeError::Damaged { format: name, reason: error.to_string() };
+    let name = media_type.name();
+    let damaged = |error: ImageError| match error {
+        ImageError::Unsupported(error) => {
+            DecodeError::Unsupported { format: name, reason: error.to_string() }
+        }
+        error => DecodeError::Damaged { format: name, reason: error.to_string() },
+    };
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(allocation_limits(limits));
     let mut decoder = reader.into_decoder().map_err(damaged)?;
     let (width, height) = decoder.dimensions();
     within(limits, width, height)?;
+    if width == 0 || height == 0 {
+        return Err(DecodeError::Empty(name));
+    }
     let orientation = decoder.orientation().map_err(damaged)?;
     let mut pixels = DynamicImage::from_decoder(decoder).map_err(damaged)?;
     pixels.apply_orientation(orientation);
-    let pixels = pixels.into_rgb8();
+    let is_full_scale = media_type == MediaType::Pnm && declares_its_maximum(bytes);
+    let pixels = depth::to_rgb8(pixels, is_full_scale);
     let (width, height) = pixels.dimensions();
-    Ok(Picture { pixels, width, height, media_type })
+    Ok(Picture { pixels, width, height, media_type, warnings: Vec::new() })
+}
+
+/// Whether the header of a PNM file says how many bits are in use. Many writers always say 65535.
+fn declares_its_maximum(bytes: &[u8]) -> bool {
+    let decoder = PnmDecoder::new(Cursor::new(bytes));
+    decoder.is_ok_and(|decoder| decoder.into_inner().1.maximal_sample() != u32::from(u16::MAX))
 }
 
 fn within(limits: ImageLimits, width: u32, height: u32) -> Result<(), DecodeError> {
@@ -170,156 +247,4 @@ fn allocation_limits(limits: ImageLimits) -> Limits {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use image::{ExtendedColorType, ImageEncoder};
-
-    const LIMITS: ImageLimits = ImageLimits { max_pixels: 1_000_000 };
-
-    fn gradient(width: u32, height: u32) -> RgbImage {
-        RgbImage::from_fn(width, height, |x, y| {
-            image::Rgb([(x * 5) as u8, (y * 7) as u8, ((x + y) * 3) as u8])
-        })
-    }
-
-    fn encode(format: image::ImageFormat) -> Vec<u8> {
-        let mut bytes = Cursor::new(Vec::new());
-        gradient(40, 20).write_to(&mut bytes, format).unwrap();
-        bytes.into_inner()
-    }
-
-    /// A JPEG whose EXIF block has only the orientation tag.
-    fn with_orientation(orientation: u8) -> Vec<u8> {
-        let exif = [
-            b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(),
-            &[orientation, 0, 0, 0, 0, 0, 0, 0],
-        ]
-        .concat();
-        let mut bytes = Vec::new();
-        let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 95);
-        encoder.set_exif_metadata(exif).unwrap();
-        encoder.write_image(gradient(40, 20).as_raw(), 40, 20, ExtendedColorType::Rgb8).unwrap();
-        bytes
-    }
-
-    #[test]
-    fn all_three_formats_are_decoded() {
-        for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png, image::ImageFormat::WebP]
-        {
-            let picture = decode(&encode(format), LIMITS, Needed::All).unwrap();
-            assert_eq!(picture.pixels.dimensions(), (40, 20), "{format:?}");
-        }
-    }
-
-    #[test]
-    fn the_exif_orientation_is_applied() {
-        let plain = decode(&with_orientation(1), LIMITS, Needed::All).unwrap().pixels;
-        let turned = decode(&with_orientation(6), LIMITS, Needed::All).unwrap().pixels;
-        assert_eq!(turned.dimensions(), (20, 40));
-        assert_eq!(turned.get_pixel(19, 0), plain.get_pixel(0, 0));
-    }
-
-    #[test]
-    fn a_large_jpeg_is_reduced_to_the_needed_resolution() {
-        let mut jpeg = Vec::new();
-        let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 95);
-        encoder.encode_image(&gradient(401, 200)).unwrap();
-        for (needed, expected) in [
-            (Needed::All, (401, 200)),
-            (Needed::Size(201, 100), (401, 200)),
-            (Needed::Size(200, 100), (201, 100)),
-            (Needed::Size(20, 50), (101, 50)),
-            (Needed::LongestEdge(50), (51, 25)),
-            (Needed::LongestEdge(4000), (401, 200)),
-        ] {
-            let picture = decode(&jpeg, LIMITS, needed).unwrap();
-            assert_eq!(picture.pixels.dimensions(), expected, "{needed:?}");
-            assert_eq!((picture.width, picture.height), (401, 200));
-        }
-        let turned = decode(&with_orientation(6), LIMITS, Needed::Size(10, 20)).unwrap();
-        assert_eq!(turned.pixels.dimensions(), (10, 20));
-        assert_eq!((turned.width, turned.height), (20, 40));
-    }
-
-    #[test]
-    fn a_reduced_picture_is_an_area_average() {
-        let mut jpeg = Vec::new();
-        let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 100);
-        let smooth = RgbImage::from_fn(320, 160, |x, y| {
-            image::Rgb([(x / 2) as u8, y as u8, ((x + y) / 4) as u8])
-        });
-        encoder.encode_image(&smooth).unwrap();
-        let whole = decode(&jpeg, LIMITS, Needed::All).unwrap().pixels;
-        let half = decode(&jpeg, LIMITS, Needed::Size(160, 80)).unwrap().pixels;
-        for (x, y, pixel) in half.enumerate_pixels() {
-            for channel in 0..3 {
-                let at = |dx, dy| i32::from(whole.get_pixel(2 * x + dx, 2 * y + dy)[channel]);
-                let mean = (at(0, 0) + at(1, 0) + at(0, 1) + at(1, 1)) / 4;
-                assert!((i32::from(pixel[channel]) - mean).abs() <= 3, "{x} {y}");
-            }
-        }
-    }
-
-    #[test]
-    fn contradicting_frame_headers_are_rejected() {
-        let mut bytes = encode(image::ImageFormat::Jpeg);
-        let frame = bytes.windows(2).position(|pair| pair == [0xFF, 0xC0]).unwrap();
-        // A second frame header, with a small size, before the real one.
-        let mut small = bytes[frame..frame + 19].to_vec();
-        small[5..9].copy_from_slice(&[0, 8, 0, 8]);
-        bytes.splice(frame..frame, small);
-        assert!(matches!(decode(&bytes, LIMITS, Needed::All), Err(DecodeError::Damaged { .. })));
-    }
-
-    #[test]
-    fn a_file_with_too_many_scans_is_rejected_before_decoding() {
-        let mut bytes = encode(image::ImageFormat::Jpeg);
-        let scan = bytes.windows(2).position(|pair| pair == [0xFF, 0xDA]).unwrap();
-        let header = bytes[scan..scan + 14].to_vec();
-        bytes.splice(scan..scan, header.repeat(1000));
-        let error = decode(&bytes, LIMITS, Needed::All).unwrap_err().to_string();
-        assert!(error.contains("too many scans"), "{error}");
-    }
-
-    #[test]
-    fn every_corrupted_byte_yields_a_picture_or_an_error() {
-        let whole = encode(image::ImageFormat::Jpeg);
-        for at in 0..whole.len() {
-            let mut bytes = whole.clone();
-            bytes[at] ^= 0x55;
-            if let Ok(picture) = decode(&bytes, LIMITS, Needed::Size(10, 5)) {
-                let pixels = u64::from(picture.width) * u64::from(picture.height);
-                assert!(pixels <= LIMITS.max_pixels, "byte {at}");
-            }
-        }
-    }
-
-    #[test]
-    fn a_truncated_file_is_rejected() {
-        for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png, image::ImageFormat::WebP]
-        {
-            let whole = encode(format);
-            for keep in [12, whole.len() / 4, whole.len() / 2, whole.len() - 20] {
-                assert!(
-                    decode(&whole[..keep], LIMITS, Needed::All).is_err(),
-                    "{format:?} cut at {keep}"
-                );
-            }
-        }
-    }
-
-    #[test]
-    fn a_huge_picture_is_rejected_by_its_header() {
-        let tight = ImageLimits { max_pixels: 799 };
-        let error = decode(&encode(image::ImageFormat::Png), tight, Needed::All).unwrap_err();
-        assert!(matches!(error, DecodeError::TooManyPixels { width: 40, height: 20, .. }));
-    }
-
-    #[test]
-    fn text_is_rejected() {
-        assert!(matches!(
-            decode(b"hello, robot", LIMITS, Needed::All),
-            Err(DecodeError::UnknownFormat)
-        ));
-    }
-}
+mod tests;

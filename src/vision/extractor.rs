@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use super::batcher::{Batcher, Layout, PendingInference, Pooled};
 use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jpeg};
 use super::execution::{Execution, Provider, ProviderPreference};
+use super::information::Information;
 use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest};
 use super::pooling::{FeatureSet, PoolingError};
 use super::preprocess::{self, PreprocessError, Tensor, preprocess};
@@ -75,6 +76,8 @@ struct SubmittedPicture {
     media_type: MediaType,
     width: u32,
     height: u32,
+    warnings: Vec<String>,
+    information: Information,
     decode: Duration,
     submitted: Instant,
 }
@@ -95,9 +98,21 @@ impl PendingExtraction {
 
 impl SubmittedPicture {
     fn with(self, Pooled { descriptor, dense, batch }: Pooled) -> Extraction {
-        let Self { digest, media_type, width, height, decode, submitted } = self;
+        let Self { digest, media_type, width, height, warnings, information, decode, submitted } =
+            self;
         let times = StageTimes { decode, extract: submitted.elapsed() };
-        Extraction { descriptor, dense, digest, media_type, width, height, times, batch }
+        Extraction {
+            descriptor,
+            dense,
+            digest,
+            media_type,
+            width,
+            height,
+            warnings,
+            information,
+            times,
+            batch,
+        }
     }
 }
 
@@ -116,6 +131,10 @@ pub struct Extraction {
     pub width: u32,
     /// Height in pixels, after applying the EXIF orientation.
     pub height: u32,
+    /// What the sender should know about the picture, such as damage.
+    pub warnings: Vec<String>,
+    /// How much structure the picture has.
+    pub information: Information,
     /// Durations of the stages.
     pub times: StageTimes,
     /// Size of the batch that the picture was part of.
@@ -233,9 +252,11 @@ impl Extractor {
         let start = Instant::now();
         let input = &self.manifest.input;
         let needed = if self.exact_decode { Needed::All } else { preprocess::needed(input) };
-        let Picture { pixels, width, height, media_type } = decode(bytes, self.limits, needed)?;
+        let picture = decode(bytes, self.limits, needed)?;
+        let Picture { pixels, width, height, media_type, warnings } = picture;
         let tensor = preprocess(&pixels, (width, height), input)?;
         drop(pixels);
+        let information = Information::of(&tensor, input);
         if !is_wanted() {
             return Err(ExtractError::Abandoned);
         }
@@ -244,7 +265,16 @@ impl Extractor {
         // Hashed after submitting, so that it overlaps with inference.
         let digest = Digest::of(bytes);
         let decode = submitted - start;
-        let picture = SubmittedPicture { digest, media_type, width, height, decode, submitted };
+        let picture = SubmittedPicture {
+            digest,
+            media_type,
+            width,
+            height,
+            warnings,
+            information,
+            decode,
+            submitted,
+        };
         Ok(PendingExtraction { inference, picture })
     }
 
@@ -321,7 +351,7 @@ fn choose_execution(
 }
 
 /// Two street scenes, by day and by night, on which models are measured.
-const SAMPLES: [&[u8]; 2] =
+pub(super) const SAMPLES: [&[u8]; 2] =
     [include_bytes!("samples/street-day.jpg"), include_bytes!("samples/street-night.jpg")];
 
 /// Decodes the bundled sample pictures to input tensors.

@@ -12,7 +12,7 @@ pub mod decode;
 mod execution;
 pub mod exif;
 mod extractor;
-mod jpeg;
+mod information;
 mod loaded;
 pub mod manifest;
 mod pool;
@@ -24,6 +24,7 @@ mod runtime;
 mod session;
 mod settings;
 mod sync;
+mod trial;
 
 pub use admission::{
     Admission, AdmissionLevels, AdmissionRequest, AdmissionSettings, Permit, RejectReason,
@@ -31,16 +32,18 @@ pub use admission::{
 };
 pub use batcher::Layout;
 pub use bench::{Bench, BenchFigures, BenchRow, BenchSettings};
-pub use decode::{DecodeError, ImageLimits, Needed, Picture};
+pub use decode::{DecodeError, Foreign, ImageLimits, Needed, Picture};
 pub use execution::{Execution, Provider, ProviderPreference};
 pub use extractor::{
     ExtractError, Extraction, Extractor, ExtractorSettings, PendingExtraction, StageTimes,
 };
+pub use information::{Information, Uninformative};
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
-pub use manifest::{MANIFEST, Manifest, ManifestError, file_digest};
+pub use manifest::{DataFile, MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
 pub use pooling::FeatureSet;
 pub use provider::{MIN_SIMILARITY, Measurement, Trial};
 pub use raw_pixels::{PixelEncoding, RawPixels, RawPixelsError};
 pub use runtime::{AUTO, Assets, BUILT_IN_MODEL, CHOSEN, PREFERRED_MODELS, RuntimeError, WhyModel};
 pub use settings::{ImageSettings, auto, threads_or_cores};
+pub use trial::{ModelFault, try_model};

@@ -3,9 +3,9 @@
 use std::fs::File;
 use std::io::{self, Read};
 use std::iter;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use sha2::{Digest as _, Sha256};
 
 use whereabouts_core::{DescriptorKind, Digest};
@@ -31,9 +31,9 @@ pub struct Manifest {
     pub licence: String,
     /// Origin of the weights.
     pub source: String,
-    /// External weights, for models above the 2 GB limit of an ONNX file.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub data: Option<DataFile>,
+    /// Files of external weights, which exporters write for large models, and some for all models.
+    #[serde(default, deserialize_with = "one_or_many", skip_serializing_if = "Vec::is_empty")]
+    pub data: Vec<DataFile>,
     /// The input tensor.
     pub input: Input,
     /// The output tensors.
@@ -46,7 +46,7 @@ pub struct Manifest {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DataFile {
-    /// File name, as referenced by the ONNX file.
+    /// Path relative to the ONNX file, as referenced there.
     pub file: PathBuf,
     /// Pinned digest, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -61,17 +61,31 @@ struct DescriptorInputs<'a> {
     pooling: &'a Pooling,
 }
 
+/// Reads one table or a list of them.
+fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<DataFile>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum OneOrMany {
+        One(DataFile),
+        Many(Vec<DataFile>),
+    }
+    Ok(match OneOrMany::deserialize(deserializer)? {
+        OneOrMany::One(file) => vec![file],
+        OneOrMany::Many(files) => files,
+    })
+}
+
 impl Manifest {
     /// The files of the model and their pinned digests, the ONNX file first.
     pub fn files(&self) -> impl Iterator<Item = (&Path, Option<Digest>)> {
-        let data = self.data.as_ref().map(|data| (data.file.as_path(), data.sha256));
+        let data = self.data.iter().map(|data| (data.file.as_path(), data.sha256));
         iter::once((self.file.as_path(), self.sha256)).chain(data)
     }
 
     /// Pins the digests of the files, in the order of [`files`](Self::files).
     pub fn pin(&mut self, digests: &[Digest]) {
         self.sha256 = digests.first().copied().or(self.sha256);
-        if let (Some(data), Some(digest)) = (&mut self.data, digests.get(1)) {
+        for (data, digest) in self.data.iter_mut().zip(digests.iter().skip(1)) {
             data.sha256 = Some(*digest);
         }
     }
@@ -272,11 +286,20 @@ impl Manifest {
         let (input, output, pooling) = (&self.input, &self.output, &self.pooling);
         let [rows, columns] = pooling.grid;
         let is_plain = |file: &Path| file.components().count() == 1 && file.file_name().is_some();
-        if !self.files().all(|(file, _)| is_plain(file) && file != Path::new(MANIFEST)) {
+        if !is_plain(&self.file) || self.file == Path::new(MANIFEST) {
             return Some("file must be a plain file name next to the manifest".into());
         }
-        if self.data.as_ref().is_some_and(|data| data.file == self.file) {
-            return Some("data.file must differ from file".into());
+        let is_below = |file: &Path| {
+            let mut parts = file.components();
+            file.file_name().is_some() && parts.all(|part| matches!(part, Component::Normal(_)))
+        };
+        if !self.data.iter().all(|data| is_below(&data.file) && data.file != Path::new(MANIFEST)) {
+            return Some("data.file must be a file below the folder of the manifest".into());
+        }
+        let mut names: Vec<&Path> = self.files().map(|(file, _)| file).collect();
+        names.sort_unstable();
+        if names.windows(2).any(|pair| pair[0] == pair[1]) {
+            return Some("data.file must differ from file and be named once".into());
         }
         if input.multiple == 0 || output.stride == 0 {
             return Some("input.multiple and output.stride must be at least 1".into());

@@ -1,12 +1,14 @@
 //! One model on disk, and the ONNX Runtime sessions that run it.
 
+use std::borrow::Cow;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use half::f16;
 use ort::environment::Environment;
-use ort::session::Session;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
-use ort::value::TensorRef;
+use ort::session::{Session, SessionInputValue};
+use ort::value::{Outlet, TensorElementType, TensorRef, ValueType};
 
 use super::execution::Execution;
 use super::manifest::{Input, Manifest, Output, Resize};
@@ -61,7 +63,15 @@ impl Model {
             .map_err(|error| {
                 InferenceError::Load(format!("{} by {execution}: {error}", self.file.display()))
             })?;
+        let is_half = |outlet: &Outlet| {
+            matches!(outlet.dtype(), ValueType::Tensor { ty: TensorElementType::Float16, .. })
+        };
+        let takes_half = session
+            .inputs()
+            .iter()
+            .any(|input| input.name() == self.manifest.input.name && is_half(input));
         Ok(Runner {
+            takes_half,
             session,
             manifest: Arc::clone(&self.manifest),
             _environment: Arc::clone(&self.environment),
@@ -108,12 +118,27 @@ impl Model {
 #[derive(Debug)]
 pub(super) struct Runner {
     session: Session,
+    /// Whether the input has 16-bit numbers.
+    takes_half: bool,
     manifest: Arc<Manifest>,
     /// Must outlive the session.
     _environment: Arc<Environment>,
 }
 
 impl Runner {
+    /// The inputs and outputs of the graph.
+    pub fn interface(&self) -> (&[Outlet], &[Outlet]) {
+        (self.session.inputs(), self.session.outputs())
+    }
+
+    /// Whether the graph takes or gives 16-bit numbers.
+    pub fn is_half(&self) -> bool {
+        let (inputs, outputs) = self.interface();
+        inputs.iter().chain(outputs).any(|outlet| {
+            matches!(outlet.dtype(), ValueType::Tensor { ty: TensorElementType::Float16, .. })
+        })
+    }
+
     /// Runs a blank picture, because the first run of a session allocates and is slower than others.
     pub fn warm_up(&mut self) -> Result<(), InferenceError> {
         let Input { width, height, .. } = self.manifest.input;
@@ -136,14 +161,29 @@ impl Runner {
             joined = parts.concat();
             joined.as_slice()
         };
-        let inputs = TensorRef::from_array_view((shape, data)).map_err(failed)?;
+        let half: Vec<f16>;
+        let inputs: SessionInputValue = if self.takes_half {
+            half = data.iter().map(|&number| f16::from_f32(number)).collect();
+            TensorRef::from_array_view((shape, half.as_slice())).map_err(failed)?.into()
+        } else {
+            TensorRef::from_array_view((shape, data)).map_err(failed)?.into()
+        };
         let outputs =
             self.session.run(ort::inputs![input.name.as_str() => inputs]).map_err(failed)?;
-        let numbers = |name: &str| {
+        let numbers = |name: &str| -> Result<Cow<[f32]>, InferenceError> {
             let value = outputs.get(name).ok_or_else(|| {
                 InferenceError::Run(format!("the model has no output called {name:?}"))
             })?;
-            value.try_extract_tensor::<f32>().map(|(_, numbers)| numbers).map_err(failed)
+            match value.dtype() {
+                ValueType::Tensor { ty: TensorElementType::Float16, .. } => {
+                    let (_, numbers) = value.try_extract_tensor::<f16>().map_err(failed)?;
+                    Ok(numbers.iter().map(|number| number.to_f32()).collect())
+                }
+                _ => {
+                    let numbers = value.try_extract_tensor::<f32>().map_err(failed)?;
+                    Ok(Cow::Borrowed(numbers.1))
+                }
+            }
         };
         let features = numbers(&output.features)?;
         let reliability = output.reliability.as_deref().map(numbers).transpose()?;
@@ -153,8 +193,8 @@ impl Runner {
         };
         let cells = output.cells(first);
         let local = (0..count).map(|index| {
-            let features = &features[part(features, index)];
-            let reliability = reliability.map(|numbers| &numbers[part(numbers, index)]);
+            let features = &features[part(&features, index)];
+            let reliability = reliability.as_ref().map(|numbers| &numbers[part(numbers, index)]);
             Ok(LocalFeatures::from_output(output, cells, features, reliability)?)
         });
         local.collect()

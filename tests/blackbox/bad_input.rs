@@ -25,7 +25,7 @@ async fn a_body_that_is_not_an_image_is_rejected_and_the_next_frame_is_answered(
         let cut = server.post_jpeg(path, whole[..whole.len() / 2].to_vec()).await.problem(422);
         assert!(cut.contains("truncated"), "{cut}");
         let no_picture = server.post_jpeg(path, text.clone()).await.problem(422);
-        assert!(no_picture.contains("JPEG, PNG or WebP"), "{no_picture}");
+        assert!(no_picture.contains("JPEG, PNG, WebP"), "{no_picture}");
         let empty = server.post_jpeg(path, Vec::new()).await.problem(400);
         assert!(empty.contains("empty"), "{empty}");
         let typed = server.post(path, "text/plain", text.clone()).await.problem(415);

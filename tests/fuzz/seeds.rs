@@ -30,7 +30,15 @@ pub fn pictures() -> Vec<Vec<u8>> {
         bytes.into_inner()
     };
     let turned = with_exif(&jpeg, &exif_of([oriented(6)].as_slice()));
-    vec![jpeg, turned, encoded(ImageFormat::Png), encoded(ImageFormat::WebP)]
+    let others = [
+        ImageFormat::Png,
+        ImageFormat::WebP,
+        ImageFormat::Tiff,
+        ImageFormat::Bmp,
+        ImageFormat::Gif,
+        ImageFormat::Pnm,
+    ];
+    [jpeg, turned].into_iter().chain(others.map(encoded)).collect()
 }
 
 pub fn manifests() -> Vec<Vec<u8>> {

@@ -356,8 +356,14 @@ pub async fn submit_record(store: &dyn Store, record: JobRecord, frame: &[u8]) {
 pub fn record(map: &str, frame: &[u8]) -> JobRecord {
     let (now, id) = (Timestamp::now(), Uuid::now_v7());
     let digest = Digest::of(frame);
-    let query =
-        Query { id, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
+    let query = Query {
+        id,
+        digest,
+        media_type: MediaType::Jpeg,
+        created_at: now,
+        descriptor: None,
+        uninformative: None,
+    };
     let job = Job::queued(map.parse().unwrap(), id, RefinerKind::Local, now);
     JobRecord {
         job,

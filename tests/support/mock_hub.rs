@@ -45,6 +45,8 @@ pub struct Hub {
 
 struct Shared {
     file: Bytes,
+    /// Another file, and how its path ends.
+    other: Option<(String, Bytes)>,
     version: u32,
     faults: VecDeque<Fault>,
     requested_paths: Vec<String>,
@@ -55,8 +57,18 @@ struct Shared {
 impl Hub {
     /// Serves `file` under every path; the first requests meet one of `faults` each.
     pub async fn start(file: Vec<u8>, faults: &[Fault]) -> Self {
+        Self::serve(file, None, faults).await
+    }
+
+    /// Serves `other` under every path that ends in `name`, and `file` under the rest.
+    pub async fn start_with(file: Vec<u8>, name: &str, other: Vec<u8>) -> Self {
+        Self::serve(file, Some((name.to_owned(), other.into())), &[]).await
+    }
+
+    async fn serve(file: Vec<u8>, other: Option<(String, Bytes)>, faults: &[Fault]) -> Self {
         let shared = Arc::new(Mutex::new(Shared {
             file: file.into(),
+            other,
             version: 1,
             faults: faults.iter().copied().collect(),
             requested_paths: Vec::new(),
@@ -98,10 +110,13 @@ async fn answer(State(shared): State<Arc<Mutex<Shared>>>, request: Request) -> R
         shared.requested_paths.push(request.uri().path().to_owned());
         shared.ranges.push(text(request.headers(), RANGE.as_str()));
         if let Fault::Change = fault {
-            shared.file = shared.file.iter().rev().copied().collect();
+            // A comment in front of an ONNX file moves every other byte and changes nothing else.
+            shared.file = [b"2\x05other", &shared.file[..]].concat().into();
             shared.version += 1;
         }
-        (fault, shared.file.clone(), format!("\"{}\"", shared.version))
+        let other = shared.other.as_ref().filter(|(name, _)| request.uri().path().ends_with(name));
+        let file = other.map_or(&shared.file, |(_, other)| other).clone();
+        (fault, file, format!("\"{}\"", shared.version))
     };
     let whole = file.len();
     let from = match fault {

@@ -98,7 +98,8 @@ impl HubModel {
         };
         let mut meter = DownloadMeter::new(self.entry.name());
         let hub = &self.config.model.hub;
-        let pulled = folder.pull(&self.entry, hub, settings, |p| meter.show(&p)).await;
+        let pulled =
+            folder.pull(&self.assets, &self.entry, hub, settings, |p| meter.show(&p)).await;
         meter.finish();
         pulled.map(drop).map_err(anyhow::Error::new)
     }

@@ -11,7 +11,8 @@ use serde_json::json;
 use super::ModelContext;
 use whereabouts_core::{DescriptorKind, Digest};
 use whereabouts_models::InstallError;
-use whereabouts_vision::{AUTO, BUILT_IN_MODEL, MANIFEST, Manifest};
+use whereabouts_vision::{AUTO, Assets, BUILT_IN_MODEL, MANIFEST, Manifest};
+use whereabouts_vision::{ModelFault, try_model};
 
 /// One row of the list of models.
 #[derive(Serialize)]
@@ -164,18 +165,30 @@ struct Check {
     pinned: bool,
     /// The digests, or the error.
     detail: String,
+    /// What works with restrictions.
+    notes: Vec<String>,
 }
 
 impl Check {
-    fn run(name: String, folder: PathBuf) -> Self {
-        let (ok, pinned, detail) = match whereabouts_models::verify(&folder) {
+    fn run(assets: &Assets, name: String, folder: PathBuf) -> Self {
+        let (ok, pinned, detail, notes) = match whereabouts_models::verify(&folder) {
             Ok(verdict) => {
                 let pinned = verdict.manifest.files().all(|(_, pinned)| pinned.is_some());
-                (true, pinned, join(&verdict.digests))
+                let digests = join(&verdict.digests);
+                match try_model(assets, &folder) {
+                    Ok(notes) => (true, pinned, digests, notes),
+                    Err(ModelFault::Runtime(why)) => {
+                        (true, pinned, digests, vec![format!("it was not run: {why}")])
+                    }
+                    Err(fault) => (false, pinned, fault.to_string(), Vec::new()),
+                }
             }
-            Err(error) => (false, matches!(error, InstallError::Damaged { .. }), error.to_string()),
+            Err(error) => {
+                let pinned = matches!(error, InstallError::Damaged { .. });
+                (false, pinned, error.to_string(), Vec::new())
+            }
         };
-        Self { name, ok, folder, pinned, detail }
+        Self { name, ok, folder, pinned, detail, notes }
     }
 }
 
@@ -190,8 +203,10 @@ pub fn verify(context: &ModelContext, name: Option<&str>, json: bool) -> anyhow:
         Some(name) => BTreeMap::from([(name.to_owned(), context.assets.model(name)?)]),
         None => context.assets.installed(),
     };
-    let checks: Vec<_> =
-        models.into_iter().map(|(name, folder)| Check::run(name, folder)).collect();
+    let checks: Vec<_> = models
+        .into_iter()
+        .map(|(name, folder)| Check::run(&context.assets, name, folder))
+        .collect();
     if json {
         println!("{}", json!({ "models": checks }));
     } else {
@@ -215,6 +230,7 @@ fn print_check(check: &Check) {
         ),
         (false, _) => println!("{}: bad: {}", check.name, check.detail),
     }
+    check.notes.iter().for_each(|note| println!("  note: {note}"));
 }
 
 fn remedy(context: &ModelContext, check: &Check) -> anyhow::Error {

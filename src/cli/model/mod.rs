@@ -54,7 +54,9 @@ enum Action {
         /// Name of a model that `list` shows
         name: String,
     },
-    /// Install a model from a file
+    /// Install a model from a file, after trying it on two pictures
+    ///
+    /// Files of external weights that the ONNX file refers to are installed with it.
     Add {
         /// ONNX file
         file: PathBuf,
@@ -65,7 +67,7 @@ enum Action {
         #[arg(long)]
         name: Option<String>,
     },
-    /// Verify the SHA-256 of installed models; the exit code is 1 if a file has changed
+    /// Verify the SHA-256 of installed models and try them on two pictures; the exit code is 1 if one is damaged
     Verify {
         /// Verify only this model
         name: Option<String>,
@@ -98,12 +100,19 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         Action::Show { name, json } => inspect::show(&context, &name, json),
         Action::Pull { name } => pull(&context, &name).await,
         Action::Add { file, manifest, name } => {
-            match context.folder()?.add(&file, &manifest, name.as_deref())? {
+            let add = || {
+                context
+                    .folder()?
+                    .add(&context.assets, &file, &manifest, name.as_deref())
+                    .with_context(|| format!("{} was not installed", file.display()))
+            };
+            match tokio::task::block_in_place(add)? {
                 Added::Present(folder) => {
                     println!("{}: this file is already installed", folder.display());
                 }
-                Added::Installed { folder, name, digests } => {
-                    println!("{name}: installed in {}", folder.display());
+                Added::Installed { folder, name, digests, notes } => {
+                    println!("{name}: tried on two pictures and installed in {}", folder.display());
+                    notes.iter().for_each(|note| println!("  note: {note}"));
                     println!("  {}, recorded in its manifest", inspect::join(&digests));
                     println!("  run it with `whereabouts serve --model {name}`");
                     println!("  or make it the default with `whereabouts model use {name}`");
@@ -111,7 +120,9 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
             }
             Ok(())
         }
-        Action::Verify { name, json } => inspect::verify(&context, name.as_deref(), json),
+        Action::Verify { name, json } => {
+            tokio::task::block_in_place(|| inspect::verify(&context, name.as_deref(), json))
+        }
         Action::Bench(args) => tokio::task::block_in_place(|| bench::run(&context, args)),
         Action::Use { name } => select(&context, &name),
     }
@@ -174,7 +185,7 @@ async fn pull(context: &ModelContext, name: &str) -> anyhow::Result<()> {
     let mut meter = DownloadMeter::new(name);
     let pulled = context
         .folder()?
-        .pull(entry, hub, settings, |progress| meter.show(&progress))
+        .pull(&context.assets, entry, hub, settings, |progress| meter.show(&progress))
         .await
         .inspect_err(|_| meter.finish())
         .with_context(|| format!("{name} was not installed"));
@@ -183,11 +194,12 @@ async fn pull(context: &ModelContext, name: &str) -> anyhow::Result<()> {
         Pulled::Present(folder) => {
             println!("{name}: already installed and intact, in {}", folder.display());
         }
-        Pulled::Installed { folder, digests, pinned, replaced } => {
+        Pulled::Installed { folder, digests, pinned, replaced, notes } => {
             if let Some(fault) = replaced {
                 println!("{name}: replaced the installed files: {fault}");
             }
-            println!("{name}: installed in {}", folder.display());
+            println!("{name}: tried on two pictures and installed in {}", folder.display());
+            notes.iter().for_each(|note| println!("  note: {note}"));
             let digests = inspect::join(&digests);
             match pinned {
                 true => println!("  {digests}, as pinned by the catalogue"),

@@ -1,7 +1,11 @@
 //! Adding, verifying and locking models in a temporary folder.
 
 use super::*;
-use whereabouts_vision::Assets;
+
+/// The assets of the checkout, which has ONNX Runtime.
+fn runtime() -> Assets {
+    Assets::locate(None)
+}
 
 fn fixture(file: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/fixtures/models/tiny-tokens").join(file)
@@ -11,7 +15,7 @@ fn fixture(file: &str) -> PathBuf {
 fn an_added_file_is_pinned_and_found() {
     let assets = tempfile::tempdir().unwrap();
     let folder = ModelsFolder::open(assets.path()).unwrap();
-    let add = |name| folder.add(&fixture("model.onnx"), &fixture(MANIFEST), name);
+    let add = |name| folder.add(&runtime(), &fixture("model.onnx"), &fixture(MANIFEST), name);
     let Added::Installed { folder: placed, digests, .. } = add(Some("mine")).unwrap() else {
         panic!("it was not there before");
     };
@@ -29,16 +33,18 @@ fn an_added_file_is_pinned_and_found() {
 fn a_taken_name_and_a_wrong_file_are_rejected() {
     let assets = tempfile::tempdir().unwrap();
     let folder = ModelsFolder::open(assets.path()).unwrap();
-    folder.add(&fixture("model.onnx"), &fixture(MANIFEST), None).unwrap();
+    folder.add(&runtime(), &fixture("model.onnx"), &fixture(MANIFEST), None).unwrap();
     let other = assets.path().join("other.onnx");
-    fs::write(&other, "other").unwrap();
-    let wrong = folder.add(&other, &fixture(MANIFEST), None).unwrap_err().to_string();
+    // The same graph with a comment.
+    let comment = b"\x32\x05other";
+    fs::write(&other, [&fs::read(fixture("model.onnx")).unwrap()[..], comment].concat()).unwrap();
+    let wrong = folder.add(&runtime(), &other, &fixture(MANIFEST), None).unwrap_err().to_string();
     assert!(wrong.contains("pins"), "{wrong}");
     let manifest = assets.path().join("other.toml");
     let text = fs::read_to_string(fixture(MANIFEST)).unwrap();
     let unpinned: Vec<_> = text.lines().filter(|line| !line.starts_with("sha256")).collect();
     fs::write(&manifest, unpinned.join("\n")).unwrap();
-    assert!(matches!(folder.add(&other, &manifest, None), Err(InstallError::Taken(_))));
+    assert!(matches!(folder.add(&runtime(), &other, &manifest, None), Err(InstallError::Taken(_))));
 }
 
 #[test]
@@ -50,12 +56,12 @@ fn external_weights_are_installed_and_verified() {
     let text = fs::read_to_string(fixture(MANIFEST)).unwrap();
     let data = "[data]\nfile = \"model.onnx.data\"\n[input]";
     fs::write(&manifest, text.replace("[input]", data)).unwrap();
-    let missing = folder.add(&file, &manifest, None).unwrap_err().to_string();
+    let missing = folder.add(&runtime(), &file, &manifest, None).unwrap_err().to_string();
     assert!(missing.contains("model.onnx.data"), "{missing}");
 
     fs::write(given.path().join("model.onnx.data"), "weights").unwrap();
     let Added::Installed { folder: placed, digests, .. } =
-        folder.add(&file, &manifest, None).unwrap()
+        folder.add(&runtime(), &file, &manifest, None).unwrap()
     else {
         panic!("it was not there before");
     };
@@ -64,7 +70,7 @@ fn external_weights_are_installed_and_verified() {
     fs::write(placed.join("model.onnx.data"), "weight5").unwrap();
     assert!(matches!(verify(&placed), Err(InstallError::Damaged { .. })));
     fs::write(given.path().join("model.onnx.data"), "others").unwrap();
-    assert!(matches!(folder.add(&file, &manifest, None), Err(InstallError::Taken(_))));
+    assert!(matches!(folder.add(&runtime(), &file, &manifest, None), Err(InstallError::Taken(_))));
 }
 
 #[test]

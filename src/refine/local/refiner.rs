@@ -280,7 +280,7 @@ fn conclude(candidates: &[Candidate], comparison: &Comparison) -> Result<Refinem
 /// Returns the evidence for one of the compared candidates.
 fn agreement(pairs: &[PairMatch], of: usize) -> Option<Evidence> {
     let agreeing: Vec<usize> = pairs.iter().map(|pair| pair.matches.len()).collect();
-    Evidence::agreement(&agreeing, of)
+    Evidence::agreement(&agreeing, pairs.get(of)?.cells, of)
 }
 
 /// Explains in one sentence why the first candidate is first.

@@ -142,13 +142,14 @@ fn result(result: BulkResult) -> AddImageResult {
         outcome: Some(Outcome::Problem(convert::problem(error))),
     };
     match result {
-        BulkResult::Saved(ImageAnswer { image, changed, .. }, new) => {
+        BulkResult::Saved(ImageAnswer { image, changed, warnings }, new) => {
             let stored = Stored {
                 present: !new,
                 digest: image.digest.to_string(),
                 width: image.width,
                 height: image.height,
                 changed: names(&changed),
+                warnings,
             };
             AddImageResult { id: image.id.to_string(), outcome: Some(Outcome::Stored(stored)) }
         }

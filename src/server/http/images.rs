@@ -110,7 +110,7 @@ impl MetaParams {
         description = "Milliseconds from arrival that the client waits for the answer. After 504 the \
                        image may or may not be stored; send it again.")),
     request_body(content(
-        (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"),
+        (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/*"),
         (ImageForm = "multipart/form-data"),
     )),
     responses(
@@ -220,7 +220,7 @@ pub(super) struct ContentParams {
 /// The picture of an image
 #[utoipa::path(get, path = "/maps/{map}/images/{id}/content", tag = "images",
     params(("map" = String, Path), ("id" = String, Path), ContentParams), responses(
-    (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"))),
+    (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/*"))),
     (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
     (status = 422, body = Problem, description = "max_edge is out of range", content_type = "application/problem+json"),
     (status = 429, body = Problem, description = "Overloaded, and max_edge asks for a smaller picture", content_type = "application/problem+json"),

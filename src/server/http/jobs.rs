@@ -96,7 +96,7 @@ pub(super) async fn get_job(
 /// The frame of a job
 #[utoipa::path(get, path = "/jobs/{id}/frame", tag = "jobs",
     params(("id" = Uuid, Path), ContentParams), responses(
-    (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"))),
+    (status = 200, content((Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/*"))),
     (status = 404, body = Problem, description = "No such job, or its frame is no longer there", content_type = "application/problem+json"),
     (status = 422, body = Problem, description = "max_edge is out of range", content_type = "application/problem+json"),
     (status = 429, body = Problem, description = "Overloaded, and max_edge asks for a smaller picture", content_type = "application/problem+json"),

@@ -91,7 +91,7 @@ struct FrameForm {
                        passes is abandoned with 504. With refine=wait, the answer is sent in time, \
                        refined or not.")),
     request_body(content(
-        (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/webp"),
+        (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/*"),
         (FrameForm = "multipart/form-data"),
     )),
     responses(

@@ -262,6 +262,7 @@ fn record(map: &str) -> JobRecord {
         media_type: MediaType::Jpeg,
         created_at: now,
         descriptor: None,
+        uninformative: None,
     };
     JobRecord {
         job,

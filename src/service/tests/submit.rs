@@ -16,6 +16,7 @@ fn frame() -> LocalizedFrame {
         digest: Digest::of(b"frame"),
         media_type: MediaType::Jpeg,
         descriptor: descriptor(0),
+        uninformative: None,
         dense: Some(DenseFeatures::new(1, 1, 1, vec![1.0], None).unwrap()),
     }
 }

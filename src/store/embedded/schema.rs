@@ -276,6 +276,7 @@ mod tests {
                 media_type: MediaType::Jpeg,
                 created_at: now,
                 descriptor: None,
+                uninformative: None,
             };
             let job = Job::queued("m".parse().unwrap(), id, RefinerKind::Local, now);
             let job = Job { state, finished_at: state.is_final().then_some(now), ..job };

@@ -11,5 +11,6 @@ mod model_files;
 mod models;
 mod needs_openvino;
 mod needs_photographs;
+mod odd_models;
 mod overload;
 mod schema;

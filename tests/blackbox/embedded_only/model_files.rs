@@ -22,7 +22,7 @@ pub struct Bench {
 }
 
 impl Bench {
-    fn new() -> Self {
+    pub fn new() -> Self {
         Self::with(|manifest| manifest)
     }
 
@@ -45,7 +45,7 @@ impl Bench {
     }
 
     /// A catalogue without a pinned digest: the first download is trusted.
-    fn unpinned() -> Self {
+    pub fn unpinned() -> Self {
         Self::with(|manifest| {
             let lines: Vec<_> = manifest.lines().filter(|l| !l.starts_with("sha256")).collect();
             lines.join("\n")
@@ -56,11 +56,11 @@ impl Bench {
         self.dir.path().join("assets")
     }
 
-    fn models(&self) -> PathBuf {
+    pub fn models(&self) -> PathBuf {
         self.assets().join("models")
     }
 
-    fn command(&self, hub: &str, args: &[&str]) -> Command {
+    pub fn command(&self, hub: &str, args: &[&str]) -> Command {
         let mut command = Command::new(&*BINARY);
         command
             .arg("model")
@@ -74,13 +74,13 @@ impl Bench {
         command
     }
 
-    fn run(&self, hub: &str, args: &[&str]) -> Outcome {
+    pub fn run(&self, hub: &str, args: &[&str]) -> Outcome {
         Outcome::of(&self.command(hub, args).output().unwrap())
     }
 
     /// Asserts that nothing is installed, not even partially.
     #[track_caller]
-    fn nothing_is_installed(&self) {
+    pub fn nothing_is_installed(&self) {
         assert!(!self.models().join("tiny").exists());
         let list = self.run("http://127.0.0.1:9", &["list", "--json"]).good();
         let list: Value = serde_json::from_str(&list).unwrap();
@@ -96,27 +96,27 @@ impl Bench {
     }
 }
 
-struct Outcome {
+pub struct Outcome {
     code: Option<i32>,
-    out: String,
+    pub out: String,
     err: String,
 }
 
 impl Outcome {
-    fn of(output: &Output) -> Self {
+    pub fn of(output: &Output) -> Self {
         let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
         Self { code: output.status.code(), out: text(&output.stdout), err: text(&output.stderr) }
     }
 
     #[track_caller]
-    fn good(self) -> String {
+    pub fn good(self) -> String {
         assert_eq!(self.code, Some(0), "{}{}", self.out, self.err);
         self.out
     }
 
     /// Asserts that the command failed and that its error contains all of these words.
     #[track_caller]
-    fn bad(self, words: &[&str]) {
+    pub fn bad(self, words: &[&str]) {
         assert_eq!(self.code, Some(1), "{}{}", self.out, self.err);
         for word in words {
             assert!(self.err.contains(word), "{word:?} is not in: {}", self.err);
@@ -324,7 +324,7 @@ fn a_local_file_is_added_and_selected_without_a_hub() {
     assert!(said.contains("model use mine"), "{said}");
     run(&["add", file, "--manifest", manifest, "--name", "../mine"])
         .bad(&["is not a valid model name"]);
-    run(&["add", manifest, "--manifest", manifest]).bad(&["pins"]);
+    run(&["add", manifest, "--manifest", manifest]).bad(&["text file", "--manifest"]);
     run(&["add", file, "--manifest", file]).bad(&["manifest"]);
 
     let in_use = || -> String {

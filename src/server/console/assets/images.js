@@ -72,7 +72,7 @@ export function uploadCard(map, { signal, added, centre }) {
   const said = h("div", { role: "status" });
   const send = h("button", { type: "submit", class: "primary" }, "Add the image");
   const form = h("form", {},
-    h("label", { for: "up-file" }, "Picture (JPEG, PNG or WebP)", h("input", { type: "file", id: "up-file", accept: "image/jpeg,image/png,image/webp", required: true })),
+    h("label", { for: "up-file" }, "Picture (JPEG, PNG, WebP, TIFF, BMP, GIF or PNM)", h("input", { type: "file", id: "up-file", accept: "image/*,.pgm,.ppm,.pbm,.pnm,.pam", required: true })),
     h("div", { class: "grid-2" },
       geographic ? [field("lat", "Latitude, degrees", { ...number, min: "-90", max: "90" }), field("lon", "Longitude, degrees", { ...number, min: "-180", max: "180" }), field("heading", "Heading, degrees", { ...number, min: "0", max: "360" })]
         : [field("x", "x, metres", number), field("y", "y, metres", number)],
@@ -91,8 +91,8 @@ export function uploadCard(map, { signal, added, centre }) {
     send.disabled = true;
     said.textContent = "Sending…";
     try {
-      const image = await call(address(["maps", map.name, "images"], query), { method: "POST", body: file, headers: { "Content-Type": file.type || "image/jpeg" }, signal });
-      said.textContent = `Added as ${image.id}.`;
+      const image = await call(address(["maps", map.name, "images"], query), { method: "POST", body: file, headers: { "Content-Type": file.type || "application/octet-stream" }, signal });
+      said.textContent = [`Added as ${image.id}.`, ...(image.warnings ?? []).map((warning) => `Warning: ${warning}.`)].join(" ");
       form.reset();
       added(image);
     } catch (problem) { if (!isAbort(problem)) fill(said, failure(problem)); }

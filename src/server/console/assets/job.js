@@ -62,7 +62,7 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
           picture(frameOf(id, 640), "The frame of this job", { signal, className: "small-picture", gone: "The frame is no longer stored, or this server does not serve frames." }),
           h("div", {}, h("h2", {}, "Estimate"),
             estimate ? h("p", { class: "big" }, percent(estimate.confidence), h("span", { class: "muted" }, " confidence")) : h("p", { class: "muted" }, ended() ? "None." : "Available when the job has ended."),
-            estimate && h("p", {}, estimate.known ? "The place is known." : "May not be in the map: the confidence is below the configured threshold."),
+            estimate && h("p", {}, estimate.known ? "The place is known." : estimate.reason ?? "May not be in the map: the confidence is below the configured threshold."),
             estimate && h("p", {}, h("code", {}, estimate.image_id), h("br"), h("span", { class: "muted" }, pose(estimate.pose))),
             job.reasoning && h("div", {}, h("h2", {}, "Reasoning"), job.reasoning.split(/\n+/).map((part) => h("p", { class: "told" }, part))))),
         h("div", { class: "card" }, facts(

@@ -25,7 +25,7 @@ export async function show({ root, query, signal, setQuery, title }) {
   const out = h("div", { class: "view" });
   const drop = h("div", { class: "drop" },
     h("div", { class: "actions" }, choose("try-file", "Choose a picture", "primary", {}), choose("try-camera", "Use the camera", "", { capture: "environment" })),
-    h("p", { class: "muted" }, "or drop one here, or paste it. It is sent unchanged: JPEG, PNG or WebP."));
+    h("p", { class: "muted" }, "or drop one here, or paste it. It is sent unchanged: JPEG, PNG, WebP, TIFF, BMP, GIF or PNM."));
   fill(root, h("h1", {}, "Try it"),
     h("form", { class: "filters", "aria-label": "Options", onsubmit: (event) => event.preventDefault() }, h("label", { for: "try-map" }, "Map", map), h("label", { class: "check", for: "try-refine" }, refine, "Refine the answer in a job")),
     drop, out);
@@ -89,7 +89,8 @@ export async function show({ root, query, signal, setQuery, title }) {
     }
     fill(told, h("h2", {}, job ? "Refined estimate" : "Estimate"),
       estimate ? h("p", { class: "big" }, percent(estimate.confidence), h("span", { class: "muted" }, " confidence")) : h("p", {}, "None: the map has no images."),
-      estimate && h("p", {}, estimate.known ? "The place is known." : "May not be in the map: the confidence is below the configured threshold."),
+      estimate && h("p", {}, estimate.known ? "The place is known." : estimate.reason ?? "May not be in the map: the confidence is below the configured threshold."),
+      (answer.warnings ?? []).map((warning) => h("div", { class: "notice warn" }, h("strong", {}, "Damaged picture"), h("p", {}, warning))),
       facts(["Pose", estimate && pose(estimate.pose)], ["Answered in", `${duration(timing.total)} (decode ${duration(timing.decode)}, extract ${duration(timing.extract)}, search ${duration(timing.search)})`],
         ["Round trip", duration(round)], ["Model", answer.model]));
   }

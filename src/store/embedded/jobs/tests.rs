@@ -9,8 +9,14 @@ use whereabouts_core::{Digest, MapName, MediaType, RefinerKind};
 async fn submitted(store: &EmbeddedStore, map: &str) -> Uuid {
     let (now, id) = (Timestamp::now(), Uuid::now_v7());
     let digest = Digest::of(id.as_bytes());
-    let query =
-        Query { id, digest, media_type: MediaType::Jpeg, created_at: now, descriptor: None };
+    let query = Query {
+        id,
+        digest,
+        media_type: MediaType::Jpeg,
+        created_at: now,
+        descriptor: None,
+        uninformative: None,
+    };
     let map: MapName = map.parse().unwrap();
     let job = Job::queued(map, id, RefinerKind::Local, now);
     let id = job.id;
