@@ -13,6 +13,7 @@ mod image;
 mod job;
 mod key;
 mod map;
+mod model_server;
 mod pose;
 mod secret;
 mod service_time;
@@ -23,7 +24,9 @@ pub use self::image::{ExportedImage, Image, ImageId, MediaType};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
 pub use confidence::{Calibration, CalibrationSettings, Estimate, Evidence};
 pub use dense::DenseFeatures;
-pub use description::{CacheLevels, CachedDescription, DescribedFrame, PairRegion, SimilarFrame};
+pub use description::{
+    CacheLevels, CachedDescription, DescribedFrame, DescriptionSubject, PairRegion, SimilarFrame,
+};
 pub use descriptor::{Descriptor, DescriptorError, dot};
 pub use digest::Digest;
 pub use job::{
@@ -31,6 +34,7 @@ pub use job::{
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use map::{CoordinateFrame, DescriptorKind, Map, MapName, Precision, Scene};
+pub use model_server::{ModelCapabilities, ModelServer, ModelTrouble};
 pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, PoseInput};
 pub use secret::Secret;
 pub use service_time::ServiceTime;
