@@ -35,6 +35,7 @@ test: assets nasm chromium ## Set up, build and run every test
 	tests/grpc/check.sh $(BINARY) target/grpc-venv
 	tests/console/check.sh $(BINARY) target/console-venv
 	tests/deploy/check.sh $(BINARY) target/deploy-venv
+	tests/mllm/check.sh $(BINARY) target/mllm-venv
 	examples/check.sh $(BINARY) target/examples-venv
 
 scale-out: assets nasm ## Run only the black-box tests of servers and workers on a shared database

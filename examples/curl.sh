@@ -168,6 +168,13 @@ call 204 -X DELETE "$url/webhooks/$webhook"
 # Operations.
 call 200 "$url/status"
 call 200 "$url/usage?map=curl-example&days=7"
+
+# Descriptions that were paid for: none, unless the refiner is mllm.
+description=$(printf '0%.0s' $(seq 64))
+call 200 "$url/descriptions?map=curl-example"
+call 404 "$url/descriptions/$description"
+call 404 -X DELETE "$url/descriptions/$description"
+call 200 -X DELETE "$url/descriptions?map=curl-example"
 call 200 "$url/metrics"
 call 200 "$url/openapi.json"
 call 200 "$url/docs"

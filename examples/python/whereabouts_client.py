@@ -348,6 +348,8 @@ class Job:
     error: str | None = None
     trace_id: str | None = None
     """Trace id of its request and refinement, if the server exports traces."""
+    fresh_since: datetime | None = None
+    """Descriptions from before this time are bought anew."""
 
     @property
     def ended(self) -> bool:

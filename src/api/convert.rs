@@ -202,6 +202,7 @@ impl From<Job> for proto::Job {
             usage: Some(job.usage.into()),
             error: job.error.unwrap_or_default(),
             trace_id: job.trace_id.unwrap_or_default(),
+            fresh_since: job.fresh_since.map(moment_to),
         }
     }
 }

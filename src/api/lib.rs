@@ -5,6 +5,7 @@ mod batch;
 mod client;
 #[cfg(feature = "grpc")]
 mod convert;
+mod descriptions;
 mod error;
 mod images;
 mod jobs;
@@ -19,6 +20,7 @@ pub use self::batch::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 pub use self::client::{Client, MAX_ATTEMPTS, MAX_PAUSE, explained, segment};
 #[cfg(feature = "grpc")]
 pub use self::convert::{job_state_to, moment_to};
+pub use self::descriptions::{DescriptionPage, KeyedDescription, PurgedDescriptions};
 pub use self::error::ErrorKind;
 pub use self::images::{ExportPage, ImageAnswer, ImageMeta, ImagePage, ImagePatch, ImportedImage};
 pub use self::jobs::{JobChange, JobPage, JobStatus, Missed, PairDescribed, PairRegions};

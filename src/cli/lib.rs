@@ -4,6 +4,7 @@ mod backup;
 mod client;
 mod config;
 mod demo;
+mod descriptions;
 mod doctor;
 mod eval;
 mod healthcheck;
@@ -14,6 +15,7 @@ mod jobs;
 mod keys;
 mod localize;
 mod migrate;
+mod mllm;
 mod model;
 mod openapi;
 mod progress;
@@ -49,6 +51,8 @@ enum Command {
     Jobs(jobs::Args),
     Keys(keys::Args),
     Model(model::Args),
+    Mllm(mllm::Args),
+    Descriptions(descriptions::Args),
     Demo(demo::Args),
     Eval(Box<eval::Args>),
     Backup(backup::Args),
@@ -74,6 +78,8 @@ impl Cli {
             Command::Jobs(args) => block_on(jobs::run(args)),
             Command::Keys(args) => block_on(keys::run(args)),
             Command::Model(args) => block_on(model::run(args)),
+            Command::Mllm(args) => block_on(mllm::run(args)),
+            Command::Descriptions(args) => block_on(descriptions::run(args)),
             Command::Demo(args) => block_on(demo::run(args)),
             Command::Eval(args) => block_on(eval::run(*args)),
             Command::Backup(args) => block_on(backup::run(args)),

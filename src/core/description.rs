@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-use crate::{Descriptor, Digest, StandIn, Usage};
+use crate::{Descriptor, Digest, ImageId, MapName, StandIn, Usage};
 
 /// A frame for which at least one pair has been described.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -37,7 +37,7 @@ pub struct CacheLevels {
 }
 
 /// A description as the model wrote it, with its cost.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct CachedDescription {
     /// Similarities and differences of the pair.
     pub text: String,
@@ -45,6 +45,25 @@ pub struct CachedDescription {
     pub usage: Usage,
     /// When the description was written.
     pub created_at: Timestamp,
+    /// What the text is about; null for a description from an earlier version.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub about: Option<DescriptionSubject>,
+}
+
+/// The pair that a cached description is about, and who wrote it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct DescriptionSubject {
+    /// Name of the map.
+    pub map: MapName,
+    /// Id of the candidate's image.
+    pub image_id: ImageId,
+    /// The query that posted the frame.
+    pub query_id: Uuid,
+    /// Base URL of the model's server, without credentials.
+    pub server: String,
+    /// Name of the model.
+    pub model: String,
 }
 
 /// A pair of matching regions in a frame and a reference image. Positions are fractions of the picture's

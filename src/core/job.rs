@@ -130,11 +130,11 @@ impl Add for Usage {
 
     fn add(self, other: Self) -> Self {
         Self {
-            calls: self.calls + other.calls,
-            cached: self.cached + other.cached,
-            prompt_tokens: self.prompt_tokens + other.prompt_tokens,
-            completion_tokens: self.completion_tokens + other.completion_tokens,
-            estimated: self.estimated + other.estimated,
+            calls: self.calls.saturating_add(other.calls),
+            cached: self.cached.saturating_add(other.cached),
+            prompt_tokens: self.prompt_tokens.saturating_add(other.prompt_tokens),
+            completion_tokens: self.completion_tokens.saturating_add(other.completion_tokens),
+            estimated: self.estimated.saturating_add(other.estimated),
         }
     }
 }
@@ -202,6 +202,10 @@ pub struct Job {
     #[serde(default)]
     #[schema(nullable)]
     pub estimate: Option<Estimate>,
+    /// Descriptions from before this time are bought anew; null if cached ones of any age are used.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub fresh_since: Option<Timestamp>,
     /// Usage of all attempts since the job was queued or last retried.
     pub usage: Usage,
     /// Why the job failed or was degraded, or why it was queued again.
@@ -236,6 +240,7 @@ impl Job {
             reasoning: None,
             reasoning_took_ms: None,
             estimate: None,
+            fresh_since: None,
             usage: Usage::default(),
             error: None,
             trace_id: None,

@@ -13,6 +13,7 @@ mod image;
 mod job;
 mod key;
 mod map;
+mod model_server;
 pub mod moment;
 mod pose;
 mod secret;
@@ -26,7 +27,9 @@ pub use self::image::{ExportedImage, Image, ImageField, ImageId, MediaType};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
 pub use confidence::{Calibration, CalibrationSettings, Estimate, Evidence};
 pub use dense::DenseFeatures;
-pub use description::{CacheLevels, CachedDescription, DescribedFrame, PairRegion, SimilarFrame};
+pub use description::{
+    CacheLevels, CachedDescription, DescribedFrame, DescriptionSubject, PairRegion, SimilarFrame,
+};
 pub use descriptor::{Descriptor, DescriptorError, dot};
 pub use digest::Digest;
 pub use job::{
@@ -34,6 +37,7 @@ pub use job::{
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use map::{CoordinateFrame, DescriptorKind, Map, MapName, Precision, Scene};
+pub use model_server::{ModelCapabilities, ModelServer, ModelTrouble};
 pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, PoseInput, PosePatch};
 pub use secret::Secret;
 pub use service_time::ServiceTime;

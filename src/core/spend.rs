@@ -13,7 +13,7 @@ pub struct Spent {
 
 impl From<&DayUsage> for Spent {
     fn from(day: &DayUsage) -> Self {
-        let tokens = day.usage.prompt_tokens + day.usage.completion_tokens;
+        let tokens = day.usage.prompt_tokens.saturating_add(day.usage.completion_tokens);
         Self { tokens, money: day.money }
     }
 }
@@ -21,7 +21,7 @@ impl From<&DayUsage> for Spent {
 impl Spent {
     /// The sum of the two amounts.
     pub fn plus(self, other: Self) -> Self {
-        Self { tokens: self.tokens + other.tokens, money: self.money + other.money }
+        Self { tokens: self.tokens.saturating_add(other.tokens), money: self.money + other.money }
     }
 
     /// The difference of the two amounts, saturating at zero.

@@ -222,6 +222,7 @@ impl Evaluator<'_> {
             },
             candidates,
             spent: Usage::default(),
+            fresh_since: None,
         }
     }
 
@@ -294,13 +295,23 @@ fn coarse_outcome(
     }
 }
 
-/// Puts the refined candidates first, followed by those that were not refined, in coarse order.
+/// Puts the refined candidates first, followed by those that were not refined, in coarse order. An order that
+/// another refiner found counts as none: it is not the work of the method.
 fn refined_outcome(
     coarse: &QueryOutcome,
     refinement: Refinement,
     confidence: f32,
     elapsed: Duration,
 ) -> QueryOutcome {
+    if refinement.ordered_by.is_some() {
+        return QueryOutcome {
+            times: StageTimes { refine: ms(elapsed), ..coarse.times },
+            descriptions: refinement.descriptions,
+            usage: refinement.usage,
+            degraded: refinement.degraded,
+            ..coarse.clone()
+        };
+    }
     let ranking = refinement.ranking.as_slice();
     let at_rank = |rank: usize| coarse.predictions.iter().find(|one| one.coarse_rank == rank);
     let refined = ranking.iter().filter_map(|ranked| at_rank(ranked.coarse_rank));

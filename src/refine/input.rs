@@ -1,5 +1,6 @@
 //! What a refiner works on.
 
+use jiff::Timestamp;
 use uuid::Uuid;
 use whereabouts_core::{Candidate, Descriptor, Digest, Map, Usage};
 use whereabouts_store::{JobRecord, MapStore};
@@ -19,6 +20,8 @@ pub struct RefineInput {
     pub candidates: Vec<Candidate>,
     /// The cost of earlier attempts at the same job. It counts against the job's budget.
     pub spent: Usage,
+    /// Descriptions from before this time are bought anew.
+    pub fresh_since: Option<Timestamp>,
 }
 
 /// The camera frame of a query.
@@ -52,6 +55,7 @@ impl RefineInput {
             },
             candidates: record.candidates.clone(),
             spent: record.job.usage,
+            fresh_since: record.job.fresh_since,
         })
     }
 }
@@ -60,7 +64,6 @@ impl RefineInput {
 mod tests {
     use super::*;
     use crate::mllm::tests::shelf::Shelf;
-    use jiff::Timestamp;
     use whereabouts_core::{Job, MediaType, RefinerKind};
     use whereabouts_store::Query;
 

@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use whereabouts_core::{
-    CacheLevels, Description, Evidence, ImageId, Map, PairRegion, Ranking, RefinerKind, Spent,
-    Usage,
+    CacheLevels, Description, Evidence, ImageId, Map, ModelServer, PairRegion, Ranking,
+    RefinerKind, Spent, Usage,
 };
 use whereabouts_store::{HardNegatives, Step, StoreError};
 
@@ -69,6 +69,8 @@ pub trait NegativeEvidence: Send + Sync {
 pub trait PaidCalls: Send + Sync {
     /// Returns the current levels.
     fn levels(&self) -> PaidCallLevels;
+    /// Returns what is known about the servers of the models.
+    fn servers(&self) -> Vec<ModelServer>;
 }
 
 /// The state of a refiner's calls to a paid model.
@@ -98,6 +100,8 @@ pub struct Refinement {
     pub descriptions: Vec<Description>,
     /// The candidates in refined order.
     pub ranking: Ranking,
+    /// The refiner whose order it is, if that is not the one that was asked.
+    pub ordered_by: Option<RefinerKind>,
     /// The evidence for the first of the ranking, if the refiner measures it.
     pub evidence: Option<Evidence>,
     /// Why the candidates are in this order.

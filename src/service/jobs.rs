@@ -77,9 +77,10 @@ impl Jobs {
         Ok(self.store.cancel(id).await?)
     }
 
-    /// Queues a job again that ended without success.
-    pub async fn retry(&self, id: Uuid) -> Result<Job, ServiceError> {
-        Ok(self.store.retry(id).await?)
+    /// Queues a job again that ended without success. With `fresh`, any job that has ended, and its descriptions
+    /// are bought anew.
+    pub async fn retry(&self, id: Uuid, fresh: bool) -> Result<Job, ServiceError> {
+        Ok(self.store.retry(id, fresh.then(Timestamp::now)).await?)
     }
 
     /// Returns the number of jobs that are queued or running.

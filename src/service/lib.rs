@@ -6,6 +6,7 @@ mod bulk;
 mod calibration;
 mod cancellation;
 mod corrections;
+mod descriptions;
 mod error;
 mod events;
 mod idempotency;
@@ -40,6 +41,7 @@ use uuid::Uuid;
 pub use self::bulk::{BulkImage, BulkItem, BulkResult, BulkSettings};
 pub use self::calibration::{Calibrator, ConfidenceSettings};
 pub use self::cancellation::Deadline;
+pub use self::descriptions::Descriptions;
 pub use self::error::ServiceError;
 pub use self::events::{AnyJobEvent, JobEvent};
 pub use self::idempotency::{Idempotency, IdempotencyOutcome, IdempotencySettings};
@@ -87,6 +89,8 @@ pub struct Service {
     pub transfer: Transfer,
     /// Usage reports.
     pub usage: UsageReports,
+    /// The cache of descriptions.
+    pub descriptions: Descriptions,
     /// Idempotency keys.
     pub idempotency: Idempotency,
     /// API keys.
@@ -214,6 +218,7 @@ impl Service {
             },
             transfer: Transfer { maps: maps.clone(), exports: store.clone(), blobs: store.clone() },
             usage: UsageReports { store: store.clone(), refiner, keep_days: settings.usage_days },
+            descriptions: Descriptions { cache: store.clone() },
             idempotency: Idempotency {
                 store: store.clone(),
                 process,

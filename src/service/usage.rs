@@ -6,8 +6,8 @@ use jiff::{SignedDuration, Timestamp};
 
 use super::ServiceError;
 use whereabouts_api::{Today, Total, UsageReport};
-use whereabouts_core::{MapName, utc_day};
-use whereabouts_refine::Refiner;
+use whereabouts_core::{MapName, ModelServer, utc_day};
+use whereabouts_refine::{PaidCalls, Refiner};
 use whereabouts_store::UsageStore;
 
 /// Reports what calls to paid models cost.
@@ -43,6 +43,12 @@ impl UsageReports {
             money: sum.money + spent.money,
         });
         Ok(UsageReport { today: self.today(), days: spent, total })
+    }
+
+    /// Returns what is known about the servers of the refiner's models, if it calls any.
+    pub fn model_servers(&self) -> Vec<ModelServer> {
+        let calls = self.refiner.as_ref().and_then(|refiner| refiner.paid_calls());
+        calls.map(PaidCalls::servers).unwrap_or_default()
     }
 
     /// Returns today's spend and budget, if the refiner calls a paid model.

@@ -38,18 +38,22 @@ impl JobRecord {
         true
     }
 
-    /// Queues a failed, cancelled or degraded job again.
-    pub(super) fn retry(&mut self) -> Result<(), StoreError> {
+    /// Queues a failed, cancelled or degraded job again. With `fresh_since`, which has descriptions from before
+    /// bought anew, any job that has ended.
+    pub(super) fn retry(&mut self, fresh_since: Option<Timestamp>) -> Result<(), StoreError> {
         let job = &mut self.job;
         match job.state {
             JobState::Failed | JobState::Cancelled | JobState::Degraded => {}
+            JobState::Succeeded if fresh_since.is_some() => {}
             state => {
                 return Err(StoreError::Conflict(format!(
-                    "the job is {state}; only a failed, degraded or cancelled one is retried"
+                    "the job is {state}; only a failed, degraded or cancelled one is retried, and with \
+                     fresh=true also one that has succeeded"
                 )));
             }
         }
         job.state = JobState::Queued;
+        job.fresh_since = fresh_since;
         (job.attempts, job.usage, job.finished_at, job.error) = (0, Usage::default(), None, None);
         Ok(())
     }

@@ -8,7 +8,8 @@ use uuid::Uuid;
 
 use super::StoreError;
 use whereabouts_core::{
-    CacheLevels, CachedDescription, DescribedFrame, Descriptor, Digest, SimilarFrame,
+    CacheLevels, CachedDescription, DescribedFrame, Descriptor, Digest, ImageId, MapName,
+    SimilarFrame,
 };
 
 /// Bounds of the description cache.
@@ -18,6 +19,39 @@ pub struct DescriptionBounds {
     pub max_bytes: u64,
     /// Older descriptions have expired and are no longer returned.
     pub max_age: Duration,
+}
+
+/// Which descriptions to list or to remove. Each field that is set must match.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct DescriptionFilter {
+    /// Of this map.
+    pub map: Option<MapName>,
+    /// About this image.
+    pub image: Option<ImageId>,
+    /// By this model.
+    pub model: Option<String>,
+    /// From the server at this base URL.
+    pub server: Option<String>,
+    /// With this in the text, ignoring case.
+    pub text: Option<String>,
+}
+
+impl DescriptionFilter {
+    /// Whether a description matches. One from an earlier version is about nothing.
+    pub fn matches(&self, description: &CachedDescription) -> bool {
+        fn is<T: PartialEq>(wanted: Option<&T>, found: Option<&T>) -> bool {
+            wanted.is_none_or(|wanted| found == Some(wanted))
+        }
+        let about = description.about.as_ref();
+        is(self.map.as_ref(), about.map(|about| &about.map))
+            && is(self.image.as_ref(), about.map(|about| &about.image_id))
+            && is(self.model.as_ref(), about.map(|about| &about.model))
+            && is(self.server.as_ref(), about.map(|about| &about.server))
+            && self
+                .text
+                .as_ref()
+                .is_none_or(|text| description.text.to_lowercase().contains(&text.to_lowercase()))
+    }
 }
 
 /// Descriptions by key. A key covers everything that shapes the text: both pictures, the prompt, the
@@ -32,6 +66,16 @@ pub trait DescriptionCache: Send + Sync {
         key: Digest,
         value: CachedDescription,
     ) -> Result<(), StoreError>;
+
+    /// Returns cached descriptions that match, in the order of their keys, after the key `after`.
+    async fn descriptions(
+        &self,
+        filter: &DescriptionFilter,
+        after: Option<&Digest>,
+        limit: usize,
+    ) -> Result<Vec<(Digest, CachedDescription)>, StoreError>;
+    /// Removes these descriptions, and returns how many were there.
+    async fn remove_descriptions(&self, keys: &[Digest]) -> Result<usize, StoreError>;
 
     /// Acquires the right to buy the description with this key, so that no two processes pay for the
     /// same one. The lease expires at `until`. Returns `false` while another process holds it.

@@ -142,7 +142,10 @@ pub trait JobStore: Send + Sync {
     /// Cancels a job that has not ended, and returns its new state.
     async fn cancel(&self, id: Uuid) -> Result<Job, StoreError>;
     /// Queues a failed, cancelled or degraded job again, with its attempts and cost reset to zero.
-    async fn retry(&self, id: Uuid) -> Result<Job, StoreError>;
+    ///
+    /// With `fresh_since`, any job that has ended is queued again, and descriptions from before that time are
+    /// bought anew.
+    async fn retry(&self, id: Uuid, fresh_since: Option<Timestamp>) -> Result<Job, StoreError>;
     /// Returns a receiver of the ids of jobs as they change. A slow receiver misses the oldest ones.
     fn changes(&self) -> broadcast::Receiver<Uuid>;
 }

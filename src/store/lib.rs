@@ -25,7 +25,7 @@ mod usage;
 mod webhooks;
 
 pub use self::blobs::{BlobPin, BlobStore};
-pub use self::descriptions::{DescriptionBounds, DescriptionCache};
+pub use self::descriptions::{DescriptionBounds, DescriptionCache, DescriptionFilter};
 pub use self::drafts::{Draft, DraftStore};
 pub use self::error::StoreError;
 pub use self::idempotency::{IdempotencyRecord, IdempotencyStore, Progress, StoredResponse};

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::mock_mllm::{DescribeCall, MockMllm, Reply, Script, ranking};
+use super::mock_mllm::{DescribeCall, MockMllm, Purpose, Reply, Script, ranking};
 use super::support::{Server, frame};
 use super::wait::{eventually_within, until};
 
@@ -369,4 +369,144 @@ async fn two_hundred_jobs_survive_kill_9_with_a_fifth_of_the_calls_failing() {
     );
     assert!(degraded < JOBS / 10);
     assert_eq!(mock.violations(), [""; 0]);
+}
+
+#[tokio::test]
+async fn a_dead_key_costs_a_call_or_two_and_the_status_says_why() {
+    let dir = TempDir::new().unwrap();
+    let refused = || {
+        let body =
+            json!({"error": {"message": "Incorrect API key provided", "code": "invalid_api_key"}});
+        Reply::Raw { status: 401, headers: vec![], body: body.to_string() }
+    };
+    let mock = MockMllm::start(Script {
+        intercept: Box::new(move |_| Some(refused())),
+        ..Script::default()
+    })
+    .await;
+    let server = start(&dir, &mock, &[]);
+    server.town("m", 10).await;
+    for place in 0..3 {
+        let job = refine(&server, place).await;
+        assert_eq!(job["state"], "degraded", "{job}");
+        let error = job["error"].as_str().unwrap();
+        assert!(error.contains("`local` instead of `mllm`"), "{error}");
+        assert!(error.contains("401") && error.contains("Incorrect API key"), "{error}");
+        assert_eq!(job["ranking"].as_array().unwrap().len(), 10);
+    }
+    let calls = mock.arrived(Purpose::Describe) + mock.arrived(Purpose::Check);
+    assert!(calls <= 4, "{calls} calls");
+    let status = server.get("/status").await.expect(200);
+    let [model] = status["model_servers"].as_array().unwrap().as_slice() else {
+        panic!("{status}")
+    };
+    assert_eq!((&model["suspended"], &model["trouble"]["kind"]), (&json!(true), &json!("key")));
+    assert_eq!(model["trouble"]["status"], 401);
+    assert!(model["trouble"]["message"].as_str().unwrap().contains("Incorrect API key"));
+    assert!(server.log().contains("Incorrect API key"));
+}
+
+#[tokio::test]
+async fn what_a_server_can_do_is_found_out_at_start_and_shown() {
+    let dir = TempDir::new().unwrap();
+    let mock = MockMllm::start(Script {
+        structured: false,
+        facts: Box::new(|path| {
+            (path == "/props")
+                .then(|| json!({"default_generation_settings": {"n_ctx": 4096}, "total_slots": 1}))
+        }),
+        ..Script::default()
+    })
+    .await;
+    let server = start(&dir, &mock, &[]);
+    server.town("m", 6).await;
+    let job = refine(&server, 0).await;
+    assert_eq!((&job["state"], &job["error"]), (&json!("succeeded"), &json!(null)));
+    assert_eq!((mock.max_in_flight(), mock.structure_refused()), (1, 0));
+    assert_eq!(mock.violations(), [""; 0]);
+    let status = server.get("/status").await.expect(200);
+    let can = &status["model_servers"][0]["capabilities"];
+    assert_eq!((&can["context_tokens"], &can["calls_at_once"]), (&json!(4096), &json!(1)), "{can}");
+    assert_eq!(
+        (&can["answer_format"], &can["two_pictures"]),
+        (&json!("text"), &json!(true)),
+        "{can}"
+    );
+    assert_eq!(status["model_servers"][0]["trouble"], json!(null));
+}
+
+#[tokio::test]
+async fn descriptions_are_listed_shown_and_removed_and_a_fresh_retry_buys_them_anew() {
+    let dir = TempDir::new().unwrap();
+    let mock = MockMllm::start(Script::default()).await;
+    let server = start(&dir, &mock, &[]);
+    server.town("m", 4).await;
+    let job = refine(&server, 0).await;
+    assert_eq!(mock.describe_calls(), 4);
+
+    let page = server.get("/descriptions?map=m&limit=3").await.expect(200);
+    assert_eq!(page["descriptions"].as_array().unwrap().len(), 3);
+    let next = page["next_cursor"].as_str().unwrap();
+    let rest = server.get(&format!("/descriptions?limit=3&cursor={next}")).await.expect(200);
+    let [last] = rest["descriptions"].as_array().unwrap().as_slice() else { panic!("{rest}") };
+    assert_eq!((&last["about"]["map"], &rest["next_cursor"]), (&json!("m"), &json!(null)));
+    assert_eq!(last["about"]["server"], mock.url());
+    let path = format!("/descriptions/{}", last["key"].as_str().unwrap());
+    assert_eq!(server.get(&path).await.expect(200)["text"], last["text"]);
+    assert_eq!(server.delete(&path).await.expect(200), json!({"removed": 1}));
+    server.get(&path).await.problem(404);
+    server.get("/descriptions/none").await.problem(400);
+    assert_eq!(
+        server.get("/descriptions?model=other").await.expect(200)["descriptions"],
+        json!([])
+    );
+
+    // The removed one is bought again.
+    refine(&server, 0).await;
+    assert_eq!(mock.describe_calls(), 5);
+    let retry = format!("/jobs/{}/retry", job["id"].as_str().unwrap());
+    server.post(&retry, "text/plain", vec![]).await.problem(409);
+    let fresh = server.post(&format!("{retry}?fresh=true"), "text/plain", vec![]).await.expect(200);
+    assert_eq!(fresh["state"], "queued");
+    let href = format!("/jobs/{}?wait=30", job["id"].as_str().unwrap());
+    let again = server.get(&href).await.expect(200);
+    assert_eq!((&again["state"], mock.describe_calls()), (&json!("succeeded"), 9), "{again}");
+
+    server.delete("/descriptions").await.problem(400);
+    assert_eq!(server.delete("/descriptions?map=m").await.expect(200), json!({"removed": 4}));
+    let none = server.get("/descriptions").await.expect(200);
+    assert_eq!(none["descriptions"], json!([]));
+}
+
+#[tokio::test]
+async fn mllm_check_says_what_a_server_can_do_and_what_to_do_if_it_cannot_be_used() {
+    let check = async |url: String| {
+        let run = move || {
+            let mut command = std::process::Command::new(&*super::support::BINARY);
+            command.args(["mllm", "check"]).env("WHEREABOUTS_MLLM__BASE_URL", url).output()
+        };
+        let output = tokio::task::spawn_blocking(run).await.unwrap().unwrap();
+        let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+        (output.status.code(), text(output.stdout), text(output.stderr))
+    };
+    let mock = MockMllm::start(Script::default()).await;
+    let (code, out, err) = check(mock.url()).await;
+    assert_eq!(code, Some(0), "{out}{err}");
+    assert!(out.contains("two pictures: accepted") && out.contains("bounded_schema"), "{out}");
+    assert_eq!((mock.describe_calls(), mock.reason_calls()), (0, 0));
+
+    let one_picture = |call: &super::mock_mllm::RawCall<'_>| {
+        let pictures = call.body.to_string().matches("image_url\":{").count();
+        let body = json!({"message": "At most 1 image(s) may be provided in one request."});
+        (pictures > 1).then(|| Reply::Raw { status: 400, headers: vec![], body: body.to_string() })
+    };
+    let mock =
+        MockMllm::start(Script { intercept: Box::new(one_picture), ..Script::default() }).await;
+    let (code, out, err) = check(mock.url()).await;
+    assert_eq!(code, Some(1), "{out}{err}");
+    assert!(err.contains("limit-mm-per-prompt") && err.contains("At most 1 image"), "{err}");
+
+    let (code, _, err) = check("localhost:8000/v1".into()).await;
+    assert_eq!(code, Some(1), "{err}");
+    assert!(err.contains("mllm.base_url") && err.contains("http://host:port/v1"), "{err}");
 }

@@ -11,12 +11,13 @@ import os
 import sys
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+NOTES = "OBJECTS. A wall.\nMATCHES. The same wall (sure).\nCOMPARISON. Brick in both."
 ANSWER = {
     "id": "1",
     "object": "chat.completion",
     "model": "scripted",
     "choices": [
-        {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": "The same wall."}}
+        {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": NOTES}}
     ],
     "usage": {"prompt_tokens": 100, "completion_tokens": 10, "total_tokens": 110},
 }

@@ -3,7 +3,9 @@
 import re
 import unittest
 
-from compose import ComposeFile, image_environment, instructions
+import yaml
+from compose import ComposeFile, image_environment, instructions, with_variables
+from compose_spec import PyCompose
 from files import (
     DEFAULTS,
     DEPLOY,
@@ -71,6 +73,35 @@ class Compose(ComposeFile, unittest.TestCase):
         [job] = config["scrape_configs"]
         target = f"whereabouts:{self.server['ports'][0]['target']}"
         self.assertEqual([one["targets"] for one in job["static_configs"]], [[target]])
+
+
+class LocalMllm(unittest.TestCase):
+    FILE = "deploy/compose.local-mllm.yaml"
+
+    def setUp(self):
+        self.file = yaml.safe_load(with_variables(read(self.FILE)))
+        self.services = self.file["services"]
+
+    def test_it_conforms_to_the_compose_specification_and_its_settings_exist(self):
+        PyCompose.from_yaml(yaml.safe_dump(self.file)).validate()
+        check_settings(self, self.FILE)
+        settings_in_force(image_environment() | self.services["whereabouts"]["environment"])
+        report(f"{self.FILE}: valid, and `whereabouts config` accepts its settings")
+
+    def test_the_models_server_has_no_way_out_and_is_found(self):
+        llama, server = self.services["llama"], self.services["whereabouts"]
+        self.assertTrue(all(self.file["networks"][name]["internal"] for name in llama["networks"]))
+        self.assertNotIn("ports", llama)
+        port = llama["command"][llama["command"].index("--port") + 1]
+        self.assertEqual(server["environment"]["WHEREABOUTS_MLLM__BASE_URL"], f"http://llama:{port}/v1")
+        self.assertEqual(server["depends_on"]["llama"]["condition"], "service_healthy")
+
+    def test_both_are_hardened(self):
+        for name, service in self.services.items():
+            with self.subTest(name):
+                self.assertTrue(service["read_only"])
+                self.assertEqual(service["cap_drop"], ["ALL"])
+                self.assertIn("no-new-privileges:true", service["security_opt"])
 
 
 if __name__ == "__main__":

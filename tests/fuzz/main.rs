@@ -112,6 +112,11 @@ fn forms() {
 }
 
 #[test]
+fn responses_of_language_model_servers() {
+    fuzz("completions", seeds::completions(), targets::completion);
+}
+
+#[test]
 fn answers_of_language_models() {
     fuzz("answers", seeds::answers(), targets::answer);
 }

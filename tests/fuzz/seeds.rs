@@ -183,6 +183,14 @@ pub fn truths() -> Vec<Vec<u8>> {
     ])
 }
 
+pub fn completions() -> Vec<Vec<u8>> {
+    texts(&[
+        r#"{"choices": [{"message": {"content": "<think>a</think>b"}, "finish_reason": "stop"}], "usage": {"prompt_tokens": 7}}"#,
+        r#"{"error": {"message": "no", "code": 429}}"#,
+        "data: {\"choices\": [{\"delta\": {\"content\": \"a\"}}]}\n\ndata: [DONE]\n",
+    ])
+}
+
 pub fn answers() -> Vec<Vec<u8>> {
     texts(&[
         r#"{"reasoning": "the sign", "ranking": ["C", "A", "B"]}"#,

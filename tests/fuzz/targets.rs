@@ -12,7 +12,7 @@ use whereabouts_archive::{Item, Reader};
 use whereabouts_core::{CoordinateFrame, Pose, PoseInput};
 use whereabouts_eval::{Folder, FolderPoses, PictureFile, TruthSource};
 use whereabouts_index::SealedGraph;
-use whereabouts_refine::mllm::Labels;
+use whereabouts_refine::mllm::{Labels, is_readable};
 use whereabouts_server::http::is_picture_form;
 use whereabouts_vision::ImageLimits;
 use whereabouts_vision::decode::{Needed, decode};
@@ -112,11 +112,15 @@ pub fn answer(bytes: &[u8]) -> bool {
     const CANDIDATES: usize = 10;
     let text = String::from_utf8_lossy(bytes);
     let labels = Labels::new((0..CANDIDATES).collect(), None);
-    let Ok(verdict) = labels.parse(&text) else { return false };
+    let Ok(verdict) = labels.parse(&text, false) else { return false };
     let once: HashSet<usize> = verdict.order.iter().copied().collect();
     assert!(once.len() == CANDIDATES && verdict.order.len() == CANDIDATES);
     assert!(once.iter().all(|&index| index < CANDIDATES));
     true
+}
+
+pub fn completion(bytes: &[u8]) -> bool {
+    is_readable(bytes)
 }
 
 pub fn form(bytes: &[u8]) -> bool {

@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 use uuid::Uuid;
-use whereabouts_core::{CachedDescription, DescribedFrame};
+use whereabouts_core::{CachedDescription, DescribedFrame, DescriptionSubject};
 use whereabouts_core::{Descriptor, Digest, Usage};
-use whereabouts_store::{DescriptionBounds, Store};
+use whereabouts_store::{DescriptionBounds, DescriptionFilter, Store};
 
 use crate::support::{Fixture, Random, Tuning, add, eventually, fill, map, next, odd_texts};
 
@@ -14,6 +14,7 @@ contract!(
     a_description_is_cached_verbatim,
     an_expired_description_is_not_used,
     the_oldest_descriptions_are_evicted,
+    descriptions_are_listed_by_what_they_are_about_and_removed,
     a_purchase_is_begun_and_ended,
     earlier_frames_are_found_by_their_similarity,
     the_oldest_frames_are_evicted,
@@ -22,7 +23,7 @@ contract!(
 
 fn description(text: &str) -> CachedDescription {
     let usage = Usage { calls: 1, prompt_tokens: 1 << 40, ..Usage::default() };
-    CachedDescription { text: text.into(), usage, created_at: Timestamp::now() }
+    CachedDescription { text: text.into(), usage, created_at: Timestamp::now(), about: None }
 }
 
 fn key(number: usize) -> Digest {
@@ -65,6 +66,49 @@ async fn an_expired_description_is_not_used(fixture: &Fixture) {
     tidy(&*store).await;
     // It may be computed again.
     store.keep_description(key(0), description("text")).await.unwrap();
+}
+
+async fn descriptions_are_listed_by_what_they_are_about_and_removed(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let about = |map: &str, image: usize| DescriptionSubject {
+        map: map.parse().unwrap(),
+        image_id: format!("image-{image}").parse().unwrap(),
+        query_id: Uuid::from_u128(7),
+        server: "http://host/v1".into(),
+        model: "m".into(),
+    };
+    for number in 0..6 {
+        let map = if number < 4 { "a" } else { "b" };
+        let about = Some(about(map, number)).filter(|_| number > 0);
+        let text = format!("Text {number}");
+        let description = CachedDescription { about, ..description(&text) };
+        store.keep_description(key(number), description).await.unwrap();
+    }
+    let found = async |filter: &DescriptionFilter, after: Option<&Digest>, limit| {
+        store.descriptions(filter, after, limit).await.unwrap()
+    };
+    let all = found(&DescriptionFilter::default(), None, 100).await;
+    assert_eq!(all.len(), 6);
+    assert!(all.is_sorted_by_key(|(key, _)| key.hex()));
+    let page = found(&DescriptionFilter::default(), Some(&all[1].0), 2).await;
+    assert_eq!(page, all[2..4]);
+    // The first is from an earlier version, and is about nothing.
+    let of_map =
+        DescriptionFilter { map: Some("a".parse().unwrap()), ..DescriptionFilter::default() };
+    assert_eq!(found(&of_map, None, 100).await.len(), 3);
+    let image = Some("image-5".parse().unwrap());
+    let of_image = DescriptionFilter { image, ..DescriptionFilter::default() };
+    assert_eq!(found(&of_image, None, 100).await[0].0, key(5));
+    let of_text = DescriptionFilter { text: Some("TEXT 0".into()), ..DescriptionFilter::default() };
+    assert_eq!(found(&of_text, None, 100).await[0].0, key(0));
+    let by_model = DescriptionFilter { model: Some("n".into()), ..DescriptionFilter::default() };
+    assert_eq!(found(&by_model, None, 100).await, []);
+
+    assert_eq!(store.remove_descriptions(&[key(0), key(5), key(9)]).await.unwrap(), 2);
+    assert_eq!(store.description(&key(5)).await.unwrap(), None);
+    assert_eq!(found(&DescriptionFilter::default(), None, 100).await.len(), 4);
+    tidy(&*store).await;
+    assert_eq!(store.levels().entries, 4);
 }
 
 async fn the_oldest_descriptions_are_evicted(fixture: &Fixture) {

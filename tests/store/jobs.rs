@@ -259,16 +259,16 @@ async fn an_unsuccessful_job_may_be_queued_again(fixture: &Fixture) {
     let store = fixture.open().await;
     for state in [JobState::Failed, JobState::Degraded, JobState::Cancelled] {
         let id = submit(&*store, "m", b"frame").await;
-        let refused = store.retry(id).await.unwrap_err();
+        let refused = store.retry(id, None).await.unwrap_err();
         assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
         let taken = claim(&*store).await.unwrap();
         let usage = Usage { calls: 1, ..Usage::default() };
         store.progress(taken.claim(), Step { usage, description: None }).await.unwrap();
-        assert!(store.retry(id).await.is_err());
+        assert!(store.retry(id, None).await.is_err());
         let end = Job { error: Some("why".into()), ..ended(&taken, state) };
         store.finish(taken.claim(), end).await.unwrap();
         assert_eq!(store.queued().await.unwrap(), 0);
-        let again = store.retry(id).await.unwrap();
+        let again = store.retry(id, None).await.unwrap();
         assert_eq!((again.state, again.attempts), (JobState::Queued, 0));
         assert_eq!((again.usage, again.finished_at, again.error), (Usage::default(), None, None));
         assert_eq!(store.queued().await.unwrap(), 1);
@@ -277,7 +277,7 @@ async fn an_unsuccessful_job_may_be_queued_again(fixture: &Fixture) {
         assert_eq!((second.job.id, second.job.attempts, second.claims), (id, 1, 2));
         is_void(&*store, &taken, taken.claim()).await;
         store.finish(second.claim(), ended(&second, JobState::Succeeded)).await.unwrap();
-        let refused = store.retry(id).await.unwrap_err();
+        let refused = store.retry(id, None).await.unwrap_err();
         assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
     }
 }
@@ -306,7 +306,7 @@ async fn the_queue_limit_is_exact(fixture: &Fixture) {
     store.finish(running.claim(), ended(&running, JobState::Failed)).await.unwrap();
     store.submit(record("m", b"frame"), LIMIT).await.unwrap();
     // A job that is queued again is not rejected.
-    store.retry(running.job.id).await.unwrap();
+    store.retry(running.job.id, None).await.unwrap();
     assert_eq!(store.queued().await.unwrap(), LIMIT + 1);
     assert!(store.submit(record("m", b"frame"), LIMIT).await.is_err());
 }
@@ -335,7 +335,7 @@ async fn every_change_of_a_job_is_notified(fixture: &Fixture) {
     notified(&mut changes, id).await;
     store.finish(taken.claim(), ended(&taken, JobState::Failed)).await.unwrap();
     notified(&mut changes, id).await;
-    store.retry(id).await.unwrap();
+    store.retry(id, None).await.unwrap();
     notified(&mut changes, id).await;
     store.cancel(id).await.unwrap();
     notified(&mut changes, id).await;
@@ -347,7 +347,7 @@ async fn an_unknown_job_is_not_found(fixture: &Fixture) {
     let taken = claim(&*store).await.unwrap();
     let gone = Uuid::now_v7();
     assert!(store.job(gone).await.unwrap().is_none());
-    for refused in [store.cancel(gone).await, store.retry(gone).await] {
+    for refused in [store.cancel(gone).await, store.retry(gone, None).await] {
         let refused = refused.unwrap_err();
         assert!(matches!(refused, StoreError::NotFound(_)), "{refused}");
     }

@@ -307,6 +307,7 @@ async fn a_description_is_computed_by_one_process_until_its_lease_ends() {
         text: "text".into(),
         usage: Default::default(),
         created_at: Timestamp::now(),
+        about: None,
     };
     alive.keep_description(key("kept"), description.clone()).await.unwrap();
     assert_eq!(other.description(&key("kept")).await.unwrap(), Some(description));

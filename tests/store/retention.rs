@@ -60,7 +60,7 @@ async fn old_jobs_are_removed_with_frames_that_nothing_else_needs(fixture: &Fixt
     assert!(listed(store, Some(shared)).await.is_empty());
     assert_eq!(listed(store, Some(waiting)).await, [young]);
     assert!(store.job(old).await.unwrap().is_none());
-    assert!(store.retry(old).await.is_err());
+    assert!(store.retry(old, None).await.is_err());
     let again = store.remove_ended(keep(30, 100), 64).await.unwrap();
     assert_eq!(again, RemovedJobs::default());
 }
@@ -86,7 +86,7 @@ async fn a_retried_job_is_kept_until_it_ends_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let store = &*store;
     let id = job(store, "a", Some(40)).await;
-    store.retry(id).await.unwrap();
+    store.retry(id, None).await.unwrap();
     assert_eq!(store.remove_ended(keep(30, 0), 8).await.unwrap().jobs(), 0);
     store.cancel(id).await.unwrap();
     let removed = store.remove_ended(keep(30, 0), 8).await.unwrap();

@@ -137,7 +137,7 @@ async fn the_end_of_a_job_is_queued_for_the_webhooks_subscribed_at_that_time(fix
     assert_eq!(jobs(listed(&*store, failures).await), [bad]);
     assert!(listed(&*store, elsewhere).await.is_empty());
     // A job that ends again is delivered again.
-    store.retry(early).await.unwrap();
+    store.retry(early, None).await.unwrap();
     assert_eq!(end(&*store, JobState::Degraded).await, early);
     assert_eq!(jobs(listed(&*store, all).await), [early, bad, good]);
     let due = store.due_deliveries(all, Timestamp::now(), 9).await.unwrap();
@@ -149,7 +149,7 @@ async fn the_end_of_a_job_is_queued_for_the_webhooks_subscribed_at_that_time(fix
     let job = store.job(early).await.unwrap().unwrap().job;
     assert_eq!(message["data"], serde_json::to_value(job).unwrap());
     // A job is delivered once, however often it is cancelled.
-    store.retry(bad).await.unwrap();
+    store.retry(bad, None).await.unwrap();
     store.cancel(bad).await.unwrap();
     store.cancel(bad).await.unwrap();
     assert_eq!(listed(&*store, all).await.len(), 4);

@@ -10,7 +10,7 @@ use std::time::Duration;
 use axum::Router;
 use axum::body::{Body, Bytes};
 use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, Uri, header};
+use axum::http::{HeaderMap, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream;
 use serde_json::{Value, json};
@@ -18,7 +18,7 @@ use tokio::net::TcpListener;
 use tokio::sync::Barrier;
 use tokio::task::JoinHandle;
 
-use checks::{ParsedCall, check_envelope, check_request, notes_in};
+use checks::{ParsedCall, check_envelope, check_order, check_request, notes_in, purpose_of};
 
 /// The hashes of the two pictures of a describe call, as they were sent.
 pub type Pair = (String, String);
@@ -61,8 +61,12 @@ impl ReasonCall {
 /// What the mock does with a call.
 #[derive(Clone)]
 pub enum Reply {
-    /// Answers with this text.
+    /// Answers with this text; a describe call with [`notes`] of it.
     Text(String),
+    /// Answers with exactly this text.
+    Said(String),
+    /// Answers with this status, headers and body.
+    Raw { status: u16, headers: Vec<(String, String)>, body: String },
     /// Answers 429 with this `Retry-After`.
     Busy(String),
     /// Answers with this status and message.
@@ -84,11 +88,39 @@ pub fn ranking(labels: &[&str]) -> Reply {
     Reply::Text(json!({"reasoning": "because", "ranking": labels}).to_string())
 }
 
+/// A description in the parts that prompts ask for.
+pub fn notes(text: &str) -> String {
+    format!("OBJECTS. {text}\nMATCHES. As listed.\nCOMPARISON. As listed.")
+}
+
+/// What a call is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    Describe,
+    Reason,
+    /// It finds out what the server can do.
+    Check,
+}
+
+/// A call as it came, before it is checked.
+pub struct RawCall<'a> {
+    pub purpose: Purpose,
+    /// 1 for the first call of its purpose.
+    pub number: usize,
+    pub body: &'a Value,
+}
+
+type Facts = Box<dyn Fn(&str) -> Option<Value> + Send + Sync>;
+type Intercept = Box<dyn Fn(&RawCall<'_>) -> Option<Reply> + Send + Sync>;
 type Describe = Box<dyn Fn(&DescribeCall) -> Reply + Send + Sync>;
 type Reason = Box<dyn Fn(&ReasonCall) -> Reply + Send + Sync>;
 
 /// How the mock behaves.
 pub struct Script {
+    /// Answers a call instead of the rest of the script, which does not see it.
+    pub intercept: Intercept,
+    /// What `GET` of a path below the server's root returns.
+    pub facts: Facts,
     pub describe: Describe,
     pub reason: Reason,
     /// Whether `response_format` is accepted; otherwise it is answered 400.
@@ -109,6 +141,8 @@ impl Default for Script {
     /// Names the pair in each description, and ranks in the order of the prompt.
     fn default() -> Self {
         Self {
+            intercept: Box::new(|_| None),
+            facts: Box::new(|_| None),
             describe: Box::new(|call| {
                 Reply::Text(format!("notes on {} {}", call.pair.0, call.pair.1))
             }),
@@ -128,6 +162,9 @@ impl Default for Script {
 struct Seen {
     describe_calls: usize,
     reason_calls: usize,
+    checks: usize,
+    /// Describe, reason and check calls, whatever became of them.
+    arrived: [usize; 3],
     in_flight: usize,
     max_in_flight: usize,
     /// How often each pair was requested, and how often answered.
@@ -181,6 +218,16 @@ impl MockMllm {
 
     pub fn reason_calls(&self) -> usize {
         self.seen(|seen| seen.reason_calls)
+    }
+
+    /// Calls that found out what the server can do.
+    pub fn checks(&self) -> usize {
+        self.seen(|seen| seen.checks)
+    }
+
+    /// Calls of a purpose that arrived, whatever became of them.
+    pub fn arrived(&self, purpose: Purpose) -> usize {
+        self.seen(|seen| seen.arrived[purpose as usize])
     }
 
     pub fn in_flight(&self) -> usize {
@@ -246,15 +293,38 @@ impl Drop for InFlight<'_> {
 
 async fn answer(
     State(shared): State<Arc<Shared>>,
+    method: Method,
     uri: Uri,
     headers: HeaderMap,
     body: Bytes,
 ) -> Response {
-    let _in_flight = InFlight::new(&shared.seen);
     let script = &shared.script;
+    if method == Method::GET {
+        return match (script.facts)(uri.path()) {
+            Some(facts) => axum::Json(facts).into_response(),
+            None => StatusCode::NOT_FOUND.into_response(),
+        };
+    }
+    if let Ok(request) = serde_json::from_slice::<Value>(&body) {
+        let purpose = purpose_of(&request);
+        let number = {
+            let mut seen = shared.seen.lock().unwrap();
+            seen.arrived[purpose as usize] += 1;
+            seen.arrived[purpose as usize]
+        };
+        let call = RawCall { purpose, number, body: &request };
+        if let Some(reply) = (script.intercept)(&call) {
+            return render(reply, Some(100)).await;
+        }
+        if purpose == Purpose::Check {
+            return shared.checked(&request);
+        }
+    }
+    let _in_flight = InFlight::new(&shared.seen);
     let parsed = check_envelope(&uri, &headers, script)
         .and_then(|()| serde_json::from_slice(&body).map_err(|error| error.to_string()))
-        .and_then(|request: Value| check_request(&request, script.max_edge));
+        .and_then(|request: Value| check_request(&request, script.max_edge))
+        .and_then(|parsed| check_order(&body).map(|()| parsed));
     let parsed = match parsed {
         Ok(parsed) => parsed,
         Err(violation) => {
@@ -284,6 +354,18 @@ async fn answer(
 }
 
 impl Shared {
+    /// Answers a call that finds out what the server can do. It is no part of the script.
+    fn checked(&self, request: &Value) -> Response {
+        self.seen.lock().unwrap().checks += 1;
+        if !self.script.structured && request.get("response_format").is_some() {
+            return refusal(400, "Unsupported parameter: 'response_format'");
+        }
+        let ranks = request.to_string().contains("Rank both");
+        let answer = json!({"reasoning": "a check", "ranking": ["A", "B"]}).to_string();
+        let text = if ranks { answer.as_str() } else { "2" };
+        axum::Json(completion(text, Some(10))).into_response()
+    }
+
     fn reply(&self, parsed: ParsedCall) -> Reply {
         let mut seen = self.seen.lock().unwrap();
         let ParsedCall { pictures, prompt, repair, structured } = parsed;
@@ -301,8 +383,11 @@ impl Shared {
         *requested += 1;
         let again = usize::from(*answered > 0);
         seen.asked_again += again;
-        let reply = (self.script.describe)(&call);
-        if matches!(reply, Reply::Text(_)) {
+        let reply = match (self.script.describe)(&call) {
+            Reply::Text(text) if !text.trim().is_empty() => Reply::Said(notes(&text)),
+            reply => reply,
+        };
+        if matches!(reply, Reply::Text(_) | Reply::Said(_)) {
             seen.pairs.entry(pair).or_default().1 += 1;
         }
         reply
@@ -316,7 +401,16 @@ async fn render(reply: Reply, prompt_tokens: Option<usize>) -> Response {
         json(Body::from_stream(stream::iter([Ok(Bytes::from_static(start.as_bytes())), cut])))
     };
     match reply {
-        Reply::Text(text) => json(Body::from(completion(&text, prompt_tokens).to_string())),
+        Reply::Raw { status, headers, body } => {
+            let mut response = Response::builder().status(status);
+            for (name, value) in headers {
+                response = response.header(name, value);
+            }
+            response.body(Body::from(body)).unwrap()
+        }
+        Reply::Text(text) | Reply::Said(text) => {
+            json(Body::from(completion(&text, prompt_tokens).to_string()))
+        }
         Reply::Busy(wait) => {
             let refused = refusal(429, "Rate limit reached");
             ([(header::RETRY_AFTER, wait)], refused).into_response()

@@ -54,8 +54,8 @@ pub struct Args {
     #[arg(long, value_delimiter = ',', default_value = "gem")]
     pub descriptor: Vec<DescriptorKind>,
     /// Refiners to evaluate: local, mllm, both, or off
-    #[arg(long, value_delimiter = ',', default_value = "local")]
-    pub refine: Vec<RefinerChoice>,
+    #[arg(long, value_delimiter = ',', default_value = "local", value_parser = refiners)]
+    refine: Vec<Refiners>,
     /// Number of candidates to refine [default: as configured, which is 10 with mllm, otherwise 20]
     #[arg(short, value_parser = clap::value_parser!(u8).range(1..=100))]
     k: Option<u8>,
@@ -99,6 +99,18 @@ pub struct Args {
     pub json: bool,
 }
 
+/// The refiners of one value of --refine.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Refiners(Vec<RefinerChoice>);
+
+fn refiners(text: &str) -> Result<Refiners, String> {
+    if text == "both" {
+        return Ok(Refiners(REFINERS.iter().map(|entry| entry.kind.into()).collect()));
+    }
+    let choice = RefinerChoice::try_from(text.to_owned());
+    choice.map(|choice| Refiners(vec![choice])).map_err(|error| format!("{error}, both"))
+}
+
 /// A threshold to evaluate in addition to the suggested one.
 #[derive(Debug, Clone, Copy)]
 pub struct KnownThreshold(pub Option<f64>);
@@ -135,12 +147,23 @@ impl Args {
         })
     }
 
+    /// Returns the refiners to evaluate, each once.
+    pub fn refiners(&self) -> Vec<RefinerChoice> {
+        let mut choices = Vec::new();
+        for choice in self.refine.iter().flat_map(|refiners| &refiners.0) {
+            if !choices.contains(choice) {
+                choices.push(*choice);
+            }
+        }
+        choices
+    }
+
     /// Returns the configuration of a server on the work folder.
     pub fn config(&self) -> anyhow::Result<Config> {
         // The number of candidates follows from the configured refiner and applies to all of them, so the last
         // one in the table takes precedence.
         let configured = REFINERS.iter().rev().find_map(|entry| {
-            self.refine.iter().copied().find(|choice| choice.kind() == Some(entry.kind))
+            self.refiners().into_iter().find(|choice| choice.kind() == Some(entry.kind))
         });
         let refiner = configured.unwrap_or(RefinerChoice::OFF);
         let flags = Overrides::default()

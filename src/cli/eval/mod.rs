@@ -89,7 +89,16 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
             "{lost} files were not evaluated; repair or remove them, then run the same command again"
         );
     }
-    Ok(())
+    // The figures of such a method are not its own.
+    match summary.methods.iter().find(|method| method.degraded > 0) {
+        Some(method) => bail!(
+            "{} of {} queries were not fully refined by {}; run the same command again to try them again",
+            method.degraded,
+            summary.queries,
+            method.name
+        ),
+        None => Ok(()),
+    }
 }
 
 /// Opens the service on the work folder. Its workers are not started: there is no job queue.
@@ -109,7 +118,7 @@ async fn refiners(
     context: &RefinerContext,
 ) -> anyhow::Result<Vec<Arc<dyn Refiner>>> {
     let mut refiners: Vec<Arc<dyn Refiner>> = Vec::new();
-    for entry in args.refine.iter().filter_map(|choice| choice.entry()) {
+    for entry in args.refiners().into_iter().filter_map(|choice| choice.entry()) {
         let running = service.jobs.refiner.as_ref().filter(|refiner| refiner.kind() == entry.kind);
         refiners.push(match running {
             Some(refiner) => Arc::clone(refiner),

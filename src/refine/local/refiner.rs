@@ -268,6 +268,7 @@ fn conclude(candidates: &[Candidate], comparison: &Comparison) -> Result<Refinem
             .collect(),
         reasoning: reasoning(candidates, present, pairs, &ordered),
         reasoning_took_ms: None,
+        ordered_by: None,
         evidence: ranked.first().and_then(|&first| agreement(pairs, first)),
         ranking,
         usage: Usage::default(),

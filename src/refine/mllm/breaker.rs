@@ -1,4 +1,4 @@
-//! A circuit breaker, which suspends calls to a server that keeps failing.
+//! A circuit breaker, which suspends calls to a server that keeps failing, or that refuses every call.
 //!
 //! Its state is in a watch channel of tokio, whose changes are atomic; it has no locks of its own.
 
@@ -64,9 +64,19 @@ impl Breaker {
         }
     }
 
+    /// Returns for how long calls are refused; `None` if they are not.
+    pub fn open_for(&self) -> Option<Duration> {
+        match *self.state.borrow() {
+            State::Open { until } => {
+                Some(until.saturating_duration_since(Instant::now())).filter(|wait| !wait.is_zero())
+            }
+            State::Closed { .. } | State::HalfOpen => None,
+        }
+    }
+
     /// Returns whether calls are refused at the moment.
     pub fn is_open(&self) -> bool {
-        matches!(*self.state.borrow(), State::Open { until } if until > Instant::now())
+        self.open_for().is_some()
     }
 
     fn decide(&self) -> Decision {
@@ -94,12 +104,13 @@ impl Breaker {
             let open = State::Open { until: Instant::now() + self.open_for };
             *state = match (*state, probe, outcome) {
                 (State::HalfOpen, true, CallOutcome::Success) => State::Closed { failed: 0 },
-                (State::HalfOpen, true, CallOutcome::Failure) => open,
+                (State::HalfOpen, true, CallOutcome::Failure | CallOutcome::Refusal) => open,
                 // The next call is the probe.
                 (State::HalfOpen, true, CallOutcome::Unknown) => {
                     State::Open { until: Instant::now() }
                 }
                 (State::Closed { .. }, _, CallOutcome::Success) => State::Closed { failed: 0 },
+                (State::Closed { .. }, _, CallOutcome::Refusal) => open,
                 (State::Closed { failed }, _, CallOutcome::Failure)
                     if failed + 1 >= self.failures =>
                 {
@@ -119,6 +130,8 @@ impl Breaker {
 enum CallOutcome {
     Success,
     Failure,
+    /// The server refuses this call as it will all others.
+    Refusal,
     /// The call was dropped.
     Unknown,
 }
@@ -140,6 +153,12 @@ impl Admission<'_> {
     /// Reports that the server failed.
     pub fn failed(mut self) {
         self.report(CallOutcome::Failure);
+    }
+
+    /// Reports that the server refuses every call, and returns the time until the next try.
+    pub fn refused(mut self) -> Duration {
+        self.report(CallOutcome::Refusal);
+        self.breaker.open_for().unwrap_or_default()
     }
 
     fn report(&mut self, outcome: CallOutcome) {
@@ -196,6 +215,18 @@ mod tests {
         assert!(poll!(&mut other).is_pending());
         probe.succeeded();
         assert!(other.await.is_ok());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_refusal_of_every_call_opens_it_at_once() {
+        let breaker = Breaker::new(100, OPEN_FOR);
+        let (first, other) = (breaker.admit().await.unwrap(), breaker.admit().await.unwrap());
+        assert_eq!(first.refused(), OPEN_FOR);
+        // A call that was under way says nothing about the others.
+        other.succeeded();
+        assert_eq!(breaker.open_for(), Some(OPEN_FOR));
+        tokio::time::advance(OPEN_FOR).await;
+        assert_eq!(breaker.admit().await.unwrap().refused(), OPEN_FOR);
     }
 
     #[tokio::test(start_paused = true)]

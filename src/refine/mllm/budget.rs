@@ -55,7 +55,7 @@ impl SpendLimits {
     pub fn cost(&self, prompt_tokens: u64, completion_tokens: u64) -> Spent {
         let money = prompt_tokens as f64 * self.price_prompt
             + completion_tokens as f64 * self.price_completion;
-        Spent { tokens: prompt_tokens + completion_tokens, money: money / 1e6 }
+        Spent { tokens: prompt_tokens.saturating_add(completion_tokens), money: money / 1e6 }
     }
 }
 

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use jiff::Timestamp;
 use whereabouts_core::{CachedDescription, Digest, StandIn};
 use whereabouts_store::{DescriptionCache, StoreError};
 
@@ -47,10 +48,12 @@ impl BuyOnce {
     }
 
     /// Returns the description with that key, one of the cached `stand_ins`, or else what `buy` returns.
-    /// `buy` must have put its description into the cache when it returns.
+    /// `buy` must have put its description into the cache when it returns. Cached descriptions from before
+    /// `since` do not count.
     pub async fn find_or_buy<F>(
         &self,
         key: Digest,
+        since: Option<Timestamp>,
         stand_ins: &[(Digest, StandIn)],
         buy: impl FnOnce() -> F,
     ) -> Result<FoundDescription, CallError>
@@ -59,10 +62,10 @@ impl BuyOnce {
     {
         let bought = AtomicBool::new(false);
         let find = || async {
-            if let Some(found) = self.find(&key, stand_ins).await.map_err(unavailable)? {
+            if let Some(found) = self.find(&key, since, stand_ins).await.map_err(unavailable)? {
                 return Ok(found);
             }
-            let acquired = DescriptionLease::acquire(&self.cache, &key).await;
+            let acquired = DescriptionLease::acquire(&self.cache, &key, since).await;
             let _lease = match acquired.map_err(unavailable)? {
                 Acquired::Lease(lease) => lease,
                 Acquired::Description(description) => {
@@ -88,20 +91,28 @@ impl BuyOnce {
     async fn find(
         &self,
         key: &Digest,
+        since: Option<Timestamp>,
         stand_ins: &[(Digest, StandIn)],
     ) -> Result<Option<FoundDescription>, StoreError> {
-        if let Some(description) = retry_read(|| self.cache.description(key)).await? {
+        let known = retry_read(|| self.cache.description(key)).await?;
+        if let Some(description) = known.filter(|known| counts(known, since)) {
             self.metrics.description_lookup(CacheLookup::Hit);
             return Ok(Some(FoundDescription::cached(description, None)));
         }
         for (key, stand_in) in stand_ins {
-            if let Some(description) = retry_read(|| self.cache.description(key)).await? {
+            let known = retry_read(|| self.cache.description(key)).await?;
+            if let Some(description) = known.filter(|known| counts(known, since)) {
                 self.metrics.description_lookup(CacheLookup::Similar);
                 return Ok(Some(FoundDescription::cached(description, Some(*stand_in))));
             }
         }
         Ok(None)
     }
+}
+
+/// Whether a cached description is recent enough.
+pub(super) fn counts(description: &CachedDescription, since: Option<Timestamp>) -> bool {
+    since.is_none_or(|since| description.created_at >= since)
 }
 
 fn unavailable(error: StoreError) -> CallError {

@@ -1,47 +1,106 @@
-//! From descriptions and the model's order to a refinement. Whatever failed, the ranking contains every
-//! candidate.
+//! From descriptions and an order to a refinement. Whatever failed, the ranking contains every candidate.
 
-use whereabouts_core::Ranking;
+use whereabouts_core::{Ranking, RefinerKind};
 
-use super::describe::DescribedPairs;
+use super::describe::{DescribedPairs, UndescribedPair};
+use super::labels::Verdict;
 use super::rank::ModelRanking;
-use super::reason::Verdict;
 use super::retry::CallError;
 use super::run::RefineRun;
 use crate::{RefineError, Refinement, milliseconds};
 
-/// Ranks the described candidates as the model does and puts the others behind them in coarse order. If
-/// the model gave no ranking, all are in coarse order. `ranked` is `None` if there was nothing to rank.
-pub(super) fn conclude(
-    run: &RefineRun<'_>,
-    pairs: DescribedPairs,
-    ranked: Option<Result<ModelRanking, CallError>>,
-) -> Result<Refinement, RefineError> {
-    let candidates = &run.input.candidates;
-    let degraded = shortfalls(candidates.len(), &pairs, ranked.as_ref());
-    let ranked = ranked.and_then(Result::ok);
-    let mut order = ranked.as_ref().map_or(Vec::new(), |ranked| ranked.verdict.order.clone());
-    let behind: Vec<usize> = (0..candidates.len()).filter(|index| !order.contains(index)).collect();
-    order.extend(behind);
-    let ranking = Ranking::new(candidates, &order)
-        .map_err(|error| RefineError::Permanent(error.to_string()))?;
-    Ok(Refinement {
-        descriptions: pairs.described.iter().map(|pair| pair.description(candidates)).collect(),
-        ranking,
-        evidence: None,
-        reasoning_took_ms: ranked.as_ref().map(|ranked| milliseconds(ranked.took)),
-        reasoning: ranked.map(|ranked| ranked.verdict.reasoning),
-        usage: run.usage(),
-        degraded: (!degraded.is_empty()).then(|| degraded.join("; ")),
-    })
+/// Where the order of the described candidates comes from.
+pub(super) enum Order {
+    /// The model ranked them.
+    Model(ModelRanking),
+    /// The reasoning call failed, and another refiner ranked all candidates.
+    Fallback {
+        /// Its ranking.
+        refinement: Box<Refinement>,
+        /// Its name.
+        by: RefinerKind,
+        /// Why the model did not rank.
+        why: CallError,
+    },
+    /// There is none, and why.
+    Coarse(CallError),
+    /// There is nothing to rank.
+    Nothing,
 }
 
-/// Returns the reasons why the order is not the model's alone.
-fn shortfalls(
-    candidates: usize,
+/// Ranks the described candidates as the order says. The others keep their coarse place among them, and removed
+/// ones come last.
+pub(super) fn conclude(
+    run: &RefineRun<'_>,
     pairs: &DescribedPairs,
-    ranked: Option<&Result<ModelRanking, CallError>>,
-) -> Vec<String> {
+    order: Order,
+) -> Result<Refinement, RefineError> {
+    let candidates = &run.input.candidates;
+    let mut shortfalls = shortfalls(candidates.len(), pairs);
+    let ranked = |order: &[usize]| {
+        Ranking::new(candidates, &placed(candidates.len(), pairs, order))
+            .map_err(|error| RefineError::Permanent(error.to_string()))
+    };
+    let coarse = Refinement {
+        descriptions: pairs.described.iter().map(|pair| pair.description(candidates)).collect(),
+        ranking: ranked(&[])?,
+        evidence: None,
+        reasoning: None,
+        reasoning_took_ms: None,
+        ordered_by: None,
+        usage: run.usage(),
+        degraded: None,
+    };
+    let refinement = match order {
+        Order::Model(ModelRanking { verdict, took }) => {
+            let Verdict { order, left_out, reasoning, .. } = verdict;
+            if left_out > 0 {
+                shortfalls.push(format!("the model's ranking left out {left_out} candidates"));
+            }
+            Refinement {
+                ranking: ranked(&order)?,
+                reasoning_took_ms: Some(milliseconds(took)),
+                reasoning: Some(reasoning),
+                ..coarse
+            }
+        }
+        Order::Fallback { refinement: other, by, why } => {
+            shortfalls.push(format!(
+                "the order is that of `{by}`, because the reasoning call failed ({why}); a retry of the job \
+                 reasons again and buys no description again"
+            ));
+            shortfalls.extend(other.degraded.clone());
+            let usage = coarse.usage + other.usage;
+            Refinement { descriptions: coarse.descriptions, usage, ordered_by: Some(by), ..*other }
+        }
+        Order::Coarse(why) => {
+            shortfalls.push(format!("all candidates are in coarse order: {why}"));
+            coarse
+        }
+        Order::Nothing => coarse,
+    };
+    let degraded = (!shortfalls.is_empty()).then(|| shortfalls.join("; "));
+    Ok(Refinement { degraded, ..refinement })
+}
+
+/// Puts the described candidates, in their order or in coarse order, into the places that they have among all.
+fn placed(candidates: usize, pairs: &DescribedPairs, order: &[usize]) -> Vec<usize> {
+    let mut described: Vec<usize> = pairs.described.iter().map(|pair| pair.index).collect();
+    described.sort_unstable();
+    let failed: Vec<usize> = pairs.failed.iter().map(|pair| pair.index).collect();
+    let mut next = if order.is_empty() { described.clone() } else { order.to_vec() }.into_iter();
+    let present =
+        (0..candidates).filter(|index| described.contains(index) || failed.contains(index));
+    let mut placed: Vec<usize> = present
+        .map(|index| if described.contains(&index) { next.next().unwrap_or(index) } else { index })
+        .collect();
+    let gone: Vec<usize> = (0..candidates).filter(|index| !placed.contains(index)).collect();
+    placed.extend(gone);
+    placed
+}
+
+/// Returns the reasons why not all candidates are described.
+fn shortfalls(candidates: usize, pairs: &DescribedPairs) -> Vec<String> {
     let DescribedPairs { described, failed } = pairs;
     let mut reasons = Vec::new();
     let gone = candidates - described.len() - failed.len();
@@ -50,43 +109,38 @@ fn shortfalls(
     }
     if let Some(error) = most_serious(failed) {
         let count = failed.len();
-        reasons.push(format!("{count} of {candidates} pairs could not be described: {error}"));
-    }
-    match ranked.map(|ranked| ranked.as_ref().map(|ranked| &ranked.verdict)) {
-        Some(Ok(Verdict { left_out: 0, .. })) | None => {}
-        Some(Ok(Verdict { left_out, .. })) => {
-            reasons.push(format!("the model's ranking left out {left_out} candidates"));
-        }
-        Some(Err(error)) => reasons.push(format!("all candidates are in coarse order: {error}")),
+        reasons.push(format!(
+            "{count} of {candidates} pairs could not be described and keep their coarse place: {error}"
+        ));
     }
     reasons
 }
 
 /// Returns the error that decides the outcome of the job: preferably one that prevents all calls, then a
 /// transient one, then any. Of equals, the first.
-pub(super) fn most_serious(failed: &[CallError]) -> Option<CallError> {
-    let weight = |error: &&CallError| match error {
-        CallError::Permanent(_) => 0,
-        CallError::Transient(_) => 1,
-        CallError::JobSpent => 2,
-        CallError::Suspended { .. } => 3,
-        CallError::DaySpent => 4,
+pub(super) fn most_serious(failed: &[UndescribedPair]) -> Option<CallError> {
+    let weight = |pair: &&UndescribedPair| match pair.why {
+        CallError::NoAnswer(_) => 0,
+        CallError::Permanent(_) => 1,
+        CallError::Transient(_) => 2,
+        CallError::JobSpent => 3,
+        CallError::Suspended { .. } => 4,
+        CallError::Stopped { .. } => 5,
+        CallError::DaySpent => 6,
     };
     // `max_by_key` returns the last of equals.
-    failed.iter().rev().max_by_key(weight).cloned()
-}
-
-/// Whether the error prevents all calls, whatever their content.
-pub(super) fn is_unavailable(error: &CallError) -> bool {
-    matches!(error, CallError::Suspended { .. } | CallError::DaySpent | CallError::JobSpent)
+    failed.iter().rev().max_by_key(weight).map(|pair| pair.why.clone())
 }
 
 /// Converts the error of a job that has no ranking.
 pub(super) fn failure(error: &CallError) -> RefineError {
     match error {
-        CallError::Permanent(_) | CallError::JobSpent => RefineError::Permanent(error.to_string()),
-        CallError::Transient(_) | CallError::Suspended { .. } | CallError::DaySpent => {
-            RefineError::Transient(error.to_string())
+        CallError::Permanent(_) | CallError::NoAnswer(_) | CallError::JobSpent => {
+            RefineError::Permanent(error.to_string())
         }
+        CallError::Transient(_)
+        | CallError::Stopped { .. }
+        | CallError::Suspended { .. }
+        | CallError::DaySpent => RefineError::Transient(error.to_string()),
     }
 }

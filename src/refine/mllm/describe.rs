@@ -1,24 +1,25 @@
 //! One description for each pair: cached, in flight, or bought.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::{StreamExt, stream};
 use jiff::Timestamp;
 use whereabouts_core::{
-    CachedDescription, Candidate, DescribedFrame, Description, Digest, ImageId, Scene,
-    SimilarFrame, StandIn, Usage,
+    CachedDescription, Candidate, DescribedFrame, Description, DescriptionSubject, Digest, ImageId,
+    Scene, SimilarFrame, StandIn, Usage,
 };
 use whereabouts_store::Step;
 
 use super::buy_once::FoundDescription;
-use super::client::{Call, estimate_tokens};
+use super::client::{Answer, Call};
+use super::judge;
 use super::pictures::{PictureError, SentPicture};
-use super::prompts::{self, PROMPT_VERSION, Switches, clean};
+use super::prompts::{self, PROMPT_VERSION, Prompt, Switches};
 use super::retry::CallError;
 use super::run::RefineRun;
 use super::spend::cost_of;
-use super::wire::{Content, ImageUrl, Message, Part, Role};
+use super::tokens::estimate;
+use super::wire::{Message, Part};
 use super::{MllmRefiner, RefineError};
 use crate::{RefineInput, milliseconds};
 
@@ -64,7 +65,15 @@ impl DescribedPair {
 #[derive(Default)]
 pub(super) struct DescribedPairs {
     pub described: Vec<DescribedPair>,
-    pub failed: Vec<CallError>,
+    pub failed: Vec<UndescribedPair>,
+}
+
+/// A pair without a description.
+pub(super) struct UndescribedPair {
+    /// The candidate's index among the candidates.
+    pub index: usize,
+    /// Why there is none.
+    pub why: CallError,
 }
 
 impl MllmRefiner {
@@ -109,7 +118,7 @@ impl MllmRefiner {
                 Err(error) => {
                     let image = &run.input.candidates[index].image_id;
                     tracing::warn!(job = %run.input.id, %image, %error, "a pair was not described");
-                    pairs.failed.push(error);
+                    pairs.failed.push(UndescribedPair { index, why: error });
                 }
             }
         }
@@ -145,7 +154,9 @@ impl MllmRefiner {
         let stand_in =
             |frame: &SimilarFrame| (self.key(&frame.digest, &pair.digest, scene), frame.stand_in);
         let stand_ins: Vec<_> = run.similar.iter().map(stand_in).collect();
-        let found = self.descriptions.find_or_buy(pair.key, &stand_ins, || self.buy(run, pair));
+        let since = run.input.fresh_since;
+        let found =
+            self.descriptions.find_or_buy(pair.key, since, &stand_ins, || self.buy(run, pair));
         let described = found.await.map(|found| described(run, pair.index, found));
         if let Ok(described) = &described {
             let description = Some(described.description(&run.input.candidates));
@@ -154,6 +165,7 @@ impl MllmRefiner {
         (pair.index, described)
     }
 
+    /// Buys a description. An answer that is none is asked for again, once.
     async fn buy(
         &self,
         run: &RefineRun<'_>,
@@ -163,24 +175,90 @@ impl MllmRefiner {
         let frame = run.frame.get_or_try_init(frame).await?;
         let candidate = self.pictures.picture(&pair.digest).await?;
         let prompt = prompts::describe(run.input.map.scene, self.switches());
-        let call = Call {
-            model: &self.settings.describe_model,
-            prompt_tokens: estimate_tokens(&prompt) + frame.tokens + candidate.tokens,
-            messages: vec![question(prompt, frame, &candidate)],
-            schema: None,
+        let mut call = self.question(prompt, frame, &candidate);
+        let first = self.paid_call(run, &self.describer, &call).await;
+        let why = match self.judged(&first) {
+            Ok(text) => return self.keep(run, pair, first?, text).await,
+            Err(why) => why,
         };
-        let answer = self.paid_call(run, &call).await?;
-        let text = clean(&answer.text, self.settings.description_max_chars);
-        let usage = cost_of(&answer);
-        if text.is_empty() {
-            self.record_spend(run, usage, None).await;
-            run.progress.step(Step { usage, description: None }).await;
-            let why = answer.cut.as_deref().unwrap_or("the model said nothing");
-            return Err(CallError::Permanent(format!("the description is empty: {why}")));
+        let answer = match first {
+            Ok(answer) => answer,
+            // A filter rejects the pair however often it is asked.
+            Err(error) => return Err(error),
+        };
+        self.charge_for_nothing(run, &answer).await;
+        tracing::info!(job = %run.input.id, why, "asking again for a description");
+        if let Some(Message { content: super::wire::Content::Parts(parts), .. }) =
+            call.messages.last_mut()
+        {
+            parts.push(Part::text(&prompts::describe_again(&why, self.switches())));
         }
-        let description = CachedDescription { text, usage, created_at: Timestamp::now() };
+        call.max_tokens = call.max_tokens.saturating_mul(2);
+        let second = self.paid_call(run, &self.describer, &call).await?;
+        match judge::description(&second, self.switches(), self.settings.description_max_chars) {
+            Ok(text) => self.keep(run, pair, second, text).await,
+            Err(why) => {
+                self.charge_for_nothing(run, &second).await;
+                Err(CallError::NoAnswer(format!(
+                    "the model gave no description, although it was asked twice: {why}"
+                )))
+            }
+        }
+    }
+
+    /// Returns the description in an answer, or why there is none.
+    fn judged(&self, answer: &Result<Answer, CallError>) -> Result<String, String> {
+        let answer = answer.as_ref().map_err(ToString::to_string)?;
+        judge::description(answer, self.switches(), self.settings.description_max_chars)
+    }
+
+    /// Records a bought description.
+    async fn keep(
+        &self,
+        run: &RefineRun<'_>,
+        pair: &Pair,
+        answer: Answer,
+        text: String,
+    ) -> Result<(CachedDescription, Duration), CallError> {
+        let usage = cost_of(&answer);
+        let about = DescriptionSubject {
+            map: run.input.map.name.clone(),
+            image_id: run.input.candidates[pair.index].image_id.clone(),
+            query_id: run.input.frame.query_id,
+            server: self.describer.shown_url(),
+            model: self.settings.describe_model.clone(),
+        };
+        let description =
+            CachedDescription { text, usage, created_at: Timestamp::now(), about: Some(about) };
         self.record_spend(run, usage, Some((pair.key, description.clone()))).await;
         Ok((description, answer.took))
+    }
+
+    /// Records the cost of an answer that is no description.
+    async fn charge_for_nothing(&self, run: &RefineRun<'_>, answer: &Answer) {
+        let usage = cost_of(answer);
+        self.record_spend(run, usage, None).await;
+        run.progress.step(Step { usage, description: None }).await;
+    }
+
+    /// Names each picture in the text before it, because models lose count of which is which.
+    fn question(&self, prompt: Prompt, frame: &SentPicture, candidate: &SentPicture) -> Call<'_> {
+        let text = estimate(&prompt.system) + estimate(&prompt.user);
+        let parts = vec![
+            Part::text("FRAME:"),
+            Part::picture(&frame.url),
+            Part::text("CANDIDATE:"),
+            Part::picture(&candidate.url),
+            Part::text(&prompt.user),
+        ];
+        Call {
+            model: &self.settings.describe_model,
+            prompt_tokens: text + frame.tokens + candidate.tokens,
+            messages: vec![Message::system(prompt.system), Message::parts(parts)],
+            shorter: None,
+            labels: None,
+            max_tokens: self.describer.max_tokens(),
+        }
     }
 
     fn switches(&self) -> Switches {
@@ -194,7 +272,8 @@ impl MllmRefiner {
     fn key(&self, query: &Digest, candidate: &Digest, scene: Scene) -> Digest {
         let settings = &self.settings;
         let shapes = format!(
-            "description\n{query}\n{candidate}\n{PROMPT_VERSION}\n{}\n{}\n{scene}\n{}\n{}\n{}\n{}",
+            "description\n{query}\n{candidate}\n{PROMPT_VERSION}\n{}\n{}\n{}\n{scene}\n{}\n{}\n{}\n{}",
+            self.describer.url(),
             settings.object_matching,
             settings.constraints,
             settings.describe_model,
@@ -215,22 +294,6 @@ fn described(run: &RefineRun<'_>, index: usize, found: FoundDescription) -> Desc
     }
     let usage = if cached { from_cache } else { description.usage };
     DescribedPair { index, text: description.text, cached, stands_in, took, usage }
-}
-
-/// Names each picture in the text before it, because models lose count of which is which.
-fn question(prompt: String, frame: &SentPicture, candidate: &SentPicture) -> Message {
-    let text = |text: &str| Part::Text { text: text.to_owned() };
-    let picture = |picture: &SentPicture| Part::ImageUrl {
-        image_url: ImageUrl { url: Arc::clone(&picture.url) },
-    };
-    let parts = vec![
-        Part::Text { text: prompt },
-        text("FRAME:"),
-        picture(frame),
-        text("CANDIDATE:"),
-        picture(candidate),
-    ];
-    Message { role: Role::User, content: Content::Parts(parts) }
 }
 
 impl From<PictureError> for CallError {

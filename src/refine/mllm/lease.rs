@@ -7,6 +7,7 @@ use jiff::{SignedDuration, Timestamp};
 use whereabouts_core::{CachedDescription, Digest};
 use whereabouts_store::{DescriptionCache, StoreError};
 
+use super::buy_once::counts;
 use crate::store_retry::{retry_read, retry_write};
 
 /// The pause between two looks for a description that another process is buying.
@@ -31,10 +32,12 @@ pub(super) enum Acquired {
 }
 
 impl DescriptionLease {
-    /// Waits until this process may buy the description of that key or another process has bought it.
+    /// Waits until this process may buy the description of that key or another process has bought it. One from
+    /// before `since` does not count.
     pub async fn acquire(
         cache: &Arc<dyn DescriptionCache>,
         key: &Digest,
+        since: Option<Timestamp>,
     ) -> Result<Acquired, StoreError> {
         loop {
             let until = Timestamp::now().saturating_add(LENGTH).unwrap_or(Timestamp::MAX);
@@ -45,7 +48,8 @@ impl DescriptionLease {
                 lease.key = None;
             }
             // The process that held the lease may have finished since the cache was last read.
-            if let Some(known) = retry_read(|| cache.description(key)).await? {
+            let known = retry_read(|| cache.description(key)).await?;
+            if let Some(known) = known.filter(|known| counts(known, since)) {
                 return Ok(Acquired::Description(known));
             }
             if granted {

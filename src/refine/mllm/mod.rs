@@ -6,34 +6,53 @@
 //! | `settings` | the section `[mllm]` of the configuration |
 //! | `prompts` | the prompts |
 //! | `run` | the state of one refinement |
-//! | `describe`, `pictures` | one description for each pair |
+//! | `describe`, `judge`, `pictures` | one description for each pair, and what is none |
 //! | `buy_once`, `single_flight`, `lease` | a description is bought once: in this process, across processes |
-//! | `rank`, `reason`, `conclude` | the reasoning call, and from its answer to a ranking |
-//! | `client`, `endpoint`, `wire` | the chat-completions format over HTTP |
+//! | `rank`, `labels`, `conclude` | the reasoning call, and from its answer to a ranking |
+//! | `answer`, `order`, `loose_json`, `schema` | what the reasoning model is asked to write, and what it writes |
+//! | `client`, `forms`, `exchange`, `endpoint` | calls to a server over HTTP |
+//! | `wire`, `response`, `error_body`, `thinking`, `tokens` | the chat-completions format, in all its dialects |
+//! | `capability`, `check`, `check_calls`, `server_facts` | what a server can do, found out by trying |
 //! | `spend`, `budget`, `reservation` | limits on spend: in this process, across processes |
-//! | `retry`, `breaker`, `rate` | retries, circuit breaker, rate limits |
+//! | `failure`, `retry`, `breaker`, `rate` | kinds of failures, retries, circuit breaker, rate limits |
 //!
 //! A model's answer is untrusted input: it can change the order of these candidates, and nothing else.
 
+mod answer;
 mod breaker;
 mod budget;
 mod buy_once;
+mod capability;
+mod check;
+mod check_calls;
 mod client;
 mod conclude;
 mod describe;
 mod endpoint;
+mod error_body;
+mod exchange;
+mod failure;
+mod forms;
+mod judge;
+mod labels;
 mod lease;
+mod loose_json;
+mod order;
 mod pictures;
 mod prompts;
 mod rank;
 mod rate;
-mod reason;
 mod reservation;
+mod response;
 mod retry;
 mod run;
+mod schema;
+mod server_facts;
 mod settings;
 mod single_flight;
 mod spend;
+mod thinking;
+mod tokens;
 mod wire;
 
 #[cfg(test)]
@@ -45,19 +64,26 @@ use std::time::Duration;
 use async_trait::async_trait;
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
-use whereabouts_core::{DayUsage, RefinerKind, Spent, utc_day};
+use whereabouts_core::{DayUsage, ModelServer, RefinerKind, Spent, utc_day};
 use whereabouts_store::{
     BlobStore, DescriptionCache, MapStore, SharedLimits, TokenBuckets, UsageStore,
 };
 use whereabouts_vision::ImageLimits;
 
+pub use answer::{AnswerError, Certainty};
+pub use check::{CheckedServer, Finding, check};
+pub use labels::{Labels, Verdict};
 pub use prompts::PROMPT_VERSION;
-pub use reason::{AnswerError, Labels, Verdict};
+pub use response::is_readable;
 pub use retry::{random_fraction, retry_after};
-pub use settings::{KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError, OnUnavailable};
+pub use settings::{
+    KeyHeader, MaxTokensField, MllmSettings, MllmSettingsError, OnUnavailable, ServerSettings,
+};
 
 use self::buy_once::BuyOnce;
 use self::client::MllmClient;
+use self::conclude::Order;
+use self::describe::DescribedPair;
 use self::pictures::Pictures;
 use self::retry::CallError;
 use self::run::RefineRun;
@@ -96,7 +122,10 @@ pub struct MllmRefiner {
     usage: Arc<dyn UsageStore>,
     fallback: Option<Arc<dyn Refiner>>,
     pictures: Pictures,
-    client: MllmClient,
+    /// The server of the describing model.
+    describer: Arc<MllmClient>,
+    /// The server of the reasoning model; often the same.
+    reasoner: Arc<MllmClient>,
     descriptions: BuyOnce,
     spend: SpendControl,
     settings: MllmSettings,
@@ -118,6 +147,9 @@ pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, 
     let refiner = MllmRefiner::new(parts, context.settings.mllm.clone())?;
     // Read before the workers start, and so before this process spends anything.
     refiner.seed_spent_today(&store.usage(utc_day(Timestamp::now())).await?);
+    if context.settings.mllm.check_at_start {
+        refiner.check_in_background();
+    }
     Ok(Arc::new(refiner))
 }
 
@@ -130,7 +162,15 @@ pub(crate) fn fingerprint(settings: &RefinerSettings) -> Result<String, BuildErr
 impl MllmRefiner {
     /// Builds a refiner. Reads the API key from its file, but makes no call.
     pub fn new(parts: MllmParts, settings: MllmSettings) -> Result<Self, MllmSettingsError> {
-        let client = MllmClient::new(&settings, TokenBuckets::new(parts.shared.clone()))?;
+        let client = |server: &ServerSettings| {
+            let buckets = TokenBuckets::new(parts.shared.clone());
+            MllmClient::new(&settings, server, buckets).map(Arc::new)
+        };
+        let describer = client(&settings.describing())?;
+        let reasoner = match settings.has_two_servers() {
+            true => client(&settings.reasoning())?,
+            false => Arc::clone(&describer),
+        };
         let pictures = Pictures::new(parts.blobs, parts.limits, settings.image_max_edge)
             .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
         Ok(Self {
@@ -140,7 +180,8 @@ impl MllmRefiner {
             usage: parts.usage,
             fallback: parts.fallback,
             pictures,
-            client,
+            describer,
+            reasoner,
             spend: SpendControl::new(settings.limits(), parts.shared),
             settings,
         })
@@ -154,7 +195,12 @@ impl MllmRefiner {
         self.spend.budget.seed(now, spent.map(Spent::from).fold(Spent::default(), Spent::plus));
     }
 
-    /// Has the fallback refine the job, and reports that in `degraded`.
+    /// Finds out what the servers can do. Calls wait until that is known.
+    pub fn check_in_background(&self) {
+        check::in_background(&self.describer, &self.reasoner, &self.settings);
+    }
+
+    /// Has the fallback refine a job without any description, and reports that in `degraded`.
     async fn fall_back(
         &self,
         fallback: &dyn Refiner,
@@ -165,12 +211,61 @@ impl MllmRefiner {
         let degraded = format!("refined by `{}` instead of `mllm`: {why}", fallback.kind());
         Ok(Refinement {
             usage: run.usage() + refinement.usage,
+            ordered_by: Some(fallback.kind()),
             degraded: Some(match refinement.degraded {
                 Some(also) => format!("{degraded}; {also}"),
                 None => degraded,
             }),
             ..refinement
         })
+    }
+
+    /// Refines a job of which no pair was described.
+    async fn without_descriptions(
+        &self,
+        run: &RefineRun<'_>,
+        why: &CallError,
+    ) -> Result<Refinement, RefineError> {
+        self.deferred(why)?;
+        match &self.fallback {
+            Some(fallback) => self.fall_back(fallback.as_ref(), run, why).await,
+            None => Err(conclude::failure(why)),
+        }
+    }
+
+    /// Returns the order of the described candidates, from the model if it gives one.
+    async fn order(
+        &self,
+        run: &RefineRun<'_>,
+        described: &[DescribedPair],
+    ) -> Result<Order, RefineError> {
+        let why = match self.rank(run, described).await {
+            Ok(ranking) => return Ok(Order::Model(ranking)),
+            Err(why @ CallError::NoAnswer(_)) => return Ok(Order::Coarse(why)),
+            Err(why) => why,
+        };
+        tracing::warn!(job = %run.input.id, error = %why, "the reasoning call failed");
+        self.deferred(&why)?;
+        let Some(fallback) = &self.fallback else { return Ok(Order::Coarse(why)) };
+        match fallback.refine(run.input, run.progress).await {
+            Ok(refinement) => {
+                Ok(Order::Fallback { refinement: Box::new(refinement), by: fallback.kind(), why })
+            }
+            Err(error) => {
+                tracing::warn!(job = %run.input.id, %error, "the fallback failed, too");
+                Ok(Order::Coarse(why))
+            }
+        }
+    }
+
+    /// Returns an error that defers the job, if the settings say so and it is known for how long.
+    fn deferred(&self, why: &CallError) -> Result<(), RefineError> {
+        match available_after(why) {
+            Some(after) if self.settings.on_unavailable == OnUnavailable::Wait => {
+                Err(RefineError::Deferred { why: why.to_string(), after })
+            }
+            _ => Ok(()),
+        }
     }
 }
 
@@ -198,39 +293,40 @@ impl Refiner for MllmRefiner {
         input: &RefineInput,
         progress: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
+        if self.settings.check_at_start {
+            check::again(&self.describer, &self.reasoner, &self.settings);
+        }
         let budget =
             self.spend.budget.for_job(input.spent.prompt_tokens, input.spent.completion_tokens);
         let similar = self.similar_frames(input).await?;
         let run = RefineRun::new(input, budget, similar, progress);
         let pairs = self.pairs(input).await?;
         let pairs = self.describe_all(&run, &pairs).await;
-        let ranked = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
-            ([], None) => None,
-            ([], Some(error)) => Some(Err(error)),
-            (described, _) => Some(self.rank(&run, described).await),
+        let order = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
+            ([], None) => Order::Nothing,
+            ([], Some(why)) => return self.without_descriptions(&run, &why).await,
+            (described, _) => self.order(&run, described).await?,
         };
-        let waits = self.settings.on_unavailable == OnUnavailable::Wait;
-        match (ranked, &self.fallback) {
-            (Some(Err(why)), _) if waits && let Some(after) = available_after(&why) => {
-                Err(RefineError::Deferred { why: why.to_string(), after })
-            }
-            (Some(Err(why)), Some(fallback)) if conclude::is_unavailable(&why) => {
-                self.fall_back(fallback.as_ref(), &run, &why).await
-            }
-            (Some(Err(why)), _) if pairs.described.is_empty() => Err(conclude::failure(&why)),
-            (ranked, _) => conclude::conclude(&run, pairs, ranked),
-        }
+        conclude::conclude(&run, &pairs, order)
     }
 }
 
 impl PaidCalls for MllmRefiner {
     fn levels(&self) -> PaidCallLevels {
         PaidCallLevels {
-            suspended: self.client.is_suspended(),
+            suspended: self.describer.is_suspended() || self.reasoner.is_suspended(),
             spent_today: self.spend.budget.spent(Timestamp::now()),
             limit: self.spend.daily_limit(),
             cache: self.cache.levels(),
         }
+    }
+
+    fn servers(&self) -> Vec<ModelServer> {
+        let mut servers = vec![self.describer.report()];
+        if self.settings.has_two_servers() {
+            servers.push(self.reasoner.report());
+        }
+        servers
     }
 }
 
@@ -238,12 +334,17 @@ impl PaidCalls for MllmRefiner {
 fn available_after(why: &CallError) -> Option<Duration> {
     match why {
         // At least a little, because the breaker may be about to close.
-        CallError::Suspended { wait } => Some((*wait).max(Duration::from_millis(100))),
+        CallError::Suspended { wait, .. } | CallError::Stopped { wait, .. } => {
+            Some((*wait).max(Duration::from_millis(100)))
+        }
         CallError::DaySpent => {
             let now = Timestamp::now();
             let midnight = utc_day(now).tomorrow().ok()?.to_zoned(TimeZone::UTC).ok()?;
             now.duration_until(midnight.timestamp()).try_into().ok()
         }
-        CallError::Permanent(_) | CallError::Transient(_) | CallError::JobSpent => None,
+        CallError::Permanent(_)
+        | CallError::NoAnswer(_)
+        | CallError::Transient(_)
+        | CallError::JobSpent => None,
     }
 }

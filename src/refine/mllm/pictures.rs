@@ -89,8 +89,12 @@ fn prepare(bytes: &Bytes, limits: ImageLimits, max_edge: u32) -> Result<SentPict
     let picture = decode(bytes, limits, needed).map_err(|error| unfit(&error))?;
     let pixels = shrink_to(&picture.pixels, max_edge).map_err(|error| unfit(&error))?;
     let jpeg = encode_jpeg(&pixels).map_err(|error| unfit(&error))?;
-    let url = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
-    Ok(SentPicture { url: url.into(), tokens: estimate_tokens(&pixels) })
+    Ok(SentPicture { url: data_url(&jpeg), tokens: estimate_tokens(&pixels) })
+}
+
+/// Returns the data URL of a JPEG.
+pub(super) fn data_url(jpeg: &[u8]) -> Arc<str> {
+    format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg)).into()
 }
 
 /// Estimates by the rule of OpenAI's vision models: 85 tokens, plus 170 for each tile of 512 pixels. Other

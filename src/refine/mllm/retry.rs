@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use jiff::fmt::rfc2822::DateTimeParser;
 use uuid::Uuid;
 
-use super::breaker::Open;
+use super::failure::{Failure, FailureKind};
 
 /// Why a call got no answer, after all its attempts.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -15,17 +15,30 @@ pub enum CallError {
     /// A retry would fail in the same way.
     #[error("{0}")]
     Permanent(String),
+    /// The model gave no answer that can be used, although it was asked twice.
+    #[error("{0}")]
+    NoAnswer(String),
     /// A later retry may succeed.
     #[error("{0}")]
     Transient(String),
+    /// The server refuses every call until somebody changes something, and so the circuit breaker opened.
+    #[error("{why}")]
+    Stopped {
+        /// Why, in the server's words.
+        why: String,
+        /// Time until the next try.
+        wait: Duration,
+    },
     /// The circuit breaker is open because the last calls failed.
     #[error(
-        "calls to the MLLM are suspended for another {} s, because the last ones failed",
+        "calls to the MLLM are suspended for another {} s, because the last ones failed: {cause}",
         wait.as_secs_f64().ceil()
     )]
     Suspended {
         /// Time until it lets a call through.
         wait: Duration,
+        /// Why the last call failed.
+        cause: String,
     },
     /// The day's budget is spent.
     #[error("the budget of the day is spent (mllm.tokens_per_day, mllm.money_per_day)")]
@@ -35,45 +48,29 @@ pub enum CallError {
     JobSpent,
 }
 
-/// Why one attempt got no answer.
+/// Why one attempt got no answer, or none was made.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Failure {
-    /// The server rejects this request.
-    Refused(String),
-    /// The server is overloaded or limits the rate of calls.
-    Busy {
-        /// Its explanation.
-        why: String,
-        /// Its `Retry-After`.
-        retry_after: Option<Duration>,
-    },
-    /// The server or the connection failed.
-    Broken {
-        /// How it failed.
-        why: String,
-        /// The server's `Retry-After`.
-        retry_after: Option<Duration>,
-    },
-    /// The server does not support `response_format`.
-    Unstructured(String),
+pub enum AttemptError {
+    /// The attempt failed. If that opened the circuit breaker at once, the time until the next try.
+    Failed(Failure, Option<Duration>),
     /// The circuit breaker is open.
-    Open(Open),
+    Open {
+        /// Time until it lets a call through.
+        wait: Duration,
+        /// Why the last call failed.
+        cause: String,
+    },
 }
 
-impl Failure {
-    /// Whether it is the server's fault and not the request's. The circuit breaker counts these.
-    pub fn is_the_servers(&self) -> bool {
-        matches!(self, Self::Broken { .. })
-    }
-
+impl AttemptError {
     fn is_transient(&self) -> bool {
-        matches!(self, Self::Busy { .. } | Self::Broken { .. })
+        matches!(self, Self::Failed(failure, None) if failure.kind.is_transient())
     }
 
     fn retry_after(&self) -> Option<Duration> {
         match self {
-            Self::Busy { retry_after, .. } | Self::Broken { retry_after, .. } => *retry_after,
-            Self::Refused(_) | Self::Unstructured(_) | Self::Open(_) => None,
+            Self::Failed(failure, _) => failure.retry_after,
+            Self::Open { .. } => None,
         }
     }
 }
@@ -97,7 +94,7 @@ impl CallRetryPolicy {
     /// Calls `attempt` until it succeeds or is not to be retried.
     pub async fn run<T, F>(&self, mut attempt: impl FnMut() -> F) -> Result<T, CallError>
     where
-        F: Future<Output = Result<T, Failure>>,
+        F: Future<Output = Result<T, AttemptError>>,
     {
         let mut attempts = 0;
         let counted = || {
@@ -106,7 +103,7 @@ impl CallRetryPolicy {
         };
         let outcome = counted
             .retry(self.pauses())
-            .when(Failure::is_transient)
+            .when(AttemptError::is_transient)
             .adjust(|failure, pause| match failure.retry_after() {
                 Some(asked) if asked > self.longest_retry_after => None,
                 asked => pause.map(|pause| pause.max(asked.unwrap_or_default())),
@@ -125,19 +122,27 @@ impl CallRetryPolicy {
             .with_jitter()
     }
 
-    fn give_up(&self, failure: Failure, attempts: u32) -> CallError {
-        match failure {
-            Failure::Open(Open { wait }) => CallError::Suspended { wait },
-            Failure::Refused(why) | Failure::Unstructured(why) => CallError::Permanent(why),
-            Failure::Busy { why, retry_after } | Failure::Broken { why, retry_after } => {
-                match retry_after.filter(|_| attempts < self.attempts) {
-                    Some(asked) => CallError::Transient(format!(
-                        "{why}; it asks for a retry after {} s, later than mllm.retry_after_max_s",
-                        asked.as_secs()
-                    )),
-                    None => CallError::Transient(format!("{why} (tried {attempts} times)")),
-                }
-            }
+    fn give_up(&self, error: AttemptError, attempts: u32) -> CallError {
+        let (failure, stopped) = match error {
+            AttemptError::Open { wait, cause } => return CallError::Suspended { wait, cause },
+            AttemptError::Failed(failure, stopped) => (failure, stopped),
+        };
+        let why = failure.why;
+        if let Some(wait) = stopped {
+            return CallError::Stopped { why, wait };
+        }
+        if failure.kind == FailureKind::Filtered {
+            return CallError::NoAnswer(why);
+        }
+        if !failure.kind.is_transient() {
+            return CallError::Permanent(why);
+        }
+        match failure.retry_after.filter(|_| attempts < self.attempts) {
+            Some(asked) => CallError::Transient(format!(
+                "{why}; it asks for a retry after {} s, later than mllm.retry_after_max_s",
+                asked.as_secs_f64().ceil()
+            )),
+            None => CallError::Transient(format!("{why} (tried {attempts} times)")),
         }
     }
 }
@@ -148,14 +153,20 @@ pub fn random_fraction() -> f64 {
     f64::from(low as u32) / f64::from(u32::MAX)
 }
 
-/// Parses a `Retry-After` header: seconds, or a date (RFC 9110, section 10.2.3).
+/// Parses a `Retry-After` header: seconds, which some servers write with a fraction, or a date (RFC 9110,
+/// section 10.2.3).
 pub fn retry_after(value: &str, now: Timestamp) -> Option<Duration> {
     let value = value.trim();
-    if let Ok(seconds) = value.parse() {
-        return Some(Duration::from_secs(seconds));
+    if let Ok(seconds) = value.trim_end_matches('s').parse::<f64>() {
+        return Duration::try_from_secs_f64(seconds).ok();
     }
     let at = DateTimeParser::new().parse_timestamp(value).ok()?;
     Some(Duration::try_from(at.duration_since(now)).unwrap_or(Duration::ZERO))
+}
+
+/// Parses a `retry-after-ms` header, which is more exact than `Retry-After`.
+pub fn retry_after_ms(value: &str) -> Option<Duration> {
+    Duration::try_from_secs_f64(value.trim().parse::<f64>().ok()? / 1000.0).ok()
 }
 
 #[cfg(test)]
@@ -169,11 +180,13 @@ mod tests {
         longest_retry_after: Duration::from_secs(60),
     };
 
-    fn busy(seconds: Option<u64>) -> Failure {
-        Failure::Busy { why: "429".into(), retry_after: seconds.map(Duration::from_secs) }
+    fn busy(seconds: Option<u64>) -> AttemptError {
+        let retry_after = seconds.map(Duration::from_secs);
+        let failure = Failure { retry_after, ..Failure::new(FailureKind::Busy, "429".into()) };
+        AttemptError::Failed(failure, None)
     }
 
-    async fn run(failures: Vec<Failure>) -> (Result<usize, CallError>, usize, Duration) {
+    async fn run(failures: Vec<AttemptError>) -> (Result<usize, CallError>, usize, Duration) {
         let (start, mut attempts) = (Instant::now(), 0);
         let mut failures = failures.into_iter();
         let outcome = POLICY
@@ -194,7 +207,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn pauses_double_with_jitter() {
-        let broken = Failure::Broken { why: "500".into(), retry_after: None };
+        let broken = AttemptError::Failed(Failure::new(FailureKind::Server, "500".into()), None);
         let (outcome, attempts, took) = run(vec![broken; 3]).await;
         assert_eq!((outcome, attempts), (Ok(7), 4));
         // 0.5 + 1 + 2 s, each cut by up to a half.
@@ -216,9 +229,11 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_rejected_request_is_not_retried() {
-        let (outcome, attempts, _) = run(vec![Failure::Refused("401".into())]).await;
-        assert_eq!((outcome, attempts), (Err(CallError::Permanent("401".into())), 1));
+    async fn a_call_that_every_server_would_refuse_again_is_not_retried() {
+        let (wait, why) = (Duration::from_secs(30), String::from("401"));
+        let refused = AttemptError::Failed(Failure::new(FailureKind::Key, why.clone()), Some(wait));
+        let (outcome, attempts, _) = run(vec![refused]).await;
+        assert_eq!((outcome, attempts), (Err(CallError::Stopped { why, wait }), 1));
     }
 
     #[test]
@@ -229,6 +244,11 @@ mod tests {
         assert_eq!(date, Some(Duration::from_secs(30)));
         let past = retry_after("Sun, 06 Nov 1994 08:00:00 GMT", now);
         assert_eq!(past, Some(Duration::ZERO));
-        assert_eq!(retry_after("soon", now), None);
+        assert_eq!(retry_after("0.25", now), Some(Duration::from_millis(250)));
+        assert_eq!(retry_after("6s", now), Some(Duration::from_secs(6)));
+        assert_eq!(retry_after_ms("1500"), Some(Duration::from_millis(1500)));
+        for wrong in ["soon", "-1", "NaN", "inf", "1e400", ""] {
+            assert_eq!((retry_after(wrong, now), retry_after_ms(wrong)), (None, None), "{wrong}");
+        }
     }
 }

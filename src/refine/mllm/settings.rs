@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::budget::SpendLimits;
+use super::endpoint;
 use whereabouts_core::Secret;
 
 /// `[mllm]`
@@ -26,6 +27,14 @@ pub struct MllmSettings {
     pub describe_model: String,
     /// The model that ranks.
     pub reason_model: String,
+    /// The base URL of the server of the model that ranks; empty for the same server.
+    pub reason_base_url: String,
+    /// The key of that server; empty for none.
+    pub reason_api_key: Secret,
+    /// A file that holds the key of that server; empty for none.
+    pub reason_api_key_file: PathBuf,
+    /// Whether the server is asked at start what it can do.
+    pub check_at_start: bool,
     /// The most concurrent calls.
     pub concurrency: usize,
     /// The longest edge of a sent picture, in pixels.
@@ -83,6 +92,25 @@ pub struct MllmSettings {
     pub similar_frames_kept: usize,
 }
 
+/// A server, and the models that are used there.
+#[derive(Debug, Clone)]
+pub struct ServerSettings {
+    /// The setting that holds the base URL, for error messages.
+    pub url_key: &'static str,
+    /// The base URL as it was set.
+    pub base_url: String,
+    /// The key; empty for none.
+    pub api_key: Secret,
+    /// A file that holds the key; empty for none.
+    pub api_key_file: PathBuf,
+    /// The header that carries the key.
+    pub key_header: KeyHeader,
+    /// The `api-version` of the URL's query; empty for none.
+    pub api_version: String,
+    /// The models that are used there.
+    pub models: Vec<String>,
+}
+
 /// The header that carries the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -103,6 +131,16 @@ pub enum MaxTokensField {
     MaxTokens,
 }
 
+impl MaxTokensField {
+    /// Returns its name in a request.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::MaxCompletionTokens => "max_completion_tokens",
+            Self::MaxTokens => "max_tokens",
+        }
+    }
+}
+
 /// What becomes of a job while no call may be made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -117,7 +155,9 @@ pub enum OnUnavailable {
 #[derive(Debug, thiserror::Error)]
 pub enum MllmSettingsError {
     /// The key file cannot be read.
-    #[error("mllm.api_key_file {path} cannot be read: {source}")]
+    #[error(
+        "the key file {path} (mllm.api_key_file, mllm.reason_api_key_file) cannot be read: {source}"
+    )]
     KeyFile {
         /// The file.
         path: PathBuf,
@@ -128,8 +168,10 @@ pub enum MllmSettingsError {
     #[error("the key of mllm.api_key or mllm.api_key_file holds characters no header can carry")]
     Key,
     /// The URL is not valid.
-    #[error("mllm.base_url {url:?} is not a URL of http or https: {reason}")]
+    #[error("{key} {url:?} is not a URL of http or https: {reason}")]
     Url {
+        /// The setting's name.
+        key: &'static str,
         /// The setting.
         url: String,
         /// What is wrong with it.
@@ -182,6 +224,13 @@ impl MllmSettings {
         if !self.api_key.is_empty() && !self.api_key_file.as_os_str().is_empty() {
             return Some("give mllm.api_key or mllm.api_key_file, not both".into());
         }
+        if !self.reason_api_key.is_empty() && !self.reason_api_key_file.as_os_str().is_empty() {
+            return Some("give mllm.reason_api_key or mllm.reason_api_key_file, not both".into());
+        }
+        let servers = [self.describing(), self.reasoning()];
+        if let Some(error) = servers.iter().find_map(|server| endpoint::url(server).err()) {
+            return Some(error.to_string());
+        }
         if job_timeout_s <= self.timeout_s {
             return Some(format!(
                 "jobs.timeout_s ({job_timeout_s}) must outlast mllm.timeout_s ({}), or a slow call \
@@ -192,14 +241,42 @@ impl MllmSettings {
         None
     }
 
-    /// Returns the key, or reads it from its file.
-    pub fn key(&self) -> Result<Secret, MllmSettingsError> {
-        if self.api_key_file.as_os_str().is_empty() {
-            return Ok(self.api_key.clone());
+    /// Returns the server of the model that describes.
+    pub fn describing(&self) -> ServerSettings {
+        let mut models = vec![self.describe_model.clone()];
+        if !self.has_two_servers() && self.reason_model != self.describe_model {
+            models.push(self.reason_model.clone());
         }
-        std::fs::read_to_string(&self.api_key_file).map(|text| Secret::new(&text)).map_err(
-            |source| MllmSettingsError::KeyFile { path: self.api_key_file.clone(), source },
-        )
+        ServerSettings {
+            url_key: "mllm.base_url",
+            base_url: self.base_url.clone(),
+            api_key: self.api_key.clone(),
+            api_key_file: self.api_key_file.clone(),
+            key_header: self.key_header,
+            api_version: self.api_version.clone(),
+            models,
+        }
+    }
+
+    /// Returns the server of the model that ranks.
+    pub fn reasoning(&self) -> ServerSettings {
+        if !self.has_two_servers() {
+            return self.describing();
+        }
+        ServerSettings {
+            url_key: "mllm.reason_base_url",
+            base_url: self.reason_base_url.clone(),
+            api_key: self.reason_api_key.clone(),
+            api_key_file: self.reason_api_key_file.clone(),
+            key_header: self.key_header,
+            api_version: self.api_version.clone(),
+            models: vec![self.reason_model.clone()],
+        }
+    }
+
+    /// Whether the models have servers of their own.
+    pub fn has_two_servers(&self) -> bool {
+        !self.reason_base_url.trim().is_empty()
     }
 
     /// Returns the longest time a call may take.
@@ -217,6 +294,18 @@ impl MllmSettings {
             price_prompt: self.price_prompt,
             price_completion: self.price_completion,
         }
+    }
+}
+
+impl ServerSettings {
+    /// Returns the key, or reads it from its file.
+    pub fn key(&self) -> Result<Secret, MllmSettingsError> {
+        if self.api_key_file.as_os_str().is_empty() {
+            return Ok(self.api_key.clone());
+        }
+        std::fs::read_to_string(&self.api_key_file).map(|text| Secret::new(&text)).map_err(
+            |source| MllmSettingsError::KeyFile { path: self.api_key_file.clone(), source },
+        )
     }
 }
 
@@ -256,9 +345,29 @@ pub(super) mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), "sk-from-file\n").unwrap();
         let settings = MllmSettings { api_key_file: file.path().to_owned(), ..defaults() };
-        assert_eq!(settings.key().unwrap(), Secret::new("sk-from-file"));
+        assert_eq!(settings.describing().key().unwrap(), Secret::new("sk-from-file"));
         let missing = MllmSettings { api_key_file: "no-such-file".into(), ..defaults() };
-        assert!(missing.key().unwrap_err().to_string().contains("no-such-file"));
+        assert!(missing.describing().key().unwrap_err().to_string().contains("no-such-file"));
+    }
+
+    #[test]
+    fn the_models_may_have_servers_of_their_own() {
+        let one = MllmSettings { reason_model: "r".into(), ..defaults() };
+        assert_eq!(one.reasoning().models, ["gpt-4o", "r"]);
+        let two = MllmSettings {
+            reason_base_url: "http://other/v1".into(),
+            api_key: Secret::new("sk-one"),
+            ..one
+        };
+        let (describing, reasoning) = (two.describing(), two.reasoning());
+        assert_eq!((describing.models.len(), reasoning.models.as_slice()), (1, &["r".into()][..]));
+        assert!(reasoning.api_key.is_empty(), "a key is for its own server only");
+    }
+
+    #[test]
+    fn a_base_url_that_cannot_be_meant_is_refused_at_start() {
+        let settings = MllmSettings { reason_base_url: "host:80/v1".into(), ..defaults() };
+        assert!(settings.validate(300).unwrap().contains("mllm.reason_base_url"));
     }
 
     #[test]

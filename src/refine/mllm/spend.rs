@@ -9,7 +9,7 @@ use whereabouts_store::SharedLimits;
 
 use super::MllmRefiner;
 use super::budget::{Budget, Exceeded, JobBudget, Reservation, SpendLimits};
-use super::client::{Answer, Call};
+use super::client::{Answer, Call, MllmClient};
 use super::reservation::SharedReservation;
 use super::retry::CallError;
 use super::run::RefineRun;
@@ -95,11 +95,12 @@ impl MllmRefiner {
     pub(super) async fn paid_call(
         &self,
         run: &RefineRun<'_>,
+        client: &MllmClient,
         call: &Call<'_>,
     ) -> Result<Answer, CallError> {
-        let max_tokens = self.client.max_tokens();
+        let max_tokens = call.max_tokens.into();
         let reserved = self.spend.reserve(&run.budget, call.prompt_tokens, max_tokens).await?;
-        let answer = self.client.call(call).await?;
+        let answer = client.call(call).await?;
         reserved.settle(answer.prompt_tokens, answer.completion_tokens);
         run.charge(cost_of(&answer));
         Ok(answer)

@@ -52,6 +52,12 @@ impl ValueEnum for RefinerChoice {
     }
 }
 
+impl From<RefinerKind> for RefinerChoice {
+    fn from(kind: RefinerKind) -> Self {
+        Self(REFINERS.iter().find(|entry| entry.kind == kind))
+    }
+}
+
 impl TryFrom<String> for RefinerChoice {
     type Error = String;
 

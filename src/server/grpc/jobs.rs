@@ -92,9 +92,10 @@ impl JobService for Api {
         request: Request<RetryJobRequest>,
     ) -> Result<Response<RetryJobResponse>, Status> {
         let context = self.context(request.extensions()).map_err(status::of)?;
+        let RetryJobRequest { id, fresh } = request.into_inner();
         let retrying = async {
-            let id = context.job(&request.into_inner().id, 0.0).await?.id;
-            context.service.jobs.retry(id).await
+            let id = context.job(&id, 0.0).await?.id;
+            context.service.jobs.retry(id, fresh).await
         };
         let job = retrying.await.map_err(status::of)?;
         Ok(Response::new(RetryJobResponse { job: Some(job.into()) }))

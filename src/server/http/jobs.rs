@@ -141,8 +141,21 @@ pub(super) async fn cancel_job(
     Ok(Json(service.jobs.cancel(job_id(&id)?).await?))
 }
 
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RetryParams {
+    /// Buy the job's descriptions anew, and retry a job that has succeeded, too.
+    #[serde(default)]
+    #[param(required = false)]
+    fresh: bool,
+}
+
 /// Queue a failed, degraded or cancelled job again
-#[utoipa::path(post, path = "/jobs/{id}/retry", tag = "jobs", params(("id" = Uuid, Path)), responses(
+///
+/// Descriptions that are in the cache are not bought again, unless `fresh` is set.
+#[utoipa::path(post, path = "/jobs/{id}/retry", tag = "jobs",
+    params(("id" = Uuid, Path), RetryParams), responses(
     (status = 200, body = Job),
     (status = 404, body = Problem, description = "No such job", content_type = "application/problem+json"),
     (status = 409, body = Problem, description = "The job has not ended, or has succeeded", content_type = "application/problem+json"),
@@ -150,8 +163,9 @@ pub(super) async fn cancel_job(
 pub(super) async fn retry_job(
     Ready(service): Ready,
     Segments(id): Segments<String>,
+    Params(params): Params<RetryParams>,
 ) -> Result<Json<Job>, Problem> {
-    Ok(Json(service.jobs.retry(job_id(&id)?).await?))
+    Ok(Json(service.jobs.retry(job_id(&id)?, params.fresh).await?))
 }
 
 pub(super) fn job_id(text: &str) -> Result<Uuid, Problem> {

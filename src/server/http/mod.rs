@@ -3,6 +3,7 @@
 mod batch;
 mod body;
 mod description;
+mod descriptions;
 mod events;
 mod examples;
 mod health;
@@ -125,6 +126,10 @@ fn described() -> Described {
     .route(robot.map(MapSource::Job), routes!(events::follow_job))
     .route(operator.map(MapSource::Query), routes!(events::follow_jobs))
     .route(operator.map(MapSource::Query), routes!(usage::usage))
+    .route(admin, routes!(descriptions::list_descriptions))
+    .route(admin, routes!(descriptions::get_description))
+    .route(admin.changes(), routes!(descriptions::remove_description))
+    .route(admin.changes(), routes!(descriptions::purge_descriptions))
     .route(operator, routes!(status::status))
     .route(admin.changes(), routes!(keys::create_key))
     .route(admin, routes!(keys::list_keys))

@@ -10,7 +10,7 @@ use super::state::{AppState, Tiles};
 use crate::gate::Problem;
 use crate::gate::Ready;
 use whereabouts_api::Today;
-use whereabouts_core::RefinerKind;
+use whereabouts_core::{ModelServer, RefinerKind};
 use whereabouts_service::ServiceError;
 use whereabouts_telemetry::{LogIssue, Minute};
 
@@ -44,6 +44,8 @@ pub(super) struct Status {
     /// Budget of today; null if the refiner calls no external model.
     #[schema(nullable)]
     today: Option<Today>,
+    /// Servers of multimodal models that the refiner uses: whether they answer, why not, and what they can do.
+    model_servers: Vec<ModelServer>,
     /// The server of map tiles, if one is configured.
     #[schema(nullable)]
     tiles: Option<Tiles>,
@@ -114,6 +116,7 @@ pub(super) async fn status(
         db_bytes,
         free_bytes: service.retention.free_bytes().await,
         today: service.usage.today(),
+        model_servers: service.usage.model_servers(),
         tiles: about.tiles.clone(),
         minutes: state.gate.metrics.last_hour.minutes(now),
         errors: about.troubles.last(),

@@ -18,7 +18,7 @@ async fn an_unknown_job_is_not_found() {
         jobs.get(id, None).await.unwrap_err().kind,
         jobs.get(id, Some(Duration::from_secs(1))).await.unwrap_err().kind,
         jobs.cancel(id).await.unwrap_err().kind,
-        jobs.retry(id).await.unwrap_err().kind,
+        jobs.retry(id, false).await.unwrap_err().kind,
         jobs.frame(id, None).await.unwrap_err().kind,
         jobs.matches(id, &super::image_id(0)).await.unwrap_err().kind,
         jobs.follow(id).await.err().unwrap().kind,
@@ -31,11 +31,11 @@ async fn a_cancelled_job_ends_and_can_be_queued_again() {
     let fixture = Fixture::new().await;
     let (jobs, job) = (&fixture.service.jobs, fixture.job("yard").await);
     assert_eq!(jobs.get(job.id, None).await.unwrap().state, JobState::Queued);
-    assert_eq!(jobs.retry(job.id).await.unwrap_err().kind, ErrorKind::Conflict);
+    assert_eq!(jobs.retry(job.id, false).await.unwrap_err().kind, ErrorKind::Conflict);
     assert_eq!(jobs.cancel(job.id).await.unwrap().state, JobState::Cancelled);
     assert_eq!(jobs.open().await.unwrap(), 0);
     assert_eq!(jobs.oldest_age().await.unwrap(), Duration::ZERO);
-    assert_eq!(jobs.retry(job.id).await.unwrap().state, JobState::Queued);
+    assert_eq!(jobs.retry(job.id, false).await.unwrap().state, JobState::Queued);
     assert_eq!(jobs.open().await.unwrap(), 1);
 }
 

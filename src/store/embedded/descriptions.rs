@@ -5,6 +5,7 @@
 //! after a restart, which forgets uses, the oldest.
 
 use std::collections::{BTreeMap, HashMap};
+use std::ops::Bound;
 use std::sync::Arc;
 
 use async_trait::async_trait;
@@ -15,7 +16,7 @@ use uuid::Uuid;
 use super::super::{DescriptionBounds, StoreError};
 use super::trees::{Trees, decode, encode, failed, put};
 use super::{EmbeddedStore, blocking};
-use crate::DescriptionCache;
+use crate::{DescriptionCache, DescriptionFilter};
 use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, SimilarFrame};
 use whereabouts_core::{Descriptor, Digest, StandIn};
 
@@ -148,6 +149,54 @@ impl DescriptionCache for EmbeddedStore {
                     trees.descriptions.insert(key.hex(), value).map(drop).map_err(failed)
                 },
                 |()| {},
+            )
+            .await
+    }
+
+    async fn descriptions(
+        &self,
+        filter: &DescriptionFilter,
+        after: Option<&Digest>,
+        limit: usize,
+    ) -> Result<Vec<(Digest, CachedDescription)>, StoreError> {
+        let (inner, filter) = (Arc::clone(&self.inner), filter.clone());
+        let from = match after {
+            Some(after) => Bound::Excluded(after.hex().into_bytes()),
+            None => Bound::Unbounded,
+        };
+        blocking(move || {
+            let mut found = Vec::new();
+            for entry in inner.trees.descriptions.range((from, Bound::Unbounded)) {
+                let (key, value) = entry.map_err(failed)?;
+                let record: CachedDescription = decode(&value)?;
+                let key = std::str::from_utf8(&key).ok().and_then(|hex| hex.parse().ok());
+                if let Some(key) = key.filter(|_| filter.matches(&record)) {
+                    found.push((key, record));
+                }
+                if found.len() >= limit {
+                    break;
+                }
+            }
+            Ok(found)
+        })
+        .await
+    }
+
+    async fn remove_descriptions(&self, keys: &[Digest]) -> Result<usize, StoreError> {
+        let (inner, keys) = (Arc::clone(&self.inner), keys.to_vec());
+        self.inner
+            .writer
+            .commit(
+                move |trees, _| {
+                    let mut removed = 0;
+                    for key in &keys {
+                        let there = trees.descriptions.remove(key.hex()).map_err(failed)?;
+                        inner.descriptions.order().forget(key);
+                        removed += usize::from(there.is_some());
+                    }
+                    Ok(removed)
+                },
+                |_| {},
             )
             .await
     }

@@ -236,10 +236,10 @@ impl JobStore for EmbeddedStore {
         .await
     }
 
-    async fn retry(&self, id: Uuid) -> Result<Job, StoreError> {
+    async fn retry(&self, id: Uuid, fresh_since: Option<Timestamp>) -> Result<Job, StoreError> {
         self.change(id, move |trees, mut record| {
             let ended = ended_at(&record.job);
-            record.retry()?;
+            record.retry(fresh_since)?;
             write_job(trees, &record, Listing::Requeued { ended })?;
             Ok(record)
         })

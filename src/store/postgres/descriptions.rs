@@ -11,7 +11,7 @@ use uuid::Uuid;
 use super::super::StoreError;
 use super::blobs::digest_of;
 use super::{Inner, PostgresStore, count, counted, record};
-use crate::DescriptionCache;
+use crate::{DescriptionCache, DescriptionFilter};
 use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, SimilarFrame};
 use whereabouts_core::{Descriptor, Digest, StandIn};
 
@@ -73,6 +73,43 @@ impl DescriptionCache for PostgresStore {
         .bind(count(text.len() + key.as_bytes().len()))
         .bind(text);
         inner.run(query).await.map(drop)
+    }
+
+    async fn descriptions(
+        &self,
+        filter: &DescriptionFilter,
+        after: Option<&Digest>,
+        limit: usize,
+    ) -> Result<Vec<(Digest, CachedDescription)>, StoreError> {
+        let inner = &self.inner;
+        let mut found = Vec::new();
+        let mut after = after.map(|after| after.as_bytes().to_vec()).unwrap_or_default();
+        loop {
+            let query = sqlx::query_as(
+                "SELECT key, record FROM descriptions WHERE key > $1 ORDER BY key LIMIT $2",
+            )
+            .bind(after.clone())
+            .bind(REMOVAL_BATCH);
+            let page: Vec<(Vec<u8>, sqlx::types::Json<CachedDescription>)> =
+                inner.call(async { Ok(query.fetch_all(&inner.pool).await?) }).await?;
+            let Some((last, _)) = page.last() else { return Ok(found) };
+            after = last.clone();
+            for (key, record) in page {
+                if filter.matches(&record.0) {
+                    found.push((digest_of(&key)?, record.0));
+                }
+                if found.len() >= limit {
+                    return Ok(found);
+                }
+            }
+        }
+    }
+
+    async fn remove_descriptions(&self, keys: &[Digest]) -> Result<usize, StoreError> {
+        let keys: Vec<Vec<u8>> = keys.iter().map(|key| key.as_bytes().to_vec()).collect();
+        let query = sqlx::query("DELETE FROM descriptions WHERE key = ANY($1)").bind(keys);
+        let removed = self.inner.run(query).await?;
+        Ok(usize::try_from(removed).unwrap_or(usize::MAX))
     }
 
     async fn acquire_lease(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {

@@ -393,9 +393,9 @@ impl JobStore for PostgresStore {
         self.change(id, |known| Ok(known.cancel(Timestamp::now()).then_some(RowUpdate::End))).await
     }
 
-    async fn retry(&self, id: Uuid) -> Result<Job, StoreError> {
+    async fn retry(&self, id: Uuid, fresh_since: Option<Timestamp>) -> Result<Job, StoreError> {
         self.change(id, |known| {
-            known.retry()?;
+            known.retry(fresh_since)?;
             Ok(Some(RowUpdate::Queue { for_s: 0.0 }))
         })
         .await

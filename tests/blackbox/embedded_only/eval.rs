@@ -8,7 +8,7 @@ use exif::{Field, In, Rational, Tag};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::mock_mllm::{MockMllm, Script};
+use crate::mock_mllm::{MockMllm, Reply, Script};
 use crate::support::{BINARY, frame, reference};
 use crate::wait::until;
 
@@ -220,6 +220,28 @@ async fn a_killed_run_is_resumed_and_pays_for_no_description_twice() {
     let again = folders.eval(&args);
     assert_eq!(again["methods"], summary["methods"]);
     assert_eq!((mock.describe_calls(), mock.reason_calls()), (described, reasoned));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_work_of_the_fallback_is_not_printed_as_the_models_and_the_exit_code_tells() {
+    let folders = Folders::town(4);
+    let script = Script {
+        describe: Box::new(|_| Reply::Status(401, "no such key".into())),
+        ..Script::default()
+    };
+    let mock = MockMllm::start(script).await;
+    let url = mock.url();
+    let args = ["--refine", "both", "--mllm-base-url", &url, "-k", "4"];
+    let output = folders.command(&args).output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{error}");
+    assert!(error.contains("4 of 4 queries were not fully refined by gem+mllm"), "{error}");
+    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(names(&summary), ["gem", "gem+local", "gem+mllm"]);
+    let methods = &summary["methods"];
+    assert_eq!(methods[2]["recall"], methods[0]["recall"]);
+    assert_eq!(methods[2]["degraded"], 4);
+    assert!(methods[2]["degraded_why"].as_str().unwrap().contains("no such key"));
 }
 
 #[test]

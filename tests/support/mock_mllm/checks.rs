@@ -6,7 +6,7 @@ use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
-use super::Script;
+use super::{Purpose, Script};
 
 /// A valid request.
 pub struct ParsedCall {
@@ -57,19 +57,24 @@ pub fn check_request(request: &Value, max_edge: u32) -> Result<ParsedCall, Strin
         .iter()
         .filter_map(|name| fields.get(*name))
         .collect();
-    let bounded = matches!(bounds.as_slice(), [bound] if bound.as_u64().is_some_and(|n| n > 0));
-    ensure(bounded, "the answer's length must be bounded once, by a positive integer")?;
+    let bounded =
+        bounds.len() <= 1 && bounds.iter().all(|bound| bound.as_u64().is_some_and(|n| n > 0));
+    ensure(bounded, "the answer's length must be bounded once at most, by a positive integer")?;
     let structured = fields.get("response_format").map(check_format).transpose()?.is_some();
     let messages = request["messages"].as_array().ok_or("messages is no array")?;
     let mut parsed =
         ParsedCall { pictures: vec![], prompt: String::new(), repair: false, structured };
+    let (rules, messages) = match messages.split_first() {
+        Some((first, rest)) if first["role"] == "system" => (first["content"].as_str(), rest),
+        _ => (None, messages.as_slice()),
+    };
     for (index, message) in messages.iter().enumerate() {
         let expected = if index % 2 == 0 { "user" } else { "assistant" };
         ensure(message["role"] == expected, format!("message {index} is not the {expected}'s"))?;
         let text = check_content(&message["content"], max_edge, &mut parsed.pictures)?;
         ensure(!text.trim().is_empty(), format!("message {index} is empty"))?;
         if index == 0 {
-            parsed.prompt = text;
+            parsed.prompt = [rules.unwrap_or_default(), &text].join("\n");
         }
     }
     ensure(messages.len() % 2 == 1, "the last message is not the user's")?;
@@ -114,6 +119,9 @@ fn check_picture(url: &Value, max_edge: u32) -> Result<String, String> {
 
 /// The rules of strict structured output.
 fn check_format(format: &Value) -> Result<(), String> {
+    if format["type"] == "json_object" {
+        return Ok(());
+    }
     ensure(format["type"] == "json_schema", "response_format is no json_schema")?;
     let named = &format["json_schema"];
     let name = named["name"].as_str().unwrap_or_default();
@@ -127,6 +135,25 @@ fn check_format(format: &Value) -> Result<(), String> {
     let required = schema["required"].as_array().ok_or("the schema requires nothing")?;
     let all = properties.keys().all(|name| required.iter().any(|required| required == name));
     ensure(all && required.len() == properties.len(), "not every property is required")
+}
+
+/// Decoders write the properties of a schema in the order of its bytes, and reasoning is to come first.
+pub fn check_order(body: &[u8]) -> Result<(), String> {
+    let body = String::from_utf8_lossy(body);
+    match body.split_once("\"properties\":{") {
+        Some((_, first)) => ensure(first.starts_with("\"reasoning\""), "the ranking comes first"),
+        None => Ok(()),
+    }
+}
+
+/// What a call is for, by what it contains.
+pub fn purpose_of(request: &Value) -> Purpose {
+    let text = request["messages"].to_string();
+    match (text.contains("Capability check"), text.contains("\"image_url\"")) {
+        (true, _) => Purpose::Check,
+        (false, true) => Purpose::Describe,
+        (false, false) => Purpose::Reason,
+    }
 }
 
 /// Label and text of all notes in a reasoning prompt.

@@ -69,47 +69,81 @@ async fn an_answer_above_the_size_limit_is_rejected() {
 }
 
 #[tokio::test]
-async fn a_pair_that_fails_permanently_is_ranked_last() {
+async fn a_pair_without_a_description_keeps_its_coarse_place() {
     let script = Script {
         describe: Box::new(|call| match call.number {
-            2 => status(413),
+            // The pair is asked for twice.
+            2 | 3 => Reply::Said("I'm sorry, but I can't help with that.".into()),
             number => Reply::Text(format!("notes number {number}.")),
         }),
-        reason: Box::new(|call| ranking(&call.labels_with_first("number 4."))),
+        reason: Box::new(|call| ranking(&call.labels_with_first("number 5."))),
         ..Script::default()
     };
-    let bench = Bench::with(script, |settings| settings.concurrency = 1).await;
+    let bench = Bench::with(script, |settings| {
+        settings.concurrency = 1;
+        settings.hide_coarse_rank = false;
+    })
+    .await;
     let refinement = bench.refine(4).await.unwrap();
-    let order = ranks(&refinement);
-    assert_eq!((order[0], order[3]), (4, 2));
+    assert_eq!(ranks(&refinement), [4, 2, 1, 3]);
     assert_eq!(refinement.descriptions.len(), 3);
     let why = refinement.degraded.unwrap();
-    assert!(why.starts_with("1 of 4 pairs could not be described") && why.contains("413"), "{why}");
+    assert!(
+        why.starts_with("1 of 4 pairs could not be described") && why.contains("refused"),
+        "{why}"
+    );
+    // It was not cached, and is asked for again.
+    bench.refine(4).await.unwrap();
+    assert_eq!(bench.mock.describe_calls(), 5 + 1);
 }
 
 #[tokio::test]
-async fn without_any_description_the_job_has_no_ranking() {
+async fn without_any_description_the_fallback_refines_and_without_it_the_job_fails() {
     let always =
         |reply: Reply| Script { describe: Box::new(move |_| reply.clone()), ..Script::default() };
     let bench = Bench::new(always(status(404))).await;
-    assert!(matches!(bench.refine(2).await.unwrap_err(), RefineError::Permanent(_)));
-    assert_eq!(bench.mock.describe_calls(), 2);
+    assert!(matches!(bench.refine(2).await.unwrap_err(), RefineError::Transient(_)));
+    assert_eq!(bench.mock.describe_calls(), 1);
     let bench = Bench::with(always(status(500)), |settings| settings.breaker_failures = 100).await;
     assert!(matches!(bench.refine(2).await.unwrap_err(), RefineError::Transient(_)));
     assert_eq!(bench.mock.describe_calls(), 8);
-    let bench = Bench::new(always(Reply::Text(" \u{200b}\n".into()))).await;
+    let mut bench = Bench::new(always(Reply::Said(" \u{200b}\n".into()))).await;
     let error = bench.refine(1).await.unwrap_err();
-    assert!(error.to_string().contains("the description is empty"), "{error}");
+    assert!(error.to_string().contains("said nothing"), "{error}");
+    assert_eq!(bench.mock.describe_calls(), 2);
+    bench.fallback = Some(Arc::new(limits::Reverse));
+    bench.rebuild(|_| {});
+    let refinement = bench.refine(2).await.unwrap();
+    assert_eq!(ranks(&refinement), [2, 1]);
+    assert!(refinement.degraded.unwrap().contains("said nothing"));
 }
 
 #[tokio::test]
-async fn after_a_failed_reasoning_call_the_order_is_the_coarse_one() {
-    let script = Script { reason: Box::new(|_| status(500)), ..Script::default() };
-    let bench = Bench::new(script).await;
+async fn after_a_failed_reasoning_call_the_order_is_the_fallbacks_and_the_descriptions_stay() {
+    let script = Script {
+        reason: Box::new(|call| match call.number {
+            number if number <= 10 => status(500),
+            _ => ranking(&call.labels()),
+        }),
+        ..Script::default()
+    };
+    let mut bench = Bench::with(script, |settings| settings.breaker_failures = 100).await;
     let refinement = bench.refine(3).await.unwrap();
     assert_eq!(ranks(&refinement), [1, 2, 3]);
     assert!(refinement.degraded.unwrap().contains("all candidates are in coarse order"));
-    assert_eq!(refinement.usage.calls, 3);
+    assert_eq!((refinement.usage.calls, refinement.descriptions.len()), (3, 3));
+
+    bench.fallback = Some(Arc::new(limits::Reverse));
+    bench.rebuild(|_| {});
+    let refinement = bench.refine(3).await.unwrap();
+    assert_eq!(ranks(&refinement), [3, 2, 1]);
+    let why = refinement.degraded.unwrap();
+    assert!(why.contains("the order is that of `local`") && why.contains("on purpose"), "{why}");
+    assert_eq!((refinement.usage.cached, refinement.descriptions.len()), (3, 3));
+
+    // The reasoning is tried again later, at no new description.
+    let refinement = bench.refine(3).await.unwrap();
+    assert_eq!((refinement.degraded, bench.mock.describe_calls()), (None, 3));
 }
 
 #[tokio::test]
@@ -119,7 +153,8 @@ async fn a_schema_is_not_sent_again_after_the_server_rejected_it() {
     for _ in 0..3 {
         assert_eq!(bench.refine(2).await.unwrap().degraded, None);
     }
-    assert_eq!((bench.mock.structure_refused(), bench.mock.reason_calls()), (1, 3));
+    // A schema with bounds, one without, and any object.
+    assert_eq!((bench.mock.structure_refused(), bench.mock.reason_calls()), (3, 3));
 }
 
 #[tokio::test]

@@ -6,7 +6,7 @@ use super::*;
 use whereabouts_core::{Ranking, RefinerKind, Usage};
 
 /// Stands in for the local refiner: reverses the coarse order.
-struct Reverse;
+pub struct Reverse;
 
 #[async_trait]
 impl Refiner for Reverse {
@@ -26,6 +26,7 @@ impl Refiner for Reverse {
             evidence: None,
             reasoning: None,
             reasoning_took_ms: None,
+            ordered_by: None,
             usage: Usage::default(),
             degraded: None,
         })
@@ -58,6 +59,7 @@ async fn an_open_breaker_hands_the_job_to_the_fallback() {
     for _ in 0..2 {
         let refinement = bench.refine(5).await.unwrap();
         assert_eq!(ranks(&refinement), [5, 4, 3, 2, 1]);
+        assert_eq!(refinement.ordered_by, Some(RefinerKind::Local));
         let why = refinement.degraded.unwrap();
         assert!(why.contains("`local` instead of `mllm`") && why.contains("suspended"), "{why}");
     }
@@ -70,6 +72,53 @@ async fn without_a_fallback_an_open_breaker_is_a_transient_error() {
     let bench = Bench::with(failing(1000), brittle).await;
     let error = bench.refine(5).await.unwrap_err();
     assert!(matches!(error, RefineError::Transient(_)), "{error}");
+    let why = error.to_string();
+    assert!(why.contains("suspended") && why.contains("500") && why.contains("down"), "{why}");
+    let [server] = bench.refiner.servers().try_into().unwrap();
+    assert!(server.suspended && server.suspended_for_s.is_some());
+    let trouble = server.trouble.unwrap();
+    assert_eq!((trouble.kind.as_str(), trouble.status), ("server_error", Some(500)));
+}
+
+#[tokio::test]
+async fn a_server_that_refuses_every_call_is_asked_once_or_twice_and_then_no_more() {
+    for (status, kind) in [(401, "key"), (402, "quota"), (404, "not_found"), (413, "too_large")] {
+        let script = Script {
+            describe: Box::new(move |_| Reply::Status(status, "the server's words".into())),
+            ..Script::default()
+        };
+        let mut bench = Bench::new(script).await;
+        bench.fallback = Some(Arc::new(Reverse));
+        bench.rebuild(|settings| settings.breaker_open_s = 3600);
+        for _ in 0..3 {
+            let refinement = bench.refine(10).await.unwrap();
+            let why = refinement.degraded.unwrap();
+            assert!(why.contains("`local` instead of `mllm`"), "{why}");
+            assert!(
+                why.contains("the server's words") && why.contains(&status.to_string()),
+                "{why}"
+            );
+        }
+        assert!(bench.mock.describe_calls() <= 2, "{status}: {}", bench.mock.describe_calls());
+        let [server] = bench.refiner.servers().try_into().unwrap();
+        assert_eq!(server.trouble.unwrap().kind, kind);
+    }
+}
+
+#[tokio::test]
+async fn a_refused_job_is_deferred_if_it_is_to_wait() {
+    let script = Script {
+        describe: Box::new(|_| Reply::Status(401, "no such key".into())),
+        ..Script::default()
+    };
+    let bench = Bench::with(script, |settings| {
+        settings.breaker_open_s = 3600;
+        settings.on_unavailable = OnUnavailable::Wait;
+    })
+    .await;
+    let error = bench.refine(5).await.unwrap_err();
+    let RefineError::Deferred { why, after } = error else { panic!("{error}") };
+    assert!(why.contains("no such key") && after.as_secs() > 3500, "{why} {after:?}");
 }
 
 #[tokio::test]

@@ -21,7 +21,9 @@ use whereabouts_core::{
     Usage,
 };
 use whereabouts_index::SearchMode;
-use whereabouts_store::{Added, BlobPin, HardNegatives, IndexState, Step, StoreError};
+use whereabouts_store::{
+    Added, BlobPin, DescriptionFilter, HardNegatives, IndexState, Step, StoreError,
+};
 use whereabouts_telemetry::metrics::registry;
 use whereabouts_testkit::mock_mllm::{MockMllm, Script};
 use whereabouts_vision::decode::encode_jpeg;
@@ -147,6 +149,7 @@ impl Shelf {
             },
             candidates: (0..candidates).map(candidate).collect(),
             spent: Usage::default(),
+            fresh_since: None,
         }
     }
 }
@@ -300,6 +303,19 @@ impl DescriptionCache for MemoryCache {
     ) -> Result<(), StoreError> {
         self.descriptions.lock().insert(key, value);
         Ok(())
+    }
+
+    async fn descriptions(
+        &self,
+        _: &DescriptionFilter,
+        _: Option<&Digest>,
+        _: usize,
+    ) -> Result<Vec<(Digest, CachedDescription)>, StoreError> {
+        unused()
+    }
+
+    async fn remove_descriptions(&self, _: &[Digest]) -> Result<usize, StoreError> {
+        unused()
     }
 
     async fn similar_frames(
