@@ -168,7 +168,7 @@ class Contract(unittest.TestCase):
 
     def test_an_image_is_corrected_by_an_update_or_by_adding_it_again(self) -> None:
         call, message = self.call, self.message
-        name, picture = pictures("map")[0]
+        _, picture = pictures("map")[0]
         call("MapService", "PutMap", message("PutMapRequest", map="moved", frame=2))
 
         def metric(x: float) -> Any:
