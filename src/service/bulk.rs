@@ -215,7 +215,7 @@ impl Images {
         saved: SavedImage,
         meta: Result<ImageMeta, ServiceError>,
     ) -> Result<(ImageAnswer, bool), ServiceError> {
-        let SavedImage { answer: ImageAnswer { image, changed }, is_new } = saved;
+        let SavedImage { answer: ImageAnswer { image, changed, warnings }, is_new } = saved;
         let described = self.described(map, &image, meta).await;
         let moved = described.as_ref().is_ok_and(|(other, _)| other.image.id != image.id);
         if is_new && (described.is_err() || moved) {
@@ -225,6 +225,7 @@ impl Images {
         if moved {
             return Ok((answer, is_other_new));
         }
+        answer.warnings = warnings;
         if is_new {
             answer.changed = Vec::new();
         } else {

@@ -119,7 +119,8 @@ async fn bound_stream(
             Err(problem) => return encoding::refuse(request, problem),
         };
         let headers = request.headers().clone();
-        let request = request.map(|body| upload::bounded(body, &headers, gate.settings.server.body_pause));
+        let request =
+            request.map(|body| upload::bounded(body, &headers, gate.settings.server.body_pause));
         encoding::expanded(request, encoding)
     };
     let mut response = next.run(request).await;

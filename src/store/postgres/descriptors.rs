@@ -23,6 +23,9 @@ pub(super) const MAX_INDEXED_DIM: usize = 4000;
 /// Number of images requested from the index in addition to `k`, to be ranked again.
 const OVERFETCH: usize = 8;
 
+/// Equal images at the top of a result from which the index may have kept the rest of the map.
+const CROWD: usize = 10;
+
 /// Descriptors with more dimensions do not fit into a table's page, and are stored out of line.
 const MAX_INLINE_DIM: usize = 1900;
 
@@ -234,10 +237,10 @@ impl Inner {
         mode: SearchMode,
     ) -> Result<Vec<Found>, StoreError> {
         if mode == SearchMode::Fast && self.has_graph(map).await? {
-            let found = self.nearest(map, query, k, true).await?;
-            // If many images were removed, an index scan may end before it has found enough. Disposition search
-            // exactly.
-            if found.len() == k {
+            let mut found = self.nearest(map, query, k.max(CROWD), true).await?;
+            // If many images were removed, an index scan may end before it has found enough.
+            if found.len() >= k && !is_crowd(&found) {
+                found.truncate(k);
                 return Ok(found);
             }
         }
@@ -372,4 +375,12 @@ fn candidates(found: Vec<Found>) -> Vec<Candidate> {
         pose: found.pose,
     };
     found.into_iter().enumerate().map(candidate).collect()
+}
+
+/// Whether the first results are equal images. pgvector links each of many equal images to others of them only, and a
+/// scan that gets among them does not get out again, however far they are from the query.
+fn is_crowd(found: &[Found]) -> bool {
+    const TIE: f64 = 1e-6;
+    let (first, last) = (found.first(), found.get(CROWD - 1));
+    first.zip(last).is_some_and(|(first, last)| first.similarity - last.similarity < TIE)
 }
