@@ -23,7 +23,7 @@ from dataclasses import fields, is_dataclass
 from datetime import datetime, timedelta, timezone
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import index_and_localize
 import whereabouts_client as client
@@ -544,12 +544,21 @@ class Contract(unittest.TestCase):
         for kind in ours:
             if kind is not client.Health:
                 names = {field.name for field in fields(kind)}
-                self.assertEqual(names, set(schemas[kind.__name__]["properties"]), kind.__name__)
+                self.assertEqual(names, properties(schemas, schemas[kind.__name__]), kind.__name__)
 
     def test_the_literals_are_the_enum_values_of_the_openapi_schemas(self) -> None:
         schemas = json.loads(CONTRACT.read_text())["components"]["schemas"]
         for name in ("Scene", "Frame", "DescriptorKind", "Priority", "JobState"):
             self.assertEqual(set(getattr(client, name).__args__), set(words(schemas[name])), name)
+
+
+def properties(schemas: dict[str, Any], schema: dict[str, Any]) -> set[str]:
+    """The fields of a schema, including those of the schemas that it extends."""
+    found = set(schema.get("properties", ()))
+    for part in schema.get("allOf", ()):
+        extended = schemas[part["$ref"].rsplit("/", 1)[1]] if "$ref" in part else part
+        found |= properties(schemas, extended)
+    return found
 
 
 def words(schema: dict[str, object]) -> list[str]:
