@@ -43,7 +43,11 @@ impl Table {
             bail!("{name} has more than {MAX_BYTES} bytes; split it, and the folder with it");
         }
         let bytes = std::fs::read(file).with_context(|| format!("cannot read {name}"))?;
-        let text = decoded(&bytes).with_context(|| name.to_string())?;
+        let mut text = decoded(&bytes).with_context(|| name.to_string())?;
+        if !text.contains('\n') {
+            // The line ends of old spreadsheets, at which the CSV reader would not end a comment.
+            text = text.replace('\r', "\n");
+        }
         let head = Head::find(&text, is_key).with_context(|| {
             format!("{name} has no row of column names; begin it with one, such as file,lat,lon")
         })?;
