@@ -125,8 +125,6 @@ impl Grey {
         let fit = |edge: usize| (edge * FINE.min(longest)).div_ceil(longest).max(1);
         let (width, height) = (fit(from_width), fit(from_height));
         let columns: Vec<usize> = (0..from_width).map(|x| x * width / from_width).collect();
-        let mut sums = vec![0.0; width * height];
-        let mut counts = vec![0u32; width * height];
         let plane = from_width * from_height;
         let (red, rest) = tensor.data.split_at(plane);
         let (green, blue) = rest.split_at(plane);
@@ -134,17 +132,29 @@ impl Grey {
         const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
         let weights: [f32; 3] = [0, 1, 2].map(|channel| LUMA[channel] * input.std[channel]);
         let offset: f32 = (0..3).map(|channel| LUMA[channel] * input.mean[channel]).sum();
-        for y in 0..from_height {
-            let row = y * from_width..(y + 1) * from_width;
-            let to = (y * height / from_height) * width;
-            let pixels = red[row.clone()].iter().zip(&green[row.clone()]).zip(&blue[row]);
-            for (((r, g), b), column) in pixels.zip(&columns) {
-                sums[to + column] += weights[0] * r + weights[1] * g + weights[2] * b;
-                counts[to + column] += 1;
+        let mut values = Vec::with_capacity(width * height);
+        for to_row in 0..height {
+            let first = |row: usize| (row * from_height).div_ceil(height);
+            let rows = first(to_row)..first(to_row + 1);
+            // The rows are added first, which the compiler vectorises, and the columns once for all of them.
+            let mut lumas = vec![0.0; from_width];
+            for y in rows.clone() {
+                let row = y * from_width..(y + 1) * from_width;
+                let pixels = red[row.clone()].iter().zip(&green[row.clone()]).zip(&blue[row]);
+                for (luma, ((r, g), b)) in lumas.iter_mut().zip(pixels) {
+                    *luma += weights[0] * r + weights[1] * g + weights[2] * b;
+                }
             }
+            let mut sums = vec![(0.0, 0u32); width];
+            for (luma, column) in lumas.iter().zip(&columns) {
+                let (sum, count) = &mut sums[*column];
+                (*sum, *count) = (*sum + luma, *count + 1);
+            }
+            let rows = rows.len() as f32;
+            let value = |(sum, count): (f32, u32)| 255.0 * (sum / (count as f32 * rows) + offset);
+            values.extend(sums.into_iter().map(value));
         }
-        let value = |(sum, count): (&f32, &u32)| 255.0 * (sum / *count.max(&1) as f32 + offset);
-        Self { width, height, values: sums.iter().zip(&counts).map(value).collect() }
+        Self { width, height, values }
     }
 
     /// Averages blocks of 2 × 2.
