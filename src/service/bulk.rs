@@ -62,7 +62,7 @@ pub enum BulkItem {
 #[derive(Debug)]
 pub enum BulkResult {
     /// The stored image, and whether it is new.
-    Saved(ImageAnswer, bool),
+    Saved(Box<ImageAnswer>, bool),
     /// The name of something that is not an image, and why it was skipped.
     Skipped(String, &'static str),
     /// The id that the caller gave the image, if any, and the error.
@@ -201,7 +201,7 @@ impl Images {
         Some(match result {
             Ok((answer, is_new)) => {
                 let _ = saved.set(SavedImage { answer: answer.clone(), is_new });
-                BulkResult::Saved(answer, is_new)
+                BulkResult::Saved(Box::new(answer), is_new)
             }
             Err(error) => BulkResult::Failed(id, error),
         })

@@ -7,11 +7,11 @@ use std::sync::Arc;
 use ort::value::{Outlet, TensorElementType, ValueType};
 
 use super::decode::Needed;
+use super::execution::Execution;
 use super::extractor::{ExtractError, SAMPLES, sample};
 use super::manifest::{Input, MANIFEST, Manifest, Resize};
 use super::pooling::{LocalFeatures, PoolingError};
 use super::preprocess::{Tensor, preprocess};
-use super::execution::Execution;
 use super::runtime::{Assets, RuntimeError};
 use super::session::{InferenceError, Model, Runner};
 use super::{ImageLimits, Picture, decode};

@@ -142,7 +142,8 @@ fn result(result: BulkResult) -> AddImageResult {
         outcome: Some(Outcome::Problem(convert::problem(error))),
     };
     match result {
-        BulkResult::Saved(ImageAnswer { image, changed, warnings }, new) => {
+        BulkResult::Saved(answer, new) => {
+            let ImageAnswer { image, changed, warnings } = *answer;
             let stored = Stored {
                 present: !new,
                 digest: image.digest.to_string(),

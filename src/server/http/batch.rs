@@ -218,7 +218,8 @@ fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, Servi
 
 fn batch_result(result: BulkResult) -> BatchResult {
     let (id, outcome, changed, problem, warnings) = match result {
-        BulkResult::Saved(ImageAnswer { image, changed, warnings }, new) => {
+        BulkResult::Saved(answer, new) => {
+            let ImageAnswer { image, changed, warnings } = *answer;
             let outcome = if new { BatchOutcome::Stored } else { BatchOutcome::Present };
             (Some(image.id.into()), outcome, changed, None, warnings)
         }
