@@ -125,7 +125,7 @@ impl Images {
                     }
                     let result = match item {
                         Ok((item, id)) => self.process(map, caller, index, item, id, &saved).await,
-                        Err(failed) => Some(failed),
+                        Err((id, error)) => Some(BulkResult::Failed(id, error)),
                     };
                     (number, result)
                 }
@@ -148,7 +148,7 @@ impl Images {
         &self,
         index: usize,
         item: BulkItem,
-    ) -> Result<(BulkItem, Option<ImageId>), BulkResult> {
+    ) -> Result<(BulkItem, Option<ImageId>), (Option<ImageId>, ServiceError)> {
         let given = match &item {
             BulkItem::Image(BulkImage { meta, .. }) | BulkItem::Meta(Ok(meta)) => {
                 meta.id.as_deref()
@@ -159,14 +159,14 @@ impl Images {
         let max_images = self.bulk.max_images;
         match (id, &item) {
             (Err(error), BulkItem::Meta(_)) => Ok((BulkItem::Meta(Err(error.into())), None)),
-            (Err(error), _) => Err(BulkResult::Failed(None, error.into())),
+            (Err(error), _) => Err((None, error.into())),
             (Ok(id), BulkItem::Meta(_)) => Ok((item, id)),
             (Ok(id), _) if index >= max_images => {
                 let detail = format!(
                     "an upload has at most {max_images} images (bulk.max_images); send this one and the rest in \
                      another upload"
                 );
-                Err(BulkResult::Failed(id, ServiceError::new(ErrorKind::TooLarge, detail)))
+                Err((id, ServiceError::new(ErrorKind::TooLarge, detail)))
             }
             (Ok(id), _) => Ok((item, id)),
         }

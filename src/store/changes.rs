@@ -154,8 +154,8 @@ pub(super) fn changed_map(
             MapContent::WithoutPoses if same_descriptors => {}
             MapContent::WithPoses if same_descriptors => {
                 return Err(StoreError::Conflict(format!(
-                    "images of the map {} have poses in the coordinate frame {}, so it cannot become {}; \
-                     remove their poses first (PATCH each image with {{\"pose\": null}}), or index them in \
+                    "images of the map {} have poses in the coordinate frame {}, so that is fixed and cannot \
+                     become {}; remove their poses first (PATCH each image with {{\"pose\": null}}), or index them in \
                      a new map",
                     stored.name, stored.frame, requested.frame
                 )));

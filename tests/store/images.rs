@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use futures_util::future::join_all;
 use whereabouts_core::ExportedImage;
-use whereabouts_core::{GeographicPose, Image, ImageId, Map, MetricPose, Pose};
+use whereabouts_core::{CoordinateFrame, GeographicPose, Image, ImageId, Map, MetricPose, Pose};
 use whereabouts_index::SearchMode;
 use whereabouts_store::{Added, Store, StoreError};
 
@@ -153,7 +153,8 @@ async fn all_fields_of_an_image_are_kept(fixture: &Fixture) {
 
 async fn poses_are_returned_in_the_order_of_addition(fixture: &Fixture) {
     let store = fixture.open().await;
-    let (map, _) = store.put_map(map("m", 3)).await.unwrap();
+    let in_metres = Map { frame: CoordinateFrame::Metric, ..map("m", 3) };
+    let (map, _) = store.put_map(in_metres).await.unwrap();
     assert!(store.positions(&map).await.unwrap().is_empty());
     let at = |x: f64| {
         let (z, qx, qy, qz, qw) = (None, None, None, None, None);

@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use futures_util::future::join_all;
 use whereabouts_core::{
-    Calibration, CalibrationSettings, CoordinateFrame, DescriptorKind, Digest, Map, Precision,
-    Scene,
+    Calibration, CalibrationSettings, DescriptorKind, Digest, Map, Precision, Scene,
 };
 use whereabouts_index::SearchMode;
 use whereabouts_store::{IndexState, Store, StoreError};
@@ -46,11 +45,10 @@ async fn a_map_is_created_once_and_its_scene_and_description_can_change(fixture:
 async fn descriptor_settings_are_fixed_once_there_are_images(fixture: &Fixture) {
     let store = fixture.open().await;
     let (mut known, _) = store.put_map(map("m", 3)).await.unwrap();
-    let others: [fn(Map) -> Map; 5] = [
+    let others: [fn(Map) -> Map; 4] = [
         |map| Map { model: "other".into(), model_digest: Digest::of(b"other"), ..map },
         |map| Map { precision: Precision::Bf16, ..map },
         |map| Map { descriptor: DescriptorKind::Cls, ..map },
-        |map| Map { frame: CoordinateFrame::Metric, ..map },
         |map| Map { dim: 5, ..map },
     ];
     for other in others {

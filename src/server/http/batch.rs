@@ -14,7 +14,7 @@ use futures_util::{Stream, StreamExt};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use utoipa::ToSchema;
 
-use super::body::{Segments, content_type};
+use super::body::{Segments, content_type, object};
 use super::maps::map_name;
 use super::state::AppState;
 use crate::gate::{BodyPaused, GateSettings, Problem, Ready, no_bulk_memory, too_large};
@@ -205,7 +205,7 @@ fn unreadable(error: &(dyn std::error::Error + 'static), text: &str) -> Problem 
 /// Parses the `meta` of an image. The name of its file is its id, unless `meta` has one.
 fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, ServiceError> {
     let meta: ImageMeta = meta
-        .map(serde_json::from_slice)
+        .map(object)
         .transpose()
         .map_err(|error| {
             let of = name.map(|name| format!(" of {name:?}")).unwrap_or_default();

@@ -91,12 +91,20 @@ impl<T: DeserializeOwned> FromRequest<AppState> for JsonBody<T> {
         let bytes =
             read_whole(request.into_body(), state.gate.settings.server.body_limit_bytes).await?;
         let text: &[u8] = if bytes.is_empty() { b"{}" } else { &bytes };
-        serde_json::from_slice(text).map(Self).map_err(|error| {
+        object(text).map(Self).map_err(|error| {
             Problem::new(
                 ErrorKind::Malformed,
                 format!("the body is not the JSON expected: {error}"),
             )
         })
+    }
+}
+
+/// Reads a JSON object. An array is refused, which the fields of a type would be read from in their order.
+pub(super) fn object<T: DeserializeOwned>(text: &[u8]) -> Result<T, serde_json::Error> {
+    match text.trim_ascii_start().first() {
+        Some(b'[') => Err(serde::de::Error::custom("it is an array; send an object")),
+        _ => serde_json::from_slice(text),
     }
 }
 

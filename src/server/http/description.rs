@@ -25,6 +25,7 @@ pub(super) fn completed(mut description: OpenApi, policies: &Policies) -> OpenAp
             (Method::GET, &mut item.get),
             (Method::PUT, &mut item.put),
             (Method::POST, &mut item.post),
+            (Method::PATCH, &mut item.patch),
             (Method::DELETE, &mut item.delete),
         ];
         for (method, operation) in operations {

@@ -138,6 +138,7 @@ pub(super) fn show(description: &mut OpenApi) {
             ("GET", &mut item.get),
             ("PUT", &mut item.put),
             ("POST", &mut item.post),
+            ("PATCH", &mut item.patch),
             ("DELETE", &mut item.delete),
         ];
         for (method, operation) in operations {

@@ -10,7 +10,7 @@ use jiff::Timestamp;
 use serde::Deserialize;
 use utoipa::IntoParams;
 
-use super::body::{JsonBody, Params, PictureBody, Segments};
+use super::body::{JsonBody, Params, PictureBody, Segments, object};
 use super::maps::map_name;
 use super::pixels::PixelParams;
 use super::state::AppState;
@@ -164,7 +164,7 @@ struct ImageForm {
 }
 
 fn meta_from_part(part: &Bytes) -> Result<ImageMeta, Problem> {
-    serde_json::from_slice(part).map_err(|error| {
+    object(part).map_err(|error| {
         let detail = format!("the part \"meta\" is not the JSON expected: {error}");
         Problem::new(ErrorKind::Malformed, detail)
     })
