@@ -227,9 +227,11 @@ async fn formats_that_are_not_read_are_refused_with_the_way_to_convert_them() {
         (b"<!DOCTYPE html>", ["HTML", "where the file comes from"]),
     ] {
         let path = format!("/localize?map={map}");
-        let detail =
-            server.post(&path, "application/octet-stream", bytes.to_vec()).await.problem(422);
-        assert!(words.iter().all(|word| detail.contains(word)), "{detail}");
+        // The second is what curl sends if it is told nothing.
+        for sent_as in ["application/octet-stream", "application/x-www-form-urlencoded"] {
+            let detail = server.post(&path, sent_as, bytes.to_vec()).await.problem(422);
+            assert!(words.iter().all(|word| detail.contains(word)), "{detail}");
+        }
         let file = TempDir::new().unwrap();
         std::fs::write(file.path().join("a.jpg"), bytes).unwrap();
         let dir = file.path().to_str().unwrap();

@@ -12,7 +12,7 @@ use crate::gate::{Problem, read_whole, throw_away, too_large};
 use whereabouts_api::ErrorKind;
 use whereabouts_core::MediaType;
 use whereabouts_service::Service;
-use whereabouts_vision::{AdmissionRequest, RawPixels};
+use whereabouts_vision::{AdmissionRequest, Foreign, RawPixels};
 
 /// The query string.
 pub(super) struct Params<T>(pub T);
@@ -136,8 +136,10 @@ impl PictureBody {
             other => {
                 let (trusted, header) = (may_be_picture(other), header.to_owned());
                 let picture = read_whole(request.into_body(), limit).await?;
-                // Whatever the header says, the bytes decide.
-                if !trusted && layout.is_none() && MediaType::sniff(&picture).is_none() {
+                // Whatever the header says, the bytes decide. The decoders know what to do about other formats.
+                let is_known =
+                    MediaType::sniff(&picture).is_some() || Foreign::sniff(&picture).is_some();
+                if !trusted && layout.is_none() && !is_known {
                     return Err(unsupported(&header));
                 }
                 Self { picture, meta: None }
