@@ -5,7 +5,7 @@ use std::sync::Arc;
 use serde_json::Value;
 
 use super::ledger::{Fact, Key, Ledger, Stored};
-use super::support::{frame, reference};
+use super::support::{frame, install_cryptography, reference};
 
 /// A seeded random number generator: SplitMix64 (Steele, Lea and Flood, 2014).
 #[derive(Debug, Clone)]
@@ -55,6 +55,7 @@ pub struct Killed;
 
 impl Client {
     pub fn new(number: usize, seed: u64, pictures: &Arc<Pictures>) -> Self {
+        install_cryptography();
         Self {
             number,
             random: Random(seed ^ (number as u64) << 32),

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use bytes::Bytes;
 use futures_util::StreamExt;
 use whereabouts_core::{
-    CalibrationSettings, Candidate, Descriptor, Digest, Image, Map, MetricPose, Pose,
+    CalibrationSettings, Candidate, CoordinateFrame, Descriptor, Digest, Image, Map, MetricPose,
+    Pose,
 };
 use whereabouts_index::SearchMode;
 use whereabouts_store::{Store, StoreError};
@@ -291,7 +292,8 @@ async fn long_descriptors_are_searched(fixture: &Fixture) {
 
 async fn hard_negatives_are_the_most_similar_images_of_other_places(fixture: &Fixture) {
     let store = fixture.open().await;
-    let (map, _) = store.put_map(map("m", 16)).await.unwrap();
+    let in_metres = Map { frame: CoordinateFrame::Metric, ..map("m", 16) };
+    let (map, _) = store.put_map(in_metres).await.unwrap();
     let mut random = Random(11);
     // A walk of 60 images, 1 m apart, that comes back to its beginning after 40; a few have no pose.
     let mut known = Vec::new();

@@ -237,7 +237,7 @@ fn unpooled() -> reqwest::Client {
 }
 
 /// reqwest has no cryptography of its own; this is the one that the binary has.
-fn install_cryptography() {
+pub fn install_cryptography() {
     let _ = rustls::crypto::ring::default_provider().install_default();
 }
 
