@@ -141,10 +141,9 @@ async fn a_folder_of_every_format_is_indexed_and_localized_by_the_commands() {
     let indexed = run(&["index", dir, "--map", &map, "--server", &server.url]);
     assert!(indexed.status.success(), "{}", text(&indexed));
     let said = text(&indexed);
-    assert!(
-        said.contains("11 added") && said.contains("broken.jpg: warning: the JPEG is damaged"),
-        "{said}"
-    );
+    let warning = said.lines().find(|line| line.contains("the JPEG is damaged"));
+    assert!(said.contains("11 added"), "{said}");
+    assert!(warning.is_some_and(|line| line.ends_with("(1): broken.jpg")), "{said}");
     let file = folder.path().join("twelve.tif");
     let file = file.to_str().unwrap();
     let said = run(&["localize", file, "--map", &map, "--server", &server.url]);
