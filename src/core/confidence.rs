@@ -219,7 +219,8 @@ pub struct Estimate {
 impl Estimate {
     /// An estimate that counts as known if its confidence is at least `known_from`.
     pub fn new(image_id: &ImageId, pose: Option<Pose>, confidence: f32, known_from: f64) -> Self {
-        let known = f64::from(confidence) >= known_from;
+        // In the precision of the confidence: 0.9 as f32 is less than 0.9 as f64.
+        let known = confidence >= known_from as f32;
         Self { image_id: image_id.clone(), pose, confidence, known, reason: None }
     }
 

@@ -60,8 +60,9 @@ impl UtmZone {
     /// S). `S` is both: the band from 32° to 40° north, unless the northing does not lie in it.
     pub fn with_letter(number: u8, letter: Option<char>, northing: f64) -> Option<Self> {
         let is_south = match letter.map(|letter| letter.to_ascii_uppercase()) {
-            None | Some('N'..='R' | 'T'..='X') => false,
-            Some('C'..='M') => true,
+            // I and O are no bands.
+            None | Some('N' | 'P'..='R' | 'T'..='X') => false,
+            Some('C'..='H' | 'J'..='M') => true,
             // 31.5° and 40.5° north, at any longitude of a zone.
             Some('S') => !(3_485_000.0..=4_495_000.0).contains(&northing),
             Some(_) => return None,

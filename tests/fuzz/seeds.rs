@@ -186,7 +186,7 @@ pub fn truths() -> Vec<Vec<u8>> {
 pub fn completions() -> Vec<Vec<u8>> {
     texts(&[
         r#"{"choices": [{"message": {"content": "<think>a</think>b"}, "finish_reason": "stop"}], "usage": {"prompt_tokens": 7}}"#,
-        r#"{"error": {"message": "no", "code": 429}}"#,
+        r#"{"choices": [{"message": {"content": [{"type": "text", "text": "a"}], "reasoning_content": "b"}}]}"#,
         "data: {\"choices\": [{\"delta\": {\"content\": \"a\"}}]}\n\ndata: [DONE]\n",
     ])
 }

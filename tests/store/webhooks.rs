@@ -173,7 +173,8 @@ async fn a_delivery_is_due_at_its_time_until_it_has_ended(fixture: &Fixture) {
     assert_eq!(due(&*store, id, later).await, [pings[2], pings[0]]);
     assert_eq!(store.waiting_deliveries().await.unwrap(), 2);
     // It has been delivered; a late outcome changes nothing.
-    assert_eq!(note(1, Disposition::Dead).await.unwrap(), None);
+    let late = attempt(later, Disposition::Dead);
+    assert_eq!(store.note_attempt(id, pings[1], late).await.unwrap(), None);
     let again = store.queue_again(id, pings[0], now).await.unwrap_err().to_string();
     assert!(again.contains("waits anyway"), "{again}");
     assert_eq!(store.queue_again(id, pings[1], now).await.unwrap().attempts, 0);

@@ -26,7 +26,10 @@ pub(super) fn place_in_name(name: &str) -> Result<Option<Place>, &'static str> {
         let pose = MetricPose { x, y, z: None, qx: None, qy: None, qz: None, qw: None };
         Pose::Metric(pose).checked().ok().map(|_| pose)
     });
-    let zone = metric.and_then(|pose| zone(field(2), field(3), pose, geographic));
+    let zone = match metric {
+        Some(pose) => zone(field(2), field(3), pose, geographic)?,
+        None => None,
+    };
     match (metric, geographic) {
         (None, None) if fields.len() > 2 || stem.len() > 1 => Err(
             "its name begins with @, but has neither an easting and a northing nor a latitude and a longitude",
@@ -38,26 +41,33 @@ pub(super) fn place_in_name(name: &str) -> Result<Option<Place>, &'static str> {
 }
 
 /// The UTM zone of a name. A number alone may mean anything; with a letter, or with a latitude and a longitude, it
-/// is a zone.
+/// is a zone, and must be one.
 fn zone(
     number: &str,
     letter: &str,
     pose: MetricPose,
     geographic: Option<GeographicPose>,
-) -> Option<UtmZone> {
+) -> Result<Option<UtmZone>, &'static str> {
     let digits = number.trim_end_matches(|c: char| c.is_ascii_alphabetic());
-    let mut letters = number[digits.len()..].chars().chain(letter.chars());
-    let (letter, more) = (letters.next(), letters.next());
-    let is_zone = (letter.is_some() || geographic.is_some()) && more.is_none();
     let is_plausible = (0.0..=1e6).contains(&pose.x) && (0.0..=1e7).contains(&pose.y);
-    if !(is_zone && is_plausible) {
-        return None;
-    }
-    let number = digits.parse().ok()?;
-    match geographic {
-        Some(GeographicPose { lat, .. }) if lat != 0.0 => UtmZone::new(number, lat < 0.0),
-        _ => UtmZone::with_letter(number, letter, pose.y),
-    }
+    let Some(number_of_zone) = digits.parse::<u8>().ok().filter(|_| is_plausible) else {
+        return Ok(None);
+    };
+    let letters: Vec<char> = number[digits.len()..].chars().chain(letter.chars()).collect();
+    let zone = match (&letters[..], geographic) {
+        ([], None) => return Ok(None),
+        ([] | [_], Some(GeographicPose { lat, .. })) if lat != 0.0 => {
+            UtmZone::new(number_of_zone, lat < 0.0)
+        }
+        ([], Some(_)) => UtmZone::with_letter(number_of_zone, None, pose.y),
+        ([letter], _) => UtmZone::with_letter(number_of_zone, Some(*letter), pose.y),
+        // Words behind the northing are of another convention.
+        _ if letters.len() > 2 => return Ok(None),
+        _ => None,
+    };
+    zone.map(Some).ok_or(
+        "its name has no UTM zone behind the northing: a number from 1 to 60 and a letter from C to X, but I and O",
+    )
 }
 
 #[cfg(test)]
@@ -70,6 +80,16 @@ mod tests {
 
     fn zone_of(name: &str) -> Option<String> {
         place(name).zone.map(|zone| zone.to_string())
+    }
+
+    #[test]
+    fn a_zone_that_does_not_exist_is_an_error_and_not_left_out() {
+        for zone in ["10@I", "10@o", "99@S", "0@T", "1O@S", "10S@T", "61K@"] {
+            assert!(place_in_name(&format!("@543270@4178900@{zone}@.jpg")).is_err(), "{zone}");
+        }
+        for other in ["", "7", "cam1@left", "2@left"] {
+            assert_eq!(zone_of(&format!("@543270@4178900@{other}@.jpg")), None, "{other}");
+        }
     }
 
     #[test]
@@ -94,7 +114,6 @@ mod tests {
             ("@1000.0@5.0@.jpg", None),
             ("@1000.0@5.0@left@camera@.jpg", None),
             ("@-10.5@5.0@10@S@.jpg", None),
-            ("@543250.96@4178900.70@99@S@.jpg", None),
             ("@543250.96@4178900.70.jpg", None),
         ] {
             assert_eq!(zone_of(name).as_deref(), zone, "{name}");

@@ -14,6 +14,7 @@ use super::check_calls::{picture_call, ranking_call};
 use super::client::{Answer, Call, MllmClient};
 use super::endpoint::sibling;
 use super::failure::{Failure, FailureKind};
+use super::judge::refuses;
 use super::labels::Labels;
 use super::schema::AnswerFormat;
 use super::server_facts::{Facts, of_models, of_props, of_running};
@@ -228,9 +229,19 @@ impl<'a> Check<'a> {
     async fn pictures(&mut self, model: &str) -> Result<(), Ended> {
         const WHAT: &str = "two pictures";
         let failure = match self.ask(picture_call(self.client, model, 2)).await {
-            Ok(_) => {
+            Ok(answer) => {
                 self.client.revise(|known| known.two_pictures = Some(true));
-                self.found(WHAT, true, "accepted in one request");
+                let said: String = answer.text.chars().take(120).collect();
+                match refuses(&said) {
+                    false => self.found(WHAT, true, "accepted in one request"),
+                    true => {
+                        let detail = format!(
+                            "the server accepted them, but the model refused to look: use a multimodal model that \
+                             describes places (mllm.describe_model). It said: {said}"
+                        );
+                        self.found(WHAT, false, detail);
+                    }
+                }
                 return Ok(());
             }
             Err(failure) if failure.kind != FailureKind::Request => {

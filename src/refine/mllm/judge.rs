@@ -1,5 +1,7 @@
 //! Decides whether an answer is a description. What is none is neither cached nor shown to the reasoning model.
 
+use std::collections::HashSet;
+
 use super::client::Answer;
 use super::prompts::{Switches, clean, parts};
 
@@ -11,6 +13,13 @@ const REFUSAL_BEGINS: usize = 240;
 
 /// The shortest description, in words.
 const LEAST_WORDS: usize = 8;
+
+/// The least that is written besides the names of the parts, in letters and digits.
+const LEAST_CONTENT: usize = 8;
+
+/// A text of this many words that has only [`FEW_WORDS`] different ones is a loop of the model.
+const MANY_WORDS: usize = 40;
+const FEW_WORDS: usize = 8;
 
 /// The shortest description in another script, in characters.
 const LONG: usize = 100;
@@ -36,11 +45,33 @@ pub fn description(
         let begins: String = text.chars().take(120).collect();
         return Err(format!("the model refused: {begins}"));
     }
+    if repeats_itself(&text) {
+        return Err("the model repeats a few words over and over".to_owned());
+    }
+    if headings >= 2 && !has_content(&text, switches) {
+        return Err("the parts that were asked for are empty".to_owned());
+    }
     if headings < 2 && !speaks_of_both(&text) {
         let names = parts(switches).join(", ");
         return Err(format!("the answer has none of the parts that were asked for ({names})"));
     }
     Ok(text)
+}
+
+/// Whether a long text has hardly any different words.
+fn repeats_itself(text: &str) -> bool {
+    let words: Vec<&str> = text.split_whitespace().collect();
+    let different: HashSet<&str> = words.iter().copied().collect();
+    words.len() >= MANY_WORDS && different.len() <= FEW_WORDS
+}
+
+/// Whether something is written besides the names of the parts.
+fn has_content(text: &str, switches: Switches) -> bool {
+    let mut rest = text.to_lowercase();
+    for part in parts(switches) {
+        rest = rest.replace(&part.to_lowercase(), "");
+    }
+    rest.chars().filter(|c| c.is_alphanumeric()).count() >= LEAST_CONTENT
 }
 
 /// Whether a line begins with the name of a part, whatever formats it.
@@ -52,7 +83,7 @@ fn has_heading(text: &str, part: &str) -> bool {
 }
 
 /// Whether a text says that the model cannot or will not describe the pictures.
-fn refuses(text: &str) -> bool {
+pub(super) fn refuses(text: &str) -> bool {
     let begins: String = text.chars().take(REFUSAL_BEGINS).collect();
     let begins = begins.to_lowercase().replace(['’', '‘', '`'], "'");
     text.chars().count() <= LONGEST_REFUSAL && REFUSALS.iter().any(|words| begins.contains(words))
@@ -79,7 +110,7 @@ const SUBJECTS: [&[&str]; 7] = [
     &["similarit", "agree", "alike", "comparison", "compared", "resembl"],
 ];
 
-const REFUSALS: [&str; 42] = [
+const REFUSALS: &[&str] = &[
     "i can't help",
     "i cannot help",
     "i can not help",
@@ -122,6 +153,32 @@ const REFUSALS: [&str; 42] = [
     "please provide the",
     "please upload",
     "i'm sorry",
+    "sorry, but",
+    "my guidelines",
+    "usage policy",
+    "content policy",
+    "usage policies",
+    "error:",
+    "failed to load",
+    "could not load",
+    "unable to load",
+    "upload the",
+    "could you upload",
+    "could you provide",
+    "can you provide",
+    "not provided",
+    "didn't receive",
+    "did not receive",
+    "not attached",
+    "lo siento",
+    "je suis désolé",
+    "tut mir leid",
+    "mi dispiace",
+    "desculpe",
+    "抱歉",
+    "对不起",
+    "申し訳",
+    "죄송",
 ];
 
 #[cfg(test)]
@@ -173,6 +230,24 @@ mod tests {
                 "As an AI language model, I cannot view the frame or the candidate you mention here.",
                 "refused",
             ),
+            (
+                "Error: failed to load image 1 and image 2: timeout while fetching them, retry later",
+                "refused",
+            ),
+            (
+                "Could you upload the second picture? The first picture shows a street with a door.",
+                "refused",
+            ),
+            (
+                "Sorry, but identifying buildings from photos is not something that I do, as a rule.",
+                "refused",
+            ),
+            (
+                "Lo siento, pero no puedo ayudar con la comparación del frame y el candidate.",
+                "refused",
+            ),
+            (&"the door ".repeat(300), "over and over"),
+            ("Objects:\n\nMatches:\n\nComparison:\n", "empty"),
             ("Yes.", "none of the parts"),
             ("Both look similar.", "none of the parts"),
             ("Sure! Here is what you asked for, dear user, I hope it helps.", "none of the parts"),

@@ -151,7 +151,7 @@ mod tests {
                 }
             }
         }
-        assert_eq!(methods, 14);
+        assert_eq!(methods, 15);
         for path in [REFLECTION, REFLECTION_ALPHA] {
             assert!(policies.of(&Method::POST, path).unwrap().streams);
         }

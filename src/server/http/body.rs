@@ -102,6 +102,8 @@ impl<T: DeserializeOwned> FromRequest<AppState> for JsonBody<T> {
 
 /// Reads a JSON object. An array is refused, which the fields of a type would be read from in their order.
 pub(super) fn object<T: DeserializeOwned>(text: &[u8]) -> Result<T, serde_json::Error> {
+    // Windows PowerShell writes a byte order mark.
+    let text = text.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(text);
     match text.trim_ascii_start().first() {
         Some(b'[') => Err(serde::de::Error::custom("it is an array; send an object")),
         _ => serde_json::from_slice(text),

@@ -138,7 +138,8 @@ async fn meets(habit: &'static Habit) -> Result<(), String> {
         intercept: Box::new(|call| habit.applies(call).then(|| habit.reply())),
         // Long enough that not all of them fit into a short context.
         describe: Box::new(|call| {
-            Reply::Text(format!("notes {}. {}", call.number, "wall ".repeat(600)))
+            let walls: Vec<String> = (1..=350).map(|wall| format!("wall {wall}")).collect();
+            Reply::Text(format!("notes {}. {}", call.number, walls.join(", ")))
         }),
         reason: Box::new(|_| ranking(&["B", "A", "D", "C"])),
         ..Script::default()
