@@ -293,7 +293,7 @@ class RealServer(unittest.TestCase):
         town, frames = str(self.town), str(self.town / "frames")
         unreachable = f"http://127.0.0.1:{free_port()}"
         for images, queries, name, url, hint in [
-            (town, frames, "m", self.server.url, "no JPEG"),
+            (town, frames, "m", self.server.url, "no pictures"),
             (frames, frames + "-not", "m", self.server.url, "is not a folder"),
             (frames, frames, "m", unreachable, "whereabouts serve"),
             (frames, frames, "No Name", self.server.url, "No Name"),

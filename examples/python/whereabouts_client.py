@@ -119,8 +119,6 @@ class Image:
     pose: Pose | None = None
     captured_at: datetime | None = None
     tags: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    """Of an upload: what the sender should know about the picture, such as damage in transit."""
 
 
 @dataclass(frozen=True)
@@ -128,9 +126,9 @@ class ImageAnswer(Image):
     """An image as it is stored now, and what the call changed of it."""
 
     changed: tuple[Literal["pose", "captured_at", "tags"], ...] = ()
-    """Fields of an image stored before that the call changed. Empty if the image is new or stayed as it was."""
+    """Fields of an image stored before that the call changed. Empty if it is new or stayed as it was."""
     warnings: tuple[str, ...] = ()
-    """What the sender should know about the picture, such as a position that was not taken."""
+    """What the sender should know about the picture, such as damage in transit."""
 
 
 class Keep:
