@@ -347,7 +347,7 @@ class Job:
     trace_id: str | None = None
     """Trace id of its request and refinement, if the server exports traces."""
     fresh_since: datetime | None = None
-    """Descriptions from before this time are bought anew."""
+    """Descriptions from before this time are bought again."""
 
     @property
     def ended(self) -> bool:

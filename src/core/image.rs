@@ -102,12 +102,6 @@ impl MediaType {
     /// The formats, for messages.
     pub const NAMES: &str = "JPEG, PNG, WebP, TIFF, BMP, GIF or PNM (PBM, PGM, PPM, PAM)";
 
-    /// The usual extensions of file names, in lower case and without the dot.
-    pub const EXTENSIONS: [&str; 13] = [
-        "jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "gif", "pbm", "pgm", "ppm", "pnm",
-        "pam",
-    ];
-
     /// The value of a `Content-Type` header.
     pub fn as_str(self) -> &'static str {
         match self {

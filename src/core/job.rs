@@ -202,7 +202,7 @@ pub struct Job {
     #[serde(default)]
     #[schema(nullable)]
     pub estimate: Option<Estimate>,
-    /// Descriptions from before this time are bought anew; null if cached ones of any age are used.
+    /// Descriptions from before this time are bought again; null if cached ones of any age are used.
     #[serde(default)]
     #[schema(nullable)]
     pub fresh_since: Option<Timestamp>,

@@ -20,7 +20,7 @@ pub struct RefineInput {
     pub candidates: Vec<Candidate>,
     /// The cost of earlier attempts at the same job. It counts against the job's budget.
     pub spent: Usage,
-    /// Descriptions from before this time are bought anew.
+    /// Descriptions from before this time are bought again.
     pub fresh_since: Option<Timestamp>,
 }
 

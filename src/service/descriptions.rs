@@ -56,14 +56,14 @@ impl Descriptions {
         &self,
         filter: &DescriptionFilter,
     ) -> Result<PurgedDescriptions, ServiceError> {
-        let mut removed = 0;
+        let (mut removed, mut after) = (0, None);
         loop {
-            let found = self.cache.descriptions(filter, None, BATCH).await?;
+            // From where the last batch ended: those before it do not match, and need not be read again.
+            let found = self.cache.descriptions(filter, after.as_ref(), BATCH).await?;
             let keys: Vec<Digest> = found.into_iter().map(|(key, _)| key).collect();
-            if keys.is_empty() {
-                return Ok(PurgedDescriptions { removed });
-            }
+            let Some(&last) = keys.last() else { return Ok(PurgedDescriptions { removed }) };
             removed += self.cache.remove_descriptions(&keys).await?;
+            after = Some(last);
         }
     }
 }

@@ -78,7 +78,7 @@ impl Jobs {
     }
 
     /// Queues a job again that ended without success. With `fresh`, any job that has ended, and its descriptions
-    /// are bought anew.
+    /// are bought again.
     pub async fn retry(&self, id: Uuid, fresh: bool) -> Result<Job, ServiceError> {
         Ok(self.store.retry(id, fresh.then(Timestamp::now)).await?)
     }

@@ -39,7 +39,7 @@ impl JobRecord {
     }
 
     /// Queues a failed, cancelled or degraded job again. With `fresh_since`, which has descriptions from before
-    /// bought anew, any job that has ended.
+    /// bought again, any job that has ended.
     pub(super) fn retry(&mut self, fresh_since: Option<Timestamp>) -> Result<(), StoreError> {
         let job = &mut self.job;
         match job.state {

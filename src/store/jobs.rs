@@ -144,7 +144,7 @@ pub trait JobStore: Send + Sync {
     /// Queues a failed, cancelled or degraded job again, with its attempts and cost reset to zero.
     ///
     /// With `fresh_since`, any job that has ended is queued again, and descriptions from before that time are
-    /// bought anew.
+    /// bought again.
     async fn retry(&self, id: Uuid, fresh_since: Option<Timestamp>) -> Result<Job, StoreError>;
     /// Returns a receiver of the ids of jobs as they change. A slow receiver misses the oldest ones.
     fn changes(&self) -> broadcast::Receiver<Uuid>;

@@ -75,7 +75,7 @@ impl FailureKind {
         }
     }
 
-    /// Whether all calls will fail in this way until somebody changes something. The circuit breaker opens at
+    /// Whether all calls will fail in this way until its settings or account change. The circuit breaker opens at
     /// once.
     pub fn stops_all(self) -> bool {
         use FailureKind::{Key, NotFound, Quota, Redirect, Request, TooLarge};

@@ -181,7 +181,7 @@ fn arguments(message: &Value) -> Option<String> {
     }
 }
 
-/// Joins the events of a response that is streamed although nobody asked for that.
+/// Joins the events of a response that is streamed although the request did not ask for that.
 fn streamed(text: &str) -> Option<Value> {
     let events = text.lines().filter_map(|line| line.strip_prefix("data:")).map(str::trim);
     let events: Vec<Value> = events.filter_map(|event| serde_json::from_str(event).ok()).collect();

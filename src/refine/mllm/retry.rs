@@ -21,7 +21,7 @@ pub enum CallError {
     /// A later retry may succeed.
     #[error("{0}")]
     Transient(String),
-    /// The server refuses every call until somebody changes something, and so the circuit breaker opened.
+    /// The server refuses every call until its settings or account change, and so the circuit breaker opened.
     #[error("{why}")]
     Stopped {
         /// Why, in the server's words.

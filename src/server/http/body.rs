@@ -5,6 +5,7 @@ use axum::http::header::CONTENT_TYPE;
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, StatusCode};
 use bytes::Bytes;
+use percent_encoding::percent_decode_str;
 use serde::de::DeserializeOwned;
 
 use super::state::AppState;
@@ -32,7 +33,7 @@ impl<T: DeserializeOwned> FromRequestParts<AppState> for Params<T> {
 /// Refuses a query string that is not UTF-8, which the parser would repair with replacement characters.
 fn check_utf8(query: &str) -> Result<(), Problem> {
     for pair in query.split('&') {
-        if std::str::from_utf8(&percent_decoded(pair)).is_err() {
+        if percent_decode_str(pair).decode_utf8().is_err() {
             let name = pair.split('=').next().unwrap_or_default();
             let detail = format!(
                 "the query parameter {:?} is not UTF-8; percent-encode its text as UTF-8, such as %C3%A9 for é",
@@ -42,29 +43,6 @@ fn check_utf8(query: &str) -> Result<(), Problem> {
         }
     }
     Ok(())
-}
-
-fn percent_decoded(text: &str) -> Vec<u8> {
-    let mut rest = text.as_bytes();
-    let mut decoded = Vec::with_capacity(rest.len());
-    let digit = |byte: u8| char::from(byte).to_digit(16);
-    while let Some((&byte, after)) = rest.split_first() {
-        let escaped = match (byte, after) {
-            (b'%', [high, low, ..]) => digit(*high).zip(digit(*low)),
-            _ => None,
-        };
-        match escaped {
-            Some((high, low)) => {
-                decoded.push((high * 16 + low) as u8);
-                rest = &after[2..];
-            }
-            None => {
-                decoded.push(byte);
-                rest = after;
-            }
-        }
-    }
-    decoded
 }
 
 /// The variable segments of the path.

@@ -145,7 +145,7 @@ pub(super) async fn cancel_job(
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub(super) struct RetryParams {
-    /// Buy the job's descriptions anew, and retry a job that has succeeded, too.
+    /// Buy the job's descriptions again, and retry a job that has succeeded, too.
     #[serde(default)]
     #[param(required = false)]
     fresh: bool,
