@@ -62,7 +62,7 @@ pub async fn measure(url: &str, set: &Set) -> anyhow::Result<()> {
     }
     let built = start.elapsed();
     let table = format!("descriptors_{}_0", map.uid.simple());
-    let graph = format!("graph_{}_0", map.uid.simple());
+    let graph = format!("firsts_{}_0", map.uid.simple());
     let bytes = "SELECT pg_relation_size($1::regclass)::double precision / 1e6";
     let table_mb: f64 = sqlx::query_scalar(bytes).bind(table).fetch_one(&pool).await?;
     let graph_mb: f64 = sqlx::query_scalar(bytes).bind(graph).fetch_one(&pool).await?;

@@ -96,10 +96,6 @@ enum Kind {
 }
 
 impl Fixture {
-    pub fn is_postgres(&self) -> bool {
-        matches!(self.0, Kind::Postgres(_))
-    }
-
     pub fn embedded() -> Self {
         Self(Kind::Embedded(tempfile::tempdir().unwrap()))
     }

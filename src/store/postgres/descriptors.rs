@@ -2,7 +2,9 @@
 //!
 //! A table stores the descriptors at full precision, as 32-bit floats. Its HNSW index is over the same
 //! numbers in 16 bits (`halfvec`), which halves its memory: the index returns a few more images than
-//! requested, and these are ranked again at full precision. `tests/store/search.rs` checks the recall.
+//! requested, and these are ranked again at full precision. Of images that are equal in 16 bits it contains
+//! the first only, because pgvector loses other images among many equal ones; a search adds the *twins* of
+//! what it found (`migrations/0003_twins.sql`). `tests/store/search.rs` checks the recall.
 
 use std::collections::HashSet;
 
@@ -22,9 +24,6 @@ pub(super) const MAX_INDEXED_DIM: usize = 4000;
 
 /// Number of images requested from the index in addition to `k`, to be ranked again.
 const OVERFETCH: usize = 8;
-
-/// Equal images at the top of a result from which the index may have kept the rest of the map.
-const CROWD: usize = 10;
 
 /// Descriptors with more dimensions do not fit into a table's page, and are stored out of line.
 const MAX_INLINE_DIM: usize = 1900;
@@ -80,9 +79,27 @@ fn table_prefix(uid: Uuid) -> String {
     format!("descriptors_{}_", uid.simple())
 }
 
-/// Returns the name of the index of that table.
-pub(super) fn graph(uid: Uuid, revision: u32) -> String {
-    format!("graph_{}_{revision}", uid.simple())
+/// What belongs to the descriptors of a map's revision.
+pub(super) struct Names {
+    pub table: String,
+    /// The HNSW index of the first of equal descriptors.
+    pub graph: String,
+    /// The index of what equal descriptors have in common.
+    pub codes: String,
+    /// The HNSW index of all descriptors, which earlier versions built.
+    pub old_graph: String,
+}
+
+impl Names {
+    pub fn of(uid: Uuid, revision: u32) -> Self {
+        let name = |what: &str| format!("{what}_{}_{revision}", uid.simple());
+        Self {
+            table: table(uid, revision),
+            graph: name("firsts"),
+            codes: name("codes"),
+            old_graph: name("graph"),
+        }
+    }
 }
 
 /// Creates the table of a map's descriptors.
@@ -209,9 +226,12 @@ impl Inner {
         if self.graphs.has(map) {
             return Ok(true);
         }
-        let graph = sqlx::query_scalar("SELECT graph FROM maps WHERE uid = $1 AND revision = $2")
-            .bind(map.uid)
-            .bind(i64::from(map.revision));
+        let graph = sqlx::query_scalar(
+            "SELECT coalesce(indexed_revision = revision, false) FROM maps
+             WHERE uid = $1 AND revision = $2",
+        )
+        .bind(map.uid)
+        .bind(i64::from(map.revision));
         let graph: Option<bool> = graph.fetch_optional(&self.pool).await?;
         if graph == Some(true) {
             self.graphs.add(map);
@@ -237,10 +257,9 @@ impl Inner {
         mode: SearchMode,
     ) -> Result<Vec<Found>, StoreError> {
         if mode == SearchMode::Fast && self.has_graph(map).await? {
-            let mut found = self.nearest(map, query, k.max(CROWD), true).await?;
+            let found = self.nearest(map, query, k, true).await?;
             // If many images were removed, an index scan may end before it has found enough.
-            if found.len() >= k && !is_crowd(&found) {
-                found.truncate(k);
+            if found.len() >= k {
                 return Ok(found);
             }
         }
@@ -255,14 +274,22 @@ impl Inner {
         by_graph: bool,
     ) -> Result<Vec<Found>, StoreError> {
         let (table, dim) = (table(map.uid, map.revision), map.dim);
+        // OFFSET 0 makes the planner look up rows one by one; a generic plan would read all of the map's.
         let nearest = match by_graph {
             true => format!(
-                "SELECT slot, descriptor FROM {table}
-                 ORDER BY descriptor::halfvec({dim}) <=> $1::real[]::halfvec({dim}) LIMIT $3"
+                "WITH firsts AS MATERIALIZED (
+                     SELECT slot, descriptor FROM {table} WHERE NOT twin
+                     ORDER BY descriptor::halfvec({dim}) <=> $1::real[]::halfvec({dim}) LIMIT $3)
+                 SELECT slot, descriptor FROM firsts
+                 UNION ALL
+                 SELECT twins.slot, twins.descriptor FROM firsts
+                 JOIN LATERAL (
+                     SELECT slot, descriptor FROM {table}
+                     WHERE descriptor_code(descriptor) = descriptor_code(firsts.descriptor) AND twin
+                     OFFSET 0) twins ON true"
             ),
             false => format!("SELECT slot, descriptor FROM {table}"),
         };
-        // OFFSET 0 makes the planner look up images one by one; a generic plan would read all of the map's.
         let sql = format!(
             "SELECT n.slot, i.id, i.pose, 1 - n.distance AS similarity
              FROM (SELECT slot, descriptor <=> $1::real[]::vector AS distance
@@ -375,12 +402,4 @@ fn candidates(found: Vec<Found>) -> Vec<Candidate> {
         pose: found.pose,
     };
     found.into_iter().enumerate().map(candidate).collect()
-}
-
-/// Whether the first results are equal images. pgvector links each of many equal images to others of them only, and a
-/// scan that gets among them does not get out again, however far they are from the query.
-fn is_crowd(found: &[Found]) -> bool {
-    const TIE: f64 = 1e-6;
-    let (first, last) = (found.first(), found.get(CROWD - 1));
-    first.zip(last).is_some_and(|(first, last)| first.similarity - last.similarity < TIE)
 }

@@ -198,8 +198,9 @@ impl PostgresDraft {
         let Map { scene, frame, description, .. } = stored;
         let map = Map { scene, frame, description, ..self.next.clone() };
         sqlx::query(
-            "UPDATE maps SET revision = $2, record = $3::json, graph = $4, calibration = NULL,
-                 measured_by = NULL WHERE uid = $1",
+            "UPDATE maps SET revision = $2, record = $3::json, graph = $4,
+                 indexed_revision = CASE WHEN $4 THEN $2 END, calibration = NULL, measured_by = NULL
+             WHERE uid = $1",
         )
         .bind(uid)
         .bind(i64::from(map.revision))

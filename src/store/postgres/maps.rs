@@ -45,7 +45,8 @@ impl MapStore for PostgresStore {
     async fn index_state(&self, map: &Map) -> Result<IndexState, StoreError> {
         let inner = &self.inner;
         let query = sqlx::query(
-            "SELECT m.graph, coalesce(sum(c.images), 0)::bigint AS images,
+            "SELECT coalesce(m.indexed_revision = m.revision, false) AS graph,
+                 coalesce(sum(c.images), 0)::bigint AS images,
                  coalesce(sum(c.changes), 0)::bigint AS changes,
                  coalesce(sum(c.moved), 0)::bigint AS moved
              FROM maps m LEFT JOIN image_counts c ON c.map_uid = m.uid
@@ -213,6 +214,7 @@ impl Inner {
                 let changed = sqlx::query(
                     "UPDATE maps SET uid = $2, record = $3::json,
                          graph = graph AND uid = $2,
+                         indexed_revision = CASE WHEN uid = $2 THEN indexed_revision END,
                          calibration = CASE WHEN uid = $2 THEN calibration END
                      WHERE uid = $1",
                 );

@@ -33,6 +33,7 @@ fn migrations() -> Vec<Migration> {
     vec![
         migration(1, "first", include_str!("../../../migrations/0001_first.sql")),
         migration(2, "moved", include_str!("../../../migrations/0002_moved.sql")),
+        migration(3, "twins", include_str!("../../../migrations/0003_twins.sql")),
     ]
 }
 
