@@ -7,8 +7,10 @@ use std::collections::BinaryHeap;
 use super::codes::{Coded, Codes, Ranked};
 use super::layer::{Cell, Layer, NONE};
 
-/// A search has converged once it has expanded this many times as many points as it had when its result last changed.
-const PATIENCE: f32 = 4.0;
+/// How many points a search of the usual kind expands until its result no longer changes. One with a beam of width
+/// `ef` has converged when it went on for `ef` divided by this many times as long as it took to its result, so that
+/// `ef` is its patience too.
+const USUAL: usize = 24;
 
 /// A search for the points most similar to `query` among those that `keep` accepts.
 pub(super) struct Beam<'a, C, K> {
@@ -37,6 +39,8 @@ struct Wider {
     /// The `k` most similar points so far.
     top: BinaryHeap<Reverse<Ranked>>,
     k: usize,
+    /// The width of the first beam.
+    patience: usize,
     expanded: usize,
     /// How many points had been expanded when `top` changed last.
     changed: usize,
@@ -93,6 +97,7 @@ impl<'a, C: Cell, K: Fn(u32) -> bool> Beam<'a, C, K> {
             displaced: Vec::new(),
             top: BinaryHeap::with_capacity(k + 1),
             k,
+            patience: self.ef,
             expanded: 0,
             changed: 0,
         };
@@ -148,9 +153,8 @@ impl<'a, C: Cell, K: Fn(u32) -> bool> Beam<'a, C, K> {
 
     /// Whether the `k` best have not changed for so long that a wider beam would hardly change them.
     pub fn has_converged(&self) -> bool {
-        self.wider
-            .as_ref()
-            .is_none_or(|wider| wider.expanded as f32 >= PATIENCE * wider.changed as f32)
+        let converged = |wider: &Wider| wider.expanded * USUAL >= wider.patience * wider.changed;
+        self.wider.as_ref().is_none_or(converged)
     }
 
     /// Whether there are fewer points than the beam is wide.
