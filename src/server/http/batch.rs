@@ -173,13 +173,22 @@ async fn images(request: Request, room: Room) -> Result<Images, Problem> {
     match archive::Format::of(&head) {
         Some(format) => Ok(Box::pin(archive::images(room.over(body), format, room))),
         None if archive::MEDIA_TYPES.contains(&media_type.as_str()) => {
-            let detail =
-                "the body is not a tar archive; send one (tar c *.jpg | curl --data-binary @- …)";
-            Err(Problem::new(ErrorKind::Malformed, detail))
+            let what = archive::compression_of(&head).map_or_else(
+                || "is not a tar archive".to_owned(),
+                |name| format!("is compressed with {name}, and only gzip is read"),
+            );
+            Err(Problem::new(
+                ErrorKind::Malformed,
+                format!(
+                    "the body {what}; send a tar archive (tar c *.jpg | curl --data-binary @- …)"
+                ),
+            ))
         }
         None => {
-            let what =
-                if head.starts_with(b"PK") { "a zip archive; unpack it, and" } else { "neither;" };
+            let what = archive::compression_of(&head).map_or_else(
+                || "neither;".to_owned(),
+                |name| format!("compressed with {name}; unpack it, and"),
+            );
             Err(Problem::new(
                 ErrorKind::UnsupportedMedia,
                 format!(

@@ -22,12 +22,10 @@ const RENDER: &str =
     "render it to PNG first, for example with `magick -density 150 IN OUT.png` (ImageMagick)";
 
 /// Formats by their first bytes; of several that fit, the first.
-const MAGIC: [(&[u8], &str, &str); 64] = [
+const MAGIC: [(&[u8], &str, &str); 62] = [
     (b"\xFF\x0A", "a JPEG XL picture", "convert it with `djxl IN.jxl OUT.jpg`"),
     (b"\xFF\x4F\xFF\x51", "a JPEG 2000 picture", CONVERT),
     (b"II\xBC\x01", "a JPEG XR picture", "convert it with `JxrDecApp -i IN -o OUT.tif` (jxrlib)"),
-    (b"\0\0\x01\0", "an ICO icon", MAGICK),
-    (b"\0\0\x02\0", "a CUR cursor", MAGICK),
     (
         b"8BPS",
         "a Photoshop picture (PSD)",
@@ -139,6 +137,12 @@ impl Foreign {
             )
         } else if bytes.get(128..132) == Some(b"DICM") {
             as_is("a DICOM picture", "convert it with `dcmj2pnm --write-png IN OUT.png` (DCMTK)")
+        } else if bytes.starts_with(b"\0\0\x01\0") && bytes.get(4..6) != Some(&[0, 0]) {
+            as_is("an ICO icon", MAGICK)
+        } else if bytes.starts_with(b"\0\0\x02\0") && bytes.get(4..6) != Some(&[0, 0]) {
+            as_is("a CUR cursor", MAGICK)
+        } else if is_tga(bytes) {
+            as_is("a TGA picture", CONVERT)
         } else if is_pcx(bytes) {
             as_is("a PCX picture", CONVERT)
         } else if is_markup(bytes) {
@@ -178,6 +182,19 @@ fn iso_brand(bytes: &[u8]) -> Option<&[u8; 4]> {
         [0, 0, 0, 12, b'j', b'P', b' ', b' ', ..] => Some(b"jp2 "),
         _ => None,
     }
+}
+
+/// TGA has no magic number; its header has few values that are possible.
+fn is_tga(bytes: &[u8]) -> bool {
+    let Some(&header) = bytes.first_chunk::<18>() else { return false };
+    let [_, has_palette, kind, .., depth, _] = header;
+    let is_kind = match kind {
+        1 | 9 => has_palette == 1,
+        2 | 3 | 10 | 11 => has_palette == 0 && header[3..8] == [0; 5],
+        _ => false,
+    };
+    let has_pixels = header[12..14] != [0, 0] && header[14..16] != [0, 0];
+    is_kind && has_pixels && matches!(depth, 8 | 15 | 16 | 24 | 32)
 }
 
 /// PCX has a magic number of one byte only.
@@ -238,6 +255,8 @@ mod tests {
             (b"PF\n2 2\n-1.0\n", "floating-point", "PNG"),
             (b"\0\0\x01\0\x01\0\x20\x20", "ICO", "magick"),
             (b"\0\0\x02\0\x01\0\x20\x20", "CUR", "magick"),
+            (b"\0\0\x02\0\0\0\0\0\0\0\0\0\x40\0\x30\0\x18\0", "TGA", "ffmpeg"),
+            (b"\x05\x01\x09\0\0\0\x01\x18\0\0\0\0\x40\0\x30\0\x08\0", "TGA", "ffmpeg"),
             (b"8BPS\0\x01", "PSD", "PNG"),
             (b"qoif\0\0\0\x02", "QOI", "ffmpeg"),
             (b"DDS |\0\0\0", "DDS", "ffmpeg"),
