@@ -119,7 +119,9 @@ impl Imaging {
             let _permit = permit;
             Ok(decode::decode(&bytes, limits, decode::Needed::Size(16, 16))?.warnings)
         };
-        self.on_pool(decode).await
+        let warnings: Vec<String> = self.on_pool(decode).await?;
+        self.metrics.count_damage(&warnings);
+        Ok(warnings)
     }
 
     /// Returns pixels without a file format as PNG.
