@@ -1,6 +1,27 @@
 # Sourced by the scripts that start a server; not run by itself.
 # shellcheck shell=bash
 
+# arguments SCRIPT BINARY VENV: sets $binary and $venv to the absolute paths of the arguments of a script, and changes to
+# its folder. VENV is a Python virtual environment; `environment` creates it if it is missing.
+arguments() {
+    local folder
+    folder=$(dirname "$1")
+    if [ $# -ne 3 ]; then
+        echo "usage: $1 BINARY VENV, such as: $1 target/release/whereabouts" \
+            "target/$(basename "$(realpath "$folder")")-venv" >&2
+        exit 2
+    fi
+    binary=$(realpath "$2")
+    # shellcheck disable=SC2034 # used by the sourcing script
+    venv=$(realpath -m "$3")
+    cd "$folder"
+}
+
+# no_panic: fails if the server has panicked.
+no_panic() {
+    if grep panicked "$scratch/log" >&2; then exit 1; fi
+}
+
 # environment FOLDER REQUIREMENTS...: creates a Python virtual environment with these requirements files, or recreates
 # it if they have changed.
 environment() {

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
-use whereabouts_core::ImageField;
+use whereabouts_core::{ImageField, Pose};
 
 /// The result of a bulk upload.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
@@ -31,6 +31,10 @@ pub struct BatchResult {
     pub id: Option<String>,
     /// Whether the image was stored.
     pub outcome: BatchOutcome,
+    /// Pose that the image has now; null if it has none, or was not stored.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub pose: Option<Pose>,
     /// Fields of an image already present that the upload changed.
     #[serde(default)]
     pub changed: Vec<ImageField>,

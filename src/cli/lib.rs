@@ -92,13 +92,40 @@ impl Cli {
         match result {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => {
-                eprintln!("whereabouts: {error:#}");
+                eprintln!("whereabouts: {}", message(&error));
                 ExitCode::FAILURE
             }
         }
     }
 }
 
+/// The message of an error and those of its causes, each once: many messages contain that of their cause.
+fn message(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if text.is_empty() {
+            text = cause;
+        } else if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
+}
+
 fn block_on(command: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
     tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(command)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_is_printed_once() {
+        let cause = std::io::Error::other("is a directory");
+        let error = anyhow::Error::new(cause).context("cannot read m: is a directory; name a file");
+        let error = error.context("m was not installed");
+        let text = "m was not installed: cannot read m: is a directory; name a file";
+        assert_eq!(message(&error), text);
+    }
 }

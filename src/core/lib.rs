@@ -12,6 +12,7 @@ mod digest;
 mod image;
 mod job;
 mod key;
+mod leftovers;
 mod map;
 mod model_server;
 pub mod moment;
@@ -36,13 +37,14 @@ pub use job::{
     DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage, utc_day,
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
+pub use leftovers::Leftover;
 pub use map::{CoordinateFrame, DescriptorKind, Map, MapName, Precision, Scene};
 pub use model_server::{ModelCapabilities, ModelServer, ModelTrouble};
 pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, PoseInput, PosePatch};
 pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;
-pub use utm::UtmZone;
+pub use utm::{UtmZone, UtmZoneError};
 pub use webhook::{
     Attempt, Delivery, DeliveryState, Disposition, Message, StoredWebhook, Webhook, WebhookEvent,
     WebhookSecret,

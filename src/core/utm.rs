@@ -56,18 +56,49 @@ impl UtmZone {
         number.is_finite().then(|| Self { number: number.min(60.0) as u8, is_south: lat < 0.0 })
     }
 
-    /// The zone of an easting and a northing whose letter may be a latitude band (C to X) or a hemisphere (N or
-    /// S). `S` is both: the band from 32° to 40° north, unless the northing does not lie in it.
-    pub fn with_letter(number: u8, letter: Option<char>, northing: f64) -> Option<Self> {
-        let is_south = match letter.map(|letter| letter.to_ascii_uppercase()) {
-            // I and O are no bands.
-            None | Some('N' | 'P'..='R' | 'T'..='X') => false,
-            Some('C'..='H' | 'J'..='M') => true,
-            // 31.5° and 40.5° north, at any longitude of a zone.
-            Some('S') => !(3_485_000.0..=4_495_000.0).contains(&northing),
-            Some(_) => return None,
-        };
-        Self::new(number, is_south)
+    /// The zone of a northing whose letter may be a latitude band (C to X) or a hemisphere (N or S). `S` is both: the
+    /// band from 32° to 40° north, unless the northing does not lie in it. `lat` is a latitude that is given as well.
+    ///
+    /// # Errors
+    /// There is no such zone, or the letter contradicts the northing or the latitude.
+    pub fn with_letter(
+        number: u8,
+        letter: char,
+        northing: f64,
+        lat: Option<f64>,
+    ) -> Result<Self, UtmZoneError> {
+        let of = |is_south| Self::new(number, is_south).ok_or(UtmZoneError::Unknown);
+        let is_north = |lat: f64| lat >= 0.0;
+        match letter.to_ascii_uppercase() {
+            'N' if lat.is_none_or(is_north) => of(false),
+            'N' => Err(UtmZoneError::Contradiction),
+            'S' => {
+                let in_band = of(false)?.is_in_band(northing, 'S');
+                match lat.map_or(in_band, is_north) {
+                    false => of(true),
+                    true if in_band => of(false),
+                    true => Err(UtmZoneError::Contradiction),
+                }
+            }
+            letter => {
+                let zone = of(band_start(letter).ok_or(UtmZoneError::Unknown)? < 0.0)?;
+                let fits = zone.is_in_band(northing, letter)
+                    && lat.is_none_or(|lat| is_north(lat) != zone.is_south);
+                if fits { Ok(zone) } else { Err(UtmZoneError::Contradiction) }
+            }
+        }
+    }
+
+    /// Whether a northing lies in a latitude band, or so near to it that the series and the rounding of places may
+    /// have moved it there.
+    fn is_in_band(self, northing: f64, letter: char) -> bool {
+        const MARGIN: f64 = 0.5;
+        const LAST: f64 = 72.0;
+        let Some(start) = band_start(letter) else { return false };
+        let end = start + if start == LAST { 12.0 } else { 8.0 };
+        let at = |lat: f64| self.to_metres(lat, self.central_meridian()).map(|(_, y)| y);
+        let bounds = at(start - MARGIN).zip(at(end + MARGIN));
+        bounds.is_some_and(|(low, high)| (low..=high).contains(&northing))
     }
 
     fn central_meridian(self) -> f64 {
@@ -124,6 +155,26 @@ impl UtmZone {
         }
         Some((FALSE_EASTING + RADIUS * eta, self.false_northing() + RADIUS * xi))
     }
+}
+
+/// Why a number and a letter are not the zone of a position.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum UtmZoneError {
+    /// There is no such zone.
+    #[error(
+        "there is no such UTM zone: it has a number from 1 to 60 and a letter from C to X, but I and O"
+    )]
+    Unknown,
+    /// The letter is of another part of the globe.
+    #[error("the letter of the UTM zone contradicts the northing or the latitude")]
+    Contradiction,
+}
+
+/// The southern end of a latitude band in degrees.
+fn band_start(letter: char) -> Option<f64> {
+    // I and O are no bands.
+    let index = "CDEFGHJKLMNPQRSTUVWX".find(letter)?;
+    Some(index as f64 * 8.0 - 80.0)
 }
 
 impl fmt::Display for UtmZone {
@@ -203,16 +254,56 @@ mod tests {
 
     #[test]
     fn a_letter_is_a_band_or_a_hemisphere() {
-        let of = |letter, northing| UtmZone::with_letter(10, letter, northing);
-        assert_eq!(of(Some('T'), 4.4e6), of(None, 4.4e6));
-        assert_eq!(of(Some('H'), 6.2e6), Some(zone(10, true)));
-        assert_eq!(of(Some('s'), 4_178_900.0), Some(zone(10, false)), "the band S");
-        assert_eq!(of(Some('S'), 6_252_000.0), Some(zone(10, true)), "south");
-        assert_eq!(of(Some('N'), 100.0), Some(zone(10, false)));
-        for letter in ['A', 'Z', '1'] {
-            assert_eq!(of(Some(letter), 0.0), None, "{letter}");
+        let of = |letter, northing| UtmZone::with_letter(10, letter, northing, None);
+        assert_eq!(of('T', 4.4e6), Ok(zone(10, false)));
+        assert_eq!(of('H', 6.2e6), Ok(zone(10, true)));
+        assert_eq!(of('s', 4_178_900.0), Ok(zone(10, false)), "the band S");
+        assert_eq!(of('S', 6_252_000.0), Ok(zone(10, true)), "south");
+        assert_eq!(of('N', 100.0), Ok(zone(10, false)));
+        for letter in ['A', 'I', 'o', 'Z', '1', 'é'] {
+            assert_eq!(of(letter, 0.0), Err(UtmZoneError::Unknown), "{letter}");
         }
-        assert!(UtmZone::with_letter(0, None, 0.0).is_none() && UtmZone::new(61, false).is_none());
+        assert_eq!(UtmZone::with_letter(0, 'T', 4.4e6, None), Err(UtmZoneError::Unknown));
+        assert!(UtmZone::new(61, false).is_none());
+    }
+
+    #[test]
+    fn a_band_that_contradicts_the_northing_or_the_latitude_is_refused() {
+        // Berlin, 5.8 million metres north of the equator.
+        for letter in "CDEFGJKLMPQRTVWX".chars() {
+            let got = UtmZone::with_letter(33, letter, 5_820_000.0, None);
+            assert_eq!(got, Err(UtmZoneError::Contradiction), "{letter}");
+        }
+        // As southern metres, 5.82 million are in the band H.
+        for (letter, lat, is_south) in [
+            ('U', Some(52.5), Some(false)),
+            ('U', None, Some(false)),
+            ('N', Some(52.5), Some(false)),
+            ('S', Some(52.5), None),
+            ('S', Some(-37.8), Some(true)),
+            ('H', Some(52.5), None),
+            ('H', Some(-37.8), Some(true)),
+            ('U', Some(-37.8), None),
+            ('N', Some(-37.8), None),
+        ] {
+            let got = UtmZone::with_letter(33, letter, 5_820_000.0, lat).ok();
+            assert_eq!(got, is_south.map(|is_south| zone(33, is_south)), "{letter} {lat:?}");
+        }
+    }
+
+    #[test]
+    fn every_band_takes_the_places_in_it() {
+        for (index, letter) in "CDEFGHJKLMNPQRSTUVWX".chars().enumerate() {
+            for lat in [0.1, 4.0, 7.9].map(|up| index as f64 * 8.0 - 80.0 + up) {
+                for lon in [12.1, 15.0, 17.9] {
+                    let (_, northing) = zone(33, lat < 0.0).to_metres(lat, lon).unwrap();
+                    for given in [None, Some(lat)] {
+                        let got = UtmZone::with_letter(33, letter, northing, given);
+                        assert_eq!(got, Ok(zone(33, lat < 0.0)), "{letter} {lat} {lon}");
+                    }
+                }
+            }
+        }
     }
 
     #[test]

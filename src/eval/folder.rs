@@ -1,6 +1,7 @@
 //! Lists the images in a folder and derives their ids. A file that cannot be one of them is skipped with the
 //! reason, and never costs the others.
 
+use std::collections::HashSet;
 use std::ffi::OsStr;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -10,8 +11,8 @@ use serde::{Deserialize, Serialize};
 use walkdir::{DirEntry, WalkDir};
 
 use super::natural;
-use super::poses::POSES_FILE;
-use whereabouts_core::{ImageId, InvalidName, MediaType};
+use super::poses::{POSES_FILE, sidecar};
+use whereabouts_core::{ImageId, InvalidName, Leftover, MediaType};
 
 /// An image file in a folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -44,27 +45,22 @@ pub struct Folder {
     pub skipped: Vec<SkippedFile>,
 }
 
-/// Folders in which other programs keep copies and leftovers.
-const FOREIGN_FOLDERS: [&str; 10] = [
-    ".thumbnails",
-    "@eadir",
-    "__macosx",
-    ".appledouble",
-    ".spotlight-v100",
-    ".fseventsd",
-    "$recycle.bin",
-    "#recycle",
-    "#snapshot",
-    "system volume information",
+/// Extensions of pictures. Whether the service reads a format is decided by its bytes; what it does not read is
+/// refused with a way to convert it.
+const EXTENSIONS: [&str; 50] = [
+    "jpg", "jpeg", "jpe", "jfif", "jif", "jps", "mpo", "png", "apng", "webp", "tif", "tiff", "bmp",
+    "dib", "gif", "pnm", "pgm", "ppm", "pbm", "pam", "heic", "heif", "hif", "heics", "avif",
+    "avifs", "jxl", "jp2", "jpx", "j2k", "j2c", "jpf", "jxr", "wdp", "hdp", "tga", "psd", "psb",
+    "qoi", "exr", "hdr", "pfm", "pcx", "sgi", "dds", "ras", "xcf", "flif", "bpg", "ff",
 ];
 
-/// Files in which other programs keep thumbnails.
-const FOREIGN_FILES: [&str; 4] = ["thumbs.db", "ehthumbs.db", "ehthumbs_vista.db", ".ds_store"];
+/// Extensions of drawings and icons, which no camera takes.
+const DRAWINGS: [&str; 8] = ["ico", "cur", "icns", "svg", "svgz", "xpm", "xbm", "wmf"];
 
-/// Extensions of pictures. Whether the service reads a format is decided by its bytes.
-const EXTENSIONS: [&str; 24] = [
-    "jpg", "jpeg", "jpe", "jfif", "png", "webp", "tif", "tiff", "bmp", "dib", "gif", "pnm", "pgm",
-    "ppm", "pbm", "pam", "heic", "heif", "hif", "avif", "jxl", "jp2", "jpx", "tga",
+/// Extensions of videos.
+const VIDEOS: [&str; 14] = [
+    "mp4", "m4v", "mov", "avi", "mkv", "webm", "mts", "m2ts", "mpg", "mpeg", "wmv", "insv", "lrv",
+    "3gp",
 ];
 
 /// Extensions of the raw formats of cameras.
@@ -83,6 +79,7 @@ impl Folder {
             bail!("{} is a file; name the folder that it is in", dir.display());
         }
         let mut folder = Self { dir: dir.to_owned(), pictures: Vec::new(), skipped: Vec::new() };
+        let mut sidecars = Vec::new();
         let mut entries = WalkDir::new(dir).follow_links(true).into_iter();
         while let Some(entry) = entries.next() {
             match entry {
@@ -90,10 +87,14 @@ impl Folder {
                     folder.skip(entry.path(), foreign(&entry), false);
                     entries.skip_current_dir();
                 }
+                Ok(entry) if entry.file_type().is_file() && is_sidecar_name(entry.path()) => {
+                    sidecars.push(entry.into_path());
+                }
                 Ok(entry) => folder.add(&entry),
                 Err(error) => folder.unreadable(&error)?,
             }
         }
+        folder.name_loose_sidecars(sidecars);
         folder.pictures.sort_by(|a, b| natural::compare(a.id.as_str(), b.id.as_str()));
         folder.skipped.sort_by(|a, b| natural::compare(&a.file, &b.file));
         if folder.pictures.is_empty() {
@@ -112,6 +113,33 @@ impl Folder {
         Ok(folder)
     }
 
+    /// Skips the descriptions that belong to no picture.
+    fn name_loose_sidecars(&mut self, sidecars: Vec<PathBuf>) {
+        let loose: Vec<(PathBuf, &str)> = {
+            let pictures: HashSet<&Path> =
+                self.pictures.iter().map(|picture| picture.file.as_path()).collect();
+            // `a.json` next to `a.jpg`.
+            let stems: HashSet<PathBuf> =
+                pictures.iter().map(|picture| picture.with_extension("")).collect();
+            let why = |sidecar: &Path| {
+                let of = sidecar.with_extension("");
+                if pictures.contains(of.as_path()) {
+                    None
+                } else if is_picture_name(&of) {
+                    Some("it describes a picture that is not in the folder, or was skipped")
+                } else {
+                    (stems.contains(&of) && sidecar::has_pose(sidecar)).then_some(
+                        "it has a pose, but not the name of a picture before .json (a.jpg.json for a.jpg); rename it",
+                    )
+                }
+            };
+            sidecars.into_iter().filter_map(|file| Some((file.clone(), why(&file)?))).collect()
+        };
+        for (file, why) in loose {
+            self.skip(&file, why, false);
+        }
+    }
+
     /// The number of skipped files that may be pictures of the user's.
     pub fn lost(&self) -> usize {
         self.skipped.iter().filter(|skipped| skipped.is_lost).count()
@@ -127,28 +155,32 @@ impl Folder {
         if entry.file_type().is_dir() {
             return;
         }
-        let lower = name.to_string_lossy().to_ascii_lowercase();
-        if FOREIGN_FILES.contains(&lower.as_str()) {
-            // Only of those with pictures in them.
-            if lower != ".ds_store" {
-                self.skip(path, "thumbnails of another program", false);
+        let name = name.to_string_lossy();
+        match Leftover::of_file(&name) {
+            None => {}
+            Some(Leftover::Settings) => return,
+            Some(Leftover::Thumbnails) => {
+                return self.skip(path, "thumbnails of another program", false);
             }
-            return;
-        }
-        if lower.starts_with("._") {
-            if is_picture_name(path) || is_raw_name(path) {
-                self.skip(
-                    path,
-                    "what macOS keeps about a file on a foreign disk, not a picture",
-                    false,
-                );
+            Some(Leftover::Shadow) => {
+                if is_picture_name(path) || is_raw_name(path) {
+                    let why = "what macOS keeps about a file on a foreign disk, not a picture";
+                    self.skip(path, why, false);
+                }
+                return;
             }
-            return;
         }
         if is_raw_name(path) {
             return self.add_raw(path);
         }
-        if lower == POSES_FILE && entry.depth() > 1 {
+        let extension = extension(path);
+        if DRAWINGS.contains(&extension.as_str()) {
+            return self.skip(path, "an icon or a drawing, not a picture of a camera", false);
+        }
+        if VIDEOS.contains(&extension.as_str()) {
+            return self.add_video(path);
+        }
+        if name.eq_ignore_ascii_case(POSES_FILE) && entry.depth() > 1 {
             let why = "only the poses.csv of the folder itself is read; name this one with --poses, or index its folder";
             self.skip(path, why, false);
             return;
@@ -176,12 +208,17 @@ impl Folder {
 
     /// Cameras often write a JPEG next to each raw file.
     fn add_raw(&mut self, path: &Path) {
-        let has_twin = ["jpg", "JPG", "jpeg", "JPEG", "heic", "HEIC"]
-            .iter()
-            .any(|extension| path.with_extension(extension).is_file());
-        match has_twin {
+        match has_twin(path) {
             true => self.skip(path, "a camera's raw file; the picture next to it is taken", false),
             false => self.skip(path, "a camera's raw file; export it as JPEG or PNG", true),
+        }
+    }
+
+    /// Phones and cameras keep a short video next to a picture.
+    fn add_video(&mut self, path: &Path) {
+        if !has_twin(path) {
+            let why = "a video; take single frames from it: ffmpeg -i IN -vf fps=1 %06d.jpg";
+            self.skip(path, why, false);
         }
     }
 
@@ -214,9 +251,7 @@ impl Folder {
 }
 
 fn is_foreign_folder(entry: &DirEntry) -> bool {
-    let name = entry.file_name().to_string_lossy().to_ascii_lowercase();
-    let is_foreign = FOREIGN_FOLDERS.contains(&name.as_str()) || name.starts_with(".trash");
-    entry.file_type().is_dir() && is_foreign
+    entry.file_type().is_dir() && Leftover::is_folder(&entry.file_name().to_string_lossy())
 }
 
 /// Describes a folder of another program, and counts the pictures in it.
@@ -228,6 +263,12 @@ fn foreign(entry: &DirEntry) -> String {
     format!("a folder of another program, with {} pictures", pictures.count())
 }
 
+/// Whether a file may describe a picture; the shadows of macOS do not.
+fn is_sidecar_name(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    extension(path) == "json" && Leftover::of_file(&name).is_none()
+}
+
 fn extension(path: &Path) -> String {
     path.extension().map(OsStr::to_string_lossy).unwrap_or_default().to_ascii_lowercase()
 }
@@ -235,6 +276,12 @@ fn extension(path: &Path) -> String {
 /// Whether the name of a file is that of a picture.
 pub(super) fn is_picture_name(path: &Path) -> bool {
     EXTENSIONS.contains(&extension(path).as_str())
+}
+
+/// Whether there is a picture of the same name.
+fn has_twin(path: &Path) -> bool {
+    let extensions = ["jpg", "JPG", "jpeg", "JPEG", "heic", "HEIC"];
+    extensions.iter().any(|extension| path.with_extension(extension).is_file())
 }
 
 fn is_raw_name(path: &Path) -> bool {
@@ -270,100 +317,4 @@ fn image_id(dir: &Path, file: &Path) -> Result<ImageId, String> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const PNG: &[u8] = b"\x89PNG\r\n\x1a\n and the rest";
-
-    fn folder(files: &[&str]) -> tempfile::TempDir {
-        let dir = tempfile::tempdir().unwrap();
-        for file in files {
-            let path = dir.path().join(file);
-            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-            std::fs::write(path, PNG).unwrap();
-        }
-        dir
-    }
-
-    fn ids(folder: &Folder) -> Vec<&str> {
-        folder.pictures.iter().map(|picture| picture.id.as_str()).collect()
-    }
-
-    /// The names of the skipped entries, and whether each is a loss.
-    fn skipped<'a>(dir: &Path, folder: &'a Folder) -> Vec<(&'a str, bool)> {
-        let of = |one: &'a SkippedFile| {
-            let name = one.file.strip_prefix(dir.to_str().unwrap()).unwrap();
-            (name.trim_start_matches('/'), one.is_lost)
-        };
-        folder.skipped.iter().map(of).collect()
-    }
-
-    #[test]
-    fn pictures_are_in_natural_order() {
-        let dir = folder(&["10.jpg", "2.jpg", "b/1.PNG", "a.txt", "IMG_7"]);
-        std::fs::write(dir.path().join("NOTES"), "text").unwrap();
-        let folder = Folder::read(dir.path()).unwrap();
-        assert_eq!(ids(&folder), ["2.jpg", "10.jpg", "IMG_7", "b/1.PNG"]);
-        assert!(folder.skipped.is_empty(), "{:?}", folder.skipped);
-    }
-
-    #[test]
-    fn what_other_programs_leave_is_skipped_and_no_loss() {
-        let dir = folder(&[
-            "a.jpg",
-            "._a.jpg",
-            ".DS_Store",
-            "Thumbs.db",
-            ".thumbnails/a.png",
-            "s/@eaDir/a.jpg/SYNOPHOTO_THUMB_M.jpg",
-            "__MACOSX/._a.jpg",
-            "a.dng",
-            "s/poses.csv",
-        ]);
-        let folder = Folder::read(dir.path()).unwrap();
-        assert_eq!(ids(&folder), ["a.jpg"]);
-        let expected =
-            ["._a.jpg", ".thumbnails", "Thumbs.db", "__MACOSX", "a.dng", "s/@eaDir", "s/poses.csv"];
-        assert_eq!(skipped(dir.path(), &folder), expected.map(|name| (name, false)));
-        assert!(folder.skipped[1].why.contains("1 pictures"), "{:?}", folder.skipped[1]);
-    }
-
-    #[cfg(unix)]
-    #[test]
-    fn a_file_that_cannot_be_taken_is_skipped_and_named() {
-        use std::os::unix::ffi::OsStrExt;
-        use std::os::unix::fs::symlink;
-        let long = format!("{}/{}.jpg", "d".repeat(120), "f".repeat(120));
-        let dir = folder(&["a.jpg", " b.jpg", &long, "only.nef", "sub/c.jpg"]);
-        symlink("/nowhere/x.jpg", dir.path().join("z.jpg")).unwrap();
-        symlink("/nowhere/notes.txt", dir.path().join("notes.txt")).unwrap();
-        symlink("..", dir.path().join("sub/up")).unwrap();
-        symlink("a.jpg", dir.path().join("link.jpg")).unwrap();
-        std::fs::write(dir.path().join(OsStr::from_bytes(b"caf\xE9.jpg")), PNG).unwrap();
-        std::fs::write(dir.path().join("tab\there.jpg"), PNG).unwrap();
-        std::fs::write(dir.path().join("y.jpg"), "../other/y.jpg").unwrap();
-        let folder = Folder::read(dir.path()).unwrap();
-        assert_eq!(ids(&folder), ["a.jpg", "link.jpg", "sub/c.jpg"]);
-        let skipped = skipped(dir.path(), &folder);
-        let lost =
-            [" b.jpg", "caf\u{FFFD}.jpg", &long, "only.nef", "tab\there.jpg", "y.jpg", "z.jpg"];
-        for name in lost {
-            assert!(skipped.contains(&(name, true)), "{name}: {skipped:?}");
-        }
-        assert!(
-            skipped.contains(&("sub/up", false)) && skipped.len() == lost.len() + 1,
-            "{skipped:?}"
-        );
-        assert_eq!(folder.lost(), lost.len());
-    }
-
-    #[test]
-    fn a_folder_that_is_none_is_refused_in_words() {
-        let dir = folder(&["a.jpg", "empty/readme.txt"]);
-        let refused =
-            |name: &str| format!("{:#}", Folder::read(&dir.path().join(name)).unwrap_err());
-        assert!(refused("a.jpg").contains("is a file; name the folder"), "{}", refused("a.jpg"));
-        assert!(refused("nowhere").contains("cannot read the folder"));
-        assert!(refused("empty").contains("found no picture"));
-    }
-}
+mod tests;

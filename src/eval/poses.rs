@@ -6,7 +6,7 @@ mod matching;
 mod names;
 mod place;
 mod rows;
-mod sidecar;
+pub(crate) mod sidecar;
 #[cfg(test)]
 mod tests;
 
@@ -38,7 +38,7 @@ pub enum PoseSource {
     Sidecar,
     /// The name of the file, of the form `@easting@northing@…`.
     Name,
-    /// EXIF GPS.
+    /// EXIF GPS or XMP.
     Exif,
 }
 
@@ -108,6 +108,7 @@ impl FolderPoses {
         };
         let mut poses = Self { known, grid: None, is_local: false, account };
         poses.grid = poses.natural_grid();
+        poses.note_frame();
         Ok(poses)
     }
 
@@ -192,7 +193,15 @@ impl FolderPoses {
         }
         self.is_local &= frame == CoordinateFrame::Metric;
         self.grid = Some(grid);
+        self.note_frame();
         Ok(())
+    }
+
+    fn note_frame(&mut self) {
+        let frame = self.frame();
+        if let Some(account) = &mut self.account {
+            account.set_frame(frame);
+        }
     }
 
     /// Returns the pose of an image. EXIF data are read from `bytes` if no other source has a pose.

@@ -1,12 +1,14 @@
 //! The folder `ASSETS/models`: installing and verifying models.
 
 mod error;
+mod lock;
 
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
 pub use self::error::InstallError;
+use self::lock::InstallLock;
 use super::catalogue::Entry;
 use super::download::{Download, DownloadSettings, Progress};
 use super::onnx::{ExternalFiles, external_files};
@@ -78,6 +80,7 @@ impl ModelsFolder {
         fs::create_dir_all(&partial).map_err(disk("make", &partial))?;
         let probe = partial.join("probe");
         File::create(&probe).map_err(disk("write", &probe))?;
+        remove_if_there(&probe).map_err(disk("remove", &probe))?;
         Ok(Self { models })
     }
 
@@ -150,6 +153,9 @@ impl ModelsFolder {
         }
         let name = manifest.name.clone();
         let _lock = self.lock(&name)?;
+        if file.is_dir() {
+            return Err(InstallError::Folder(file.to_owned()));
+        }
         let external = external_files(file)?;
         name_external(&mut manifest, &external)?;
         let mut given = vec![file.to_owned()];
@@ -170,17 +176,19 @@ impl ModelsFolder {
                 _ => Err(InstallError::Taken(target)),
             };
         }
-        digests.clear();
-        for (file, (installed, _)) in given.iter().zip(manifest.files()) {
-            let copy = self.partial(&name, installed);
-            fs::copy(file, &copy).map_err(disk("copy the model to", &copy))?;
-            // Hash the copy, because the source may have changed since it was checked.
-            digests.push(digest_of(&copy)?.0);
-            File::open(&copy).and_then(|file| file.sync_all()).map_err(disk("sync", &copy))?;
+        let copies: Vec<PathBuf> =
+            manifest.files().map(|(installed, _)| self.partial(&name, installed)).collect();
+        let installed = copied(&given, &copies).and_then(|digests| {
+            manifest.pin(&digests);
+            let (folder, notes) = self.place(assets, &manifest, None)?;
+            Ok(Added::Installed { folder, name, digests, notes })
+        });
+        if installed.is_err() {
+            for copy in copies {
+                remove_if_there(&copy).map_err(disk("remove", &copy))?;
+            }
         }
-        manifest.pin(&digests);
-        let (folder, notes) = self.place(assets, &manifest, None)?;
-        Ok(Added::Installed { folder, name, digests, notes })
+        installed
     }
 
     /// Chooses the model that `auto` resolves to; `None` removes the choice.
@@ -213,21 +221,11 @@ impl ModelsFolder {
         })
     }
 
-    fn lock(&self, name: &str) -> Result<File, InstallError> {
+    fn lock(&self, name: &str) -> Result<InstallLock, InstallError> {
         if !is_name(name) {
             return Err(InstallError::Name(name.to_owned()));
         }
-        let path = self.partial(name, Path::new("lock"));
-        let file = File::create(&path).map_err(disk("write", &path))?;
-        match file.try_lock() {
-            Ok(()) => Ok(file),
-            Err(TryLockError::WouldBlock) => {
-                Err(InstallError::Locked { name: name.to_owned(), lock: path })
-            }
-            Err(TryLockError::Error(source)) => {
-                Err(InstallError::Disk { doing: "lock", path, source })
-            }
-        }
+        InstallLock::acquire(name, self.partial(name, Path::new("lock")))
     }
 
     fn partial(&self, name: &str, what: &Path) -> PathBuf {
@@ -280,6 +278,17 @@ impl ModelsFolder {
         remove_folder(&old)?;
         Ok((target, notes))
     }
+}
+
+/// Copies files durably, and returns the digests of the copies: the sources may have changed since they were checked.
+fn copied(files: &[PathBuf], copies: &[PathBuf]) -> Result<Vec<Digest>, InstallError> {
+    let copy = |(file, copy): (&PathBuf, &PathBuf)| {
+        fs::copy(file, copy).map_err(disk("copy the model to", copy))?;
+        let digest = digest_of(copy)?.0;
+        File::open(copy).and_then(|file| file.sync_all()).map_err(disk("sync", copy))?;
+        Ok(digest)
+    };
+    files.iter().zip(copies).map(copy).collect()
 }
 
 /// Adds the files of external weights that the manifest does not name yet.

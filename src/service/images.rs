@@ -6,11 +6,13 @@ use std::sync::Arc;
 use bytes::Bytes;
 use jiff::Timestamp;
 
+use super::imaging::PictureFacts;
 use super::{BulkSettings, Keys, Maps, SUPERSEDED_RETRIES, ServiceError};
 use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage};
 use whereabouts_core::{CoordinateFrame, Image, ImageId, Map, MapName, MediaType, Pose, PoseInput};
 use whereabouts_store::{Added, BlobStore, StoreError};
-use whereabouts_vision::{AdmissionRequest, FeatureSet, exif};
+use whereabouts_vision::exif::GpsReading;
+use whereabouts_vision::{AdmissionRequest, FeatureSet};
 
 /// An image to add.
 #[derive(Debug)]
@@ -38,8 +40,8 @@ pub struct Images {
 
 impl Images {
     /// Extracts the descriptor of an image and stores both. A new image without a pose in a `wgs84` map gets that
-    /// of its EXIF data. If the image is stored already, its pose, time and
-    /// tags become those that `new` states. Returns the image, and whether it is new.
+    /// of its metadata. If the image is stored already, its pose, time and tags become those that `new` states, and
+    /// nothing is extracted. Returns the image, and whether it is new.
     pub async fn add(
         &self,
         name: &MapName,
@@ -49,19 +51,50 @@ impl Images {
             return Err(empty_body());
         }
         let stated = StatedMeta::new(new.meta)?;
+        let imaging = &self.maps.imaging;
         let (mut pin, mut retries) = (None, SUPERSEDED_RETRIES);
+        let known = self.maps.find(name).await?;
+        let stored = match &stated.id {
+            Some(id) => self.maps.store.image(&known, id).await?,
+            None => None,
+        };
+        // An image that is stored needs no model. Another may have to load it, which must not keep a permit.
+        let mut usable = match &stored {
+            Some(_) => None,
+            None => Some(self.maps.usable(name).await?),
+        };
+        let permit = Arc::new(imaging.admit(new.demand).await?);
+        let facts = imaging.examine(&permit, new.bytes.clone()).await?;
+        let digest = facts.digest;
+        let mut permit = Some(permit);
+        if let Some(stored) = stored.filter(|stored| stored.digest == digest)
+            && let Some(permit) = permit.take()
+        {
+            let warnings = imaging.warnings(permit, new.bytes.clone()).await?;
+            let answer = self.present(&known, &stored.id, &stated, &new.bytes, &facts).await?;
+            if let Some(answer) = answer {
+                let warnings = [warnings, answer.warnings].concat();
+                return Ok((ImageAnswer { warnings, ..answer }, false));
+            }
+        }
         loop {
-            let (map, extractor) = self.maps.usable(name).await?;
+            let (map, extractor) = match usable.take() {
+                Some(usable) => usable,
+                None => self.maps.usable(name).await?,
+            };
             let stated_pose = stated.pose(&map)?;
             let bytes = new.bytes.clone();
             let (kind, features) = (map.descriptor, FeatureSet::DescriptorOnly);
-            let imaging = &self.maps.imaging;
-            let extraction = imaging.extract(&extractor, bytes, kind, features, new.demand).await?;
+            let extraction = match permit.take() {
+                Some(permit) => {
+                    imaging.extract_with(permit, &extractor, bytes, kind, features).await?
+                }
+                None => imaging.extract(&extractor, bytes, kind, features, new.demand).await?,
+            };
             imaging.metrics.observe_extraction(&extraction);
-            let digest = extraction.digest;
             let (pose, advice) = match (stated_pose, map.frame) {
                 (Some(pose), _) => (Some(pose), Vec::new()),
-                (None, CoordinateFrame::Wgs84) => pose_in(&new.bytes),
+                (None, CoordinateFrame::Wgs84) => pose_in(&facts),
                 (None, CoordinateFrame::Metric) => (None, Vec::new()),
             };
             let image = Image {
@@ -101,6 +134,29 @@ impl Images {
                 }
             }
         }
+    }
+
+    /// Answers for an image that the map has with the same bytes, whose descriptor is known. Returns `None` if it was
+    /// deleted meanwhile.
+    async fn present(
+        &self,
+        map: &Map,
+        id: &ImageId,
+        stated: &StatedMeta,
+        bytes: &Bytes,
+        facts: &PictureFacts,
+    ) -> Result<Option<ImageAnswer>, ServiceError> {
+        // The store may have lost the bytes. The pin keeps them until the record is seen to be there.
+        let _pin = self.blobs.put_blob(facts.digest, bytes.clone()).await?;
+        let mut answer = match self.restate(&map.name, id, stated).await {
+            Err(error) if error.kind == ErrorKind::NotFound => return Ok(None),
+            answer => answer?,
+        };
+        // A pose that was corrected needs no advice.
+        if answer.image.pose.is_none() && map.frame == CoordinateFrame::Wgs84 {
+            answer.warnings = pose_in(facts).1;
+        }
+        Ok(Some(answer))
     }
 
     /// Returns an image without its bytes.
@@ -184,9 +240,9 @@ impl StatedMeta {
     }
 }
 
-/// The position in the EXIF data of a picture, and what was not taken of it.
-fn pose_in(bytes: &[u8]) -> (Option<Pose>, Vec<String>) {
-    let exif::GpsReading { pose, warnings } = exif::gps(bytes);
+/// The position in the metadata of a picture, and what was not taken of it.
+fn pose_in(facts: &PictureFacts) -> (Option<Pose>, Vec<String>) {
+    let GpsReading { pose, warnings } = facts.gps.clone();
     (pose.map(Pose::Geographic), warnings)
 }
 

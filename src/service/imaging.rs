@@ -6,8 +6,9 @@ use std::sync::Arc;
 use bytes::Bytes;
 use tokio_util::sync::CancellationToken;
 use whereabouts_api::ErrorKind;
-use whereabouts_core::{DescriptorKind, MediaType};
+use whereabouts_core::{DescriptorKind, Digest, MediaType};
 use whereabouts_store::MapStore;
+use whereabouts_vision::exif::{GpsReading, gps};
 use whereabouts_vision::{
     Admission, AdmissionRequest, CpuPool, ExtractError, Extraction, Extractor, FeatureSet,
     LoadedModels, Manifest, Permit, PoolError, RawPixels, Rejected, WorkClass, decode, preprocess,
@@ -30,6 +31,15 @@ pub struct Imaging {
     pub pool: CpuPool,
     /// Counts rejections.
     pub metrics: Arc<ServiceMetrics>,
+}
+
+/// What the bytes of a picture say without being decoded.
+#[derive(Debug)]
+pub(crate) struct PictureFacts {
+    /// Their digest.
+    pub digest: Digest,
+    /// The position in its metadata.
+    pub gps: GpsReading,
 }
 
 impl Imaging {
@@ -59,6 +69,18 @@ impl Imaging {
         request: AdmissionRequest,
     ) -> Result<Extraction, ServiceError> {
         let permit = Arc::new(self.admit(request).await?);
+        self.extract_with(permit, extractor, bytes, kind, features).await
+    }
+
+    /// Like [`Imaging::extract`], with a permit that the caller has.
+    pub(crate) async fn extract_with(
+        &self,
+        permit: Arc<Permit>,
+        extractor: &Arc<Extractor>,
+        bytes: Bytes,
+        kind: DescriptorKind,
+        features: FeatureSet,
+    ) -> Result<Extraction, ServiceError> {
         let cancelled = CancellationToken::new();
         let _cancel_on_drop = cancelled.clone().drop_guard();
         let (decoder, decoding_permit) = (Arc::clone(extractor), Arc::clone(&permit));
@@ -70,6 +92,36 @@ impl Imaging {
         let extraction = self.on_pool(decode).await?.result().await?;
         permit.complete();
         Ok(extraction)
+    }
+
+    /// Hashes a picture and reads the position in its metadata.
+    pub(crate) async fn examine(
+        &self,
+        permit: &Arc<Permit>,
+        bytes: Bytes,
+    ) -> Result<PictureFacts, ServiceError> {
+        let permit = Arc::clone(permit);
+        let examine = move || {
+            let _permit = permit;
+            Ok(PictureFacts { digest: Digest::of(&bytes), gps: gps(&bytes) })
+        };
+        self.on_pool(examine).await
+    }
+
+    /// Decodes a picture only to say what is wrong with it.
+    pub(crate) async fn warnings(
+        &self,
+        permit: Arc<Permit>,
+        bytes: Bytes,
+    ) -> Result<Vec<String>, ServiceError> {
+        let limits = self.models.limits();
+        let decode = move || {
+            let _permit = permit;
+            Ok(decode::decode(&bytes, limits, decode::Needed::Size(16, 16))?.warnings)
+        };
+        let warnings: Vec<String> = self.on_pool(decode).await?;
+        self.metrics.count_damage(&warnings);
+        Ok(warnings)
     }
 
     /// Returns pixels without a file format as PNG.

@@ -128,12 +128,17 @@ impl ServiceMetrics {
     /// Observes the stages of an extraction.
     pub fn observe_extraction(&self, extraction: &Extraction) {
         self.batch_pictures.observe(extraction.batch as f64);
-        if !extraction.warnings.is_empty() {
-            self.damaged_pictures.inc();
-        }
+        self.count_damage(&extraction.warnings);
         let times = extraction.times;
         for (stage, time) in [("decode", times.decode), ("extract", times.extract)] {
             self.stage_seconds.get_or_create(&StageLabels { stage }).observe(time.as_secs_f64());
+        }
+    }
+
+    /// Counts a picture that was decoded with warnings.
+    pub fn count_damage(&self, warnings: &[String]) {
+        if !warnings.is_empty() {
+            self.damaged_pictures.inc();
         }
     }
 

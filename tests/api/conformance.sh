@@ -8,18 +8,10 @@
 # EXAMPLES is the number of requests generated for each call (default 5), in addition to those that cover its
 # parameters one by one. Exits with 1 if a response does not match the description.
 set -euo pipefail
-
-if [ $# -lt 2 ] || [ $# -gt 3 ]; then
-    echo "usage: $0 BINARY VENV [EXAMPLES], such as: $0 target/release/whereabouts target/api-venv" >&2
-    exit 2
-fi
-binary=$(realpath "$1")
-venv=$(realpath -m "$2")
 examples=${3:-5}
-cd "$(dirname "$0")"
-
 # shellcheck source-path=SCRIPTDIR source=../server.sh
-. ../server.sh
+. "$(dirname "$0")/../server.sh"
+arguments "$0" "${@:1:2}"
 environment "$venv" requirements.txt
 export WHEREABOUTS_MODEL__NAME=xfeat
 serve "$binary"
@@ -32,7 +24,4 @@ curl --silent --fail --output /dev/null -X PUT "$url/maps/town" -H 'Content-Type
     --exclude-path /events --max-examples "$examples" --seed 1 --workers 1 --phases examples,coverage,fuzzing \
     --checks not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance \
     --continue-on-failure --no-shrink --warnings off --request-timeout 60)
-if grep -q panicked "$scratch/log"; then
-    grep panicked "$scratch/log" >&2
-    exit 1
-fi
+no_panic

@@ -266,3 +266,51 @@ async fn an_exif_position_is_taken_and_one_without_its_letters_is_a_warning() {
     server.patch(&format!("/maps/{map}/images/c"), corrected).await.expect(200);
     assert_eq!(post("c", &good, 200).await["pose"], json!({"lat": 1.0, "lon": 2.0}));
 }
+
+#[tokio::test]
+async fn an_image_that_has_a_pose_in_the_map_is_not_counted_without() {
+    let (server, map) = shared_server();
+    let folder = folder(&["a.jpg", "b.jpg"]);
+    assert_eq!(counts(&indexed(server, &folder, &map, &[]).0), [2, 0, 0, 2]);
+    let corrected = json!({"pose": {"lat": 1.0, "lon": 2.0}});
+    server.patch(&format!("/maps/{map}/images/a.jpg"), corrected).await.expect(200);
+    let (report, code) = indexed(server, &folder, &map, &[]);
+    assert_eq!((counts(&report), code), ([0, 2, 0, 1], 0));
+    let poses = [&report["account"][0]["pose"], &report["account"][1]["pose"]];
+    assert_eq!(poses, [&json!("map"), &json!(null)]);
+    let text = String::from_utf8(run(server, folder.path(), &map, &[]).stdout).unwrap();
+    let lines = ["no pose (1): b.jpg", "no pose in the folder, the map keeps its own (1): a.jpg"];
+    assert!(lines.iter().all(|line| text.contains(line)), "{text}");
+}
+
+#[tokio::test]
+async fn a_description_without_its_picture_is_named() {
+    let (server, map) = shared_server();
+    let folder = folder(&["a.jpg"]);
+    for name in ["a.jpg.json", "gone.jpg.json"] {
+        write(&folder, name, r#"{"pose": {"lat": 1, "lon": 2}}"#);
+    }
+    let (report, code) = indexed(server, &folder, &map, &[]);
+    assert_eq!((counts(&report), code), ([1, 0, 0, 0], 0));
+    let skipped = report["skipped"].as_array().unwrap();
+    assert_eq!(skipped.len(), 1, "{report}");
+    assert!(skipped[0]["file"].as_str().unwrap().ends_with("gone.jpg.json"), "{report}");
+}
+
+#[tokio::test]
+async fn the_position_and_the_heading_of_a_drone_are_read_from_xmp() {
+    let (server, map) = shared_server();
+    let folder = TempDir::new().unwrap();
+    let xmp = "http://ns.adobe.com/xap/1.0/\0<rdf:Description \
+        xmlns:drone-dji='http://www.dji.com/drone-dji/1.0/' drone-dji:GpsLatitude='+45.5' \
+        drone-dji:GpsLongitude='-7.25' drone-dji:AbsoluteAltitude='+240.5' \
+        drone-dji:RelativeAltitude='+30.0' drone-dji:GimbalYawDegree='-90.0'/>";
+    let (jpeg, length) = (reference(0), (xmp.len() + 2) as u16);
+    let tagged = [&jpeg[..2], &[0xFF, 0xE1], &length.to_be_bytes(), xmp.as_bytes(), &jpeg[2..]];
+    write(&folder, "DJI_0001.JPG", tagged.concat());
+    assert_eq!(counts(&indexed(server, &folder, &map, &[]).0), [1, 0, 0, 0]);
+    assert_eq!(
+        pose(server, &map, "DJI_0001.JPG").await,
+        json!({"lat": 45.5, "lon": -7.25, "alt": 240.5, "heading": 270.0})
+    );
+}

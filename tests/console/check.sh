@@ -8,22 +8,14 @@
 # The browser is chromium from the PATH, or the one in CHROMIUM. With SCREENSHOTS=FOLDER, screenshots of the
 # views are written there. Takes about two minutes. Exits with 1 if anything fails.
 set -euo pipefail
-
-if [ $# -ne 2 ]; then
-    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/console-venv" >&2
-    exit 2
-fi
-binary=$(realpath "$1")
-venv=$(realpath -m "$2")
+# shellcheck source-path=SCRIPTDIR source=../server.sh
+. "$(dirname "$0")/../server.sh"
 screenshots=
 if [ -n "${SCREENSHOTS:-}" ]; then
     mkdir -p "$SCREENSHOTS"
     screenshots=$(realpath "$SCREENSHOTS")
 fi
-cd "$(dirname "$0")"
-
-# shellcheck source-path=SCRIPTDIR source=../server.sh
-. ../server.sh
+arguments "$0" "$@"
 browser
 environment "$venv" requirements.txt
 
@@ -37,7 +29,4 @@ done
 serve "$binary"
 TOWN=$scratch/town URL=$url KEYS=$scratch CHROMIUM=$CHROMIUM SCREENSHOTS=$screenshots PYTHONDONTWRITEBYTECODE=1 \
     timeout 400 "$venv/bin/python" -m unittest
-if grep -q panicked "$scratch/log"; then
-    grep panicked "$scratch/log" >&2
-    exit 1
-fi
+no_panic

@@ -7,17 +7,9 @@
 # VENV and the browser are those of check.sh. Takes several minutes, mostly to fill the server. Exits with 1
 # if the first view is above 200 kB or 300 ms.
 set -euo pipefail
-
-if [ $# -ne 2 ]; then
-    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/console-venv" >&2
-    exit 2
-fi
-binary=$(realpath "$1")
-venv=$(realpath -m "$2")
-cd "$(dirname "$0")"
-
 # shellcheck source-path=SCRIPTDIR source=../server.sh
-. ../server.sh
+. "$(dirname "$0")/../server.sh"
+arguments "$0" "$@"
 browser
 environment "$venv" requirements.txt
 

@@ -9,17 +9,9 @@
 # takes about half a minute. Exits with 1 if anything fails, and prints at the end which checks could not be run.
 # Uses docker compose, haproxy, kubectl (or kustomize), promtool and systemd-analyze where they are installed.
 set -euo pipefail
-
-if [ $# -ne 2 ]; then
-    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/deploy-venv" >&2
-    exit 2
-fi
-binary=$(realpath "$1")
-venv=$(realpath -m "$2")
-cd "$(dirname "$0")"
-
 # shellcheck source-path=SCRIPTDIR source=../server.sh
-. ../server.sh
+. "$(dirname "$0")/../server.sh"
+arguments "$0" "$@"
 environment "$venv" requirements.txt
 
 "$venv/bin/shellcheck" --external-sources check.sh ../../deploy/database/whereabouts.sh
@@ -49,10 +41,7 @@ export WHEREABOUTS_WEBHOOKS__ALLOW_PRIVATE=true WHEREABOUTS_WEBHOOKS__RETRY_S='[
 serve "$binary"
 BINARY=$binary SCRATCH=$scratch URL=$url OUTSIDE=$(cat "$scratch/outside") \
     timeout 120 "$venv/bin/python" -m unittest
-if grep -q panicked "$scratch/log"; then
-    grep panicked "$scratch/log" >&2
-    exit 1
-fi
+no_panic
 
 echo
 echo "Not run by this script: building the image, starting the Compose files, applying the manifests to a cluster,"

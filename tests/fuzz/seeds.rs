@@ -1,11 +1,13 @@
 //! Valid inputs to start from.
 
-use std::io::Cursor;
+use std::io::{Cursor, Write};
 use std::ops::Range;
 
 use bytes::Bytes;
 use exif::experimental::Writer as ExifWriter;
 use exif::{Field, In, Rational, Tag, Value};
+use flate2::Compression;
+use flate2::write::ZlibEncoder;
 use image::codecs::jpeg::JpegEncoder;
 use image::{ImageFormat, RgbImage};
 use jiff::Timestamp;
@@ -170,6 +172,8 @@ pub fn poses() -> Vec<Vec<u8>> {
         "file,lat,lon,alt,heading\na.jpg,45.1,7.2,240.5,359.9\nb.jpg,-45,179.999,,\n",
         "file,x,y,z,qx,qy,qz,qw\na.jpg,1.5,-2,0,0,0,0.7071068,0.7071068\nb.jpg,1e3,2,,,,,\n",
         "sep=;\n# by hand\nName;Easting;Northing;Zone\nA;543250,96;4178900,7;10S\nx\\b.jpg;1;2;11N\n",
+        "SourceFile;GPSLatitude;GPSLatitudeRef;GPSLongitude;GPSAltitude\na.jpg;45 deg 12' 30.00\";South;7,0,1E;24 m Below Sea Level\n",
+        "file|GPSPosition|x|y|zone|hemisphere\nb.jpg|45 deg 12' 30.00\" N, 7 deg 0' 1.00\" W|1|2|33|S\n",
         r#"{"lat": 45.0, "lon": 7.0, "alt": 240.0, "heading": 90.0}"#,
         r#"{"x": 1.0, "y": -2.5, "z": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}"#,
     ])
@@ -214,8 +218,44 @@ pub fn exif() -> Vec<Vec<u8>> {
         (Tag::GPSAltitude, Value::Rational(vec![Rational { num: 2405, denom: 10 }])),
     ]
     .map(|(tag, value)| Field { tag, ifd_num: In::PRIMARY, value });
-    let pictures = pictures();
-    vec![with_exif(&pictures[0], &exif_of(&fields))]
+    let (pictures, exif) = (pictures(), exif_of(&fields));
+    let xmp = "<x:xmpmeta xmlns:x='adobe:ns:meta/'><rdf:Description xmlns:exif='http://ns.adobe.com/exif/1.0/' \
+        exif:GPSLatitude='45,30.5N' exif:GPSAltitude=\"2405/10\"><exif:GPSLongitude>7,0,1E</exif:GPSLongitude>\
+        <!-- a comment --></rdf:Description></x:xmpmeta>";
+    let drone = "<rdf:Description xmlns:drone-dji='http://www.dji.com/drone-dji/1.0/' \
+        drone-dji:GpsLatitude='+45.5' drone-dji:GpsLongitude='-7.5' drone-dji:GimbalYawDegree='-90.0'/>";
+    let app1 = |packet: &str| {
+        let data = [b"http://ns.adobe.com/xap/1.0/\0", packet.as_bytes()].concat();
+        [&[0xFF, 0xD8, 0xFF, 0xE1][..], &(data.len() as u16 + 2).to_be_bytes(), &data].concat()
+    };
+    let png = |kind: &[u8], data: &[u8]| {
+        let length = (data.len() as u32).to_be_bytes();
+        [b"\x89PNG\r\n\x1a\n", &length[..], kind, data, &[0; 4]].concat()
+    };
+    let digits: String = exif.iter().map(|byte| format!("{byte:02x}")).collect();
+    let profile = format!("\nexif\n{:8}\n{digits}\n", exif.len());
+    let mut encoder = ZlibEncoder::new(Vec::new(), Compression::default());
+    encoder.write_all(profile.as_bytes()).unwrap();
+    let profile = [b"Raw profile type exif\0\0", &encoder.finish().unwrap()[..]].concat();
+    let size = (xmp.len() as u32).to_le_bytes();
+    vec![
+        with_exif(&pictures[0], &exif),
+        app1(xmp),
+        app1(drone),
+        png(b"eXIf", &exif),
+        png(b"zTXt", &profile),
+        png(b"iTXt", &[b"XML:com.adobe.xmp\0\0\0\0\0", xmp.as_bytes()].concat()),
+        [b"RIFF\0\0\0\0WEBPXMP ", &size[..], xmp.as_bytes()].concat(),
+        [b"GIF89a!\xFF\x0BXMP DataXMP", xmp.as_bytes()].concat(),
+        [
+            b"II*\0\x08\0\0\0\x01\0\xBC\x02\x01\0",
+            &size[..],
+            &26_u32.to_le_bytes(),
+            &[0; 4],
+            xmp.as_bytes(),
+        ]
+        .concat(),
+    ]
 }
 
 fn oriented(turn: u16) -> Field {

@@ -7,17 +7,9 @@
 # VENV is the folder of a Python virtual environment with grpcio (requirements.txt); it is created if missing. After
 # that, a run takes about half a minute. Exits with 1 if anything fails.
 set -euo pipefail
-
-if [ $# -ne 2 ]; then
-    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/grpc-venv" >&2
-    exit 2
-fi
-binary=$(realpath "$1")
-venv=$(realpath -m "$2")
-cd "$(dirname "$0")"
-
 # shellcheck source-path=SCRIPTDIR source=../server.sh
-. ../server.sh
+. "$(dirname "$0")/../server.sh"
+arguments "$0" "$@"
 environment "$venv" requirements.txt
 (cd ../../proto && "$venv/bin/buf" lint)
 
@@ -37,7 +29,4 @@ fi
 BINARY=$binary TOWN=$scratch/town URL=$url KEY=$scratch/key.json SERVER=$server PYTHONDONTWRITEBYTECODE=1 \
     timeout 240 "$venv/bin/python" -m unittest
 server=
-if grep -q panicked "$scratch/log"; then
-    grep panicked "$scratch/log" >&2
-    exit 1
-fi
+no_panic

@@ -7,17 +7,9 @@
 # VENV is the folder of a Python virtual environment (requirements.txt); it is created if missing. After that, a run
 # takes about half a minute. Exits with 1 if anything fails.
 set -euo pipefail
-
-if [ $# -ne 2 ]; then
-    echo "usage: $0 BINARY VENV, such as: $0 target/release/whereabouts target/mllm-venv" >&2
-    exit 2
-fi
-binary=$(realpath "$1")
-venv=$(realpath -m "$2")
-cd "$(dirname "$0")"
-
 # shellcheck source-path=SCRIPTDIR source=../server.sh
-. ../server.sh
+. "$(dirname "$0")/../server.sh"
+arguments "$0" "$@"
 environment "$venv" requirements.txt
 
 "$venv/bin/python" tiny_model.py "$scratch"

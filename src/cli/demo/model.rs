@@ -81,7 +81,10 @@ impl PendingChoice {
             Ok(()) => {
                 ModelChoice { model: name.to_owned(), reason: format!("installed from {hub}") }
             }
-            Err(error) => built_in(format!("built in; {name} could not be installed: {error:#}")),
+            Err(error) => built_in(format!(
+                "built in; {name} could not be installed: {}",
+                crate::message(&error)
+            )),
         })
     }
 }

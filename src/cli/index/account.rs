@@ -21,6 +21,7 @@ pub struct IndexReport {
     pub present: usize,
     /// Images that the map had, and whose pose, time or tags have changed.
     pub changed: usize,
+    /// Images that have no pose in the map.
     pub without_pose: usize,
     pub failed: Vec<FailedImage>,
     /// Files that are not images of the map, and why.
@@ -48,7 +49,7 @@ pub struct Entry {
     pub file: String,
     pub outcome: Outcome,
     /// Where its pose comes from; null if it has none.
-    pub pose: Option<PoseSource>,
+    pub pose: Option<PoseOrigin>,
     /// The fields that have changed.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub changed: Vec<ImageField>,
@@ -58,6 +59,31 @@ pub struct Entry {
     /// What was not taken of it.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
+}
+
+/// Where the pose of an image in the map comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PoseOrigin {
+    Table,
+    Sidecar,
+    Name,
+    Exif,
+    /// The folder has no pose, and the map keeps the one that it has.
+    Map,
+}
+
+impl PoseOrigin {
+    /// The origin of a pose that the folder has or not, and the map has or not.
+    pub fn new(in_folder: Option<PoseSource>, is_in_map: bool) -> Option<Self> {
+        match in_folder {
+            Some(PoseSource::Table) => Some(Self::Table),
+            Some(PoseSource::Sidecar) => Some(Self::Sidecar),
+            Some(PoseSource::Name) => Some(Self::Name),
+            Some(PoseSource::Exif) => Some(Self::Exif),
+            None => is_in_map.then_some(Self::Map),
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -169,6 +195,13 @@ impl IndexReport {
         if !unposed.is_empty() {
             let names = bounded(&unposed, MOST, |entry| entry.file.clone());
             lines.push(format!("no pose ({}): {names}", unposed.len()));
+        }
+        let is_kept = |entry: &&&Entry| entry.pose == Some(PoseOrigin::Map);
+        let kept: Vec<&&Entry> = images.iter().filter(is_kept).collect();
+        if !kept.is_empty() {
+            let names = bounded(&kept, MOST, |entry| entry.file.clone());
+            let count = kept.len();
+            lines.push(format!("no pose in the folder, the map keeps its own ({count}): {names}"));
         }
         lines.extend(self.rows.iter().flat_map(|rows| rows.lines(MOST)));
         let warnings: Vec<(ImageId, String)> = images

@@ -10,8 +10,9 @@ use futures_util::StreamExt;
 use reqwest::multipart::{Form, Part};
 
 use super::super::client::{Client, MAX_ATTEMPTS, MAX_PAUSE};
+use super::super::message;
 use super::super::progress::ProgressMeter;
-use super::account::{Entry, FailedImage, IndexReport, Outcome};
+use super::account::{Entry, FailedImage, IndexReport, Outcome, PoseOrigin};
 use super::{Args, map};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 use whereabouts_api::{ErrorKind, ImageMeta};
@@ -46,7 +47,7 @@ pub async fn add_folder(client: &Client, dir: &Path, args: &Args) -> anyhow::Res
             let entry = match result {
                 Ok(uploaded) => uploaded.entry(&picture.id),
                 Err(error) => {
-                    let error = format!("{error:#}");
+                    let error = message(&error);
                     progress.println(&format!("{}: {error}", picture.file.display()));
                     failed.push(FailedImage { file: picture.file, error: error.clone() });
                     Entry {
@@ -94,19 +95,19 @@ fn batches(files: Vec<PictureFile>) -> Vec<Vec<PictureFile>> {
 struct Uploaded {
     is_new: bool,
     changed: Vec<ImageField>,
-    source: Option<PoseSource>,
+    pose: Option<PoseOrigin>,
     warnings: Vec<String>,
 }
 
 impl Uploaded {
     fn entry(self, id: &ImageId) -> Entry {
-        let Self { is_new, changed, source, warnings } = self;
+        let Self { is_new, changed, pose, warnings } = self;
         let outcome = match (is_new, changed.is_empty()) {
             (true, _) => Outcome::Added,
             (false, true) => Outcome::Present,
             (false, false) => Outcome::Changed,
         };
-        Entry { file: id.to_string(), outcome, pose: source, changed, why: None, warnings }
+        Entry { file: id.to_string(), outcome, pose, changed, why: None, warnings }
     }
 }
 
@@ -147,7 +148,7 @@ impl Uploader<'_> {
             let answer = match self.post(&pending).await {
                 Ok(answer) => answer,
                 Err(error) => {
-                    let error = format!("{error:#}");
+                    let error = message(&error);
                     let fail = |image: PendingImage| (image.picture, Err(anyhow!("{error}")));
                     done.extend(pending.into_iter().map(fail));
                     return done;
@@ -156,13 +157,13 @@ impl Uploader<'_> {
             let mut pause = None;
             let mut overloaded = Vec::new();
             for (image, result) in pending.into_iter().zip(answer.results) {
-                let BatchResult { outcome, changed, problem, warnings, .. } = result;
+                let BatchResult { outcome, pose, changed, problem, warnings, .. } = result;
                 match problem {
                     None => {
                         let uploaded = Uploaded {
                             is_new: outcome == BatchOutcome::Stored,
                             changed,
-                            source: image.source,
+                            pose: PoseOrigin::new(image.source, pose.is_some()),
                             warnings: united(image.warnings, warnings),
                         };
                         done.push((image.picture, Ok(uploaded)));

@@ -10,7 +10,7 @@ use super::rows::PoseRows;
 use super::{KnownImage, PoseSource};
 use crate::Folder;
 use crate::account::bounded;
-use whereabouts_core::ImageId;
+use whereabouts_core::{CoordinateFrame, ImageId};
 
 /// What became of the rows of a table of poses. Every row is counted once.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -33,6 +33,15 @@ pub struct RowAccount {
     pub images_without_row: Vec<ImageId>,
     /// Columns that are not used.
     pub unused_columns: Vec<String>,
+    /// Columns in the coordinate frame that the poses are not taken in, if the table has both.
+    #[serde(default)]
+    pub other_frame_columns: Vec<String>,
+    /// What the user should know of the table.
+    #[serde(default)]
+    pub notes: Vec<String>,
+    /// Columns in degrees and in metres, if there are both.
+    #[serde(skip)]
+    both_frames: Option<[Vec<String>; 2]>,
 }
 
 /// A row that matches no image.
@@ -80,6 +89,9 @@ pub(super) fn apply(
         loose: Vec::new(),
         images_without_row: Vec::new(),
         unused_columns: table.unused.clone(),
+        other_frame_columns: Vec::new(),
+        notes: table.notes.clone(),
+        both_frames: table.both_frames.clone(),
     };
     let mut has_row = vec![false; ids.len()];
     for (row, found) in table.rows.iter().zip(match_rows(&names, &ids, &folder.dir)) {
@@ -125,6 +137,16 @@ pub(super) fn apply(
 }
 
 impl RowAccount {
+    /// Notes the coordinate frame in which the poses are taken.
+    pub(super) fn set_frame(&mut self, frame: Option<CoordinateFrame>) {
+        let Some([degrees, metres]) = &self.both_frames else { return };
+        let others = match frame {
+            Some(CoordinateFrame::Metric) => degrees,
+            _ => metres,
+        };
+        self.other_frame_columns.clone_from(others);
+    }
+
     /// The account in lines for people, each list bounded to `most` names.
     pub fn lines(&self, most: usize) -> Vec<String> {
         let Self { table, rows, matched, repeated, without_position, unmatched, .. } = self;
@@ -155,6 +177,12 @@ impl RowAccount {
         let names = bounded(columns, most, |name| format!("{name:?}"));
         let hint = "a direction is read from heading, in degrees clockwise from north";
         list("columns that are not used", columns.len(), format!("{names}; {hint}"));
+        let columns = &self.other_frame_columns;
+        let names = bounded(columns, most, |name| format!("{name:?}"));
+        let hint = "each map has one frame (index --frame wgs84 or metric)";
+        let what = "columns of the other coordinate frame, which are used only where a row has no other position";
+        list(what, columns.len(), format!("{names}; {hint}"));
+        lines.extend(self.notes.iter().take(most).cloned());
         lines
     }
 }

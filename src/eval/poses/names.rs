@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::place::Place;
 use crate::folder::is_picture_name;
-use whereabouts_core::{GeographicPose, MetricPose, Pose, UtmZone};
+use whereabouts_core::{GeographicPose, MetricPose, Pose, UtmZone, UtmZoneError};
 
 /// Reads the position in the name of a file. The error says why a name that should have one does not.
 pub(super) fn place_in_name(name: &str) -> Result<Option<Place>, &'static str> {
@@ -20,7 +20,9 @@ pub(super) fn place_in_name(name: &str) -> Result<Option<Place>, &'static str> {
     let number = |index: usize| field(index).parse::<f64>().ok().filter(|value| value.is_finite());
     let geographic = number(4).zip(number(5)).and_then(|(lat, lon)| {
         let pose = GeographicPose { lat, lon, alt: None, heading: None };
-        Pose::Geographic(pose).checked().ok().map(|_| pose)
+        // Programs write 0, 0 where they know no position.
+        let is_known = (lat, lon) != (0.0, 0.0) && Pose::Geographic(pose).checked().is_ok();
+        is_known.then_some(pose)
     });
     let metric = number(0).zip(number(1)).and_then(|(x, y)| {
         let pose = MetricPose { x, y, z: None, qx: None, qy: None, qz: None, qw: None };
@@ -54,20 +56,23 @@ fn zone(
         return Ok(None);
     };
     let letters: Vec<char> = number[digits.len()..].chars().chain(letter.chars()).collect();
-    let zone = match (&letters[..], geographic) {
+    let zone = match (&letters[..], geographic.map(|pose| pose.lat)) {
         ([], None) => return Ok(None),
-        ([] | [_], Some(GeographicPose { lat, .. })) if lat != 0.0 => {
-            UtmZone::new(number_of_zone, lat < 0.0)
-        }
-        ([], Some(_)) => UtmZone::with_letter(number_of_zone, None, pose.y),
-        ([letter], _) => UtmZone::with_letter(number_of_zone, Some(*letter), pose.y),
+        ([], Some(lat)) => UtmZone::new(number_of_zone, lat < 0.0).ok_or(UtmZoneError::Unknown),
+        ([letter], lat) => UtmZone::with_letter(number_of_zone, *letter, pose.y, lat),
         // Words behind the northing are of another convention.
         _ if letters.len() > 2 => return Ok(None),
-        _ => None,
+        _ => Err(UtmZoneError::Unknown),
     };
-    zone.map(Some).ok_or(
-        "its name has no UTM zone behind the northing: a number from 1 to 60 and a letter from C to X, but I and O",
-    )
+    zone.map(Some).map_err(|error| match error {
+        UtmZoneError::Unknown => {
+            "its name has no UTM zone behind the northing: a number from 1 to 60 and a letter from C to X, but I and O"
+        }
+        UtmZoneError::Contradiction => {
+            "the letter of the UTM zone in its name contradicts the northing or the latitude there; bands from C to M \
+             are south of the equator, from N to X north of it"
+        }
+    })
 }
 
 #[cfg(test)]
@@ -89,6 +94,32 @@ mod tests {
         }
         for other in ["", "7", "cam1@left", "2@left"] {
             assert_eq!(zone_of(&format!("@543270@4178900@{other}@.jpg")), None, "{other}");
+        }
+    }
+
+    #[test]
+    fn a_letter_that_contradicts_the_numbers_is_an_error() {
+        for zone in [
+            "33@K@",
+            "33@K@52.5@13.4@",
+            "33K@",
+            "33@S@52.5@13.4@",
+            "33@N@-33.8@13.4@",
+            "33@T@",
+            "33@H@52.5@13.4@",
+        ] {
+            let error = place_in_name(&format!("@391000@5820000@{zone}.jpg")).unwrap_err();
+            assert!(error.contains("contradicts"), "{zone}: {error}");
+        }
+        for (zone, expected) in [
+            ("33@U@", "33 north"),
+            ("33@N@", "33 north"),
+            ("33@U@0@0@", "33 north"),
+            ("33@S@", "33 south"),
+            ("33@H@", "33 south"),
+        ] {
+            let of = zone_of(&format!("@391000@5820000@{zone}.jpg"));
+            assert_eq!(of.as_deref(), Some(expected), "{zone}");
         }
     }
 
@@ -138,6 +169,7 @@ mod tests {
             "@1e30@1@.jpg",
             "@5@@@@.jpg",
             "@@@17@T@91@-79.99@.jpg",
+            "@@@17@T@0.0@0.0@.jpg",
             "@@@17@T@@@.jpg",
         ] {
             let is_place = matches!(place_in_name(name), Ok(Some(_)));

@@ -1,124 +1,17 @@
 //! Reads the rows of a table of poses.
 
-use std::collections::HashMap;
+mod columns;
+mod values;
+
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-use super::place::{Place, checked};
-use crate::table_file::{Table, TableRow, plain};
-use whereabouts_core::{CoordinateFrame, Pose, PoseInput, UtmZone};
-
-/// What a column means, and the names that it has, without case, spaces and punctuation. Of several names of a
-/// file, the first that a table has is taken.
-const COLUMNS: [(Column, &[&str]); 13] = [
-    (
-        Column::File,
-        &[
-            "file",
-            "filename",
-            "filepath",
-            "sourcefile",
-            "imagepath",
-            "imagefile",
-            "imagefilename",
-            "imagename",
-            "path",
-            "image",
-            "img",
-            "picture",
-            "photo",
-            "name",
-            "label",
-            "frame",
-            "imageid",
-            "id",
-        ],
-    ),
-    (Column::Lat, &["lat", "latitude", "gpslatitude", "gpslat", "latdeg", "latitudedeg", "ylat"]),
-    (
-        Column::Lon,
-        &[
-            "lon",
-            "long",
-            "lng",
-            "longitude",
-            "gpslongitude",
-            "gpslon",
-            "gpslong",
-            "gpslng",
-            "londeg",
-            "longitudedeg",
-        ],
-    ),
-    (
-        Column::Alt,
-        &["alt", "altitude", "gpsaltitude", "gpsalt", "elevation", "height", "altm", "altitudem"],
-    ),
-    (
-        Column::Heading,
-        &["heading", "bearing", "azimuth", "compass", "compassangle", "gpsimgdirection"],
-    ),
-    (
-        Column::X,
-        &[
-            "x",
-            "easting",
-            "east",
-            "utmeasting",
-            "utmeast",
-            "utmx",
-            "tx",
-            "px",
-            "posx",
-            "positionx",
-            "xm",
-        ],
-    ),
-    (
-        Column::Y,
-        &[
-            "y",
-            "northing",
-            "north",
-            "utmnorthing",
-            "utmnorth",
-            "utmy",
-            "ty",
-            "py",
-            "posy",
-            "positiony",
-            "ym",
-        ],
-    ),
-    (Column::Z, &["z", "tz", "pz", "posz", "positionz", "zm"]),
-    (Column::Qx, &["qx"]),
-    (Column::Qy, &["qy"]),
-    (Column::Qz, &["qz"]),
-    (Column::Qw, &["qw"]),
-    (Column::Zone, &["zone", "utmzone", "zonenumber", "utmzonenumber"]),
-];
-
-/// Names of the column with the letter of a UTM zone.
-const LETTER: [&str; 6] =
-    ["zoneletter", "utmzoneletter", "utmletter", "band", "utmband", "hemisphere"];
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Column {
-    File,
-    Lat,
-    Lon,
-    Alt,
-    Heading,
-    X,
-    Y,
-    Z,
-    Qx,
-    Qy,
-    Qz,
-    Qw,
-    Zone,
-}
+use self::columns::{Column, Columns, RowPlace, synonyms};
+use super::place::Place;
+use crate::table_file::Table;
+use whereabouts_core::CoordinateFrame;
 
 /// A row of a table of poses.
 #[derive(Debug, Clone)]
@@ -139,6 +32,10 @@ pub(super) struct PoseRows {
     pub repeated: usize,
     /// Columns that are not used.
     pub unused: Vec<String>,
+    /// The columns in degrees and those in metres, if there are both.
+    pub both_frames: Option<[Vec<String>; 2]>,
+    /// What the user should know of the table.
+    pub notes: Vec<String>,
 }
 
 impl PoseRows {
@@ -152,17 +49,20 @@ impl PoseRows {
         let columns = Columns::find(&table.header);
         columns.check(file, &table.header)?;
         let unused = columns.unused(&table.header);
+        let both_frames = columns.both_frames(&table.header);
+        let mut half_zones: BTreeMap<u8, u64> = BTreeMap::new();
         let mut all: Vec<PoseRow> = Vec::with_capacity(table.rows.len());
         let (mut by_name, mut repeated) = (HashMap::new(), 0);
         let mut frame: Option<(u64, CoordinateFrame)> = None;
         for row in &table.rows {
             let line = row.line;
             let at = || format!("{} line {line}", file.display());
-            let name = columns.text(row, columns.file).to_owned();
+            let name = columns.text(row, Column::File).to_owned();
             if name.is_empty() {
                 bail!("{} names no file", at());
             }
-            let place = columns.place(row).with_context(at)?;
+            let RowPlace { place, half_zone } = columns.place(row).with_context(at)?;
+            half_zones.extend(half_zone.map(|zone| (zone, line)));
             if let Some(own) = place.as_ref().and_then(only_frame) {
                 let (first, of_file) = *frame.get_or_insert((line, own));
                 if of_file != own {
@@ -191,7 +91,29 @@ impl PoseRows {
         if all.is_empty() {
             bail!("{} has no rows; add one per image", file.display());
         }
-        Ok(Self { file: file.to_owned(), rows: all, repeated, unused })
+        let mut notes = Vec::new();
+        match (half_zones.first_key_value(), half_zones.last_key_value()) {
+            (Some((zone, line)), Some((other, other_line))) if zone != other => bail!(
+                "{} has UTM zones without a hemisphere, such as {zone} in line {line} and {other} in line \
+                 {other_line}; write {zone}N or {zone}S, so that places can be told apart",
+                file.display()
+            ),
+            (Some((zone, _)), _) => notes.push(format!(
+                "the UTM zone {zone} has no hemisphere and is not used; write {zone}N or {zone}S if the metres are \
+                 to be converted to degrees"
+            )),
+            (None, _) => {}
+        }
+        let is_at_zero =
+            |place: &Place| place.geographic.is_some_and(|pose| (pose.lat, pose.lon) == (0.0, 0.0));
+        let at_zero = all.iter().filter(|row| row.place.as_ref().is_some_and(is_at_zero)).count();
+        if at_zero > 0 {
+            notes.push(format!(
+                "rows at latitude 0 and longitude 0 ({at_zero}), which receivers write without a fix; empty these \
+                 cells if the place is not known"
+            ));
+        }
+        Ok(Self { file: file.to_owned(), rows: all, repeated, unused, both_frames, notes })
     }
 }
 
@@ -202,146 +124,6 @@ fn only_frame(place: &Place) -> Option<CoordinateFrame> {
         (None, Some(_), None) => Some(CoordinateFrame::Metric),
         _ => None,
     }
-}
-
-fn synonyms(column: Column) -> &'static [&'static str] {
-    COLUMNS.iter().find(|(one, _)| *one == column).map_or(&[], |(_, names)| names)
-}
-
-/// The index of each column.
-struct Columns {
-    file: Option<usize>,
-    lat: Option<usize>,
-    lon: Option<usize>,
-    alt: Option<usize>,
-    heading: Option<usize>,
-    position: [Option<usize>; 3],
-    quaternion: [Option<usize>; 4],
-    zone: Option<usize>,
-    letter: Option<usize>,
-}
-
-impl Columns {
-    fn find(header: &[String]) -> Self {
-        let plain: Vec<String> = header.iter().map(|name| plain(name)).collect();
-        let first = |names: &[&str]| {
-            names.iter().find_map(|name| plain.iter().position(|column| column == name))
-        };
-        let of = |column: Column| first(synonyms(column));
-        Self {
-            file: of(Column::File),
-            lat: of(Column::Lat),
-            lon: of(Column::Lon),
-            alt: of(Column::Alt),
-            heading: of(Column::Heading),
-            position: [Column::X, Column::Y, Column::Z].map(of),
-            quaternion: [Column::Qx, Column::Qy, Column::Qz, Column::Qw].map(of),
-            zone: of(Column::Zone),
-            letter: first(&LETTER),
-        }
-    }
-
-    fn check(&self, file: &Path, header: &[String]) -> anyhow::Result<()> {
-        let [x, y, _] = self.position;
-        let has_position =
-            (self.lat.is_some() && self.lon.is_some()) || (x.is_some() && y.is_some());
-        let missing = match (self.file, has_position) {
-            (Some(_), true) => return Ok(()),
-            (None, _) => "names the files (file)",
-            (Some(_), false) => "has positions (lat and lon, or x and y)",
-        };
-        bail!(
-            "{} has no column that {missing}; its first row is taken as the header and has {}",
-            file.display(),
-            header.iter().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ")
-        )
-    }
-
-    fn unused(&self, header: &[String]) -> Vec<String> {
-        let has_degrees = self.lat.is_some() && self.lon.is_some();
-        let has_metres = self.position[0].is_some() && self.position[1].is_some();
-        let degrees =
-            [self.lat, self.lon, self.alt, self.heading].map(|index| index.filter(|_| has_degrees));
-        let metres = self.position.iter().chain(&self.quaternion).chain([&self.zone, &self.letter]);
-        let metres = metres.map(|index| index.filter(|_| has_metres));
-        let used: Vec<usize> =
-            degrees.into_iter().chain(metres).chain([self.file]).flatten().collect();
-        let names = header.iter().enumerate().filter(|(index, _)| !used.contains(index));
-        names.map(|(_, name)| name.clone()).filter(|name| !name.is_empty()).collect()
-    }
-
-    fn text<'a>(&self, row: &'a TableRow, column: Option<usize>) -> &'a str {
-        column.and_then(|index| row.cells.get(index)).map_or("", String::as_str)
-    }
-
-    fn number(&self, row: &TableRow, column: Option<usize>) -> anyhow::Result<Option<f64>> {
-        let text = self.text(row, column);
-        number(text).map_err(|()| anyhow::anyhow!("{text:?} is not a number"))
-    }
-
-    /// The place of a row; `None` if it has no coordinates.
-    fn place(&self, row: &TableRow) -> anyhow::Result<Option<Place>> {
-        let number = |column| self.number(row, column);
-        let [x, y, z] = self.position;
-        let (lat, lon, x, y) = (number(self.lat)?, number(self.lon)?, number(x)?, number(y)?);
-        // Columns of the other frame are ignored: tables often have more of them than a pose needs.
-        let geographic = match (lat, lon) {
-            (None, None) => None,
-            _ => {
-                let (alt, heading) = (number(self.alt)?, number(self.heading)?);
-                let input = PoseInput { lat, lon, alt, heading, ..PoseInput::default() };
-                Some(checked(input, CoordinateFrame::Wgs84)?)
-            }
-        };
-        let metric = match (x, y) {
-            (None, None) => None,
-            _ => {
-                let [qx, qy, qz, qw] = self.quaternion;
-                let (qx, qy, qz, qw) = (number(qx)?, number(qy)?, number(qz)?, number(qw)?);
-                let input =
-                    PoseInput { x, y, z: number(z)?, qx, qy, qz, qw, ..PoseInput::default() };
-                Some(checked(input, CoordinateFrame::Metric)?)
-            }
-        };
-        let mut place = Place::default();
-        for pose in [geographic, metric].into_iter().flatten() {
-            match pose {
-                Pose::Geographic(pose) => place.geographic = Some(pose),
-                Pose::Metric(pose) => {
-                    place.metric = Some(pose);
-                    place.zone = self.zone(row, pose.y)?;
-                }
-            }
-        }
-        Ok((geographic.is_some() || metric.is_some()).then_some(place))
-    }
-
-    fn zone(&self, row: &TableRow, northing: f64) -> anyhow::Result<Option<UtmZone>> {
-        let text = self.text(row, self.zone);
-        if text.is_empty() {
-            return Ok(None);
-        }
-        let digits = text.trim_end_matches(|c: char| c.is_alphabetic() || c == ' ');
-        let letter = text[digits.len()..].trim().chars().next();
-        let letter = letter.or_else(|| self.text(row, self.letter).chars().next());
-        let number = digits.trim_end_matches(".0").parse().ok();
-        let zone = number.and_then(|number| UtmZone::with_letter(number, letter, northing));
-        zone.map(Some).with_context(|| format!("{text:?} is not a UTM zone, such as 10S"))
-    }
-}
-
-/// Parses a number with a decimal point or comma; `None` for an empty cell and for what programs write instead.
-fn number(text: &str) -> Result<Option<f64>, ()> {
-    let text = text.trim_matches(|c: char| c.is_whitespace() || c == '\u{b0}');
-    let lower = text.to_ascii_lowercase();
-    if ["", "nan", "null", "none", "na", "n/a", "-"].contains(&lower.as_str()) {
-        return Ok(None);
-    }
-    let mut text = text.replace('\u{2212}', "-");
-    if text.matches(',').count() == 1 && !text.contains('.') {
-        text = text.replace(',', ".");
-    }
-    text.parse().ok().filter(|value: &f64| value.is_finite()).map(Some).ok_or(())
 }
 
 #[cfg(test)]

@@ -27,6 +27,12 @@ pub(super) fn read(picture: &Path) -> KnownImage {
     }
 }
 
+/// Whether a file is the description of a picture with a pose.
+pub(crate) fn has_pose(file: &Path) -> bool {
+    let bytes = file.metadata().map_or(u64::MAX, |metadata| metadata.len());
+    described(file, bytes).is_ok_and(|image| image.place.is_some())
+}
+
 fn described(file: &Path, bytes: u64) -> Result<KnownImage, String> {
     if bytes > MAX_BYTES {
         return Err(format!("it has more than {MAX_BYTES} bytes"));

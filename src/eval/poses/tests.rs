@@ -227,3 +227,32 @@ fn an_image_that_the_folder_does_not_have_has_no_pose() {
     let other = PictureFile { file: "b.jpg".into(), id: "b.jpg".parse().unwrap() };
     assert_eq!(poses.find(&other.id, b""), FoundPose::default());
 }
+
+#[test]
+fn columns_of_the_other_frame_are_named() {
+    let files =
+        Files::new(&[("poses.csv", "file,lat,lon,x,y,yaw\na.jpg,1,2,3,4,5\n"), ("a.jpg", "")]);
+    let mut poses = files.poses();
+    let named = |poses: &FolderPoses| poses.account().unwrap().other_frame_columns.join(" ");
+    assert_eq!((poses.frame(), named(&poses)), (Some(CoordinateFrame::Wgs84), "x y".to_owned()));
+    let lines = poses.account().unwrap().lines(20).join("\n");
+    assert!(
+        lines.contains("columns of the other coordinate frame") && lines.contains("\"x\", \"y\""),
+        "{lines}"
+    );
+    poses.convert_to(CoordinateFrame::Metric).unwrap();
+    assert_eq!(named(&poses), "lat lon");
+    assert_eq!(files.found(&poses), [posed("3.0 4.0 m", PoseSource::Table)]);
+}
+
+#[test]
+fn a_name_whose_zone_contradicts_its_northing_has_no_pose_and_a_warning() {
+    let files = Files::new(&[("@391000@5820000@33@K@.jpg", ""), ("@391000@5820000@33@U@.jpg", "")]);
+    let poses = files.poses();
+    assert_eq!(
+        files.found(&poses),
+        [(None, None), posed("391000.0 5820000.0 m", PoseSource::Name)]
+    );
+    let warnings = &poses.find(&"@391000@5820000@33@K@.jpg".parse().unwrap(), b"").warnings;
+    assert!(warnings[0].contains("contradicts"), "{warnings:?}");
+}

@@ -43,6 +43,12 @@ pub enum InstallError {
         /// What the user can do.
         remedy: String,
     },
+    /// A folder was given as the ONNX file.
+    #[error(
+        "{0} is a folder; name the ONNX file in it, such as {example}",
+        example = .0.join("model.onnx").display()
+    )]
+    Folder(PathBuf),
     /// The file is not a usable ONNX file.
     #[error(transparent)]
     Onnx(#[from] OnnxError),

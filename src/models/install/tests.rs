@@ -83,3 +83,33 @@ fn a_model_is_installed_by_one_process_at_a_time() {
     drop(held);
     assert!(folder.lock("m").is_ok());
 }
+
+/// The names in the folder of what is being installed.
+fn partial(assets: &tempfile::TempDir) -> Vec<String> {
+    let entries = fs::read_dir(assets.path().join("models/.partial")).unwrap();
+    entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
+}
+
+#[test]
+fn an_installation_leaves_nothing_behind_whether_it_succeeds_or_not() {
+    let assets = tempfile::tempdir().unwrap();
+    let folder = ModelsFolder::open(assets.path()).unwrap();
+    let given = tempfile::tempdir().unwrap();
+    let manifest = fixture(MANIFEST);
+    let refused = folder.add(&runtime(), given.path(), &manifest, None).unwrap_err().to_string();
+    assert!(refused.contains("is a folder; name the ONNX file"), "{refused}");
+    assert!(partial(&assets).is_empty(), "{:?}", partial(&assets));
+    // A graph that cannot be run, of the digest that the manifest pins.
+    let (file, other) = (given.path().join("model.onnx"), given.path().join("other.toml"));
+    let mut bytes = fs::read(fixture("model.onnx")).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle..].reverse();
+    fs::write(&file, bytes).unwrap();
+    let text = fs::read_to_string(&manifest).unwrap();
+    let unpinned: Vec<_> = text.lines().filter(|line| !line.starts_with("sha256")).collect();
+    fs::write(&other, unpinned.join("\n")).unwrap();
+    folder.add(&runtime(), &file, &other, None).unwrap_err();
+    assert!(partial(&assets).is_empty(), "{:?}", partial(&assets));
+    folder.add(&runtime(), &fixture("model.onnx"), &manifest, None).unwrap();
+    assert!(partial(&assets).is_empty(), "{:?}", partial(&assets));
+}

@@ -173,13 +173,22 @@ async fn images(request: Request, room: Room) -> Result<Images, Problem> {
     match archive::Format::of(&head) {
         Some(format) => Ok(Box::pin(archive::images(room.over(body), format, room))),
         None if archive::MEDIA_TYPES.contains(&media_type.as_str()) => {
-            let detail =
-                "the body is not a tar archive; send one (tar c *.jpg | curl --data-binary @- …)";
-            Err(Problem::new(ErrorKind::Malformed, detail))
+            let what = archive::compression_of(&head).map_or_else(
+                || "is not a tar archive".to_owned(),
+                |name| format!("is compressed with {name}, and only gzip is read"),
+            );
+            Err(Problem::new(
+                ErrorKind::Malformed,
+                format!(
+                    "the body {what}; send a tar archive (tar c *.jpg | curl --data-binary @- …)"
+                ),
+            ))
         }
         None => {
-            let what =
-                if head.starts_with(b"PK") { "a zip archive; unpack it, and" } else { "neither;" };
+            let what = archive::compression_of(&head).map_or_else(
+                || "neither;".to_owned(),
+                |name| format!("compressed with {name}; unpack it, and"),
+            );
             Err(Problem::new(
                 ErrorKind::UnsupportedMedia,
                 format!(
@@ -217,23 +226,23 @@ fn described(meta: Option<&[u8]>, name: Option<&str>) -> Result<ImageMeta, Servi
 }
 
 fn batch_result(result: BulkResult) -> BatchResult {
-    let (id, outcome, changed, problem, warnings) = match result {
+    let (id, outcome, pose, changed, problem, warnings) = match result {
         BulkResult::Saved(answer, new) => {
             let ImageAnswer { image, changed, warnings } = *answer;
             let outcome = if new { BatchOutcome::Stored } else { BatchOutcome::Present };
-            (Some(image.id.into()), outcome, changed, None, warnings)
+            (Some(image.id.into()), outcome, image.pose, changed, None, warnings)
         }
         BulkResult::Failed(id, error) => {
             let kind = error.kind.word().to_owned();
             let retry_after_s = error.retry_after.map(|pause| pause.as_secs_f64());
             let problem = BatchProblem { kind, detail: error.detail, retry_after_s };
-            (id.map(Into::into), BatchOutcome::Failed, Vec::new(), Some(problem), Vec::new())
+            (id.map(Into::into), BatchOutcome::Failed, None, Vec::new(), Some(problem), Vec::new())
         }
         BulkResult::Skipped(name, why) => {
             let detail = format!("{name:?} was skipped: {why}");
             let problem = BatchProblem { kind: "skipped".into(), detail, retry_after_s: None };
-            (Some(name), BatchOutcome::Skipped, Vec::new(), Some(problem), Vec::new())
+            (Some(name), BatchOutcome::Skipped, None, Vec::new(), Some(problem), Vec::new())
         }
     };
-    BatchResult { id, outcome, changed, problem, warnings }
+    BatchResult { id, outcome, pose, changed, problem, warnings }
 }

@@ -3,6 +3,7 @@
 
 mod calibration;
 mod idempotency;
+mod images;
 mod jobs;
 mod limits;
 mod localize;

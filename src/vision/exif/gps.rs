@@ -15,7 +15,7 @@ const DIRECTION_REF: u16 = 16;
 const DIRECTION: u16 = 17;
 
 /// Altitudes beyond this are the sentinels and overflows of writers, in metres.
-const MAX_ALTITUDE_M: f64 = 1e5;
+pub(super) const MAX_ALTITUDE_M: f64 = 1e5;
 
 /// Reads the position from the fields of a GPS directory.
 pub(super) fn read(fields: &[Field<'_>]) -> GpsReading {

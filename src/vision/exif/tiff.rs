@@ -8,6 +8,16 @@ const MAX_DIRECTORIES: usize = 16;
 const GPS_DIRECTORY: u16 = 0x8825;
 const EXIF_DIRECTORY: u16 = 0x8769;
 const SUB_DIRECTORIES: u16 = 0x014A;
+const XMP_PACKET: u16 = 0x02BC;
+
+/// What the directories of a structure say about a position.
+#[derive(Debug, Default)]
+pub(super) struct Contents<'a> {
+    /// The fields of each GPS directory.
+    pub gps: Vec<Vec<Field<'a>>>,
+    /// XMP packets, which TIFF pictures have in a field.
+    pub xmp: Vec<&'a [u8]>,
+}
 
 /// A TIFF structure (TIFF 6.0), the form of EXIF data.
 pub(super) struct Tiff<'a> {
@@ -85,10 +95,11 @@ impl<'a> Tiff<'a> {
         is_tiff(bytes).then_some(Self { bytes, order })
     }
 
-    /// Returns the fields of each GPS directory.
-    pub(super) fn gps_directories(&self) -> Vec<Vec<Field<'a>>> {
-        let Some(first) = self.u32(4) else { return Vec::new() };
-        let (mut queue, mut seen, mut found) = (vec![first], Vec::new(), Vec::new());
+    /// Walks the directories.
+    pub(super) fn contents(&self) -> Contents<'a> {
+        let mut found = Contents::default();
+        let Some(first) = self.u32(4) else { return found };
+        let (mut queue, mut seen) = (vec![first], Vec::new());
         while let Some(offset) = queue.pop() {
             if seen.contains(&offset) || seen.len() >= MAX_DIRECTORIES {
                 continue;
@@ -101,8 +112,9 @@ impl<'a> Tiff<'a> {
             for field in self.fields(offset) {
                 match field.tag {
                     GPS_DIRECTORY => {
-                        found.extend(field.offset().map(|gps| self.fields(gps)));
+                        found.gps.extend(field.offset().map(|gps| self.fields(gps)));
                     }
+                    XMP_PACKET => found.xmp.push(field.data),
                     EXIF_DIRECTORY | SUB_DIRECTORIES => queue.extend(field.offset()),
                     _ => {}
                 }
@@ -177,7 +189,12 @@ fn size_of(kind: u16) -> Option<usize> {
     }
 }
 
-impl Field<'_> {
+impl<'a> Field<'a> {
+    /// A field of the same meaning that was found as text elsewhere.
+    pub(super) fn of_text(tag: u16, text: &'a str) -> Self {
+        Self { tag, kind: ASCII, data: text.as_bytes(), order: ByteOrder::Little }
+    }
+
     /// The offset of a directory.
     fn offset(&self) -> Option<u32> {
         match self.kind {

@@ -15,7 +15,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{OwnedSemaphorePermit, mpsc};
 use tokio_util::io::{StreamReader, SyncIoBridge};
 
-pub(super) use self::format::{Format, MEDIA_TYPES, head_of};
+pub(super) use self::format::{Format, MEDIA_TYPES, compression_of, head_of};
 use self::names::{Member, member};
 use super::{LARGEST_META, Room, described, unreadable};
 use crate::gate::Problem;

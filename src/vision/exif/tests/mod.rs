@@ -1,6 +1,7 @@
 //! The habits of cameras and taggers, one row each: what they write, and the pose that follows from it.
 
 mod writer;
+mod xmp;
 
 use self::writer::*;
 use super::*;

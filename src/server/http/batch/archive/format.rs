@@ -54,6 +54,20 @@ pub(in crate::http::batch) async fn head_of(body: Body) -> Result<(Bytes, Body),
     Ok((head, Body::from_stream(first.chain(chunks))))
 }
 
+/// The name of a compression that is not read.
+pub(in crate::http::batch) fn compression_of(head: &[u8]) -> Option<&'static str> {
+    const KNOWN: [(&[u8], &str); 7] = [
+        (b"PK\x03\x04", "zip"),
+        (b"BZh", "bzip2"),
+        (b"\xFD7zXZ\0", "xz"),
+        (b"\x28\xB5\x2F\xFD", "zstd"),
+        (b"7z\xBC\xAF\x27\x1C", "7z"),
+        (b"Rar!\x1A\x07", "RAR"),
+        (b"\x1F\x9D", "compress"),
+    ];
+    KNOWN.iter().find(|(magic, _)| head.starts_with(magic)).map(|(_, name)| *name)
+}
+
 impl Format {
     /// Detects the format from the first bytes.
     pub fn of(head: &[u8]) -> Option<Self> {
@@ -150,6 +164,8 @@ mod tests {
         for other in [&b"no archive at all".repeat(100)[..], b"PK\x03\x04", b"\xFF\xD8\xFF", b""] {
             assert_eq!(Format::of(other), None);
         }
+        assert_eq!(compression_of(b"BZh91AY&SY"), Some("bzip2"));
+        assert_eq!(compression_of(&tar(b"x")), None);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Which members of an archive are files to read.
 
 use tar::EntryType;
+use whereabouts_core::Leftover;
 
 /// The longest name that is remembered, in bytes, as on Linux. An id is shorter.
 const LONGEST_NAME: usize = 4096;
@@ -49,23 +50,12 @@ pub(super) fn member(kind: EntryType, path: &[u8]) -> Member {
     while let Some(rest) = name.strip_prefix("./") {
         name = rest;
     }
-    match is_of_the_system(name) {
+    match Leftover::is_in_path(name) {
         true => skipped(
             "the operating system or a photo program wrote it; it is not a picture of the map",
         ),
         false => Member::File(name.to_owned()),
     }
-}
-
-/// Whether macOS, Windows or a NAS put the file next to the pictures: shadows of their names, thumbnails and settings
-/// of folders.
-fn is_of_the_system(name: &str) -> bool {
-    let (folders, base) = name.rsplit_once('/').unwrap_or(("", name));
-    let of_system = |folder| ["__MACOSX", "@eaDir", ".thumbnails"].contains(&folder);
-    let lower = base.to_ascii_lowercase();
-    folders.split('/').any(of_system)
-        || base.starts_with("._")
-        || [".ds_store", "thumbs.db", "desktop.ini"].contains(&lower.as_str())
 }
 
 #[cfg(test)]
