@@ -42,7 +42,8 @@ async fn main() -> anyhow::Result<()> {
         names = sets::ALL.to_vec();
     }
     for name in names {
-        let set = sets::named(name)?;
+        let name = name.to_owned();
+        let set = tokio::task::spawn_blocking(move || sets::named(&name)).await??;
         if !only("postgres") {
             embedded::measure(&set)?;
         }
