@@ -73,7 +73,7 @@ fn in_process(model: &str, frames: &[bytes::Bytes]) -> anyhow::Result<(Times, f6
     };
     let extractor = Extractor::load(&Assets::locate(config.model.assets()), &settings)?;
     let extract =
-        |frame: &[u8]| extractor.extract(frame, DescriptorKind::Gem, FeatureSet::DescriptorOnly);
+        |frame: &[u8]| extractor.extract(frame, DescriptorKind::GEM, FeatureSet::DescriptorOnly);
     let start = Instant::now();
     let times = (0..REQUESTS).map(|i| {
         let start = Instant::now();

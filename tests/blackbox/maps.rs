@@ -46,7 +46,12 @@ async fn frame_and_descriptor_are_fixed_once_there_are_images() {
 async fn an_unsupported_descriptor_or_model_is_rejected_with_a_hint() {
     let (server, map) = shared_server();
     let why = server.put(&format!("/maps/{map}"), json!({"descriptor": "cls"})).await.problem(422);
-    assert!(why.contains("[CLS]") && why.contains("gem"), "{why}");
+    assert!(why.contains("no descriptor \"cls\"") && why.contains("gem"), "{why}");
+    for name in ["GEM", "", "a b", &"a".repeat(25)] {
+        let body = json!({ "descriptor": name });
+        let why = server.put(&format!("/maps/{map}"), body).await.problem(422);
+        assert!(why.contains("kind of descriptor"), "{why}");
+    }
     let why =
         server.put(&format!("/maps/{map}"), json!({"model": "dinov2-small"})).await.problem(422);
     assert!(why.contains("model pull dinov2-small"), "{why}");
