@@ -10,7 +10,7 @@ use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jp
 use super::execution::{Execution, Provider, ProviderPreference};
 use super::information::Information;
 use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest};
-use super::pooling::{FeatureSet, Kinds, PoolingError};
+use super::pooling::{FeatureSet, Kinds, PoolingError, VocabularyError};
 use super::preprocess::{self, PreprocessError, Tensor, preprocess};
 use super::provider;
 use super::runtime::{Assets, RuntimeError};
@@ -170,6 +170,9 @@ pub enum ExtractError {
     /// The manifest of the model is invalid.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
+    /// A file of a kind of descriptor cannot be used.
+    #[error(transparent)]
+    Vocabulary(#[from] VocabularyError),
     /// ONNX Runtime or the model is missing.
     #[error(transparent)]
     Runtime(#[from] RuntimeError),
@@ -312,7 +315,7 @@ impl VerifiedModel {
         let manifest = Arc::new(Manifest::read(&folder.join(MANIFEST))?);
         let file = folder.join(&manifest.file);
         let files = verified_digests(&folder, &manifest)?;
-        let kinds = Arc::new(Kinds::of(&manifest));
+        let kinds = Arc::new(Kinds::load(&manifest, &folder)?);
         let digests =
             manifest.kinds().into_iter().map(|kind| (kind, manifest.digest(&files, kind)));
         let digests = digests.collect();

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Deserializer, Serialize};
 use sha2::{Digest as _, Sha256};
 
-pub use self::kinds::Method;
+pub use self::kinds::{Method, Vlad, Weighting};
 use whereabouts_core::{DescriptorKind, Digest};
 
 /// The manifest's file name in a model's folder.
@@ -79,18 +79,27 @@ fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<DataFil
 }
 
 impl Manifest {
-    /// The files of the model and their pinned digests, the ONNX file first.
+    /// The files of the model and their pinned digests: the ONNX file, those of external weights, and those of the
+    /// kinds of descriptors.
     pub fn files(&self) -> impl Iterator<Item = (&Path, Option<Digest>)> {
         let data = self.data.iter().map(|data| (data.file.as_path(), data.sha256));
-        iter::once((self.file.as_path(), self.sha256)).chain(data)
+        iter::once((self.file.as_path(), self.sha256)).chain(data).chain(self.vocabularies())
+    }
+
+    /// The files that kinds of descriptors need, and their pinned digests.
+    pub fn vocabularies(&self) -> impl Iterator<Item = (&Path, Option<Digest>)> {
+        self.descriptors.values().filter_map(Method::file)
     }
 
     /// Pins the digests of the files, in the order of [`files`](Self::files).
     pub fn pin(&mut self, digests: &[Digest]) {
-        self.sha256 = digests.first().copied().or(self.sha256);
-        for (data, digest) in self.data.iter_mut().zip(digests.iter().skip(1)) {
-            data.sha256 = Some(*digest);
+        let mut digests = digests.iter().copied();
+        self.sha256 = digests.next().or(self.sha256);
+        for (data, digest) in self.data.iter_mut().zip(digests.by_ref()) {
+            data.sha256 = Some(digest);
         }
+        let with_file = self.descriptors.values_mut().filter(|method| method.file().is_some());
+        with_file.zip(digests).for_each(|(method, digest)| method.pin(digest));
     }
 }
 
@@ -266,56 +275,4 @@ impl Manifest {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const XFEAT: &str = include_str!("../../deploy/models/xfeat.toml");
-
-    fn parse(text: &str) -> Result<Manifest, ManifestError> {
-        Manifest::parse(text, Path::new("manifest.toml"))
-    }
-
-    #[test]
-    fn the_built_in_manifest_is_consistent() {
-        let manifest = parse(XFEAT).unwrap();
-        assert_eq!(manifest.dimension(DescriptorKind::GEM), Some(576));
-        assert_eq!(manifest.dimension(DescriptorKind::CLS), None);
-    }
-
-    #[test]
-    fn a_contradiction_names_the_value() {
-        for (from, to, named) in [
-            ("dimension = 576", "dimension = 64", "dimension"),
-            ("width = 320", "width = 321", "width"),
-            ("file = \"model.onnx\"", "file = \"../model.onnx\"", "file"),
-            ("[input]", "[data]\nfile = \"../weights\"\n[input]", "file"),
-            ("[input]", "[data]\nfile = \"model.onnx\"\n[input]", "data.file"),
-            ("gem_p = 3.0", "gem_p = 0.0", "gem_p"),
-            ("cls = false", "cls = true", "CLS"),
-        ] {
-            let error = parse(&XFEAT.replace(from, to)).unwrap_err().to_string();
-            assert!(error.contains(named), "{to}: {error}");
-        }
-    }
-
-    #[test]
-    fn the_digest_covers_exactly_what_determines_a_descriptor() {
-        let file = Digest::of(b"weights");
-        let digest = |from: &str, to: &str| {
-            let text = XFEAT.replace(from, to);
-            assert!(from.is_empty() || text != XFEAT, "{from}");
-            parse(&text).unwrap().digest(&[file], DescriptorKind::GEM)
-        };
-        let plain = digest("", "");
-        assert_eq!(digest("licence = \"Apache-2.0\"", "licence = \"other\""), plain);
-        assert_ne!(digest("gem_p = 3.0", "gem_p = 4.0"), plain);
-        assert_ne!(digest("width = 320", "width = 640"), plain);
-        let others = [Digest::of(b"others")];
-        assert_ne!(parse(XFEAT).unwrap().digest(&others, DescriptorKind::GEM), plain);
-    }
-
-    #[test]
-    fn an_unknown_key_is_rejected() {
-        assert!(parse(&format!("colour = 1\n{XFEAT}")).is_err());
-    }
-}
+mod tests;

@@ -142,7 +142,8 @@ pub fn try_model(assets: &Assets, folder: &Path) -> Result<Vec<String>, ModelFau
         Manifest::read(&folder.join(MANIFEST)).map_err(|error| manifest_fault(error.into()))?;
     let manifest = Arc::new(manifest);
     let file = folder.join(&manifest.file);
-    let kinds = Arc::new(Kinds::of(&manifest));
+    let kinds = Kinds::load(&manifest, folder).map_err(|error| manifest_fault(error.into()))?;
+    let kinds = Arc::new(kinds);
     let model =
         Model { environment, file, manifest: Arc::clone(&manifest), kinds: Arc::clone(&kinds) };
     let threads = std::thread::available_parallelism().map_or(1, usize::from);

@@ -12,7 +12,8 @@ async fn a_map_is_created_changed_listed_and_deleted() {
         server.put("/maps/yard", json!({"scene": "indoor", "frame": "metric"})).await.expect(201);
     assert_eq!(made["scene"], "indoor");
     assert_eq!(made["model"], "xfeat");
-    assert_eq!((&made["dim"], &made["images"]), (&json!(576), &json!(0)));
+    assert_eq!((&made["descriptor"], &made["dim"]), (&json!("vlad"), &json!(512)));
+    assert_eq!(made["images"], 0);
     assert_eq!(made["index"], "exact");
 
     let changed =

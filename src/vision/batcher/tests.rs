@@ -5,7 +5,8 @@ use super::*;
 fn kinds() -> Arc<Kinds> {
     let text = include_str!("../../../deploy/models/xfeat.toml");
     let manifest = crate::Manifest::parse(text, std::path::Path::new("xfeat.toml")).unwrap();
-    Arc::new(Kinds::of(&manifest))
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../deploy/models");
+    Arc::new(Kinds::load(&manifest, std::path::Path::new(folder)).unwrap())
 }
 
 pub(super) fn queue(throughput_sessions: usize, max_batch: usize) -> Queue {

@@ -21,10 +21,17 @@ impl Manifest {
         if !self.data.iter().all(|data| is_below(&data.file) && data.file != Path::new(MANIFEST)) {
             return Some("data.file must be a file below the folder of the manifest".into());
         }
+        if !self.vocabularies().all(|(file, _)| is_plain(file) && file != Path::new(MANIFEST)) {
+            return Some(
+                "the file of a descriptor must be a plain file name next to the manifest".into(),
+            );
+        }
         let mut names: Vec<&Path> = self.files().map(|(file, _)| file).collect();
         names.sort_unstable();
         if names.windows(2).any(|pair| pair[0] == pair[1]) {
-            return Some("data.file must differ from file and be named once".into());
+            return Some(
+                "each file must be named once: file, data.file and those of descriptors".into(),
+            );
         }
         if input.multiple == 0 || output.stride == 0 {
             return Some("input.multiple and output.stride must be at least 1".into());
