@@ -12,6 +12,7 @@ use multiversion::multiversion;
 
 use super::LocalFeatures;
 use crate::manifest::{Vlad, Weighting};
+use whereabouts_core::dot;
 
 /// Lowest weight of a cell, so that a picture without reliable cells still has a descriptor.
 const MIN_WEIGHT: f32 = 1e-6;
@@ -33,7 +34,7 @@ pub(super) struct Vocabulary {
     directions: Vec<f32>,
     /// `centres`, rounded up to a multiple of [`LANES`].
     padded: usize,
-    /// For each band and centre, `channels × block`; empty if residual sums are kept whole.
+    /// For each band and centre, `block × channels`; empty if residual sums are kept whole.
     blocks: Vec<f32>,
     /// `expanded × dimension`; empty if there is none.
     projection: Vec<f32>,
@@ -68,6 +69,7 @@ impl Vocabulary {
         if !all.all(|number| number.is_finite()) {
             return Err("it contains a number that is not finite".to_owned());
         }
+        let blocks = transposed(&blocks, channels, block.unwrap_or(1));
         let padded = count.next_multiple_of(LANES);
         let mut directions = vec![0.0; channels * padded];
         for (k, centre) in centres.chunks_exact(channels).enumerate() {
@@ -165,9 +167,8 @@ impl Vocabulary {
         let matrices = self.blocks.chunks_exact(self.channels * block);
         let slots = sums.chunks_exact(self.channels).zip(short.chunks_exact_mut(block));
         for ((sum, short), matrix) in slots.zip(matrices) {
-            for (x, row) in sum.iter().zip(matrix.chunks_exact(block)) {
-                short.iter_mut().zip(row).for_each(|(out, number)| *out += x * number);
-            }
+            let columns = matrix.chunks_exact(self.channels);
+            short.iter_mut().zip(columns).for_each(|(out, column)| *out = dot(sum, column));
         }
         short
     }
@@ -187,11 +188,22 @@ impl Vocabulary {
 }
 
 fn norm(numbers: &[f32]) -> f32 {
-    numbers.iter().map(|x| x * x).sum::<f32>().sqrt()
+    dot(numbers, numbers).sqrt()
+}
+
+/// Transposes matrices of `rows × columns`.
+fn transposed(matrices: &[f32], rows: usize, columns: usize) -> Vec<f32> {
+    let mut out = Vec::with_capacity(matrices.len());
+    for matrix in matrices.chunks_exact(rows * columns) {
+        for column in 0..columns {
+            out.extend((0..rows).map(|row| matrix[row * columns + column]));
+        }
+    }
+    out
 }
 
 /// Adds `factor · from` to `to`.
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2+fma", "aarch64+neon"))]
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
 fn add(to: &mut [f32], from: &[f32], factor: f32) {
     for (to, from) in to.iter_mut().zip(from) {
         *to += factor * from;
@@ -199,8 +211,8 @@ fn add(to: &mut [f32], from: &[f32], factor: f32) {
 }
 
 /// Multiplies [`TOGETHER`] cells of `channels` numbers with a matrix of `channels` rows, whose length is a multiple of
-/// [`LANES`].
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2+fma", "aarch64+neon"))]
+/// [`LANES`]. There is no AVX-512 variant, because the compiler makes a much slower one.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
 fn multiply(cells: &[f32], matrix: &[f32], channels: usize, out: &mut [f32]) {
     let width = matrix.len() / channels;
     for at in (0..width).step_by(LANES) {
