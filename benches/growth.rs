@@ -216,7 +216,7 @@ async fn map_of(images: usize) {
         uid: Uuid::now_v7(),
         name: "m".parse().unwrap(),
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: CoordinateFrame::Wgs84,
         model: "m".into(),
         model_digest: Digest::of(b"m"),

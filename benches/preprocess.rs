@@ -83,7 +83,7 @@ fn say_similarity(files: &[Vec<u8>]) -> anyhow::Result<()> {
     for file in files {
         let descriptor = |extractor: &Extractor| {
             extractor
-                .extract(file, DescriptorKind::Gem, FeatureSet::DescriptorOnly)
+                .extract(file, DescriptorKind::GEM, FeatureSet::DescriptorOnly)
                 .map(|extraction| extraction.descriptor)
         };
         similarities.push(descriptor(&exact)?.similarity(&descriptor(&fast)?));

@@ -25,7 +25,7 @@ fn main() -> anyhow::Result<()> {
     let extractor = Extractor::load(&assets, &ExtractorSettings::plain("xfeat", 1, LIMITS))?;
     let features = |pixels: &image::RgbImage| -> anyhow::Result<DenseFeatures> {
         let (picture, features) = (encode_jpeg(pixels)?, FeatureSet::DescriptorAndDense);
-        let extraction = extractor.extract(&picture, DescriptorKind::Gem, features)?;
+        let extraction = extractor.extract(&picture, DescriptorKind::GEM, features)?;
         extraction.dense.context("dense features were requested")
     };
     let query = features(&town.query(0, 0).image)?;

@@ -99,7 +99,7 @@ async fn new_map(store: &EmbeddedStore) -> anyhow::Result<Map> {
         uid: Uuid::now_v7(),
         name: "bench".parse()?,
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: CoordinateFrame::Metric,
         model: "none".into(),
         model_digest: Digest::of(b""),

@@ -233,7 +233,7 @@ fn map(dim: usize) -> anyhow::Result<Map> {
         uid: Uuid::now_v7(),
         name: "m".parse()?,
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: CoordinateFrame::Wgs84,
         model: "made up".into(),
         model_digest: Digest::of(b"made up"),

@@ -63,7 +63,7 @@ fn standing() -> anyhow::Result<Set> {
         let view = town.reference(place).image;
         let frame = |index: usize| {
             let picture = encode_jpeg(&frame_of(&view, (place * 1000 + index) as u64))?;
-            let kind = DescriptorKind::Gem;
+            let kind = DescriptorKind::GEM;
             let extraction = extractor.extract(&picture, kind, FeatureSet::DescriptorOnly)?;
             Ok(extraction.descriptor.as_slice().to_vec())
         };

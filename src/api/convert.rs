@@ -2,8 +2,8 @@
 
 use jiff::Timestamp;
 use whereabouts_core::{
-    Candidate, CoordinateFrame, Description, DescriptorKind, Estimate, Image, Job, JobState, Pose,
-    Priority, RankedCandidate, RefinerKind, Scene, Usage,
+    Candidate, CoordinateFrame, Description, Estimate, Image, Job, JobState, Pose, Priority,
+    RankedCandidate, RefinerKind, Scene, Usage,
 };
 
 use crate::{Answer, IndexKind, MapState, NoJob, NoJobReason, TimingMs, TrackEstimate, proto};
@@ -228,10 +228,6 @@ impl From<MapState> for proto::Map {
             Scene::Indoor => proto::Scene::Indoor,
             Scene::Outdoor => proto::Scene::Outdoor,
         };
-        let descriptor = match map.descriptor {
-            DescriptorKind::Gem => proto::Descriptor::Gem,
-            DescriptorKind::Cls => proto::Descriptor::Cls,
-        };
         let frame = match map.frame {
             CoordinateFrame::Wgs84 => proto::Frame::Wgs84,
             CoordinateFrame::Metric => proto::Frame::Metric,
@@ -244,7 +240,7 @@ impl From<MapState> for proto::Map {
         Self {
             name: map.name.into(),
             scene: scene.into(),
-            descriptor: descriptor.into(),
+            descriptor: map.descriptor.to_string(),
             frame: frame.into(),
             model: map.model,
             model_digest: map.model_digest.to_string(),

@@ -14,7 +14,8 @@ pub struct MapChange {
     /// `indoor` or `outdoor` (default).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scene: Option<Scene>,
-    /// `gem` (default) or `cls`. Once the map has images, only a reindex changes it.
+    /// A kind of descriptor that the model declares, such as `gem`, `cls` or `vlad`; by default the model's default.
+    /// Once the map has images, only a reindex changes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub descriptor: Option<DescriptorKind>,
     /// `wgs84` (default) or `metric`. Fixed while an image of the map has a pose.
@@ -42,7 +43,7 @@ pub struct MapState {
     pub frame: CoordinateFrame,
     /// Model that computes the descriptors.
     pub model: String,
-    /// Digest of the model's weights, preprocessing and pooling.
+    /// Digest of the model's weights, preprocessing and pooling to this kind of descriptor.
     #[schema(value_type = String)]
     pub model_digest: Digest,
     /// Precision at which the model runs. Descriptors of different precisions are not comparable.
@@ -87,7 +88,8 @@ pub struct ReindexRequest {
     /// Model that computes the new descriptors; by default the map's model as currently installed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub model: Option<String>,
-    /// `gem` or `cls`; by default the map's kind.
+    /// A kind of descriptor that the model declares; by default the map's kind, or the model's default if the model
+    /// does not have that kind.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub descriptor: Option<DescriptorKind>,
 }

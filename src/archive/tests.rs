@@ -16,7 +16,7 @@ pub(super) fn map(name: &str) -> Map {
         uid: Uuid::nil(),
         name: name.parse().unwrap(),
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: CoordinateFrame::Wgs84,
         model: "m".into(),
         model_digest: Digest::of(b"m"),

@@ -8,6 +8,7 @@ pub mod confidence;
 pub mod dense;
 mod description;
 mod descriptor;
+mod descriptor_kind;
 mod digest;
 mod image;
 mod job;
@@ -32,13 +33,14 @@ pub use description::{
     CacheLevels, CachedDescription, DescribedFrame, DescriptionSubject, PairRegion, SimilarFrame,
 };
 pub use descriptor::{Descriptor, DescriptorError, dot};
+pub use descriptor_kind::DescriptorKind;
 pub use digest::Digest;
 pub use job::{
     DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage, utc_day,
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use leftovers::Leftover;
-pub use map::{CoordinateFrame, DescriptorKind, Map, MapName, Precision, Scene};
+pub use map::{CoordinateFrame, Map, MapName, Precision, Scene};
 pub use model_server::{ModelCapabilities, ModelServer, ModelTrouble};
 pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, PoseInput, PosePatch};
 pub use secret::Secret;

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-use super::{Digest, InvalidName};
+use super::{DescriptorKind, Digest, InvalidName};
 
 /// The name of a map: 1 to 64 of `a-z 0-9 . _ -`, starting with a letter or a digit.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, ToSchema)]
@@ -70,17 +70,6 @@ pub enum Scene {
     Indoor,
 }
 
-/// The kind of global descriptor that a map uses.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum DescriptorKind {
-    /// Generalised-mean pooling over the local features.
-    #[default]
-    Gem,
-    /// The `[CLS]` token of a transformer.
-    Cls,
-}
-
 /// The coordinate frame of a map's poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
@@ -137,7 +126,6 @@ pub(super) use display_as_written;
 
 display_as_written!(Scene { Outdoor => "outdoor", Indoor => "indoor" });
 display_as_written!(Precision { Full => "full", Bf16 => "bf16" });
-display_as_written!(DescriptorKind { Gem => "gem", Cls => "cls" });
 display_as_written!(CoordinateFrame { Wgs84 => "wgs84", Metric => "metric" });
 
 /// The record of a map.
@@ -155,8 +143,8 @@ pub struct Map {
     pub frame: CoordinateFrame,
     /// Name of the model that computes the descriptors.
     pub model: String,
-    /// Digest of the model's weights, preprocessing and pooling. Descriptors of models with different
-    /// digests are not comparable.
+    /// Digest of everything that determines a descriptor of this kind: the model's weights, preprocessing and
+    /// pooling. Descriptors with different digests are not comparable.
     #[schema(value_type = String)]
     pub model_digest: Digest,
     /// Precision at which the model runs.

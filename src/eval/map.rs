@@ -35,7 +35,11 @@ impl Evaluator<'_> {
             .imaging
             .installed_model(service.maps.imaging.models.default_model())
             .await?;
-        let identity = format!("{}\n{}", extractor.digest(), extractor.execution());
+        let digest = extractor.digest(descriptor).with_context(|| {
+            let kinds = extractor.manifest().kinds();
+            format!("the model has no descriptor {descriptor:?}; it has {kinds:?}")
+        })?;
+        let identity = format!("{digest}\n{}", extractor.execution());
         let name = format!("{descriptor}-{}", &Digest::of(identity.as_bytes()).hex()[..12]);
         let name: MapName = name.parse()?;
         let change = MapChange {

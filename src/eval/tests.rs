@@ -64,7 +64,7 @@ async fn map_of(store: &EmbeddedStore, descriptors: &[Descriptor]) -> Map {
         uid: uuid::Uuid::now_v7(),
         name: "random".parse().unwrap(),
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: whereabouts_core::CoordinateFrame::Metric,
         model: "none".into(),
         model_digest: Digest::of(b""),
@@ -139,7 +139,7 @@ async fn summary(store: &EmbeddedStore, map: &Map, mode: SearchMode) -> Summary 
     for query in &descriptors(QUERIES, 2) {
         outcomes.push(outcome(store, map, query, mode).await);
     }
-    let method = Method { descriptor: DescriptorKind::Gem, refiner: None };
+    let method = Method { descriptor: DescriptorKind::GEM, refiner: None };
     let conditions = RunConditions {
         database: String::new(),
         query_folder: String::new(),

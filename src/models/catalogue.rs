@@ -129,7 +129,7 @@ mod tests {
         for entry in catalogue.entries() {
             let manifest = &entry.manifest;
             assert_eq!(manifest.licence, "Apache-2.0", "{}", entry.name());
-            assert_eq!(manifest.dimension(DescriptorKind::Cls), Some(manifest.output.channels));
+            assert_eq!(manifest.dimension(DescriptorKind::CLS), Some(manifest.output.channels));
             let named = |other: &&Entry| other.name() == entry.name();
             assert_eq!(catalogue.entries().iter().filter(named).count(), 1);
             assert!(entry.revision != "main" || manifest.sha256.is_none(), "a branch moves");
@@ -143,7 +143,7 @@ mod tests {
             assert!(catalogue.find(name).is_some(), "{name}");
         }
         let dimensions = PREFERRED_MODELS
-            .map(|name| catalogue.find(name).unwrap().manifest.dimension(DescriptorKind::Gem));
+            .map(|name| catalogue.find(name).unwrap().manifest.dimension(DescriptorKind::GEM));
         assert_eq!(dimensions, [Some(384), Some(768), Some(1024)]);
     }
 

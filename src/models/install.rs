@@ -164,6 +164,10 @@ impl ModelsFolder {
             check_weights(&path, external.get(&data.file).copied().unwrap_or(0))?;
             given.push(path);
         }
+        // Written together with the manifest, not by the exporter of the weights.
+        given.extend(
+            manifest.vocabularies().map(|(vocabulary, _)| source.with_file_name(vocabulary)),
+        );
         let mut digests = Vec::new();
         for (file, (_, pinned)) in given.iter().zip(manifest.files()) {
             let remedy = || format!("pass the file that {} describes", source.display());

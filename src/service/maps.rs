@@ -5,7 +5,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use uuid::Uuid;
 
-use super::models::dimension;
+use super::models::{descriptor_of, kind_of};
 use super::{Imaging, Reindexes, SUPERSEDED_RETRIES, ServiceError};
 use whereabouts_api::{CalibrationState, ErrorKind, IndexKind, MapChange, MapState};
 use whereabouts_core::{Map, MapName};
@@ -57,19 +57,20 @@ impl Maps {
         let known = known.as_ref();
         let model = change.model.as_deref().or(known.map(|map| map.model.as_str()));
         let model = model.unwrap_or(self.imaging.models.default_model());
-        let descriptor = change.descriptor.or(known.map(|map| map.descriptor)).unwrap_or_default();
-        let (model_digest, precision, dim) = match known {
+        let unchanged = known.filter(|map| {
+            map.model == model && change.descriptor.is_none_or(|kind| kind == map.descriptor)
+        });
+        let (descriptor, model_digest, precision, dim) = match unchanged {
             // The images keep the model that made their descriptors, whatever is installed now.
-            Some(map)
-                if (map.model.as_str(), map.descriptor) == (model, descriptor)
-                    && self.store.index_state(map).await?.images > 0 =>
-            {
-                (map.model_digest, map.precision, map.dim)
+            Some(map) if self.store.index_state(map).await?.images > 0 => {
+                (map.descriptor, map.model_digest, map.precision, map.dim)
             }
             _ => {
                 let extractor = self.imaging.installed_model(model).await?;
-                let dim = dimension(extractor.manifest(), descriptor)?;
-                (extractor.digest(), extractor.execution().precision, dim)
+                let current = known.map(|map| map.descriptor);
+                let kind = kind_of(extractor.manifest(), change.descriptor, current)?;
+                let (digest, dim) = descriptor_of(&extractor, kind)?;
+                (kind, digest, extractor.execution().precision, dim)
             }
         };
         Ok(Map {

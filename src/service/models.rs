@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use whereabouts_api::ErrorKind;
-use whereabouts_core::{DescriptorKind, Map, MapName};
+use whereabouts_core::{DescriptorKind, Digest, Map, MapName};
 use whereabouts_vision::{Extractor, Manifest, ModelError};
 
 use super::{Maps, ServiceError};
@@ -36,14 +36,51 @@ impl Maps {
     }
 }
 
-/// The dimension of a descriptor of that kind.
-pub(super) fn dimension(manifest: &Manifest, kind: DescriptorKind) -> Result<usize, ServiceError> {
-    manifest.dimension(kind).ok_or_else(|| {
-        ServiceError::unprocessable(format!(
-            "the model {:?} has no [CLS] token; use \"descriptor\": \"gem\"",
-            manifest.name
-        ))
-    })
+/// The kind of a map's descriptors: the requested one, otherwise the one that the map has, otherwise the model's
+/// default. An error if the model does not have the requested kind.
+pub(super) fn kind_of(
+    manifest: &Manifest,
+    requested: Option<DescriptorKind>,
+    current: Option<DescriptorKind>,
+) -> Result<DescriptorKind, ServiceError> {
+    let declared = manifest.kinds();
+    match requested {
+        Some(kind) if !declared.contains(&kind) => {
+            let (name, declared) = (&manifest.name, names(&declared));
+            Err(ServiceError::unprocessable(format!(
+                "the model {name:?} has no descriptor {:?}; it has {declared}",
+                kind.as_str()
+            )))
+        }
+        Some(kind) => Ok(kind),
+        None => {
+            let current = current.filter(|kind| declared.contains(kind));
+            Ok(current.unwrap_or(manifest.default_kind()))
+        }
+    }
+}
+
+/// The digest and the dimension of a kind of descriptor that the model has.
+pub(super) fn descriptor_of(
+    extractor: &Extractor,
+    kind: DescriptorKind,
+) -> Result<(Digest, usize), ServiceError> {
+    let manifest = extractor.manifest();
+    match (extractor.digest(kind), manifest.dimension(kind)) {
+        (Some(digest), Some(dimension)) => Ok((digest, dimension)),
+        _ => Err(ServiceError::new(
+            ErrorKind::Conflict,
+            format!(
+                "the model {:?} was replaced by one without the descriptor {:?}; try again",
+                manifest.name,
+                kind.as_str()
+            ),
+        )),
+    }
+}
+
+fn names(kinds: &[DescriptorKind]) -> String {
+    kinds.iter().map(DescriptorKind::as_str).collect::<Vec<_>>().join(", ")
 }
 
 /// Explains why the loaded model cannot serve the map; `None` if it can.
@@ -52,7 +89,15 @@ fn mismatch(map: &Map, extractor: &Extractor) -> Option<String> {
         return None;
     }
     let (name, model, reindex) = (&map.name, &map.model, how_to_reindex(&map.name, &map.model));
-    let (digest, precision) = (extractor.digest(), extractor.execution().precision);
+    let precision = extractor.execution().precision;
+    let Some(digest) = extractor.digest(map.descriptor) else {
+        return Some(format!(
+            "the map {name} was indexed with the descriptor {:?}, which the model {model:?} that is installed does \
+             not have; install the former again, or reindex the map with one of {}: {reindex} --descriptor KIND",
+            map.descriptor.as_str(),
+            names(&extractor.manifest().kinds())
+        ));
+    };
     Some(if digest != map.model_digest {
         format!(
             "the map {name} was indexed with the model {model:?} of {}, but the one installed is \

@@ -10,7 +10,7 @@ use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::Semaphore;
 use uuid::Uuid;
 
-use super::models::dimension;
+use super::models::{descriptor_of, kind_of};
 use super::{Maps, ServiceError};
 use whereabouts_api::{ErrorKind, MapState, Reindex, ReindexRequest, ReindexState};
 use whereabouts_core::{Descriptor, DescriptorKind, Image, Map, MapName};
@@ -105,8 +105,8 @@ impl Reindexer {
     ) -> Result<MapState, ServiceError> {
         let map = self.maps.find(name).await?;
         let model = request.model.unwrap_or_else(|| map.model.clone());
-        let descriptor = request.descriptor.unwrap_or(map.descriptor);
-        dimension(&self.maps.imaging.manifest(&model).await?, descriptor)?;
+        let manifest = self.maps.imaging.manifest(&model).await?;
+        let descriptor = kind_of(&manifest, request.descriptor, Some(map.descriptor))?;
         let begun = Reindex {
             model: model.clone(),
             descriptor,
@@ -139,11 +139,12 @@ impl Reindexer {
         descriptor: DescriptorKind,
     ) -> Result<(), ServiceError> {
         let extractor = retry_while_overloaded(|| self.maps.imaging.installed_model(model)).await?;
+        let (model_digest, dim) = descriptor_of(&extractor, descriptor)?;
         let next = Map {
             model: model.to_owned(),
-            model_digest: extractor.digest(),
+            model_digest,
             precision: extractor.execution().precision,
-            dim: dimension(extractor.manifest(), descriptor)?,
+            dim,
             descriptor,
             revision: map.revision + 1,
             ..map.clone()

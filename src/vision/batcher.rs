@@ -11,8 +11,7 @@ use tokio::sync::oneshot;
 use whereabouts_core::{DenseFeatures, Descriptor, DescriptorKind};
 
 use super::execution::Execution;
-use super::manifest::Manifest;
-use super::pooling::FeatureSet;
+use super::pooling::{FeatureSet, Kinds};
 use super::preprocess::Tensor;
 use super::session::{InferenceError, Model, Runner};
 use super::sync::{Condvar, Mutex, MutexGuard};
@@ -85,7 +84,7 @@ impl Batcher {
             work_available: Condvar::new(),
             room_available: Condvar::new(),
             layout,
-            manifest: Arc::clone(&model.manifest),
+            kinds: Arc::clone(&model.kinds),
         });
         let latency = model.load(execution, threads, layout.max_batch)?;
         let serving = Arc::clone(&queue);
@@ -199,7 +198,7 @@ struct Queue {
     /// Notified when the queue has room and when a session has been loaded.
     room_available: Condvar,
     layout: Layout,
-    manifest: Arc<Manifest>,
+    kinds: Arc<Kinds>,
 }
 
 #[derive(Debug, Default)]
@@ -264,7 +263,7 @@ impl Queue {
 
     /// Runs one batch after another on `runner` until the queue is closed.
     fn serve_with(&self, mut runner: Runner, kind: SessionKind) {
-        self.serve(kind, |batch| batch::run(&mut runner, &self.manifest, batch));
+        self.serve(kind, |batch| batch::run(&mut runner, &self.kinds, batch));
     }
 
     /// Passes one batch after another to `run` until the queue is closed.

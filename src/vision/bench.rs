@@ -149,7 +149,7 @@ impl Bench {
         let mut pictures = self.sample.iter().cycle();
         let mut next = || pictures.next().cloned().unwrap_or_else(|| Tensor::grey(1, 1));
         let submit =
-            |picture| batcher.submit(picture, DescriptorKind::Gem, FeatureSet::DescriptorOnly);
+            |picture| batcher.submit(picture, DescriptorKind::GEM, FeatureSet::DescriptorOnly);
         let mut times = Vec::new();
         let start = Instant::now();
         while times.len() < 3 || start.elapsed() < duration {

@@ -1,5 +1,6 @@
 //! Extraction: from the bytes of a picture to its descriptor and dense features.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,7 +10,7 @@ use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jp
 use super::execution::{Execution, Provider, ProviderPreference};
 use super::information::Information;
 use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest};
-use super::pooling::{FeatureSet, PoolingError};
+use super::pooling::{FeatureSet, Kinds, PoolingError, VocabularyError};
 use super::preprocess::{self, PreprocessError, Tensor, preprocess};
 use super::provider;
 use super::runtime::{Assets, RuntimeError};
@@ -56,7 +57,8 @@ impl ExtractorSettings {
 #[derive(Debug)]
 pub struct Extractor {
     manifest: Arc<Manifest>,
-    digest: Digest,
+    /// The digest of each kind of descriptor.
+    digests: BTreeMap<DescriptorKind, Digest>,
     batcher: Batcher,
     execution: Execution,
     limits: ImageLimits,
@@ -168,6 +170,9 @@ pub enum ExtractError {
     /// The manifest of the model is invalid.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
+    /// A file of a kind of descriptor cannot be used.
+    #[error(transparent)]
+    Vocabulary(#[from] VocabularyError),
     /// ONNX Runtime or the model is missing.
     #[error(transparent)]
     Runtime(#[from] RuntimeError),
@@ -192,13 +197,13 @@ impl Extractor {
     /// Loads a model and validates it by running one picture through it. Throughput sessions are loaded in
     /// the background.
     pub fn load(assets: &Assets, settings: &ExtractorSettings) -> Result<Self, ExtractError> {
-        let VerifiedModel { model, digest } =
+        let VerifiedModel { model, digests } =
             VerifiedModel::open(assets, &settings.model, settings.preference.provider)?;
-        let execution = choose_execution(&model, digest, settings)?;
+        let execution = choose_execution(&model, &digests, settings)?;
         let batcher = Batcher::start(&model, execution, settings.layout)?;
         let mut extractor = Self {
             manifest: Arc::clone(&model.manifest),
-            digest,
+            digests,
             batcher,
             execution,
             limits: settings.limits,
@@ -214,9 +219,10 @@ impl Extractor {
         &self.manifest
     }
 
-    /// Digest of everything that determines a descriptor: weights, preprocessing and pooling.
-    pub fn digest(&self) -> Digest {
-        self.digest
+    /// Digest of everything that determines a descriptor of the given kind: weights, preprocessing and pooling.
+    /// `None` if the model does not have that kind.
+    pub fn digest(&self, kind: DescriptorKind) -> Option<Digest> {
+        self.digests.get(&kind).copied()
     }
 
     /// The execution provider and precision in use.
@@ -286,7 +292,7 @@ impl Extractor {
             image::Rgb([(x * 7 + y * 13) as u8, (x * y) as u8, (x * 3 + y) as u8])
         });
         let picture = encode_jpeg(&pixels)?;
-        self.extract(&picture, DescriptorKind::Gem, FeatureSet::DescriptorAndDense).map(drop)
+        self.extract(&picture, DescriptorKind::GEM, FeatureSet::DescriptorAndDense).map(drop)
     }
 }
 
@@ -294,7 +300,8 @@ impl Extractor {
 #[derive(Debug)]
 pub(super) struct VerifiedModel {
     pub model: Model,
-    pub digest: Digest,
+    /// The digest of each kind of descriptor.
+    pub digests: BTreeMap<DescriptorKind, Digest>,
 }
 
 impl VerifiedModel {
@@ -307,8 +314,12 @@ impl VerifiedModel {
         let folder = assets.model(name)?;
         let manifest = Arc::new(Manifest::read(&folder.join(MANIFEST))?);
         let file = folder.join(&manifest.file);
-        let digest = manifest.digest(&verified_digests(&folder, &manifest)?);
-        Ok(Self { model: Model { environment, file, manifest }, digest })
+        let files = verified_digests(&folder, &manifest)?;
+        let kinds = Arc::new(Kinds::load(&manifest, &folder)?);
+        let digests =
+            manifest.kinds().into_iter().map(|kind| (kind, manifest.digest(&files, kind)));
+        let digests = digests.collect();
+        Ok(Self { model: Model { environment, file, manifest, kinds }, digests })
     }
 }
 
@@ -316,11 +327,13 @@ impl VerifiedModel {
 /// returns the best.
 fn choose_execution(
     model: &Model,
-    digest: Digest,
+    digests: &BTreeMap<DescriptorKind, Digest>,
     settings: &ExtractorSettings,
 ) -> Result<Execution, ExtractError> {
+    let digests = digests.values().map(Digest::to_string);
     let key = format!(
-        "model {digest}, {} threads, {}, processor {}, {}",
+        "model {}, {} threads, {}, processor {}, {}",
+        digests.collect::<Vec<_>>().join(" "),
         settings.layout.threads,
         settings.preference,
         provider::processor(),

@@ -12,7 +12,7 @@ use super::extractor::{Extractor, ExtractorSettings};
 use super::manifest::{MANIFEST, Manifest};
 use super::runtime::{Assets, RuntimeError};
 use parking_lot::{Mutex, MutexGuard};
-use whereabouts_core::{Digest, Map, Precision};
+use whereabouts_core::{DescriptorKind, Digest, Map, Precision};
 
 /// How models are loaded and cached.
 #[derive(Debug, Clone)]
@@ -160,7 +160,7 @@ impl Shared {
         };
         let loaded = Extractor::load(&self.assets, &settings);
         let extractor = Arc::new(loaded.map_err(|error| broken(name, &error))?);
-        let (digest, execution) = (extractor.digest(), extractor.execution());
+        let (digest, execution) = (extractor.identity(), extractor.execution());
         tracing::info!(model = name, %digest, %execution, "model loaded");
         self.loaded().push(Loaded { extractor: Arc::clone(&extractor), files });
         Ok(extractor)
@@ -215,13 +215,15 @@ impl Extractor {
     /// Whether descriptors of this model are comparable to those of the map.
     pub fn is_of(&self, map: &Map) -> bool {
         self.manifest().name == map.model
-            && self.digest() == map.model_digest
+            && self.digest(map.descriptor) == Some(map.model_digest)
             && self.execution().precision == map.precision
     }
 
     /// Identifies the model and precision, so that dense features of different models are not mixed.
     pub fn identity(&self) -> Digest {
-        let (digest, precision) = (self.digest(), self.execution().precision);
+        // The one kind that every model has: dense features do not depend on how they are pooled.
+        let digest = self.digest(DescriptorKind::GEM).unwrap_or_else(|| Digest::of(b""));
+        let precision = self.execution().precision;
         Digest::of(format!("{digest} at {precision} precision").as_bytes())
     }
 }

@@ -1,13 +1,18 @@
 //! The manifest: a TOML file next to an ONNX file that describes it.
 
+mod check;
+mod kinds;
+
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, Read};
 use std::iter;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
 use sha2::{Digest as _, Sha256};
 
+pub use self::kinds::{Method, Vlad, Weighting};
 use whereabouts_core::{DescriptorKind, Digest};
 
 /// The manifest's file name in a model's folder.
@@ -31,6 +36,9 @@ pub struct Manifest {
     pub licence: String,
     /// Origin of the weights.
     pub source: String,
+    /// The kind of descriptor of a new map, if none is requested; `gem` if omitted.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub default_descriptor: Option<DescriptorKind>,
     /// Files of external weights, which exporters write for large models, and some for all models.
     #[serde(default, deserialize_with = "one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub data: Vec<DataFile>,
@@ -38,8 +46,11 @@ pub struct Manifest {
     pub input: Input,
     /// The output tensors.
     pub output: Output,
-    /// How the output is pooled to a descriptor.
+    /// How the output is pooled to the descriptor `gem`.
     pub pooling: Pooling,
+    /// Further kinds of descriptors by name, besides `gem` and, if the model outputs a `[CLS]` token, `cls`.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub descriptors: BTreeMap<DescriptorKind, Method>,
 }
 
 /// A file of external weights, referenced by the ONNX file.
@@ -51,14 +62,6 @@ pub struct DataFile {
     /// Pinned digest, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sha256: Option<Digest>,
-}
-
-/// The parts of a manifest that determine a descriptor.
-#[derive(Serialize)]
-struct DescriptorInputs<'a> {
-    input: &'a Input,
-    output: &'a Output,
-    pooling: &'a Pooling,
 }
 
 /// Reads one table or a list of them.
@@ -76,29 +79,27 @@ fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<DataFil
 }
 
 impl Manifest {
-    /// The files of the model and their pinned digests, the ONNX file first.
+    /// The files of the model and their pinned digests: the ONNX file, those of external weights, and those of the
+    /// kinds of descriptors.
     pub fn files(&self) -> impl Iterator<Item = (&Path, Option<Digest>)> {
         let data = self.data.iter().map(|data| (data.file.as_path(), data.sha256));
-        iter::once((self.file.as_path(), self.sha256)).chain(data)
+        iter::once((self.file.as_path(), self.sha256)).chain(data).chain(self.vocabularies())
+    }
+
+    /// The files that kinds of descriptors need, and their pinned digests.
+    pub fn vocabularies(&self) -> impl Iterator<Item = (&Path, Option<Digest>)> {
+        self.descriptors.values().filter_map(Method::file)
     }
 
     /// Pins the digests of the files, in the order of [`files`](Self::files).
     pub fn pin(&mut self, digests: &[Digest]) {
-        self.sha256 = digests.first().copied().or(self.sha256);
-        for (data, digest) in self.data.iter_mut().zip(digests.iter().skip(1)) {
-            data.sha256 = Some(*digest);
+        let mut digests = digests.iter().copied();
+        self.sha256 = digests.next().or(self.sha256);
+        for (data, digest) in self.data.iter_mut().zip(digests.by_ref()) {
+            data.sha256 = Some(digest);
         }
-    }
-
-    /// Digest of everything that determines a descriptor: the digests of the weight files, given as `files`,
-    /// and the input, output and pooling sections. Descriptive fields are not included.
-    pub fn digest(&self, files: &[Digest]) -> Digest {
-        let file = files.iter().map(Digest::to_string).collect::<Vec<_>>().join("\n");
-        let Self { input, output, pooling, .. } = self;
-        // Serialization cannot fail: the structs contain only numbers, strings and lists of these.
-        let text =
-            toml::to_string(&DescriptorInputs { input, output, pooling }).unwrap_or_default();
-        Digest::of(format!("{file}\n{text}").as_bytes())
+        let with_file = self.descriptors.values_mut().filter(|method| method.file().is_some());
+        with_file.zip(digests).for_each(|(method, digest)| method.pin(digest));
     }
 }
 
@@ -195,7 +196,7 @@ pub enum Layout {
     Tokens,
 }
 
-/// How local features are pooled to a descriptor.
+/// How local features are pooled to a generalised mean.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Pooling {
@@ -258,7 +259,7 @@ impl Manifest {
 
     /// Validates the manifest; `path` is used in error messages.
     pub fn check(&self, path: &Path) -> Result<(), ManifestError> {
-        match self.validate() {
+        match self.fault() {
             Some(detail) => Err(ManifestError::Inconsistent { path: path.to_owned(), detail }),
             None => Ok(()),
         }
@@ -271,128 +272,7 @@ impl Manifest {
             detail: error.to_string(),
         })
     }
-
-    /// Dimension of a descriptor of the given kind; `None` if the model does not support it.
-    pub fn dimension(&self, kind: DescriptorKind) -> Option<usize> {
-        match kind {
-            DescriptorKind::Gem => Some(self.pooling.dimension),
-            DescriptorKind::Cls => self.output.cls.then_some(self.output.channels),
-        }
-    }
-
-    fn validate(&self) -> Option<String> {
-        const MAX_EDGE: u32 = 4096;
-        const MAX_CHANNELS: usize = 1 << 14;
-        let (input, output, pooling) = (&self.input, &self.output, &self.pooling);
-        let [rows, columns] = pooling.grid;
-        let is_plain = |file: &Path| file.components().count() == 1 && file.file_name().is_some();
-        if !is_plain(&self.file) || self.file == Path::new(MANIFEST) {
-            return Some("file must be a plain file name next to the manifest".into());
-        }
-        let is_below = |file: &Path| {
-            let mut parts = file.components();
-            file.file_name().is_some() && parts.all(|part| matches!(part, Component::Normal(_)))
-        };
-        if !self.data.iter().all(|data| is_below(&data.file) && data.file != Path::new(MANIFEST)) {
-            return Some("data.file must be a file below the folder of the manifest".into());
-        }
-        let mut names: Vec<&Path> = self.files().map(|(file, _)| file).collect();
-        names.sort_unstable();
-        if names.windows(2).any(|pair| pair[0] == pair[1]) {
-            return Some("data.file must differ from file and be named once".into());
-        }
-        if input.multiple == 0 || output.stride == 0 {
-            return Some("input.multiple and output.stride must be at least 1".into());
-        }
-        if !(1..=MAX_CHANNELS).contains(&output.channels) {
-            return Some(format!("output.channels must be 1 to {MAX_CHANNELS}"));
-        }
-        for (edge, pixels) in [("width", input.width), ("height", input.height)] {
-            if pixels == 0 || pixels > MAX_EDGE || pixels % input.multiple != 0 {
-                return Some(format!(
-                    "input.{edge} = {pixels} must be a multiple of {} up to {MAX_EDGE}",
-                    input.multiple
-                ));
-            }
-        }
-        if input.multiple % output.stride != 0 {
-            return Some("input.multiple must be a multiple of output.stride".into());
-        }
-        if rows == 0 || columns == 0 || rows * columns > 1024 {
-            return Some("pooling.grid must have 1 to 1024 parts".into());
-        }
-        if pooling.dimension != output.channels * rows * columns {
-            return Some(format!(
-                "pooling.dimension is {}, but channels × rows × columns is {}",
-                pooling.dimension,
-                output.channels * rows * columns
-            ));
-        }
-        let is_usable = pooling.gem_p > 0.0 && pooling.gem_p.is_finite();
-        if !is_usable {
-            return Some("pooling.gem_p must be above 0".into());
-        }
-        let is_positive = input.std.iter().all(|&s| s > 0.0);
-        if !is_positive {
-            return Some("input.std must be above 0".into());
-        }
-        if output.layout == Layout::Map && (output.cls || output.registers > 0) {
-            return Some("a map layout has neither a [CLS] token nor registers".into());
-        }
-        None
-    }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const XFEAT: &str = include_str!("../../deploy/models/xfeat.toml");
-
-    fn parse(text: &str) -> Result<Manifest, ManifestError> {
-        Manifest::parse(text, Path::new("manifest.toml"))
-    }
-
-    #[test]
-    fn the_built_in_manifest_is_consistent() {
-        let manifest = parse(XFEAT).unwrap();
-        assert_eq!(manifest.dimension(DescriptorKind::Gem), Some(576));
-        assert_eq!(manifest.dimension(DescriptorKind::Cls), None);
-    }
-
-    #[test]
-    fn a_contradiction_names_the_value() {
-        for (from, to, named) in [
-            ("dimension = 576", "dimension = 64", "dimension"),
-            ("width = 320", "width = 321", "width"),
-            ("file = \"model.onnx\"", "file = \"../model.onnx\"", "file"),
-            ("[input]", "[data]\nfile = \"../weights\"\n[input]", "file"),
-            ("[input]", "[data]\nfile = \"model.onnx\"\n[input]", "data.file"),
-            ("gem_p = 3.0", "gem_p = 0.0", "gem_p"),
-            ("cls = false", "cls = true", "CLS"),
-        ] {
-            let error = parse(&XFEAT.replace(from, to)).unwrap_err().to_string();
-            assert!(error.contains(named), "{to}: {error}");
-        }
-    }
-
-    #[test]
-    fn the_digest_covers_exactly_what_determines_a_descriptor() {
-        let file = Digest::of(b"weights");
-        let digest = |from: &str, to: &str| {
-            let text = XFEAT.replace(from, to);
-            assert!(from.is_empty() || text != XFEAT, "{from}");
-            parse(&text).unwrap().digest(&[file])
-        };
-        let plain = digest("", "");
-        assert_eq!(digest("licence = \"Apache-2.0\"", "licence = \"other\""), plain);
-        assert_ne!(digest("gem_p = 3.0", "gem_p = 4.0"), plain);
-        assert_ne!(digest("width = 320", "width = 640"), plain);
-        assert_ne!(parse(XFEAT).unwrap().digest(&[Digest::of(b"others")]), plain);
-    }
-
-    #[test]
-    fn an_unknown_key_is_rejected() {
-        assert!(parse(&format!("colour = 1\n{XFEAT}")).is_err());
-    }
-}
+mod tests;

@@ -1,5 +1,9 @@
-//! Pooling of local features to a global descriptor: the `[CLS]` token or the generalised mean.
+//! Pooling of local features to a global descriptor: the `[CLS]` token, the generalised mean or VLAD.
 
+mod kinds;
+mod vlad;
+
+pub use self::kinds::{Kinds, VocabularyError};
 use super::manifest::{Layout, Output, Pooling};
 use whereabouts_core::dense::DenseFeaturesError;
 use whereabouts_core::{DenseFeatures, Descriptor, DescriptorError, DescriptorKind};
@@ -41,9 +45,14 @@ pub enum PoolingError {
         /// Numbers declared in the manifest.
         expected: usize,
     },
-    /// The model has no `[CLS]` token.
-    #[error("this model has no [CLS] token; use a map with \"descriptor\": \"gem\"")]
-    NoCls,
+    /// The model has no such kind of descriptor.
+    #[error("this model has no descriptor {kind:?}; it has {declared}")]
+    NoKind {
+        /// The kind that was requested.
+        kind: DescriptorKind,
+        /// The kinds that the manifest declares.
+        declared: String,
+    },
     /// The descriptor has no direction.
     #[error(transparent)]
     Descriptor(#[from] DescriptorError),
@@ -87,27 +96,14 @@ impl LocalFeatures {
         self,
         kind: DescriptorKind,
         features: FeatureSet,
-        pooling: &Pooling,
+        kinds: &Kinds,
     ) -> Result<(Descriptor, Option<DenseFeatures>), PoolingError> {
-        let descriptor = self.descriptor(kind, pooling)?;
+        let descriptor = kinds.descriptor(kind, &self)?;
         let dense = match features {
             FeatureSet::DescriptorOnly => None,
             FeatureSet::DescriptorAndDense => Some(self.into_dense()?),
         };
         Ok((descriptor, dense))
-    }
-
-    /// Computes the global descriptor of the given kind.
-    pub fn descriptor(
-        &self,
-        kind: DescriptorKind,
-        pooling: &Pooling,
-    ) -> Result<Descriptor, PoolingError> {
-        let numbers = match kind {
-            DescriptorKind::Cls => self.cls.clone().ok_or(PoolingError::NoCls)?,
-            DescriptorKind::Gem => self.gem(pooling),
-        };
-        Ok(Descriptor::normalised(numbers)?)
     }
 
     /// Converts the local features to dense features, normalising each cell.
@@ -160,11 +156,17 @@ impl LocalFeatures {
     }
 }
 
+/// Turns planes into cells, in blocks that stay in the processor's first cache.
 fn transposed(planes: &[f32], channels: usize, cells: usize) -> Vec<f32> {
+    const BLOCK: usize = 64;
     let mut out = vec![0.0; planes.len()];
-    for (channel, plane) in planes.chunks_exact(cells).enumerate() {
-        for (cell, &value) in out.chunks_exact_mut(channels).zip(plane) {
-            cell[channel] = value;
+    for first in (0..cells).step_by(BLOCK) {
+        let end = (first + BLOCK).min(cells);
+        let block = &mut out[first * channels..end * channels];
+        for (channel, plane) in planes.chunks_exact(cells).enumerate() {
+            for (cell, &value) in block.chunks_exact_mut(channels).zip(&plane[first..end]) {
+                cell[channel] = value;
+            }
         }
     }
     out
@@ -172,7 +174,10 @@ fn transposed(planes: &[f32], channels: usize, cells: usize) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
+    use crate::Manifest;
 
     fn map_output(channels: usize) -> Output {
         Output {
@@ -188,6 +193,14 @@ mod tests {
 
     fn pooling(grid: [usize; 2], p: f32) -> Pooling {
         Pooling { gem_p: p, grid, dimension: 0 }
+    }
+
+    /// Those of the built-in model.
+    fn kinds() -> Kinds {
+        let text = include_str!("../../deploy/models/xfeat.toml");
+        let manifest = Manifest::parse(text, Path::new("manifest.toml")).unwrap();
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../deploy/models");
+        Kinds::load(&manifest, Path::new(folder)).unwrap()
     }
 
     #[test]
@@ -216,8 +229,7 @@ mod tests {
         let tokens = [9.0, 0.0, 7.0, 7.0, 1.0, 1.0, 2.0, 2.0];
         let features = LocalFeatures::from_output(&output, (1, 2), &tokens, None).unwrap();
         assert_eq!(features.cells, [1.0, 1.0, 2.0, 2.0]);
-        let cls = features.descriptor(DescriptorKind::Cls, &pooling([1, 1], 3.0)).unwrap();
-        assert_eq!(cls.as_slice(), [1.0, 0.0]);
+        assert_eq!(features.cls, Some(vec![9.0, 0.0]));
     }
 
     #[test]
@@ -226,17 +238,21 @@ mod tests {
             LocalFeatures::from_output(&map_output(2), (1, 3), &[1., 2., 3., 10., 20., 30.], None)
                 .unwrap();
         assert_eq!(features.cells, [1., 10., 2., 20., 3., 30.]);
-        assert_eq!(
-            features.descriptor(DescriptorKind::Cls, &pooling([1, 1], 3.0)),
-            Err(PoolingError::NoCls)
-        );
+    }
+
+    #[test]
+    fn a_kind_that_is_not_declared_is_refused_with_those_that_are() {
+        let features =
+            LocalFeatures::from_output(&map_output(64), (1, 1), &[1.0; 64], None).unwrap();
+        let error = kinds().descriptor(DescriptorKind::CLS, &features).unwrap_err().to_string();
+        assert!(error.starts_with("this model has no descriptor \"cls\"; it has gem"), "{error}");
     }
 
     #[test]
     fn dense_features_are_made_only_on_request_and_do_not_change_the_descriptor() {
-        let cells: Vec<f32> = (1..=6).map(|i| i as f32).collect();
-        let features = LocalFeatures::from_output(&map_output(2), (1, 3), &cells, None).unwrap();
-        let pool = |set| features.clone().pool(DescriptorKind::Gem, set, &pooling([1, 1], 3.0));
+        let cells: Vec<f32> = (1..=64 * 9).map(|i| i as f32).collect();
+        let features = LocalFeatures::from_output(&map_output(64), (3, 3), &cells, None).unwrap();
+        let pool = |set| features.clone().pool(DescriptorKind::GEM, set, &kinds());
         let (descriptor, none) = pool(FeatureSet::DescriptorOnly).unwrap();
         let (same, dense) = pool(FeatureSet::DescriptorAndDense).unwrap();
         assert_eq!((descriptor, none), (same, None));

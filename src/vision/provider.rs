@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::execution::{Execution, ProviderPreference};
 use super::preprocess::Tensor;
 use super::session::{InferenceError, Model, Runner};
-use whereabouts_core::{Descriptor, DescriptorKind, Digest};
+use whereabouts_core::{Descriptor, Digest};
 
 /// Minimum cosine similarity of the descriptors of an eligible execution to those of the CPU at full precision.
 pub const MIN_SIMILARITY: f32 = 0.999;
@@ -105,7 +105,7 @@ fn measure(
     Ok(SampleRun { latency: times.get(times.len() / 2).copied().unwrap_or_default(), descriptors })
 }
 
-/// Computes the descriptors of `sample` by one execution on `threads` threads.
+/// Computes the descriptors of `sample`, of every kind, by one execution on `threads` threads.
 pub(super) fn descriptors(
     model: &Model,
     execution: Execution,
@@ -120,14 +120,17 @@ fn run_all(
     runner: &mut Runner,
     sample: &[Tensor],
 ) -> Result<Vec<Descriptor>, InferenceError> {
-    let one = |tensor: &Tensor| {
+    let mut descriptors = Vec::new();
+    for tensor in sample {
         let outputs = runner.run(&[tensor])?;
         let local = outputs
             .first()
             .ok_or_else(|| InferenceError::Run("the model returned no output".into()))?;
-        Ok(local.descriptor(DescriptorKind::Gem, &model.manifest.pooling)?)
-    };
-    sample.iter().map(one).collect()
+        for kind in model.kinds.names() {
+            descriptors.push(model.kinds.descriptor(kind, local)?);
+        }
+    }
+    Ok(descriptors)
 }
 
 /// The lowest pairwise cosine similarity of two lists of descriptors.

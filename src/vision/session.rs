@@ -12,7 +12,7 @@ use ort::value::{Outlet, TensorElementType, TensorRef, ValueType};
 
 use super::execution::Execution;
 use super::manifest::{Input, Manifest, Output, Resize};
-use super::pooling::{LocalFeatures, PoolingError};
+use super::pooling::{Kinds, LocalFeatures, PoolingError};
 use super::preprocess::Tensor;
 
 impl Output {
@@ -47,6 +47,7 @@ pub(super) struct Model {
     /// Path of the ONNX file.
     pub file: PathBuf,
     pub manifest: Arc<Manifest>,
+    pub kinds: Arc<Kinds>,
 }
 
 impl Model {

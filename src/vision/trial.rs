@@ -10,7 +10,7 @@ use super::decode::Needed;
 use super::execution::Execution;
 use super::extractor::{ExtractError, SAMPLES, sample};
 use super::manifest::{Input, MANIFEST, Manifest, Resize};
-use super::pooling::{LocalFeatures, PoolingError};
+use super::pooling::{Kinds, LocalFeatures, PoolingError};
 use super::preprocess::{Tensor, preprocess};
 use super::runtime::{Assets, RuntimeError};
 use super::session::{InferenceError, Model, Runner};
@@ -142,7 +142,10 @@ pub fn try_model(assets: &Assets, folder: &Path) -> Result<Vec<String>, ModelFau
         Manifest::read(&folder.join(MANIFEST)).map_err(|error| manifest_fault(error.into()))?;
     let manifest = Arc::new(manifest);
     let file = folder.join(&manifest.file);
-    let model = Model { environment, file, manifest: Arc::clone(&manifest) };
+    let kinds = Kinds::load(&manifest, folder).map_err(|error| manifest_fault(error.into()))?;
+    let kinds = Arc::new(kinds);
+    let model =
+        Model { environment, file, manifest: Arc::clone(&manifest), kinds: Arc::clone(&kinds) };
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let load = |max_batch| {
         model.load(Execution::REFERENCE, threads, max_batch).map_err(|error| match error {
@@ -161,9 +164,8 @@ pub fn try_model(assets: &Assets, folder: &Path) -> Result<Vec<String>, ModelFau
     for picture in &pictures {
         outputs.extend(run(&mut runner, &[picture], &manifest)?);
     }
-    let kinds = [DescriptorKind::Gem, DescriptorKind::Cls];
-    for kind in kinds.into_iter().filter(|kind| manifest.dimension(*kind).is_some()) {
-        let descriptors = outputs.iter().map(|output| output.descriptor(kind, &manifest.pooling));
+    for kind in kinds.names() {
+        let descriptors = outputs.iter().map(|output| kinds.descriptor(kind, output));
         let descriptors: Vec<Descriptor> = descriptors
             .collect::<Result<_, _>>()
             .map_err(|reason| ModelFault::Pooling { kind, reason })?;

@@ -97,8 +97,8 @@ mod embedded_only {
         let maps = std::fs::read_dir(dir.path().join("descriptors")).unwrap();
         let segment = maps.map(|map| map.unwrap().path().join("000000.seg")).next().unwrap();
         let mut bytes = std::fs::read(&segment).unwrap();
-        // Somewhere inside the second row: header 64, row 16 + 4 × 576 bytes.
-        bytes[64 + (16 + 4 * 576) + 500] ^= 0x55;
+        // Somewhere inside the second row: header 64, row 16 + 4 × 512 bytes.
+        bytes[64 + (16 + 4 * 512) + 500] ^= 0x55;
         std::fs::write(&segment, bytes).unwrap();
 
         let server = Server::start(dir.path(), &[]);

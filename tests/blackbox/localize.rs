@@ -60,7 +60,7 @@ async fn graph_searches_are_sampled_against_exact_search() {
     assert!(value(&checked("yes")) >= 10.0, "{metrics}");
     // In a map this small a graph misses nothing.
     assert_eq!(value(&checked("no")), 0.0);
-    assert!(value("whereabouts_index_bytes{map=\"m\"}") > 12.0 * 576.0 * 4.0);
+    assert!(value("whereabouts_index_bytes{map=\"m\"}") > 12.0 * 512.0 * 4.0);
     assert!(value("whereabouts_batch_pictures_count") >= 13.0);
     assert_eq!(value("whereabouts_oldest_job_seconds"), 0.0);
 }

@@ -12,7 +12,8 @@ async fn a_map_is_created_changed_listed_and_deleted() {
         server.put("/maps/yard", json!({"scene": "indoor", "frame": "metric"})).await.expect(201);
     assert_eq!(made["scene"], "indoor");
     assert_eq!(made["model"], "xfeat");
-    assert_eq!((&made["dim"], &made["images"]), (&json!(576), &json!(0)));
+    assert_eq!((&made["descriptor"], &made["dim"]), (&json!("vlad"), &json!(512)));
+    assert_eq!(made["images"], 0);
     assert_eq!(made["index"], "exact");
 
     let changed =
@@ -46,7 +47,12 @@ async fn frame_and_descriptor_are_fixed_once_there_are_images() {
 async fn an_unsupported_descriptor_or_model_is_rejected_with_a_hint() {
     let (server, map) = shared_server();
     let why = server.put(&format!("/maps/{map}"), json!({"descriptor": "cls"})).await.problem(422);
-    assert!(why.contains("[CLS]") && why.contains("gem"), "{why}");
+    assert!(why.contains("no descriptor \"cls\"") && why.contains("gem"), "{why}");
+    for name in ["GEM", "", "a b", &"a".repeat(25)] {
+        let body = json!({ "descriptor": name });
+        let why = server.put(&format!("/maps/{map}"), body).await.problem(422);
+        assert!(why.contains("kind of descriptor"), "{why}");
+    }
     let why =
         server.put(&format!("/maps/{map}"), json!({"model": "dinov2-small"})).await.problem(422);
     assert!(why.contains("model pull dinov2-small"), "{why}");

@@ -31,10 +31,12 @@ impl Bench {
         self.dir.path().join("data")
     }
 
-    /// Installs XFeat with another input size and grid, which gives other descriptors.
+    /// Installs XFeat with another input size and grid, which gives other descriptors, and with `gem` only.
     fn install(&self, name: &str, (width, height): (u32, u32), grid: usize) {
         let manifest = std::fs::read_to_string(format!("{XFEAT}/manifest.toml")).unwrap();
+        let (manifest, _) = manifest.split_once("[descriptors").unwrap();
         let manifest = manifest
+            .replace("default_descriptor = \"vlad\"", "")
             .replace("width = 320", &format!("width = {width}"))
             .replace("height = 240", &format!("height = {height}"))
             .replace("dimension = 576", &format!("dimension = {}", 64 * grid * grid));
@@ -136,12 +138,42 @@ async fn in_the_middle(server: &Server, map: &str) -> Value {
 }
 
 #[tokio::test]
+async fn a_map_keeps_its_kind_of_descriptor_until_a_reindex_names_another() {
+    let bench = Bench::new();
+    bench.install("xfeat-gem", (320, 240), 3);
+    let server = bench.server(&[]);
+    let kind = |map: &Value| (map["descriptor"].as_str().unwrap().to_owned(), map["dim"].clone());
+    let (gem, vlad) = (("gem".to_owned(), json!(576)), ("vlad".to_owned(), json!(512)));
+    let made = json!({"model": "xfeat", "descriptor": "gem"});
+    assert_eq!(kind(&server.put("/maps/m", made).await.expect(201)), gem);
+    for place in 0..5 {
+        add(&server, "m", place).await;
+    }
+    let changed = server.put("/maps/m", json!({"description": "old"})).await.expect(200);
+    assert_eq!(kind(&changed), gem);
+    server.put("/maps/m", json!({"descriptor": "vlad"})).await.problem(409);
+
+    begin(&server, "m", json!({})).await;
+    assert_eq!(kind(&ended(&server, "m").await), gem);
+    begin(&server, "m", json!({"descriptor": "vlad"})).await;
+    let moved = ended(&server, "m").await;
+    assert_eq!(kind(&moved), vlad);
+    for place in 0..5 {
+        first(&look(&server, "m", place).await, place, "xfeat");
+    }
+    // A model that does not have the map's kind computes its default.
+    begin(&server, "m", json!({"model": "xfeat-gem"})).await;
+    assert_eq!(kind(&ended(&server, "m").await), gem);
+    first(&look(&server, "m", 3).await, 3, "xfeat-gem");
+}
+
+#[tokio::test]
 async fn maps_of_several_models_are_served_with_a_bounded_number_loaded() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);
     bench.install("middle", (240, 160), 2);
     let server = bench.server(&[("WHEREABOUTS_MODEL__LOADED", "2")]);
-    for (map, model, dim) in [("a", "xfeat", 576), ("b", "small", 256), ("c", "middle", 256)] {
+    for (map, model, dim) in [("a", "xfeat", 512), ("b", "small", 256), ("c", "middle", 256)] {
         town(&server, map, model, 4).await;
         let state = server.get(&format!("/maps/{map}")).await.expect(200);
         assert_eq!((&state["model"], &state["dim"]), (&json!(model), &json!(dim)));
@@ -301,7 +333,7 @@ async fn a_map_whose_model_was_uninstalled_can_move_to_another() {
     assert!(why.contains("not installed"), "{why}");
     let cls = json!({"model": "xfeat", "descriptor": "cls"}).to_string().into_bytes();
     let why = server.post("/maps/m/reindex", "application/json", cls).await.problem(422);
-    assert!(why.contains("[CLS]"), "{why}");
+    assert!(why.contains("no descriptor \"cls\""), "{why}");
     begin(&server, "m", json!({"model": "xfeat"})).await;
     assert_eq!(ended(&server, "m").await["model"], "xfeat");
     first(&look(&server, "m", 3).await, 3, "xfeat");

@@ -121,7 +121,7 @@ pub fn archives() -> Vec<Vec<u8>> {
         uid: Uuid::nil(),
         name: "a".parse().unwrap(),
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: CoordinateFrame::Wgs84,
         model: "m".into(),
         model_digest: Digest::of(b"m"),

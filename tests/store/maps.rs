@@ -48,7 +48,7 @@ async fn descriptor_settings_are_fixed_once_there_are_images(fixture: &Fixture) 
     let others: [fn(Map) -> Map; 4] = [
         |map| Map { model: "other".into(), model_digest: Digest::of(b"other"), ..map },
         |map| Map { precision: Precision::Bf16, ..map },
-        |map| Map { descriptor: DescriptorKind::Cls, ..map },
+        |map| Map { descriptor: DescriptorKind::CLS, ..map },
         |map| Map { dim: 5, ..map },
     ];
     for other in others {

@@ -271,7 +271,7 @@ pub fn map(name: &str, dim: usize) -> Map {
         uid: Uuid::now_v7(),
         name: name.parse().unwrap(),
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: CoordinateFrame::Wgs84,
         model: "old".into(),
         model_digest: Digest::of(b"old"),

@@ -50,8 +50,9 @@ pub struct Args {
     /// Largest distance of a correct reference, in metres
     #[arg(long, value_name = "METRES", default_value_t = 25.0)]
     threshold_m: f64,
-    /// Descriptors of coarse retrieval to evaluate: gem, cls, or both
-    #[arg(long, value_delimiter = ',', default_value = "gem")]
+    /// Descriptors of coarse retrieval to evaluate, such as gem,vlad: kinds that the model has [default: the
+    /// model's default]
+    #[arg(long, value_delimiter = ',', value_name = "KIND")]
     pub descriptor: Vec<DescriptorKind>,
     /// Refiners to evaluate: local, mllm, both, or off
     #[arg(long, value_delimiter = ',', default_value = "local", value_parser = refiners)]

@@ -46,7 +46,13 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let Parts { service, refiners: context, .. } = open(config.clone()).await?;
     let service = Arc::new(service);
     let model = service.maps.imaging.models.default_model().to_owned();
-    let execution = service.maps.imaging.installed_model(&model).await?.execution().to_string();
+    let extractor = service.maps.imaging.installed_model(&model).await?;
+    let execution = extractor.execution().to_string();
+    let descriptors = match args.descriptor.as_slice() {
+        [] => vec![extractor.manifest().default_kind()],
+        requested => requested.to_vec(),
+    };
+    drop(extractor);
     let limits = service.maps.imaging.models.limits();
     let observer = PhaseMeter::default();
     let evaluator = Evaluator {
@@ -56,8 +62,8 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         observer: &observer,
     };
     let mut outcomes = Vec::new();
-    for descriptor in &args.descriptor {
-        outcomes.extend(evaluator.run(&data, *descriptor).await?);
+    for descriptor in descriptors {
+        outcomes.extend(evaluator.run(&data, descriptor).await?);
     }
 
     let conditions = RunConditions {

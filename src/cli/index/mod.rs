@@ -45,8 +45,9 @@ pub struct Args {
     /// Model of a new map; with --reindex, the model to compute descriptors with
     #[arg(long, value_name = "NAME")]
     pub model: Option<String>,
-    /// Descriptor of a new map; with --reindex, the descriptor to compute
-    #[arg(long)]
+    /// Descriptor of a new map, one that the model has, such as gem [default: the model's default]; with --reindex,
+    /// the descriptor to compute
+    #[arg(long, value_name = "KIND")]
     pub descriptor: Option<DescriptorKind>,
     /// Coordinate frame of a new map [default: the frame of the poses]
     #[arg(long)]

@@ -9,7 +9,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::ModelContext;
-use whereabouts_core::{DescriptorKind, Digest};
+use whereabouts_core::Digest;
 use whereabouts_models::InstallError;
 use whereabouts_vision::{AUTO, Assets, BUILT_IN_MODEL, MANIFEST, Manifest};
 use whereabouts_vision::{ModelFault, try_model};
@@ -21,7 +21,7 @@ struct ListedModel {
     /// `installed`, `available`, or `damaged` if the manifest cannot be read.
     state: &'static str,
     in_use: bool,
-    /// Dimensions of its GeM descriptor.
+    /// Dimensions of its default descriptor.
     dimension: Option<usize>,
     licence: Option<String>,
     description: String,
@@ -34,7 +34,7 @@ impl ListedModel {
             name: name.to_owned(),
             state,
             in_use: false,
-            dimension: manifest.dimension(DescriptorKind::Gem),
+            dimension: manifest.dimension(manifest.default_kind()),
             licence: Some(manifest.licence.clone()),
             description: manifest.description.clone(),
             folder,
@@ -140,8 +140,6 @@ pub fn show(context: &ModelContext, name: &str, json: bool) -> anyhow::Result<()
     let folder = folder.map_or("not installed".into(), |folder| folder.display().to_string());
     let size = bytes.map_or("unknown".into(), |bytes| DecimalBytes(bytes).to_string());
     let digest = manifest.sha256.map_or("recorded when it is pulled".into(), |d| d.to_string());
-    let cls = manifest.dimension(DescriptorKind::Cls);
-    let cls = cls.map_or("none".into(), |dimension| format!("{dimension} dimensions"));
     println!("{name}: {}", manifest.description);
     println!("  folder   {folder}");
     println!("  size     {size}");
@@ -149,8 +147,11 @@ pub fn show(context: &ModelContext, name: &str, json: bool) -> anyhow::Result<()
     println!("  address  {}", address.unwrap_or_else(|| "not in the catalogue".into()));
     println!("  licence  {}", manifest.licence);
     println!("  source   {}", manifest.source);
-    println!("  gem      {} dimensions", manifest.pooling.dimension);
-    println!("  cls      {cls}");
+    for kind in manifest.kinds() {
+        let dimension = manifest.dimension(kind).unwrap_or_default();
+        let default = if kind == manifest.default_kind() { " (default)" } else { "" };
+        println!("  {kind:8} {dimension} dimensions{default}");
+    }
     println!("\n{}", manifest.to_toml()?.trim_end());
     Ok(())
 }

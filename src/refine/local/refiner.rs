@@ -222,7 +222,7 @@ fn match_all(
         FeatureSource::Cached(features) => Ok(features),
         FeatureSource::Picture(key, bytes) => {
             let extraction = extractor
-                .extract(&bytes, DescriptorKind::Gem, FeatureSet::DescriptorAndDense)
+                .extract(&bytes, DescriptorKind::GEM, FeatureSet::DescriptorAndDense)
                 .map_err(|error: ExtractError| RefineError::Transient(error.to_string()))?;
             let features = extraction.dense.map(Arc::new).ok_or_else(|| {
                 RefineError::Permanent("the model computed no dense features".into())

@@ -4,7 +4,7 @@ use jiff::Timestamp;
 
 use super::proto;
 use whereabouts_api::RefineMode;
-use whereabouts_core::{CoordinateFrame, DescriptorKind, JobState, PoseInput, Priority, Scene};
+use whereabouts_core::{CoordinateFrame, JobState, PoseInput, Priority, Scene};
 use whereabouts_service::ServiceError;
 
 /// Converts the number of an enum; an unknown one is malformed.
@@ -49,15 +49,6 @@ pub(super) fn scene(number: i32) -> Result<Option<Scene>, ServiceError> {
         proto::Scene::Unspecified => None,
         proto::Scene::Indoor => Some(Scene::Indoor),
         proto::Scene::Outdoor => Some(Scene::Outdoor),
-    })
-}
-
-/// `None` leaves it unchanged.
-pub(super) fn descriptor(number: i32) -> Result<Option<DescriptorKind>, ServiceError> {
-    Ok(match enum_value("descriptor", number)? {
-        proto::Descriptor::Unspecified => None,
-        proto::Descriptor::Gem => Some(DescriptorKind::Gem),
-        proto::Descriptor::Cls => Some(DescriptorKind::Cls),
     })
 }
 

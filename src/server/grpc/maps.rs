@@ -105,7 +105,7 @@ impl CallContext {
         let PutMapRequest { map, scene, descriptor, frame, model, description } = request;
         let change = MapChange {
             scene: convert::scene(scene)?,
-            descriptor: convert::descriptor(descriptor)?,
+            descriptor: descriptor.map(|kind| kind.parse()).transpose()?,
             frame: convert::frame(frame)?,
             model,
             description,

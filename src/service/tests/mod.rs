@@ -198,7 +198,7 @@ fn map(name: &str) -> Map {
         uid: Uuid::now_v7(),
         name: name.parse().unwrap(),
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: CoordinateFrame::Metric,
         model: MODEL.into(),
         model_digest: Digest::of(b"model"),

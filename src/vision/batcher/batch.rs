@@ -1,12 +1,12 @@
 //! Running one batch.
 
 use super::{Pooled, Replies, Request};
-use crate::manifest::Manifest;
+use crate::pooling::Kinds;
 use crate::preprocess::Tensor;
 use crate::session::{InferenceError, Runner};
 
 /// Runs a batch and pools its outputs.
-pub(super) fn run(runner: &mut Runner, manifest: &Manifest, batch: Vec<Request>) -> Replies {
+pub(super) fn run(runner: &mut Runner, kinds: &Kinds, batch: Vec<Request>) -> Replies {
     let mut replies = Vec::with_capacity(batch.len());
     for group in group_by_shape(batch) {
         let tensors: Vec<&Tensor> = group.iter().map(|request| &request.tensor).collect();
@@ -16,7 +16,7 @@ pub(super) fn run(runner: &mut Runner, manifest: &Manifest, batch: Vec<Request>)
                 for (request, local) in group.into_iter().zip(outputs) {
                     let Request { kind, features, reply, .. } = request;
                     let pooled = local
-                        .pool(kind, features, &manifest.pooling)
+                        .pool(kind, features, kinds)
                         .map(|(descriptor, dense)| Pooled { descriptor, dense, batch });
                     replies.push((reply, pooled.map_err(InferenceError::from)));
                 }

@@ -47,7 +47,7 @@ fn session(batcher: &Arc<Batcher>, runs: &Arc<Runs>, kind: SessionKind) -> JoinH
 fn submit(batcher: &Batcher, width: usize) -> Result<PendingInference, InferenceError> {
     let waiting = || batcher.queue.lock().waiting.len();
     let tensor = Tensor::grey(width, 1);
-    let pending = batcher.submit(tensor, DescriptorKind::Gem, FeatureSet::DescriptorOnly);
+    let pending = batcher.submit(tensor, DescriptorKind::GEM, FeatureSet::DescriptorOnly);
     assert!(waiting() <= batcher.queue.layout.capacity());
     pending
 }

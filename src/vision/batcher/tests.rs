@@ -2,9 +2,11 @@
 
 use super::*;
 
-fn manifest() -> Arc<Manifest> {
+fn kinds() -> Arc<Kinds> {
     let text = include_str!("../../../deploy/models/xfeat.toml");
-    Arc::new(Manifest::parse(text, std::path::Path::new("xfeat.toml")).unwrap())
+    let manifest = crate::Manifest::parse(text, std::path::Path::new("xfeat.toml")).unwrap();
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../deploy/models");
+    Arc::new(Kinds::load(&manifest, std::path::Path::new(folder)).unwrap())
 }
 
 pub(super) fn queue(throughput_sessions: usize, max_batch: usize) -> Queue {
@@ -15,14 +17,14 @@ pub(super) fn queue(throughput_sessions: usize, max_batch: usize) -> Queue {
         work_available: Condvar::new(),
         room_available: Condvar::new(),
         layout,
-        manifest: manifest(),
+        kinds: kinds(),
     }
 }
 
 fn submit(queue: &Queue) -> PendingInference {
     let (reply, result) = oneshot::channel();
     let mut state = queue.lock();
-    let (kind, features) = (DescriptorKind::Gem, FeatureSet::DescriptorOnly);
+    let (kind, features) = (DescriptorKind::GEM, FeatureSet::DescriptorOnly);
     state.push(Request { tensor: Tensor::grey(1, 1), kind, features, reply });
     PendingInference(result)
 }
@@ -101,7 +103,7 @@ fn abandoned_pictures_make_room_in_the_queue() {
     let batcher = Batcher { queue: Arc::clone(&queue), threads: Vec::new() };
     let waiting = thread::spawn(move || {
         let pending =
-            batcher.submit(Tensor::grey(2, 2), DescriptorKind::Gem, FeatureSet::DescriptorOnly);
+            batcher.submit(Tensor::grey(2, 2), DescriptorKind::GEM, FeatureSet::DescriptorOnly);
         (batcher, pending)
     });
     drop(abandoned);
@@ -128,7 +130,7 @@ fn waiting_callers_fail_when_the_batcher_is_dropped() {
     let queue = Arc::new(queue(0, 1));
     let batcher = Batcher { queue: Arc::clone(&queue), threads: Vec::new() };
     let waiting = batcher
-        .submit(Tensor::grey(1, 1), DescriptorKind::Gem, FeatureSet::DescriptorOnly)
+        .submit(Tensor::grey(1, 1), DescriptorKind::GEM, FeatureSet::DescriptorOnly)
         .unwrap();
     drop(batcher);
     assert!(queue.take(SessionKind::Latency).is_none());

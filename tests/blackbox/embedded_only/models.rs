@@ -22,7 +22,7 @@ fn load(model: &str, layout: Layout) -> Extractor {
 }
 
 fn descriptor(extractor: &Extractor, place: usize) -> Descriptor {
-    let (kind, features) = (DescriptorKind::Gem, FeatureSet::DescriptorOnly);
+    let (kind, features) = (DescriptorKind::GEM, FeatureSet::DescriptorOnly);
     extractor.extract(&reference(place), kind, features).unwrap().descriptor
 }
 
@@ -48,7 +48,7 @@ fn a_token_model_gives_the_descriptors_computed_with_numpy() {
     let file =
         concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/models/tiny-tokens/expected.json");
     let expected: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
-    for (kind, name) in [(DescriptorKind::Cls, "cls"), (DescriptorKind::Gem, "gem")] {
+    for (kind, name) in [(DescriptorKind::CLS, "cls"), (DescriptorKind::GEM, "gem")] {
         let expected: Vec<f32> = serde_json::from_value(expected[name].clone()).unwrap();
         let extraction =
             extractor.extract(&pattern(), kind, FeatureSet::DescriptorAndDense).unwrap();

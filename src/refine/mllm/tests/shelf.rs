@@ -114,7 +114,7 @@ impl Shelf {
             uid: Uuid::from_u128(1),
             name: "m".parse().unwrap(),
             scene: Scene::Outdoor,
-            descriptor: DescriptorKind::Gem,
+            descriptor: DescriptorKind::GEM,
             frame: CoordinateFrame::Metric,
             model: "none".into(),
             model_digest: Digest::of(b"none"),

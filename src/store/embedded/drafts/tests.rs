@@ -40,7 +40,7 @@ fn map() -> Map {
         uid: Uuid::now_v7(),
         name: "m".parse().unwrap(),
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: CoordinateFrame::Wgs84,
         model: "old".into(),
         model_digest: Digest::of(b"old"),
