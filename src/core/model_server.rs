@@ -61,6 +61,6 @@ pub struct ModelCapabilities {
     /// Length of its context, in tokens; null if that is not known.
     #[schema(nullable)]
     pub context_tokens: Option<u64>,
-    /// Calls that are made at once.
+    /// Calls that are made at once at most, at the moment.
     pub calls_at_once: usize,
 }

@@ -221,7 +221,7 @@ impl<'a> Check<'a> {
         }
         self.client.revise(|known| {
             known.context = facts.context.or(known.context);
-            known.at_once = facts.slots.or(known.at_once);
+            known.slots = facts.slots.or(known.slots);
             known.checked_at = Some(Timestamp::now());
         });
     }
@@ -230,6 +230,7 @@ impl<'a> Check<'a> {
         const WHAT: &str = "two pictures";
         let failure = match self.ask(picture_call(self.client, model, 2)).await {
             Ok(answer) => {
+                self.client.proven();
                 self.client.revise(|known| known.two_pictures = Some(true));
                 let said: String = answer.text.chars().take(120).collect();
                 match refuses(&said) {
@@ -329,6 +330,7 @@ impl<'a> Check<'a> {
         match self.ask(call).await {
             Err(failure) => self.ended("a ranking", &failure).await,
             Ok(answer) => {
+                self.client.proven();
                 let format = self.client.capabilities().format.as_str();
                 let (ok, detail) = match labels.parse(&answer.text, false) {
                     Ok(_) => (true, format!("readable; asked for with the format {format}")),
@@ -348,7 +350,7 @@ impl<'a> Check<'a> {
     /// Finds out whether the server works on calls side by side, where it does not tell.
     async fn side_by_side(&mut self) {
         let calls = AT_ONCE.min(self.client.report().capabilities.calls_at_once);
-        if calls < 2 || self.client.capabilities().at_once.is_some() {
+        if calls < 2 || self.client.capabilities().slots.is_some() {
             return;
         }
         let model = self.reasons.or(self.describes).unwrap_or_default();
@@ -373,7 +375,8 @@ impl<'a> Check<'a> {
             alone >= Duration::from_millis(200) && took >= alone.mul_f64(calls as f64 * 0.8);
         if turned_away || one_by_one {
             let at_once = if one_by_one { 1 } else { answered.max(1) };
-            self.client.revise(|known| known.at_once = Some(at_once));
+            // The server may bear more when it is less busy, so this is where the limit starts.
+            self.client.gate().adjust(|limit| limit.start_from(at_once));
             self.found("calls at once", true, format!("the server works on {at_once} at a time"));
         } else {
             self.found("calls at once", true, format!("{calls} were answered side by side"));

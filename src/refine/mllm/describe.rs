@@ -12,6 +12,7 @@ use whereabouts_store::Step;
 
 use super::buy_once::FoundDescription;
 use super::client::{Answer, Call};
+use super::gate::WantedCall;
 use super::judge;
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Prompt, Switches};
@@ -104,12 +105,19 @@ impl MllmRefiner {
         }
     }
 
-    /// Describes all pairs, `mllm.concurrency` at a time.
+    /// Describes all pairs side by side; the gate to the server says how many at a time.
     pub(super) async fn describe_all(&self, run: &RefineRun<'_>, pairs: &[Pair]) -> DescribedPairs {
         // Collected first: the compiler cannot see through a closure over borrowed pairs here.
-        let calls: Vec<_> = pairs.iter().map(|pair| self.describe(run, pair)).collect();
-        let mut outcomes: Vec<_> =
-            stream::iter(calls).buffer_unordered(self.settings.concurrency).collect().await;
+        let wanted = self.describer.gate().want(pairs.len());
+        run.progress.waiting(true);
+        let calls: Vec<_> = pairs
+            .iter()
+            .zip(wanted)
+            .map(|(pair, wanted)| self.describe(run, pair, wanted))
+            .collect();
+        // One more than can be in progress: an older job then always has the next call ready.
+        let ready = self.settings.concurrency.saturating_add(1);
+        let mut outcomes: Vec<_> = stream::iter(calls).buffer_unordered(ready).collect().await;
         outcomes.sort_by_key(|(index, _)| *index);
         let mut pairs = DescribedPairs::default();
         for (index, outcome) in outcomes {
@@ -149,6 +157,8 @@ impl MllmRefiner {
         &self,
         run: &RefineRun<'_>,
         pair: &Pair,
+        // Until the pair is described or has failed, it keeps a call busy.
+        _wanted: WantedCall,
     ) -> (usize, Result<DescribedPair, CallError>) {
         let scene = run.input.map.scene;
         let stand_in =
@@ -171,12 +181,16 @@ impl MllmRefiner {
         run: &RefineRun<'_>,
         pair: &Pair,
     ) -> Result<(CachedDescription, Duration), CallError> {
+        self.describer.ready().await;
+        let place = run.place().of_pair(pair.index);
+        // Queued before the pictures are ready, so that the pairs keep their order.
+        let turn = self.describer.gate().queue(place);
         let frame = || self.pictures.picture(&run.input.frame.digest);
         let frame = run.frame.get_or_try_init(frame).await?;
         let candidate = self.pictures.picture(&pair.digest).await?;
         let prompt = prompts::describe(run.input.map.scene, self.switches());
         let mut call = self.question(prompt, frame, &candidate);
-        let first = self.paid_call(run, &self.describer, &call).await;
+        let first = self.paid_call_in_turn(run, &self.describer, &call, turn).await;
         let why = match self.judged(&first) {
             Ok(text) => return self.keep(run, pair, first?, text).await,
             Err(why) => why,
@@ -194,7 +208,8 @@ impl MllmRefiner {
             parts.push(Part::text(&prompts::describe_again(&why, self.switches())));
         }
         call.max_tokens = call.max_tokens.saturating_mul(2);
-        let second = self.paid_call(run, &self.describer, &call).await?;
+        let turn = self.describer.gate().queue(place);
+        let second = self.paid_call_in_turn(run, &self.describer, &call, turn).await?;
         match judge::description(&second, self.switches(), self.settings.description_max_chars) {
             Ok(text) => self.keep(run, pair, second, text).await,
             Err(why) => {

@@ -10,15 +10,17 @@
 //! | `buy_once`, `single_flight`, `lease` | a description is bought once: in this process, across processes |
 //! | `rank`, `labels`, `conclude` | the reasoning call, and from its answer to a ranking |
 //! | `answer`, `order`, `loose_json`, `schema` | what the reasoning model is asked to write, and what it writes |
-//! | `client`, `forms`, `exchange`, `endpoint` | calls to a server over HTTP |
+//! | `client`, `attempt`, `forms`, `exchange`, `endpoint` | calls to a server over HTTP |
 //! | `wire`, `response`, `error_body`, `thinking`, `tokens` | the chat-completions format, in all its dialects |
 //! | `capability`, `check`, `check_calls`, `server_facts` | what a server can do, found out by trying |
 //! | `spend`, `budget`, `reservation` | limits on spend: in this process, across processes |
 //! | `failure`, `retry`, `breaker`, `rate` | kinds of failures, retries, circuit breaker, rate limits |
+//! | `gate`, `limit` | which call is next, and how many at once a server bears |
 //!
 //! A model's answer is untrusted input: it can change the order of these candidates, and nothing else.
 
 mod answer;
+mod attempt;
 mod breaker;
 mod budget;
 mod buy_once;
@@ -33,9 +35,11 @@ mod error_body;
 mod exchange;
 mod failure;
 mod forms;
+mod gate;
 mod judge;
 mod labels;
 mod lease;
+mod limit;
 mod loose_json;
 mod order;
 mod pictures;
@@ -207,6 +211,7 @@ impl MllmRefiner {
         run: &RefineRun<'_>,
         why: &CallError,
     ) -> Result<Refinement, RefineError> {
+        run.progress.waiting(false);
         let refinement = fallback.refine(run.input, run.progress).await?;
         let degraded = format!("refined by `{}` instead of `mllm`: {why}", fallback.kind());
         Ok(Refinement {
@@ -239,7 +244,10 @@ impl MllmRefiner {
         run: &RefineRun<'_>,
         described: &[DescribedPair],
     ) -> Result<Order, RefineError> {
-        let why = match self.rank(run, described).await {
+        let wanted = self.reasoner.gate().want(1);
+        let ranked = self.rank(run, described).await;
+        drop(wanted);
+        let why = match ranked {
             Ok(ranking) => return Ok(Order::Model(ranking)),
             Err(why @ CallError::NoAnswer(_)) => return Ok(Order::Coarse(why)),
             Err(why) => why,
@@ -247,6 +255,7 @@ impl MllmRefiner {
         tracing::warn!(job = %run.input.id, error = %why, "the reasoning call failed");
         self.deferred(&why)?;
         let Some(fallback) = &self.fallback else { return Ok(Order::Coarse(why)) };
+        run.progress.waiting(false);
         match fallback.refine(run.input, run.progress).await {
             Ok(refinement) => {
                 Ok(Order::Fallback { refinement: Box::new(refinement), by: fallback.kind(), why })
@@ -288,6 +297,16 @@ impl Refiner for MllmRefiner {
         Some(self)
     }
 
+    async fn room(&self) {
+        loop {
+            self.reasoner.gate().room().await;
+            self.describer.gate().room().await;
+            if self.reasoner.gate().has_room() {
+                return;
+            }
+        }
+    }
+
     async fn refine(
         &self,
         input: &RefineInput,
@@ -313,7 +332,13 @@ impl Refiner for MllmRefiner {
 
 impl PaidCalls for MllmRefiner {
     fn levels(&self) -> PaidCallLevels {
+        let mut gates = vec![self.describer.gate().levels()];
+        if self.settings.has_two_servers() {
+            gates.push(self.reasoner.gate().levels());
+        }
         PaidCallLevels {
+            calls_in_flight: gates.iter().map(|gate| gate.sent).sum(),
+            calls_at_once: gates.iter().map(|gate| gate.limit).sum(),
             suspended: self.describer.is_suspended() || self.reasoner.is_suspended(),
             spent_today: self.spend.budget.spent(Timestamp::now()),
             limit: self.spend.daily_limit(),

@@ -37,7 +37,7 @@ async fn a_server_that_can_do_everything_is_asked_a_few_times() {
     let can = checked.server.capabilities;
     assert_eq!((can.two_pictures, can.answer_format.as_str()), (Some(true), "bounded_schema"));
     assert!(can.temperature && can.system_message && can.checked_at.is_some());
-    assert_eq!((can.calls_at_once, checked.server.trouble), (10, None));
+    assert_eq!((can.calls_at_once, checked.server.trouble), (32, None));
     assert!(mock.checks() <= 6, "{}", mock.checks());
 }
 

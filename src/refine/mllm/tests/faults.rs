@@ -70,10 +70,17 @@ async fn an_answer_above_the_size_limit_is_rejected() {
 
 #[tokio::test]
 async fn a_pair_without_a_description_keeps_its_coarse_place() {
+    let refused = std::sync::OnceLock::new();
     let script = Script {
-        describe: Box::new(|call| match call.number {
-            // The pair is asked for twice.
-            2 | 3 => Reply::Said("I'm sorry, but I can't help with that.".into()),
+        // The pair is asked for twice.
+        describe: Box::new(move |call| match call.number {
+            2 => {
+                refused.set(call.pair.clone()).unwrap();
+                Reply::Said("I'm sorry, but I can't help with that.".into())
+            }
+            number if number < 5 && refused.get() == Some(&call.pair) => {
+                Reply::Said("I'm sorry, but I can't help with that.".into())
+            }
             number => Reply::Text(format!("notes number {number}.")),
         }),
         reason: Box::new(|call| ranking(&call.labels_with_first("number 5."))),
