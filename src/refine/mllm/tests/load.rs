@@ -6,6 +6,7 @@ use std::time::Instant;
 use futures_util::future::join_all;
 use jiff::fmt::rfc2822::DateTimePrinter;
 use jiff::{SignedDuration, Timestamp};
+use whereabouts_testkit::front::{Front, Treatment};
 use whereabouts_testkit::mock_mllm::{Load, Purpose};
 
 use super::*;
@@ -288,4 +289,38 @@ async fn the_calls_of_the_older_job_go_first() {
     let order = order.lock();
     let turns = order.windows(2).filter(|pair| pair[0] != pair[1]).count();
     assert!(turns <= 2, "the calls of the older job were interrupted: {order:?}");
+}
+
+#[tokio::test]
+async fn connections_that_an_overloaded_host_resets_lose_no_pair() {
+    // https://github.com/ggml-org/llama.cpp/issues/11411 and https://github.com/vllm-project/vllm/issues/2060
+    for reset in [Treatment::Reset, Treatment::ResetAfterRequest] {
+        let mut bench = Bench::new(script(|_| None)).await;
+        let treat = move |open| if open > 4 { reset } else { Treatment::Pass };
+        let front = Front::start(&bench.mock.url(), treat).await;
+        bench.rebuild(|settings| settings.base_url = front.url());
+        all_good(&bench.refine_all(4, 8).await.0);
+        assert!(front.resets() >= 2, "{}", front.resets());
+        assert_eq!(bench.mock.asked_again(), 0);
+        assert!(!bench.refiner.levels().suspended);
+        assert!(bench.limit() <= 8, "{}", bench.limit());
+    }
+}
+
+#[tokio::test]
+async fn a_head_that_trickles_is_waited_for_within_the_timeout_and_no_longer() {
+    let mut bench = Bench::new(script(|_| None)).await;
+    let slow = |pause: u64| move |_| Treatment::SlowHead(Duration::from_millis(pause));
+    let front = Front::start(&bench.mock.url(), slow(5)).await;
+    bench.rebuild(|settings| {
+        settings.base_url = front.url();
+        settings.timeout_s = 1;
+        settings.attempts = 1;
+    });
+    all_good(&[bench.refine(3).await.unwrap()]);
+    let front = Front::start(&bench.mock.url(), slow(500)).await;
+    bench.cache.forget();
+    bench.rebuild(|settings| settings.base_url = front.url());
+    let error = bench.refine(3).await.unwrap_err();
+    assert!(error.to_string().contains("mllm.timeout_s"), "{error}");
 }
