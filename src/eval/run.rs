@@ -224,6 +224,7 @@ impl Evaluator<'_> {
             },
             candidates,
             priority: Priority::Normal,
+            attempts_left: 0,
             spent: Usage::default(),
             fresh_since: None,
         }

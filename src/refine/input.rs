@@ -20,6 +20,8 @@ pub struct RefineInput {
     pub candidates: Vec<Candidate>,
     /// The priority of its job.
     pub priority: Priority,
+    /// How often the job is attempted again if this attempt fails.
+    pub attempts_left: u32,
     /// The cost of earlier attempts at the same job. It counts against the job's budget.
     pub spent: Usage,
     /// Descriptions from before this time are bought again.
@@ -57,6 +59,7 @@ impl RefineInput {
             },
             candidates: record.candidates.clone(),
             priority: record.job.priority,
+            attempts_left: 0,
             spent: record.job.usage,
             fresh_since: record.job.fresh_since,
         })

@@ -190,7 +190,10 @@ impl Worker {
     }
 
     async fn refine(&self, record: &JobRecord, turn: &Turn) -> Result<Refinement, RefineError> {
-        let input = RefineInput::of_job(record, self.maps.as_ref()).await?;
+        let input = RefineInput {
+            attempts_left: self.settings.attempts.saturating_sub(record.job.attempts),
+            ..RefineInput::of_job(record, self.maps.as_ref()).await?
+        };
         let progress = JobProgress { jobs: self.jobs.as_ref(), claim: record.claim(), turn };
         self.refiner.refine(&input, &progress).await
     }

@@ -495,16 +495,22 @@ async fn mllm_check_says_what_a_server_can_do_and_what_to_do_if_it_cannot_be_use
     assert!(out.contains("two pictures: accepted") && out.contains("bounded_schema"), "{out}");
     assert_eq!((mock.describe_calls(), mock.reason_calls()), (0, 0));
 
-    let one_picture = |call: &super::mock_mllm::RawCall<'_>| {
-        let pictures = call.body.to_string().matches("image_url\":{").count();
-        let body = json!({"message": "At most 1 image(s) may be provided in one request."});
-        (pictures > 1).then(|| Reply::Raw { status: 400, headers: vec![], body: body.to_string() })
-    };
-    let mock =
-        MockMllm::start(Script { intercept: Box::new(one_picture), ..Script::default() }).await;
-    let (code, out, err) = check(mock.url()).await;
-    assert_eq!(code, Some(1), "{out}{err}");
-    assert!(err.contains("limit-mm-per-prompt") && err.contains("At most 1 image"), "{err}");
+    for (most, wanted, told) in
+        [(1, 0, "limit-mm-per-prompt"), (0, 1, "the model takes no pictures")]
+    {
+        let so_many = move |call: &super::mock_mllm::RawCall<'_>| {
+            let pictures = call.body.to_string().matches("image_url\":{").count();
+            let message = format!("At most {most} image(s) may be provided in one request.");
+            let body = json!({ "message": message }).to_string();
+            (pictures > most).then(|| Reply::Raw { status: 400, headers: vec![], body })
+        };
+        let script = Script { intercept: Box::new(so_many), ..Script::default() };
+        let mock = MockMllm::start(script).await;
+        let (code, out, err) = check(mock.url()).await;
+        assert_eq!(code, Some(wanted), "{out}{err}");
+        let said = out + &err;
+        assert!(said.contains(told) && said.contains(&format!("At most {most} image")), "{said}");
+    }
 
     let (code, _, err) = check("localhost:8000/v1".into()).await;
     assert_eq!(code, Some(1), "{err}");

@@ -250,24 +250,27 @@ impl<'a> Check<'a> {
             }
             Err(failure) => failure,
         };
-        let one = self.accepts_plainly(&picture_call(self.client, model, 1)).await;
-        let none = one || self.accepts_plainly(&picture_call(self.client, model, 0)).await;
-        let detail = match (one, none) {
-            (true, _) => format!(
-                "the server takes one picture in a request, and describing needs two. Start it so that it \
-                 takes two (vLLM: --limit-mm-per-prompt '{{\"image\": 2}}') or use another model. It said: {}",
+        if self.accepts_plainly(&picture_call(self.client, model, 1)).await {
+            self.client.proven();
+            self.client.revise(|known| known.two_pictures = Some(false));
+            let detail = format!(
+                "the server takes one picture in a request, so both are sent side by side in one, which may be \
+                 scaled down. If it can be started so that it takes two, do (vLLM: --limit-mm-per-prompt \
+                 '{{\"image\": 2}}'). It said: {}",
                 failure.why
-            ),
-            (false, true) => format!(
+            );
+            self.found(WHAT, true, detail);
+            return Ok(());
+        }
+        let none = self.accepts_plainly(&picture_call(self.client, model, 0)).await;
+        let detail = match none {
+            true => format!(
                 "the model takes no pictures: use a multimodal one (mllm.describe_model). It said: {}",
                 failure.why
             ),
-            (false, false) => failure.why.clone(),
+            false => failure.why.clone(),
         };
         self.client.note(&Failure { why: detail.clone(), ..failure.clone() });
-        if none {
-            self.client.revise(|known| known.two_pictures = Some(false));
-        }
         self.found(WHAT, false, detail);
         self.client.suspend().await;
         Err(Ended)

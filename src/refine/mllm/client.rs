@@ -15,6 +15,7 @@ use super::capability::Capabilities;
 use super::endpoint;
 use super::failure::Failure;
 use super::gate::{CallGate, CallPlace, Permit};
+use super::limit::CallPurpose;
 use super::rate::RateLimiter;
 use super::response::Flaw;
 use super::retry::{CallError, CallRetryPolicy};
@@ -79,6 +80,9 @@ pub struct MllmClient {
     pub(super) breaker: Breaker,
     pub(super) rate: RateLimiter,
     pub(super) trouble: Mutex<Option<ModelTrouble>>,
+    /// Why no answer of the last job could be used, by what the calls were for. Answers arrive, so this is no failure of
+    /// calls.
+    useless: Mutex<[Option<ModelTrouble>; 2]>,
     /// Lets as many calls pass at once as the server bears.
     pub(super) gate: Arc<CallGate>,
     /// Whether the server has answered a call since it last refused all.
@@ -141,6 +145,7 @@ impl MllmClient {
                 buckets,
             ),
             trouble: Mutex::default(),
+            useless: Mutex::default(),
             gate: CallGate::new(settings.concurrency, backoff),
             is_proven: AtomicBool::new(false),
             scout: tokio::sync::Mutex::default(),
@@ -249,9 +254,25 @@ impl MllmClient {
             models: self.models.clone(),
             suspended: wait.is_some(),
             suspended_for_s: wait.map(|wait| wait.as_secs_f64()),
-            trouble: self.trouble.lock().clone(),
+            trouble: self.trouble(),
             capabilities: self.capabilities().report(self.gate.levels().limit),
         }
+    }
+
+    /// Notes that no answer to a job's calls of that purpose could be used, or that one could.
+    pub(super) fn answers_are(&self, purpose: CallPurpose, useless: Option<&str>) {
+        self.useless.lock()[purpose as usize] = useless.map(|why| ModelTrouble {
+            at: Timestamp::now(),
+            kind: "no_answer".to_owned(),
+            status: None,
+            message: why.to_owned(),
+        });
+    }
+
+    /// Returns the last failure since a call succeeded, or why answers cannot be used.
+    fn trouble(&self) -> Option<ModelTrouble> {
+        let failed = self.trouble.lock().clone();
+        failed.or_else(|| self.useless.lock().iter().flatten().next().cloned())
     }
 
     /// Notes that a check got an answer.

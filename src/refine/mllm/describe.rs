@@ -49,6 +49,11 @@ pub(super) struct DescribedPair {
 }
 
 impl DescribedPair {
+    /// Whether this job bought the description.
+    pub fn is_bought(&self) -> bool {
+        !self.cached
+    }
+
     /// Returns the description as jobs report it.
     pub fn description(&self, candidates: &[Candidate]) -> Description {
         Description {
@@ -185,11 +190,16 @@ impl MllmRefiner {
         let place = run.place().of_pair(pair.index);
         // Queued before the pictures are ready, so that the pairs keep their order.
         let turn = self.describer.gate().queue(place);
-        let frame = || self.pictures.picture(&run.input.frame.digest);
-        let frame = run.frame.get_or_try_init(frame).await?;
-        let candidate = self.pictures.picture(&pair.digest).await?;
         let prompt = prompts::describe(run.input.map.scene, self.switches());
-        let mut call = self.question(prompt, frame, &candidate);
+        let mut call = if self.describer.capabilities().two_pictures == Some(false) {
+            let both = self.pictures.both(&run.input.frame.digest, &pair.digest).await?;
+            self.question_of_one(prompt, &both)
+        } else {
+            let frame = || self.pictures.picture(&run.input.frame.digest);
+            let frame = run.frame.get_or_try_init(frame).await?;
+            let candidate = self.pictures.picture(&pair.digest).await?;
+            self.question(prompt, frame, &candidate)
+        };
         let first = self.paid_call_in_turn(run, &self.describer, &call, turn).await;
         let why = match self.judged(&first) {
             Ok(text) => return self.keep(run, pair, first?, text).await,
@@ -258,7 +268,6 @@ impl MllmRefiner {
 
     /// Names each picture in the text before it, because models lose count of which is which.
     fn question(&self, prompt: Prompt, frame: &SentPicture, candidate: &SentPicture) -> Call<'_> {
-        let text = estimate(&prompt.system) + estimate(&prompt.user);
         let parts = vec![
             Part::text("FRAME:"),
             Part::picture(&frame.url),
@@ -266,9 +275,27 @@ impl MllmRefiner {
             Part::picture(&candidate.url),
             Part::text(&prompt.user),
         ];
+        self.question_with(prompt, parts, frame.tokens + candidate.tokens)
+    }
+
+    /// Asks about both pictures in one.
+    fn question_of_one(&self, prompt: Prompt, both: &SentPicture) -> Call<'_> {
+        let parts = vec![
+            Part::text(
+                "The two photographs stand side by side in one picture, each with its name above it: the FRAME on \
+                 the left, the CANDIDATE on the right.",
+            ),
+            Part::picture(&both.url),
+            Part::text(&prompt.user),
+        ];
+        self.question_with(prompt, parts, both.tokens)
+    }
+
+    fn question_with(&self, prompt: Prompt, parts: Vec<Part>, picture_tokens: u64) -> Call<'_> {
+        let text = estimate(&prompt.system) + estimate(&prompt.user);
         Call {
             model: &self.settings.describe_model,
-            prompt_tokens: text + frame.tokens + candidate.tokens,
+            prompt_tokens: text + picture_tokens,
             messages: vec![Message::system(prompt.system), Message::parts(parts)],
             shorter: None,
             labels: None,

@@ -6,7 +6,7 @@
 //! | `settings` | the section `[mllm]` of the configuration |
 //! | `prompts` | the prompts |
 //! | `run` | the state of one refinement |
-//! | `describe`, `judge`, `pictures` | one description for each pair, and what is none |
+//! | `describe`, `judge`, `pictures`, `side_by_side` | one description for each pair, and what is none |
 //! | `buy_once`, `single_flight`, `lease` | a description is bought once: in this process, across processes |
 //! | `rank`, `labels`, `conclude` | the reasoning call, and from its answer to a ranking |
 //! | `answer`, `order`, `loose_json`, `schema` | what the reasoning model is asked to write, and what it writes |
@@ -53,6 +53,7 @@ mod run;
 mod schema;
 mod server_facts;
 mod settings;
+mod side_by_side;
 mod single_flight;
 mod spend;
 mod thinking;
@@ -87,7 +88,8 @@ pub use settings::{
 use self::buy_once::BuyOnce;
 use self::client::MllmClient;
 use self::conclude::Order;
-use self::describe::DescribedPair;
+use self::describe::{DescribedPair, DescribedPairs};
+use self::limit::CallPurpose;
 use self::pictures::Pictures;
 use self::retry::CallError;
 use self::run::RefineRun;
@@ -248,12 +250,23 @@ impl MllmRefiner {
         let ranked = self.rank(run, described).await;
         drop(wanted);
         let why = match ranked {
-            Ok(ranking) => return Ok(Order::Model(ranking)),
-            Err(why @ CallError::NoAnswer(_)) => return Ok(Order::Coarse(why)),
+            Ok(ranking) => {
+                self.reasoner.answers_are(CallPurpose::Rank, None);
+                return Ok(Order::Model(ranking));
+            }
+            Err(why @ CallError::NoAnswer(_)) => {
+                self.reasoner.answers_are(CallPurpose::Rank, Some(&why.to_string()));
+                return Ok(Order::Coarse(why));
+            }
             Err(why) => why,
         };
         tracing::warn!(job = %run.input.id, error = %why, "the reasoning call failed");
         self.deferred(&why)?;
+        if run.input.attempts_left > 0 && matches!(why, CallError::Transient(_)) {
+            return Err(RefineError::Transient(format!(
+                "the reasoning call failed ({why}); it is tried again, and the descriptions are kept"
+            )));
+        }
         let Some(fallback) = &self.fallback else { return Ok(Order::Coarse(why)) };
         run.progress.waiting(false);
         match fallback.refine(run.input, run.progress).await {
@@ -264,6 +277,17 @@ impl MllmRefiner {
                 tracing::warn!(job = %run.input.id, %error, "the fallback failed, too");
                 Ok(Order::Coarse(why))
             }
+        }
+    }
+
+    /// Notes if the model described no pair although it answered: it refuses, or cannot see.
+    fn judge_describer(&self, pairs: &DescribedPairs) {
+        if pairs.described.iter().any(DescribedPair::is_bought) {
+            self.describer.answers_are(CallPurpose::Describe, None);
+        } else if pairs.described.is_empty()
+            && let Some(CallError::NoAnswer(why)) = conclude::most_serious(&pairs.failed)
+        {
+            self.describer.answers_are(CallPurpose::Describe, Some(&why));
         }
     }
 
@@ -321,6 +345,7 @@ impl Refiner for MllmRefiner {
         let run = RefineRun::new(input, budget, similar, progress);
         let pairs = self.pairs(input).await?;
         let pairs = self.describe_all(&run, &pairs).await;
+        self.judge_describer(&pairs);
         let order = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
             ([], None) => Order::Nothing,
             ([], Some(why)) => return self.without_descriptions(&run, &why).await,

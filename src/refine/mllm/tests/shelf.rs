@@ -149,6 +149,7 @@ impl Shelf {
             },
             candidates: (0..candidates).map(candidate).collect(),
             priority: Priority::Normal,
+            attempts_left: 0,
             spent: Usage::default(),
             fresh_since: None,
         }
