@@ -311,16 +311,10 @@ impl<'a> InFlight<'a> {
         Self(seen)
     }
 
-    fn load(&self, body: &[u8], began: Instant) -> Load {
-        let request = serde_json::from_slice(body).unwrap_or_default();
+    fn load(&self, purpose: Purpose, began: Instant) -> Load {
         let seen = self.0.lock().unwrap();
         let [describe, reason, _] = seen.arrived;
-        Load {
-            purpose: purpose_of(&request),
-            number: describe + reason,
-            in_flight: seen.in_flight,
-            at: began.elapsed(),
-        }
+        Load { purpose, number: describe + reason, in_flight: seen.in_flight, at: began.elapsed() }
     }
 }
 
@@ -344,8 +338,9 @@ async fn answer(
             None => StatusCode::NOT_FOUND.into_response(),
         };
     }
+    let mut purpose = Purpose::Describe;
     if let Ok(request) = serde_json::from_slice::<Value>(&body) {
-        let purpose = purpose_of(&request);
+        purpose = purpose_of(&request);
         let number = {
             let mut seen = shared.seen.lock().unwrap();
             seen.arrived[purpose as usize] += 1;
@@ -360,7 +355,7 @@ async fn answer(
         }
     }
     let in_flight = InFlight::new(&shared.seen);
-    let load = in_flight.load(&body, shared.began);
+    let load = in_flight.load(purpose, shared.began);
     if let Some(reply) = (script.turn_away)(&load) {
         shared.seen.lock().unwrap().turned_away += 1;
         return render(reply, Some(100)).await;

@@ -197,7 +197,7 @@ impl MllmRefiner {
         } else {
             let frame = || self.pictures.picture(&run.input.frame.digest);
             let frame = run.frame.get_or_try_init(frame).await?;
-            let candidate = self.pictures.picture(&pair.digest).await?;
+            let candidate = self.pictures.of_image(&pair.digest).await?;
             self.question(prompt, frame, &candidate)
         };
         let first = self.paid_call_in_turn(run, &self.describer, &call, turn).await;

@@ -11,8 +11,8 @@ use std::time::Duration;
 ///
 /// - *Turned away* (429, 503, a reset connection): one such answer is noise, as rare spurious ones are, and would cost
 ///   a loss-driven scheme most of its limit. Two in a row, or three of the last 32, are overload. The limit then falls
-///   to nine tenths, and no higher than the number of calls that the server is still working on, which is what it
-///   bears.
+///   to nine tenths, and further towards the number of calls that the server is still working on, which is what it
+///   bears, by half at most.
 /// - *Latency*: calls vary too much for a comparison of single ones. The median of a round of 16 calls of the same
 ///   purpose is compared with the lowest of such medians. If it is more than twice as long, the limit is halved on
 ///   trial, which is kept if it shortened the calls, and taken back if it did not: then the load was not the reason.
@@ -23,10 +23,13 @@ pub(super) struct CallLimit {
     limit: f64,
     /// Slow start ends here.
     threshold: f64,
+    /// How far the limit may fall until another call is sent and turned away: many calls that end together leave the
+    /// server with few for a moment.
+    floor: f64,
     /// Counts decreases. What was sent before the last one says nothing about the limit now.
     epoch: u32,
-    /// Whether a call was answered that was sent since the last decrease. Without one, the server takes nothing at the
-    /// moment, which says nothing about where slow start is to end.
+    /// Whether a call was answered that was sent since the decrease before the last. Without one, the server takes
+    /// nothing at the moment, which says nothing about where slow start is to end.
     is_proven: bool,
     /// The last 32 outcomes, the newest in the lowest bit; set for a call that was turned away.
     outcomes: u32,
@@ -86,6 +89,9 @@ const SHORTER: f64 = 0.7;
 /// What is left of the limit where a server turns calls away.
 const DECREASE: f64 = 0.9;
 
+/// What is left of it at least.
+const MOST_DECREASE: f64 = 0.5;
+
 /// Calls of the last 32 that must have been turned away before the limit falls.
 const SEVERAL: u32 = 3;
 
@@ -96,6 +102,7 @@ impl CallLimit {
             bound,
             limit: bound.min(START) as f64,
             threshold: bound as f64,
+            floor: 1.0,
             epoch: 0,
             is_proven: false,
             outcomes: 0,
@@ -135,7 +142,7 @@ impl CallLimit {
     /// Notes the end of a call that the server worked on. `is_full` is whether the limit held other calls back.
     pub fn answered(&mut self, call: SentCall, took: Duration, is_full: bool) {
         self.outcomes <<= 1;
-        self.is_proven |= call.epoch == self.epoch;
+        self.is_proven |= self.epoch.wrapping_sub(call.epoch) <= 1;
         if is_full && self.trial.is_none() {
             let round = self.limit.max(LEAST_ROUND);
             let step = if self.limit < self.threshold { 1.0 } else { 1.0 / round };
@@ -166,9 +173,10 @@ impl CallLimit {
             if self.is_proven {
                 self.threshold = less.floor().max(1.0);
             }
+            self.floor = self.limit * MOST_DECREASE;
             self.decrease(less);
         }
-        self.set(self.limit.min(working as f64));
+        self.set(self.limit.min(working as f64).max(self.floor));
     }
 
     fn decrease(&mut self, to: f64) {

@@ -6,7 +6,7 @@
 //! | `settings` | the section `[mllm]` of the configuration |
 //! | `prompts` | the prompts |
 //! | `run` | the state of one refinement |
-//! | `describe`, `judge`, `pictures`, `side_by_side` | one description for each pair, and what is none |
+//! | `describe`, `judge`, `pictures`, `kept`, `side_by_side` | one description for each pair, and what is none |
 //! | `buy_once`, `single_flight`, `lease` | a description is bought once: in this process, across processes |
 //! | `rank`, `labels`, `conclude` | the reasoning call, and from its answer to a ranking |
 //! | `answer`, `order`, `loose_json`, `schema` | what the reasoning model is asked to write, and what it writes |
@@ -37,6 +37,7 @@ mod failure;
 mod forms;
 mod gate;
 mod judge;
+mod kept;
 mod labels;
 mod lease;
 mod limit;
@@ -177,8 +178,13 @@ impl MllmRefiner {
             true => client(&settings.reasoning())?,
             false => Arc::clone(&describer),
         };
-        let pictures = Pictures::new(parts.blobs, parts.limits, settings.image_max_edge)
-            .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
+        let pictures = Pictures::new(
+            parts.blobs,
+            parts.limits,
+            settings.image_max_edge,
+            settings.pictures_bytes,
+        )
+        .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
         Ok(Self {
             maps: parts.maps,
             descriptions: BuyOnce::new(Arc::clone(&parts.cache), parts.metrics),

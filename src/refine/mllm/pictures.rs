@@ -8,7 +8,9 @@ use bytes::Bytes;
 use image::RgbImage;
 use tokio::sync::Semaphore;
 
+use super::kept::KeptPictures;
 use super::side_by_side::side_by_side;
+use super::single_flight::SingleFlight;
 use whereabouts_core::Digest;
 use whereabouts_store::{BlobStore, StoreError};
 use whereabouts_vision::decode::{Needed, decode, encode_jpeg};
@@ -53,6 +55,8 @@ pub struct Pictures {
     pool: CpuPool,
     /// One permit for each place in the pool's queue, so that the queue never overflows.
     permits: Arc<Semaphore>,
+    kept: KeptPictures,
+    in_preparation: SingleFlight<SentPicture>,
 }
 
 impl Pictures {
@@ -61,9 +65,32 @@ impl Pictures {
         blobs: Arc<dyn BlobStore>,
         limits: ImageLimits,
         max_edge: u32,
+        kept_bytes: usize,
     ) -> std::io::Result<Self> {
         let pool = CpuPool::new("mllm-pictures", THREADS, THREADS)?;
-        Ok(Self { blobs, limits, max_edge, pool, permits: Arc::new(Semaphore::new(THREADS)) })
+        let (permits, kept) = (Arc::new(Semaphore::new(THREADS)), KeptPictures::new(kept_bytes));
+        Ok(Self {
+            blobs,
+            limits,
+            max_edge,
+            pool,
+            permits,
+            kept,
+            in_preparation: SingleFlight::default(),
+        })
+    }
+
+    /// Prepares the picture of an image in a map, or returns the one that was prepared for another pair.
+    pub async fn of_image(&self, digest: &Digest) -> Result<SentPicture, PictureError> {
+        let prepare = || async {
+            if let Some(kept) = self.kept.get(digest) {
+                return Ok(kept);
+            }
+            let picture = self.picture(digest).await?;
+            self.kept.keep(*digest, picture.clone());
+            Ok(picture)
+        };
+        self.in_preparation.join(*digest, prepare).await
     }
 
     /// Fetches and prepares the picture with that digest.

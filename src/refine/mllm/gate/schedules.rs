@@ -39,7 +39,9 @@ fn never_more_calls_pass_than_the_bound_and_none_waits_for_ever() {
             let (gate, passing) = (Arc::clone(&gate), Arc::clone(&passing));
             spawn(move || [job, job + 3].map(|job| call(&gate, &passing, job)))
         });
-        threads.into_iter().for_each(|thread| drop(thread.join().unwrap()));
+        for thread in threads {
+            thread.join().unwrap();
+        }
         assert!(is_idle(&gate));
     });
 }

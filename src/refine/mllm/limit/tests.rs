@@ -36,7 +36,15 @@ fn two_refusals_in_a_row_lower_it_to_what_is_borne_and_one_alone_does_not() {
     limit.turned_away(call, 8);
     assert_eq!(limit.get(), 50);
     limit.turned_away(call, 8);
-    assert_eq!(limit.get(), 8);
+    // By half at most for what was sent together.
+    assert_eq!(limit.get(), 25);
+    limit.turned_away(call, 8);
+    assert_eq!(limit.get(), 25);
+    for left in [12, 8] {
+        let call = limit.sent(CallPurpose::Describe);
+        limit.turned_away(call, 8);
+        assert_eq!(limit.get(), left);
+    }
     // It doubles, because it is not known where the server's own limit is, until calls are turned away again.
     answer(&mut limit, 8, SECOND);
     assert_eq!(limit.get(), 16);

@@ -216,7 +216,8 @@ async fn a_model_that_refuses_every_pair_is_trouble_until_it_describes_one() {
 async fn a_failed_reasoning_call_is_tried_again_with_the_job_at_no_new_description() {
     let script = Script {
         reason: Box::new(|call| match call.number {
-            number if number <= 4 => status(500),
+            // Four attempts, and one more without a format of the answer.
+            number if number <= 5 => status(500),
             _ => ranking(&call.labels()),
         }),
         ..Script::default()
