@@ -28,8 +28,11 @@ pub(super) struct CallLimit {
     floor: f64,
     /// Counts decreases. What was sent before the last one says nothing about the limit now.
     epoch: u32,
-    /// Whether a call was answered that was sent since the decrease before the last. Without one, the server takes
-    /// nothing at the moment, which says nothing about where slow start is to end.
+    /// Counts sent calls.
+    sent: u64,
+    /// The number of calls that were sent when the threshold was last lowered, and whether a later one was answered.
+    /// Without one, the server takes nothing at the moment, which says nothing about where slow start is to end.
+    lowered_at: u64,
     is_proven: bool,
     /// The last 32 outcomes, the newest in the lowest bit; set for a call that was turned away.
     outcomes: u32,
@@ -50,6 +53,8 @@ pub(super) enum CallPurpose {
 pub(super) struct SentCall {
     pub purpose: CallPurpose,
     epoch: u32,
+    /// From 1.
+    number: u64,
 }
 
 /// The durations of the last calls.
@@ -104,6 +109,8 @@ impl CallLimit {
             threshold: bound as f64,
             floor: 1.0,
             epoch: 0,
+            sent: 0,
+            lowered_at: 0,
             is_proven: false,
             outcomes: 0,
             rounds: Default::default(),
@@ -135,14 +142,15 @@ impl CallLimit {
     }
 
     /// Notes that a call is sent.
-    pub fn sent(&self, purpose: CallPurpose) -> SentCall {
-        SentCall { purpose, epoch: self.epoch }
+    pub fn sent(&mut self, purpose: CallPurpose) -> SentCall {
+        self.sent += 1;
+        SentCall { purpose, epoch: self.epoch, number: self.sent }
     }
 
     /// Notes the end of a call that the server worked on. `is_full` is whether the limit held other calls back.
     pub fn answered(&mut self, call: SentCall, took: Duration, is_full: bool) {
         self.outcomes <<= 1;
-        self.is_proven |= self.epoch.wrapping_sub(call.epoch) <= 1;
+        self.is_proven |= call.number > self.lowered_at;
         if is_full && self.trial.is_none() {
             let round = self.limit.max(LEAST_ROUND);
             let step = if self.limit < self.threshold { 1.0 } else { 1.0 / round };
@@ -172,6 +180,8 @@ impl CallLimit {
             let less = self.limit * DECREASE;
             if self.is_proven {
                 self.threshold = less.floor().max(1.0);
+                self.lowered_at = self.sent;
+                self.is_proven = false;
             }
             self.floor = self.limit * MOST_DECREASE;
             self.decrease(less);
@@ -181,7 +191,6 @@ impl CallLimit {
 
     fn decrease(&mut self, to: f64) {
         self.trial = None;
-        self.is_proven = false;
         self.epoch = self.epoch.wrapping_add(1);
         self.rounds.iter_mut().for_each(|round| round.took.clear());
         self.set(to);
