@@ -16,7 +16,7 @@ pub struct ModelServer {
     /// Seconds until the next call is tried; null while calls are not suspended.
     #[schema(nullable)]
     pub suspended_for_s: Option<f64>,
-    /// The last failure since a call succeeded; null if there is none.
+    /// The last failure since a call succeeded, or why answers cannot be used; null if there is neither.
     #[schema(nullable)]
     pub trouble: Option<ModelTrouble>,
     /// What the server can do.
@@ -28,7 +28,8 @@ pub struct ModelServer {
 pub struct ModelTrouble {
     /// When the call failed.
     pub at: Timestamp,
-    /// Kind of the failure, such as `key`, `quota`, `not_found`, `timeout` or `connection_refused`.
+    /// Kind of the failure, such as `key`, `quota`, `not_found`, `timeout` or `connection_refused`; `no_answer` if the
+    /// model answers, but refuses or says nothing that can be used.
     pub kind: String,
     /// HTTP status; null if there was no response.
     #[schema(nullable)]
@@ -61,6 +62,6 @@ pub struct ModelCapabilities {
     /// Length of its context, in tokens; null if that is not known.
     #[schema(nullable)]
     pub context_tokens: Option<u64>,
-    /// Calls that are made at once.
+    /// Calls that are made at once at most, at the moment.
     pub calls_at_once: usize,
 }

@@ -14,7 +14,9 @@ use super::cache_key::CacheKey;
 use super::map::ReferenceMap;
 use super::outcome::OutcomeCache;
 use super::{Dataset, EvaluatedQuery, MethodOutcomes, Prediction, QueryOutcome, StageTimes};
-use whereabouts_core::{Calibration, DescriptorKind, Digest, Map, RefinerKind, Scene, Usage};
+use whereabouts_core::{
+    Calibration, DescriptorKind, Digest, Map, Priority, RefinerKind, Scene, Usage,
+};
 use whereabouts_index::SearchMode;
 use whereabouts_refine::{
     AttemptPolicy, DenseKey, Progress, QueryFrame, RefineError, RefineInput, Refinement, Refiner,
@@ -221,6 +223,8 @@ impl Evaluator<'_> {
                 descriptor: Some(extraction.descriptor),
             },
             candidates,
+            priority: Priority::Normal,
+            attempts_left: 0,
             spent: Usage::default(),
             fresh_since: None,
         }

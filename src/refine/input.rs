@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 use uuid::Uuid;
-use whereabouts_core::{Candidate, Descriptor, Digest, Map, Usage};
+use whereabouts_core::{Candidate, Descriptor, Digest, Map, Priority, Usage};
 use whereabouts_store::{JobRecord, MapStore};
 
 use super::RefineError;
@@ -18,6 +18,10 @@ pub struct RefineInput {
     pub frame: QueryFrame,
     /// The images to compare with the frame, in coarse order.
     pub candidates: Vec<Candidate>,
+    /// The priority of its job.
+    pub priority: Priority,
+    /// How often the job is attempted again if this attempt fails.
+    pub attempts_left: u32,
     /// The cost of earlier attempts at the same job. It counts against the job's budget.
     pub spent: Usage,
     /// Descriptions from before this time are bought again.
@@ -54,6 +58,8 @@ impl RefineInput {
                 descriptor,
             },
             candidates: record.candidates.clone(),
+            priority: record.job.priority,
+            attempts_left: 0,
             spent: record.job.usage,
             fresh_since: record.job.fresh_since,
         })

@@ -18,8 +18,11 @@ pub struct JobSettings {
     pub queue: usize,
     /// Jobs are shed while more than this share of the admission queue is in use.
     pub shed_at: f64,
-    /// Jobs that this process refines in parallel; with 0, other processes refine.
+    /// Jobs that this process refines in parallel; with 0, other processes refine. Those that wait for a network do
+    /// not count.
     pub workers: usize,
+    /// The most jobs that this process has in progress, those that wait for a network included.
+    pub in_progress: usize,
     /// How long a claim lasts. It must outlast `timeout`.
     #[serde(rename = "lease_s", with = "seconds")]
     pub lease: Duration,
@@ -59,6 +62,7 @@ impl JobSettings {
     pub fn validate(&self) -> Option<String> {
         let zero = [
             ("queue", self.queue == 0),
+            ("in_progress", self.in_progress == 0),
             ("attempts", self.attempts == 0),
             ("sweep_s", self.sweep.is_zero()),
             ("sweep_batch", self.sweep_batch == 0),

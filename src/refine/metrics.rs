@@ -6,6 +6,7 @@ use jiff::Timestamp;
 use prometheus_client::encoding::EncodeLabelSet;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use whereabouts_core::{Job, JobState};
 use whereabouts_telemetry::HourlyStats;
@@ -21,6 +22,17 @@ pub struct RefineMetrics {
     cached_descriptions: Family<RefinerLabels, Counter>,
     tokens: Family<TokenLabels, Counter>,
     description_lookups: Family<LookupLabels, Counter>,
+    in_progress: Gauge,
+}
+
+/// A job in progress; it is counted until this is dropped.
+#[derive(Debug)]
+pub struct CountedJob(Gauge);
+
+impl Drop for CountedJob {
+    fn drop(&mut self) {
+        self.0.dec();
+    }
 }
 
 /// The outcome of looking up a pair's description.
@@ -93,7 +105,24 @@ impl RefineMetrics {
                  (similar), or bought (miss)",
                 Family::default(),
             ),
+            in_progress: register(
+                registry,
+                "jobs_in_progress",
+                "Jobs that this process is refining",
+                Gauge::default(),
+            ),
         }
+    }
+
+    /// Counts a job that is in progress.
+    pub fn job_begins(&self) -> CountedJob {
+        self.in_progress.inc();
+        CountedJob(self.in_progress.clone())
+    }
+
+    /// Returns the number of jobs in progress.
+    pub fn jobs_in_progress(&self) -> usize {
+        usize::try_from(self.in_progress.get()).unwrap_or_default()
     }
 
     /// Counts an ended job.

@@ -26,6 +26,9 @@ pub trait Refiner: Send + Sync {
     fn wants_descriptor(&self) -> bool {
         false
     }
+    /// Returns once the refiner could make use of another job, besides those that wait for a network
+    /// ([`Progress::waiting`]).
+    async fn room(&self) {}
     /// Returns the refiner's ability to show which regions a pair has in common, if it has it.
     fn region_matcher(&self) -> Option<&dyn RegionMatcher> {
         None
@@ -82,6 +85,10 @@ pub struct PaidCallLevels {
     pub spent_today: Spent,
     /// What may be spent a day; 0 stands for no limit.
     pub limit: Spent,
+    /// Calls that are sent and not answered.
+    pub calls_in_flight: usize,
+    /// Calls that are made at once at most, which follows what the servers bear.
+    pub calls_at_once: usize,
     /// The size of the description cache.
     pub cache: CacheLevels,
 }
@@ -91,6 +98,9 @@ pub struct PaidCallLevels {
 pub trait Progress: Send + Sync {
     /// Records a completed step. The refinement's final usage includes the step's cost.
     async fn step(&self, step: Step);
+    /// Says whether the refinement waits for a network from now on, or needs this machine. While it waits, others
+    /// may begin.
+    fn waiting(&self, _waits: bool) {}
 }
 
 /// The result of a refinement.

@@ -1,4 +1,6 @@
-//! The worker: claims a job, has it refined, and records the outcome.
+//! The worker: claims jobs, has them refined side by side, and records the outcomes.
+
+mod in_progress;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -12,13 +14,18 @@ use whereabouts_core::{Estimate, Job, JobState};
 use whereabouts_store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
 use whereabouts_telemetry::traces;
 
+use self::in_progress::{InProgress, Turn, Turns};
 use super::store_retry::retry_for;
 use super::{
     JobServiceTime, JobSettings, NextAttempt, Progress, RefineError, RefineInput, RefineMetrics,
     Refinement, Refiner,
 };
 
-/// Refines one job after another.
+/// Refines jobs, the oldest first.
+///
+/// `jobs.workers` jobs at a time use this machine. A job that waits for a network ([`Progress::waiting`]) does not
+/// count among them: another is claimed as soon as the refiner can make use of it ([`Refiner::room`]), up to
+/// `jobs.in_progress`. A process thus claims what it can work on, and leaves the rest to others that share the queue.
 pub struct Worker {
     /// The queue.
     pub jobs: Arc<dyn JobStore>,
@@ -46,49 +53,88 @@ enum AttemptOutcome {
 }
 
 impl Worker {
-    /// Works until `shutdown`. A job in progress then goes back to the queue.
-    pub async fn run(&self, shutdown: CancellationToken) {
-        let mut changes = self.jobs.changes();
-        while !shutdown.is_cancelled() {
-            match self.step(&shutdown).await {
-                Ok(true) => continue,
-                Ok(false) => {}
+    /// Works until `shutdown`. Jobs in progress then go back to the queue.
+    pub async fn run(self, shutdown: CancellationToken) {
+        let worker = Arc::new(self);
+        let mut changes = worker.jobs.changes();
+        let turns = Turns::new(worker.settings.workers);
+        let mut jobs = InProgress::default();
+        loop {
+            let in_progress = jobs.len();
+            tokio::select! {
+                biased;
+                () = shutdown.cancelled() => break,
+                () = jobs.one_ends(), if !jobs.is_empty() => continue,
+                () = worker.is_ready(&turns, in_progress) => {}
+            }
+            // Not in the selection above: a claim that is dropped half-way may have been made.
+            match worker.claim().await {
+                Ok(Some(record)) => {
+                    let (id, turn) = (record.job.id, turns.take());
+                    let (worker, shutdown) = (Arc::clone(&worker), shutdown.clone());
+                    jobs.spawn(id, async move { worker.work_on(record, turn, &shutdown).await });
+                    continue;
+                }
+                Ok(None) => {}
                 Err(error) => tracing::error!(%error, "the job queue cannot be worked on"),
             }
             // A change wakes the worker at once; polling finds jobs whose pause or lease has ended.
-            let poll = tokio::time::sleep(self.settings.lease.min(Duration::from_secs(1)));
+            let poll = tokio::time::sleep(worker.settings.lease.min(Duration::from_secs(1)));
             tokio::select! {
                 () = shutdown.cancelled() => {}
                 () = poll => {}
-                _ = changes.recv() => {}
+                () = jobs.others_change(&mut changes) => {}
+            }
+        }
+        while !jobs.is_empty() {
+            jobs.one_ends().await;
+        }
+    }
+
+    /// Returns once another job may be claimed.
+    async fn is_ready(&self, turns: &Turns, in_progress: usize) {
+        if in_progress >= self.settings.in_progress.max(self.settings.workers) {
+            // Until one ends.
+            return std::future::pending().await;
+        }
+        loop {
+            turns.any().await;
+            self.refiner.room().await;
+            if turns.has_any() {
+                return;
             }
         }
     }
 
-    /// Claims one job and makes one attempt at it; `false` if no job is waiting.
-    pub async fn step(&self, shutdown: &CancellationToken) -> Result<bool, StoreError> {
-        let until = from_now(self.settings.lease);
-        let Some(record) = self.jobs.claim(Timestamp::now(), until).await? else {
-            return Ok(false);
-        };
+    async fn claim(&self) -> Result<Option<JobRecord>, StoreError> {
+        self.jobs.claim(Timestamp::now(), from_now(self.settings.lease)).await
+    }
+
+    /// Makes one attempt at a claimed job, and records its outcome.
+    async fn work_on(
+        &self,
+        record: JobRecord,
+        turn: Turn,
+        shutdown: &CancellationToken,
+    ) -> Result<(), StoreError> {
         let (job, claim, began) = (record.job.clone(), record.claim(), Instant::now());
+        let _counted = self.metrics.job_begins();
         let traceparent = record.traceparent.as_deref();
         let span = traces::job(job.id, job.refiner.as_str(), job.attempts, traceparent);
-        match self.attempt(&record, shutdown).instrument(span).await {
+        match self.attempt(&record, &turn, shutdown).instrument(span).await {
             AttemptOutcome::Refined(refinement) => {
                 self.record_time(began.elapsed());
                 let estimate = self.estimate(&record, &refinement).await;
-                self.finish(claim, succeeded(job, *refinement, estimate)).await?;
+                self.finish(claim, succeeded(job, *refinement, estimate)).await
             }
-            AttemptOutcome::Failed(error) => self.after_failure(claim, job, error).await?,
-            AttemptOutcome::ClaimLost => {}
+            AttemptOutcome::Failed(error) => self.after_failure(claim, job, error).await,
+            AttemptOutcome::ClaimLost => Ok(()),
             AttemptOutcome::ShuttingDown => {
                 let why = "the server was stopped".to_owned();
                 let release = Release { why, not_before: None, counts: false };
-                self.release(claim, release).await?;
+                self.release(claim, release).await
             }
         }
-        Ok(true)
     }
 
     /// Puts a job back into the queue if it is to be attempted again, and ends it otherwise.
@@ -122,12 +168,17 @@ impl Worker {
         self.finish(claim, failed(job, error)).await
     }
 
-    async fn attempt(&self, record: &JobRecord, shutdown: &CancellationToken) -> AttemptOutcome {
+    async fn attempt(
+        &self,
+        record: &JobRecord,
+        turn: &Turn,
+        shutdown: &CancellationToken,
+    ) -> AttemptOutcome {
         let timeout = self.settings.timeout;
         tokio::select! {
             () = shutdown.cancelled() => AttemptOutcome::ShuttingDown,
             () = self.claim_lost(record.claim()) => AttemptOutcome::ClaimLost,
-            refined = tokio::time::timeout(timeout, self.refine(record)) => match refined {
+            refined = tokio::time::timeout(timeout, self.refine(record, turn)) => match refined {
                 Ok(Ok(refinement)) => AttemptOutcome::Refined(Box::new(refinement)),
                 Ok(Err(error)) => AttemptOutcome::Failed(error),
                 Err(_) => AttemptOutcome::Failed(RefineError::Transient(format!(
@@ -138,9 +189,12 @@ impl Worker {
         }
     }
 
-    async fn refine(&self, record: &JobRecord) -> Result<Refinement, RefineError> {
-        let input = RefineInput::of_job(record, self.maps.as_ref()).await?;
-        let progress = JobProgress { jobs: self.jobs.as_ref(), claim: record.claim() };
+    async fn refine(&self, record: &JobRecord, turn: &Turn) -> Result<Refinement, RefineError> {
+        let input = RefineInput {
+            attempts_left: self.settings.attempts.saturating_sub(record.job.attempts),
+            ..RefineInput::of_job(record, self.maps.as_ref()).await?
+        };
+        let progress = JobProgress { jobs: self.jobs.as_ref(), claim: record.claim(), turn };
         self.refiner.refine(&input, &progress).await
     }
 
@@ -182,7 +236,7 @@ impl Worker {
     }
 
     fn record_time(&self, took: Duration) {
-        self.service_time.lock().record(took, self.settings.workers);
+        self.service_time.lock().record(took, self.metrics.jobs_in_progress());
     }
 
     async fn finish(&self, claim: Claim, job: Job) -> Result<(), StoreError> {
@@ -208,6 +262,7 @@ impl Worker {
 struct JobProgress<'a> {
     jobs: &'a dyn JobStore,
     claim: Claim,
+    turn: &'a Turn,
 }
 
 #[async_trait]
@@ -217,6 +272,10 @@ impl Progress for JobProgress<'_> {
             // The outcome of the refinement contains the step again.
             tracing::error!(job = %self.claim.job, %error, "a step of a job could not be recorded");
         }
+    }
+
+    fn waiting(&self, waits: bool) {
+        self.turn.lend(waits);
     }
 }
 
@@ -250,3 +309,6 @@ fn failed(job: Job, error: &RefineError) -> Job {
         ..job
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -56,6 +56,8 @@ pub(super) struct Gauges {
     mllm_suspended: Gauge,
     mllm_tokens_today: Gauge,
     mllm_money_today: Gauge<f64, AtomicU64>,
+    mllm_calls_in_flight: Gauge,
+    mllm_calls_limit: Gauge,
     map_images: Family<MapLabels, Gauge>,
     index_bytes: Family<MapLabels, Gauge>,
     dense_cache_bytes: Gauge<f64, AtomicU64>,
@@ -114,6 +116,18 @@ impl Gauges {
                 registry,
                 "mllm_money_today",
                 "Money spent since midnight UTC, calls in progress included",
+                Gauge::default(),
+            ),
+            mllm_calls_in_flight: register(
+                registry,
+                "mllm_calls_in_flight",
+                "Calls to the MLLM that are sent and not answered",
+                Gauge::default(),
+            ),
+            mllm_calls_limit: register(
+                registry,
+                "mllm_calls_limit",
+                "Calls to the MLLM that are made at once at most, which follows what the server bears",
                 Gauge::default(),
             ),
             map_images: register(registry, "map_images", "Images in a map", Family::default()),
@@ -180,6 +194,8 @@ impl Gauges {
             self.mllm_suspended.set(mllm.suspended.into());
             self.mllm_tokens_today.set(mllm.spent_today.tokens as i64);
             self.mllm_money_today.set(mllm.spent_today.money);
+            self.mllm_calls_in_flight.set(mllm.calls_in_flight as i64);
+            self.mllm_calls_limit.set(mllm.calls_at_once as i64);
             self.description_cache_entries.set(mllm.cache.entries as i64);
             self.description_cache_bytes.set(mllm.cache.bytes as i64);
         }

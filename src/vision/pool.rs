@@ -24,6 +24,7 @@ pub struct CpuPool(Arc<Handle>);
 struct Handle(Arc<Queue>);
 
 struct Queue {
+    threads: usize,
     /// Maximum number of waiting jobs.
     capacity: usize,
     state: Mutex<State>,
@@ -60,22 +61,29 @@ pub enum PoolError {
 impl CpuPool {
     /// Starts `threads` threads named `name` with a queue of at most `queue` jobs.
     pub fn new(name: &str, threads: usize, queue: usize) -> std::io::Result<Self> {
-        let pool = Self::without_threads(queue);
-        for index in 0..threads.max(1) {
+        let threads = threads.max(1);
+        let pool = Self::without_threads(threads, queue);
+        for index in 0..threads {
             let queue = Arc::clone(&pool.0.0);
             thread::Builder::new().name(format!("{name}-{index}")).spawn(move || queue.work())?;
         }
         Ok(pool)
     }
 
-    fn without_threads(capacity: usize) -> Self {
+    fn without_threads(threads: usize, capacity: usize) -> Self {
         let queue = Queue {
+            threads,
             capacity,
             state: Mutex::default(),
             work_available: Condvar::new(),
             idle: Condvar::new(),
         };
         Self(Arc::new(Handle(Arc::new(queue))))
+    }
+
+    /// Returns the number of its threads.
+    pub fn threads(&self) -> usize {
+        self.0.0.threads
     }
 
     /// Runs `job` on a pool thread and waits for its result.

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::mock_mllm::{DescribeCall, MockMllm, Purpose, Reply, Script, ranking};
-use super::support::{Server, frame};
+use super::support::{Server, frame, value_of};
 use super::wait::{eventually_within, until};
 
 pub fn start(dir: &TempDir, mock: &MockMllm, more: &[(&str, &str)]) -> Server {
@@ -207,7 +207,7 @@ async fn spend_is_reported_by_day_and_map_and_survives_kill_9() {
 #[tokio::test]
 async fn jobs_of_higher_priority_run_first() {
     let dir = TempDir::new().unwrap();
-    // The first job is rate limited and occupies the only worker while the others queue up.
+    // The first job is rate limited and keeps the others from being claimed while they queue up.
     let mock = MockMllm::start(Script {
         describe: Box::new(|call| match call.number {
             1..=2 => Reply::Busy("4".into()),
@@ -216,7 +216,7 @@ async fn jobs_of_higher_priority_run_first() {
         ..Script::default()
     })
     .await;
-    let server = start(&dir, &mock, &[]);
+    let server = start(&dir, &mock, &[("WHEREABOUTS_JOBS__IN_PROGRESS", "1")]);
     server.town("m", 2).await;
     let mut jobs = Vec::new();
     for (variant, priority) in ["normal", "low", "normal", "high"].into_iter().enumerate() {
@@ -495,18 +495,62 @@ async fn mllm_check_says_what_a_server_can_do_and_what_to_do_if_it_cannot_be_use
     assert!(out.contains("two pictures: accepted") && out.contains("bounded_schema"), "{out}");
     assert_eq!((mock.describe_calls(), mock.reason_calls()), (0, 0));
 
-    let one_picture = |call: &super::mock_mllm::RawCall<'_>| {
-        let pictures = call.body.to_string().matches("image_url\":{").count();
-        let body = json!({"message": "At most 1 image(s) may be provided in one request."});
-        (pictures > 1).then(|| Reply::Raw { status: 400, headers: vec![], body: body.to_string() })
-    };
-    let mock =
-        MockMllm::start(Script { intercept: Box::new(one_picture), ..Script::default() }).await;
-    let (code, out, err) = check(mock.url()).await;
-    assert_eq!(code, Some(1), "{out}{err}");
-    assert!(err.contains("limit-mm-per-prompt") && err.contains("At most 1 image"), "{err}");
+    for (most, wanted, told) in
+        [(1, 0, "limit-mm-per-prompt"), (0, 1, "the model takes no pictures")]
+    {
+        let so_many = move |call: &super::mock_mllm::RawCall<'_>| {
+            let pictures = call.body.to_string().matches("image_url\":{").count();
+            let message = format!("At most {most} image(s) may be provided in one request.");
+            let body = json!({ "message": message }).to_string();
+            (pictures > most).then(|| Reply::Raw { status: 400, headers: vec![], body })
+        };
+        let script = Script { intercept: Box::new(so_many), ..Script::default() };
+        let mock = MockMllm::start(script).await;
+        let (code, out, err) = check(mock.url()).await;
+        assert_eq!(code, Some(wanted), "{out}{err}");
+        let said = out + &err;
+        assert!(said.contains(told) && said.contains(&format!("At most {most} image")), "{said}");
+    }
 
     let (code, _, err) = check("localhost:8000/v1".into()).await;
     assert_eq!(code, Some(1), "{err}");
     assert!(err.contains("mllm.base_url") && err.contains("http://host:port/v1"), "{err}");
+}
+
+#[tokio::test]
+async fn a_pair_that_hangs_delays_its_own_job_only_and_kill_9_buys_nothing_twice() {
+    const JOBS: usize = 6;
+    let dir = TempDir::new().unwrap();
+    let mock = MockMllm::start(Script {
+        describe: Box::new(|call| match call.number {
+            2 => Reply::Hang,
+            number => Reply::Text(format!("notes on {number}")),
+        }),
+        ..Script::default()
+    })
+    .await;
+    let server = start(&dir, &mock, &[]);
+    server.town("m", 5).await;
+    let mut jobs = Vec::new();
+    for number in 0..JOBS {
+        let answer = server.post_jpeg("/localize?map=m", frame(number, 0)).await.expect(200);
+        jobs.push(answer["job"]["href"].as_str().unwrap().to_owned());
+    }
+    for href in &jobs[1..] {
+        let job = server.get(&format!("{href}?wait=30")).await.expect(200);
+        assert_eq!(job["state"], "succeeded", "{job}");
+    }
+    let job = server.get(&jobs[0]).await.expect(200);
+    assert_eq!(job["state"], "running", "{job}");
+    let metrics = server.metrics().await;
+    for name in ["whereabouts_jobs_in_progress", "whereabouts_mllm_calls_in_flight"] {
+        assert_eq!(value_of(&metrics, name), Some(1.0), "{name}");
+    }
+    server.kill();
+
+    let server = start(&dir, &mock, &[]);
+    let job = server.get(&format!("{}?wait=30", jobs[0])).await.expect(200);
+    assert_eq!(job["state"], "succeeded", "{job}");
+    assert_eq!(mock.asked_again(), 0);
+    assert_eq!(mock.describe_calls(), 5 * JOBS + 1);
 }

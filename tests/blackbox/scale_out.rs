@@ -7,7 +7,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::mock_mllm::{MockMllm, Script};
+use crate::mock_mllm::{MockMllm, Reply, Script};
 use crate::support::{Server, frame};
 use crate::wait::eventually_within;
 
@@ -67,6 +67,40 @@ async fn two_workers_that_need_the_same_pair_pay_for_it_once() {
         assert_eq!(job["state"], "succeeded", "{job}");
     }
     assert_eq!((mock.describe_calls(), mock.asked_again()), (10, 0));
+}
+
+#[tokio::test]
+#[ignore = "needs the scale-out deployment"]
+async fn a_worker_claims_no_more_jobs_than_keep_its_calls_busy() {
+    const JOBS: usize = 10;
+    const PAIRS: usize = 5;
+    // Enough to keep all calls busy, and one for each of the two turns.
+    const MOST: usize = CONCURRENCY / PAIRS + 2;
+    let dir = TempDir::new().unwrap();
+    let script = Script { describe: Box::new(|_| Reply::Hang), ..Script::default() };
+    let mock = MockMllm::start(script).await;
+    let settings = settings(&mock);
+    let server = serve(&dir, &settings);
+    server.town("m", PAIRS).await;
+    for place in 0..JOBS {
+        server.post_jpeg("/localize?map=m", frame(place, 0)).await.expect(200);
+    }
+    let mut workers = Vec::new();
+    for number in 1..=2 {
+        workers.push(worker(&dir, &settings));
+        let running = eventually_within(Duration::from_secs(20), async || {
+            let running = server.get("/jobs?state=running").await.expect(200);
+            let running = running["jobs"].as_array().unwrap().len();
+            let busy = mock.in_flight() == number * CONCURRENCY;
+            if busy {
+                Ok(running)
+            } else {
+                Err(format!("{running} jobs, {} calls", mock.in_flight()))
+            }
+        })
+        .await;
+        assert!((2 * number..=MOST * number).contains(&running), "{running}");
+    }
 }
 
 #[tokio::test]
@@ -147,7 +181,7 @@ mod alone {
 
     use super::{CONCURRENCY, serve, settings, worker};
     use crate::deployment;
-    use crate::mock_mllm::{MockMllm, Script};
+    use crate::mock_mllm::{MockMllm, Reply, Script};
     use crate::support::{Server, frame};
     use crate::wait::eventually_within;
 

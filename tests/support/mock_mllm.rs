@@ -5,7 +5,7 @@ mod checks;
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::body::{Body, Bytes};
@@ -110,6 +110,19 @@ pub struct RawCall<'a> {
     pub body: &'a Value,
 }
 
+/// A describe or reason call that has arrived, and the load that it meets.
+pub struct Load {
+    pub purpose: Purpose,
+    /// 1 for the first call that describes or ranks.
+    pub number: usize,
+    /// Calls in progress, this one included.
+    pub in_flight: usize,
+    /// Since the start of the mock.
+    pub at: Duration,
+}
+
+type TurnAway = Box<dyn Fn(&Load) -> Option<Reply> + Send + Sync>;
+type Delay = Box<dyn Fn(&Load) -> Duration + Send + Sync>;
 type Facts = Box<dyn Fn(&str) -> Option<Value> + Send + Sync>;
 type Intercept = Box<dyn Fn(&RawCall<'_>) -> Option<Reply> + Send + Sync>;
 type Describe = Box<dyn Fn(&DescribeCall) -> Reply + Send + Sync>;
@@ -133,6 +146,10 @@ pub struct Script {
     pub max_edge: u32,
     /// How long each call takes.
     pub latency: Duration,
+    /// Answers a call at once, because of the load.
+    pub turn_away: TurnAway,
+    /// How much longer a call takes because of the load.
+    pub delay: Delay,
     /// Describe calls are held until this many are in flight.
     pub together: Option<usize>,
 }
@@ -152,6 +169,8 @@ impl Default for Script {
             key: None,
             max_edge: 768,
             latency: Duration::ZERO,
+            turn_away: Box::new(|_| None),
+            delay: Box::new(|_| Duration::ZERO),
             together: None,
         }
     }
@@ -167,6 +186,7 @@ struct Seen {
     arrived: [usize; 3],
     in_flight: usize,
     max_in_flight: usize,
+    turned_away: usize,
     /// How often each pair was requested, and how often answered.
     pairs: HashMap<Pair, (usize, usize)>,
     asked_again: usize,
@@ -180,6 +200,7 @@ struct Seen {
 struct Shared {
     script: Script,
     together: Option<Barrier>,
+    began: Instant,
     seen: Mutex<Seen>,
 }
 
@@ -199,7 +220,8 @@ impl Drop for MockMllm {
 impl MockMllm {
     pub async fn start(script: Script) -> Self {
         let together = script.together.map(Barrier::new);
-        let shared = Arc::new(Shared { script, together, seen: Mutex::default() });
+        let shared =
+            Arc::new(Shared { script, together, began: Instant::now(), seen: Mutex::default() });
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let url = format!("http://{}/v1", listener.local_addr().unwrap());
         let router = Router::new().fallback(answer).with_state(Arc::clone(&shared));
@@ -236,6 +258,11 @@ impl MockMllm {
 
     pub fn max_in_flight(&self) -> usize {
         self.seen(|seen| seen.max_in_flight)
+    }
+
+    /// Calls that were turned away because of the load.
+    pub fn turned_away(&self) -> usize {
+        self.seen(|seen| seen.turned_away)
     }
 
     /// How often each pair was requested, and how often answered.
@@ -283,6 +310,12 @@ impl<'a> InFlight<'a> {
         counts.max_in_flight = counts.max_in_flight.max(counts.in_flight);
         Self(seen)
     }
+
+    fn load(&self, purpose: Purpose, began: Instant) -> Load {
+        let seen = self.0.lock().unwrap();
+        let [describe, reason, _] = seen.arrived;
+        Load { purpose, number: describe + reason, in_flight: seen.in_flight, at: began.elapsed() }
+    }
 }
 
 impl Drop for InFlight<'_> {
@@ -305,8 +338,9 @@ async fn answer(
             None => StatusCode::NOT_FOUND.into_response(),
         };
     }
+    let mut purpose = Purpose::Describe;
     if let Ok(request) = serde_json::from_slice::<Value>(&body) {
-        let purpose = purpose_of(&request);
+        purpose = purpose_of(&request);
         let number = {
             let mut seen = shared.seen.lock().unwrap();
             seen.arrived[purpose as usize] += 1;
@@ -320,7 +354,12 @@ async fn answer(
             return shared.checked(&request);
         }
     }
-    let _in_flight = InFlight::new(&shared.seen);
+    let in_flight = InFlight::new(&shared.seen);
+    let load = in_flight.load(purpose, shared.began);
+    if let Some(reply) = (script.turn_away)(&load) {
+        shared.seen.lock().unwrap().turned_away += 1;
+        return render(reply, Some(100)).await;
+    }
     let parsed = check_envelope(&uri, &headers, script)
         .and_then(|()| serde_json::from_slice(&body).map_err(|error| error.to_string()))
         .and_then(|request: Value| check_request(&request, script.max_edge))
@@ -339,9 +378,10 @@ async fn answer(
     if let (Some(barrier), 2) = (&shared.together, parsed.pictures.len()) {
         barrier.wait().await;
     }
-    if !script.latency.is_zero() {
+    let latency = script.latency + (script.delay)(&load);
+    if !latency.is_zero() {
         // A slow model is part of the script.
-        tokio::time::sleep(script.latency).await;
+        tokio::time::sleep(latency).await;
     }
     {
         let mut seen = shared.seen.lock().unwrap();

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt, stream};
+use tokio::sync::Semaphore;
 use whereabouts_core::{
     Candidate, DenseFeatures, Description, DescriptorKind, Digest, Evidence, ImageId, Map,
     PairRegion, Ranking, RefinerKind, Usage,
@@ -31,6 +32,9 @@ pub struct LocalRefiner {
     dense: Arc<DenseCache>,
     /// The threads that extract and match.
     pool: CpuPool,
+    /// One permit for each of these threads, so that jobs wait here, where they hold no pictures, and do not fill the
+    /// pool's queue.
+    turns: Semaphore,
     matcher: LocalMatcher,
 }
 
@@ -41,6 +45,7 @@ pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, 
         blobs: context.store.clone(),
         models: context.models.clone(),
         dense: Arc::clone(&context.dense),
+        turns: Semaphore::new(context.pool.threads()),
         pool: context.pool.clone(),
         matcher: LocalMatcher::new(LocalSettings::default()),
     }))
@@ -68,6 +73,8 @@ impl Refiner for LocalRefiner {
         input: &RefineInput,
         _: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
+        // Cannot fail, because the semaphore is never closed.
+        let _turn = self.turns.acquire().await;
         let comparison = self.compare_input(input).await?;
         conclude(&input.candidates, &comparison)
     }

@@ -26,8 +26,8 @@ pub struct Capabilities {
     pub system: bool,
     /// The length of its context, in tokens.
     pub context: Option<u64>,
-    /// How many calls at once it works on.
-    pub at_once: Option<usize>,
+    /// How many calls at once it says that it works on.
+    pub slots: Option<usize>,
     /// When that was last found out.
     pub checked_at: Option<Timestamp>,
 }
@@ -76,7 +76,7 @@ impl Capabilities {
             answer_tokens: None,
             system: true,
             context: None,
-            at_once: None,
+            slots: None,
             checked_at: None,
         }
     }

@@ -221,7 +221,7 @@ impl<'a> Check<'a> {
         }
         self.client.revise(|known| {
             known.context = facts.context.or(known.context);
-            known.at_once = facts.slots.or(known.at_once);
+            known.slots = facts.slots.or(known.slots);
             known.checked_at = Some(Timestamp::now());
         });
     }
@@ -230,6 +230,7 @@ impl<'a> Check<'a> {
         const WHAT: &str = "two pictures";
         let failure = match self.ask(picture_call(self.client, model, 2)).await {
             Ok(answer) => {
+                self.client.proven();
                 self.client.revise(|known| known.two_pictures = Some(true));
                 let said: String = answer.text.chars().take(120).collect();
                 match refuses(&said) {
@@ -249,24 +250,27 @@ impl<'a> Check<'a> {
             }
             Err(failure) => failure,
         };
-        let one = self.accepts_plainly(&picture_call(self.client, model, 1)).await;
-        let none = one || self.accepts_plainly(&picture_call(self.client, model, 0)).await;
-        let detail = match (one, none) {
-            (true, _) => format!(
-                "the server takes one picture in a request, and describing needs two. Start it so that it \
-                 takes two (vLLM: --limit-mm-per-prompt '{{\"image\": 2}}') or use another model. It said: {}",
+        if self.accepts_plainly(&picture_call(self.client, model, 1)).await {
+            self.client.proven();
+            self.client.revise(|known| known.two_pictures = Some(false));
+            let detail = format!(
+                "the server takes one picture in a request, so both are sent side by side in one, which may be \
+                 scaled down. If it can be started so that it takes two, do (vLLM: --limit-mm-per-prompt \
+                 '{{\"image\": 2}}'). It said: {}",
                 failure.why
-            ),
-            (false, true) => format!(
+            );
+            self.found(WHAT, true, detail);
+            return Ok(());
+        }
+        let none = self.accepts_plainly(&picture_call(self.client, model, 0)).await;
+        let detail = match none {
+            true => format!(
                 "the model takes no pictures: use a multimodal one (mllm.describe_model). It said: {}",
                 failure.why
             ),
-            (false, false) => failure.why.clone(),
+            false => failure.why.clone(),
         };
         self.client.note(&Failure { why: detail.clone(), ..failure.clone() });
-        if none {
-            self.client.revise(|known| known.two_pictures = Some(false));
-        }
         self.found(WHAT, false, detail);
         self.client.suspend().await;
         Err(Ended)
@@ -329,6 +333,7 @@ impl<'a> Check<'a> {
         match self.ask(call).await {
             Err(failure) => self.ended("a ranking", &failure).await,
             Ok(answer) => {
+                self.client.proven();
                 let format = self.client.capabilities().format.as_str();
                 let (ok, detail) = match labels.parse(&answer.text, false) {
                     Ok(_) => (true, format!("readable; asked for with the format {format}")),
@@ -348,7 +353,7 @@ impl<'a> Check<'a> {
     /// Finds out whether the server works on calls side by side, where it does not tell.
     async fn side_by_side(&mut self) {
         let calls = AT_ONCE.min(self.client.report().capabilities.calls_at_once);
-        if calls < 2 || self.client.capabilities().at_once.is_some() {
+        if calls < 2 || self.client.capabilities().slots.is_some() {
             return;
         }
         let model = self.reasons.or(self.describes).unwrap_or_default();
@@ -373,7 +378,8 @@ impl<'a> Check<'a> {
             alone >= Duration::from_millis(200) && took >= alone.mul_f64(calls as f64 * 0.8);
         if turned_away || one_by_one {
             let at_once = if one_by_one { 1 } else { answered.max(1) };
-            self.client.revise(|known| known.at_once = Some(at_once));
+            // The server may bear more when it is less busy, so this is where the limit starts.
+            self.client.gate().adjust(|limit| limit.start_from(at_once));
             self.found("calls at once", true, format!("the server works on {at_once} at a time"));
         } else {
             self.found("calls at once", true, format!("{calls} were answered side by side"));

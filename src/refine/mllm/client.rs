@@ -1,30 +1,28 @@
 //! The client of one MLLM server, with its timeouts, retries and rate limits.
 
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use jiff::Timestamp;
 use parking_lot::Mutex;
 use reqwest::header::HeaderMap;
 use reqwest::{Url, redirect};
-use tokio::sync::{Semaphore, watch};
-use tracing::Instrument;
+use tokio::sync::watch;
 
 use super::breaker::Breaker;
 use super::capability::Capabilities;
 use super::endpoint;
 use super::failure::Failure;
+use super::gate::{CallGate, CallPlace, Permit};
+use super::limit::CallPurpose;
 use super::rate::RateLimiter;
 use super::response::Flaw;
-use super::retry::{AttemptError, CallError, CallRetryPolicy};
+use super::retry::{CallError, CallRetryPolicy};
 use super::settings::{MllmSettings, MllmSettingsError, ServerSettings};
 use super::wire::Message;
 use whereabouts_core::{ModelServer, ModelTrouble, Secret};
 use whereabouts_store::TokenBuckets;
-use whereabouts_telemetry::traces;
-
-/// How long calls wait for the first one of all, whose failure may tell that the others are in vain.
-const SCOUT_WAIT: Duration = Duration::from_millis(500);
 
 /// How long calls wait for the check of the server.
 const CHECK_WAIT: Duration = Duration::from_secs(10);
@@ -78,17 +76,19 @@ pub struct MllmClient {
     pub(super) answer_max_bytes: usize,
     models: Vec<String>,
     capabilities: Mutex<Capabilities>,
-    retry: CallRetryPolicy,
-    breaker: Breaker,
-    rate: RateLimiter,
-    trouble: Mutex<Option<ModelTrouble>>,
-    /// One permit for each concurrent call.
-    permits: Semaphore,
-    at_once: AtomicUsize,
+    pub(super) retry: CallRetryPolicy,
+    pub(super) breaker: Breaker,
+    pub(super) rate: RateLimiter,
+    pub(super) trouble: Mutex<Option<ModelTrouble>>,
+    /// Why no answer of the last job could be used, by what the calls were for. Answers arrive, so this is no failure of
+    /// calls.
+    useless: Mutex<[Option<ModelTrouble>; 2]>,
+    /// Lets as many calls pass at once as the server bears.
+    pub(super) gate: Arc<CallGate>,
     /// Whether the server has answered a call since it last refused all.
     pub(super) is_proven: AtomicBool,
     /// Held by the call that finds out whether the server answers.
-    scout: tokio::sync::Mutex<()>,
+    pub(super) scout: tokio::sync::Mutex<()>,
     /// Whether a failing server was tried without a format of the answer.
     pub(super) tried_plain: AtomicBool,
     /// Whether so much was left out of a request that the server is to be checked again; once is enough.
@@ -115,7 +115,7 @@ impl MllmClient {
             .connect_timeout(settings.timeout().min(Duration::from_secs(10)))
             .build()
             .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
-        let at_once = settings.concurrency.max(1);
+        let backoff = Duration::from_millis(settings.backoff_ms);
         Ok(Self {
             http,
             url: endpoint::url(server)?,
@@ -132,7 +132,7 @@ impl MllmClient {
             )),
             retry: CallRetryPolicy {
                 attempts: settings.attempts,
-                backoff: Duration::from_millis(settings.backoff_ms),
+                backoff,
                 longest_retry_after: Duration::from_secs(settings.retry_after_max_s),
             },
             breaker: Breaker::new(
@@ -145,8 +145,8 @@ impl MllmClient {
                 buckets,
             ),
             trouble: Mutex::default(),
-            permits: Semaphore::new(at_once),
-            at_once: AtomicUsize::new(at_once),
+            useless: Mutex::default(),
+            gate: CallGate::new(settings.concurrency, backoff),
             is_proven: AtomicBool::new(false),
             scout: tokio::sync::Mutex::default(),
             tried_plain: AtomicBool::new(false),
@@ -156,13 +156,24 @@ impl MllmClient {
         })
     }
 
-    /// Makes a call, with retries as the settings allow. Dropping the future cancels it.
-    pub async fn call(&self, call: &Call<'_>) -> Result<Answer, CallError> {
+    /// Waits for the check of the server, if there is one.
+    pub(super) async fn ready(&self) {
         let mut checking = self.checking.subscribe();
         // What a slow server can do is found out by the first calls as well.
         let checked = checking.wait_for(|checking| !checking);
         let _ = tokio::time::timeout(CHECK_WAIT, checked).await;
-        self.retry.run(|| self.attempt(call)).await
+    }
+
+    /// Makes a call that has its permit, with retries as the settings allow, which wait at that place for theirs.
+    /// Dropping the future cancels it.
+    pub(super) async fn call(
+        &self,
+        call: &Call<'_>,
+        place: CallPlace,
+        permit: Permit,
+    ) -> Result<Answer, CallError> {
+        let mut first = Some(permit);
+        self.retry.run(|| self.attempt(call, place, first.take())).await
     }
 
     /// Returns the longest answer that calls ask for, in tokens.
@@ -177,29 +188,19 @@ impl MllmClient {
 
     /// Records what the server can do.
     pub(super) fn revise(&self, change: impl FnOnce(&mut Capabilities)) {
-        let at_once = {
+        let slots = {
             let mut capabilities = self.capabilities.lock();
             change(&mut capabilities);
-            capabilities.at_once
+            capabilities.slots
         };
-        self.allow(at_once);
-    }
-
-    /// Makes fewer calls at once, if the server works on fewer.
-    fn allow(&self, at_once: Option<usize>) {
-        let now = self.at_once();
-        if let Some(fewer) = at_once.map(|at_once| at_once.max(1)).filter(|fewer| *fewer < now) {
-            let excess = now - fewer;
-            let swapped =
-                self.at_once.compare_exchange(now, fewer, Ordering::AcqRel, Ordering::Relaxed);
-            if swapped.is_ok() && self.permits.forget_permits(excess) < excess {
-                tracing::debug!("calls in progress keep their permits");
-            }
+        if let Some(slots) = slots {
+            self.gate.adjust(|limit| limit.bound_by(slots));
         }
     }
 
-    fn at_once(&self) -> usize {
-        self.at_once.load(Ordering::Acquire)
+    /// Returns the gate that calls pass.
+    pub(super) fn gate(&self) -> &Arc<CallGate> {
+        &self.gate
     }
 
     /// Whether to check the server again, to find out what of all that was left out it does not support.
@@ -253,70 +254,41 @@ impl MllmClient {
             models: self.models.clone(),
             suspended: wait.is_some(),
             suspended_for_s: wait.map(|wait| wait.as_secs_f64()),
-            trouble: self.trouble.lock().clone(),
-            capabilities: self.capabilities().report(self.at_once()),
+            trouble: self.trouble(),
+            capabilities: self.capabilities().report(self.gate.levels().limit),
         }
     }
 
-    async fn attempt(&self, call: &Call<'_>) -> Result<Answer, AttemptError> {
-        // Cannot fail, because the semaphore is never closed.
-        let _permit = self.permits.acquire().await;
-        let _scout = self.scouting().await;
-        let admission = self
-            .breaker
-            .admit()
-            .await
-            .map_err(|open| AttemptError::Open { wait: open.wait, cause: self.last_trouble() })?;
-        let most = call.prompt_tokens + u64::from(call.max_tokens);
-        self.rate.take(most).await;
-        let purpose = if call.labels.is_some() { "reason" } else { "describe" };
-        let span = traces::model_call(call.model, purpose);
-        let outcome = self.exchange(call).instrument(span.clone()).await;
-        let tokens = outcome.as_ref().map(|a| (a.prompt_tokens, a.completion_tokens));
-        traces::model_answered(&span, tokens.map_err(|failure| failure.why.clone()));
-        match outcome {
-            Ok(answer) => {
-                admission.succeeded();
-                self.is_proven.store(true, Ordering::Relaxed);
-                *self.trouble.lock() = None;
-                self.rate.settle(most, answer.prompt_tokens + answer.completion_tokens).await;
-                Ok(answer)
-            }
-            Err(failure) => {
-                let stopped = match failure.kind {
-                    kind if kind.stops_all() => {
-                        self.is_proven.store(false, Ordering::Relaxed);
-                        Some(admission.refused())
-                    }
-                    kind if kind.is_the_servers() => {
-                        admission.failed();
-                        None
-                    }
-                    _ => {
-                        admission.succeeded();
-                        None
-                    }
-                };
-                self.note(&failure);
-                Err(AttemptError::Failed(failure, stopped))
-            }
-        }
+    /// Notes that no answer to a job's calls of that purpose could be used, or that one could.
+    pub(super) fn answers_are(&self, purpose: CallPurpose, useless: Option<&str>) {
+        self.useless.lock()[purpose as usize] = useless.map(|why| ModelTrouble {
+            at: Timestamp::now(),
+            kind: "no_answer".to_owned(),
+            status: None,
+            message: why.to_owned(),
+        });
     }
 
-    /// Until the server has answered once, one call goes ahead of the others, for a moment at most.
-    async fn scouting(&self) -> Option<tokio::sync::MutexGuard<'_, ()>> {
-        let is_proven = || self.is_proven.load(Ordering::Relaxed);
-        if is_proven() {
-            return None;
-        }
-        let guard = tokio::time::timeout(SCOUT_WAIT, self.scout.lock()).await.ok();
-        guard.filter(|_| !is_proven())
+    /// Returns the last failure since a call succeeded, or why answers cannot be used.
+    fn trouble(&self) -> Option<ModelTrouble> {
+        let failed = self.trouble.lock().clone();
+        failed.or_else(|| self.useless.lock().iter().flatten().next().cloned())
+    }
+
+    /// Notes that a check got an answer.
+    pub(super) fn proven(&self) {
+        self.is_proven.store(true, Ordering::Relaxed);
     }
 
     /// Keeps a failure for those who ask why.
     pub(super) fn note(&self, failure: &Failure) {
         let Failure { kind, status, why, .. } = failure;
         tracing::warn!(kind = kind.as_str(), status, why, "a call to the MLLM failed");
+        self.remember(failure);
+    }
+
+    pub(super) fn remember(&self, failure: &Failure) {
+        let Failure { kind, status, why, .. } = failure;
         *self.trouble.lock() = Some(ModelTrouble {
             at: Timestamp::now(),
             kind: kind.as_str().to_owned(),
@@ -325,7 +297,7 @@ impl MllmClient {
         });
     }
 
-    fn last_trouble(&self) -> String {
+    pub(super) fn last_trouble(&self) -> String {
         self.trouble.lock().as_ref().map(|trouble| trouble.message.clone()).unwrap_or_default()
     }
 }

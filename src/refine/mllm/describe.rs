@@ -12,6 +12,7 @@ use whereabouts_store::Step;
 
 use super::buy_once::FoundDescription;
 use super::client::{Answer, Call};
+use super::gate::WantedCall;
 use super::judge;
 use super::pictures::{PictureError, SentPicture};
 use super::prompts::{self, PROMPT_VERSION, Prompt, Switches};
@@ -48,6 +49,11 @@ pub(super) struct DescribedPair {
 }
 
 impl DescribedPair {
+    /// Whether this job bought the description.
+    pub fn is_bought(&self) -> bool {
+        !self.cached
+    }
+
     /// Returns the description as jobs report it.
     pub fn description(&self, candidates: &[Candidate]) -> Description {
         Description {
@@ -104,12 +110,19 @@ impl MllmRefiner {
         }
     }
 
-    /// Describes all pairs, `mllm.concurrency` at a time.
+    /// Describes all pairs side by side; the gate to the server says how many at a time.
     pub(super) async fn describe_all(&self, run: &RefineRun<'_>, pairs: &[Pair]) -> DescribedPairs {
         // Collected first: the compiler cannot see through a closure over borrowed pairs here.
-        let calls: Vec<_> = pairs.iter().map(|pair| self.describe(run, pair)).collect();
-        let mut outcomes: Vec<_> =
-            stream::iter(calls).buffer_unordered(self.settings.concurrency).collect().await;
+        let wanted = self.describer.gate().want(pairs.len());
+        run.progress.waiting(true);
+        let calls: Vec<_> = pairs
+            .iter()
+            .zip(wanted)
+            .map(|(pair, wanted)| self.describe(run, pair, wanted))
+            .collect();
+        // One more than can be in progress: an older job then always has the next call ready.
+        let ready = self.settings.concurrency.saturating_add(1);
+        let mut outcomes: Vec<_> = stream::iter(calls).buffer_unordered(ready).collect().await;
         outcomes.sort_by_key(|(index, _)| *index);
         let mut pairs = DescribedPairs::default();
         for (index, outcome) in outcomes {
@@ -149,6 +162,8 @@ impl MllmRefiner {
         &self,
         run: &RefineRun<'_>,
         pair: &Pair,
+        // Until the pair is described or has failed, it keeps a call busy.
+        _wanted: WantedCall,
     ) -> (usize, Result<DescribedPair, CallError>) {
         let scene = run.input.map.scene;
         let stand_in =
@@ -171,12 +186,21 @@ impl MllmRefiner {
         run: &RefineRun<'_>,
         pair: &Pair,
     ) -> Result<(CachedDescription, Duration), CallError> {
-        let frame = || self.pictures.picture(&run.input.frame.digest);
-        let frame = run.frame.get_or_try_init(frame).await?;
-        let candidate = self.pictures.picture(&pair.digest).await?;
+        self.describer.ready().await;
+        let place = run.place().of_pair(pair.index);
+        // Queued before the pictures are ready, so that the pairs keep their order.
+        let turn = self.describer.gate().queue(place);
         let prompt = prompts::describe(run.input.map.scene, self.switches());
-        let mut call = self.question(prompt, frame, &candidate);
-        let first = self.paid_call(run, &self.describer, &call).await;
+        let mut call = if self.describer.capabilities().two_pictures == Some(false) {
+            let both = self.pictures.both(&run.input.frame.digest, &pair.digest).await?;
+            self.question_of_one(prompt, &both)
+        } else {
+            let frame = || self.pictures.picture(&run.input.frame.digest);
+            let frame = run.frame.get_or_try_init(frame).await?;
+            let candidate = self.pictures.of_image(&pair.digest).await?;
+            self.question(prompt, frame, &candidate)
+        };
+        let first = self.paid_call_in_turn(run, &self.describer, &call, turn).await;
         let why = match self.judged(&first) {
             Ok(text) => return self.keep(run, pair, first?, text).await,
             Err(why) => why,
@@ -194,7 +218,8 @@ impl MllmRefiner {
             parts.push(Part::text(&prompts::describe_again(&why, self.switches())));
         }
         call.max_tokens = call.max_tokens.saturating_mul(2);
-        let second = self.paid_call(run, &self.describer, &call).await?;
+        let turn = self.describer.gate().queue(place);
+        let second = self.paid_call_in_turn(run, &self.describer, &call, turn).await?;
         match judge::description(&second, self.switches(), self.settings.description_max_chars) {
             Ok(text) => self.keep(run, pair, second, text).await,
             Err(why) => {
@@ -243,7 +268,6 @@ impl MllmRefiner {
 
     /// Names each picture in the text before it, because models lose count of which is which.
     fn question(&self, prompt: Prompt, frame: &SentPicture, candidate: &SentPicture) -> Call<'_> {
-        let text = estimate(&prompt.system) + estimate(&prompt.user);
         let parts = vec![
             Part::text("FRAME:"),
             Part::picture(&frame.url),
@@ -251,9 +275,27 @@ impl MllmRefiner {
             Part::picture(&candidate.url),
             Part::text(&prompt.user),
         ];
+        self.question_with(prompt, parts, frame.tokens + candidate.tokens)
+    }
+
+    /// Asks about both pictures in one.
+    fn question_of_one(&self, prompt: Prompt, both: &SentPicture) -> Call<'_> {
+        let parts = vec![
+            Part::text(
+                "The two photographs stand side by side in one picture, each with its name above it: the FRAME on \
+                 the left, the CANDIDATE on the right.",
+            ),
+            Part::picture(&both.url),
+            Part::text(&prompt.user),
+        ];
+        self.question_with(prompt, parts, both.tokens)
+    }
+
+    fn question_with(&self, prompt: Prompt, parts: Vec<Part>, picture_tokens: u64) -> Call<'_> {
+        let text = estimate(&prompt.system) + estimate(&prompt.user);
         Call {
             model: &self.settings.describe_model,
-            prompt_tokens: text + frame.tokens + candidate.tokens,
+            prompt_tokens: text + picture_tokens,
             messages: vec![Message::system(prompt.system), Message::parts(parts)],
             shorter: None,
             labels: None,

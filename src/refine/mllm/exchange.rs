@@ -38,7 +38,13 @@ impl MllmClient {
         let request = self.http.post(self.url.clone()).headers(self.headers.clone()).body(body);
         let began = Instant::now();
         let exchange = async {
-            let response = request.send().await.map_err(|error| self.broken(error))?;
+            let response = request.send().await.map_err(|error| {
+                let failure = self.broken(error);
+                // A server whose listen queue is full resets connections, or does not take them.
+                let turned_away =
+                    matches!(failure.kind, FailureKind::Connection | FailureKind::Refused);
+                Failure { turned_away, ..failure }
+            })?;
             if response.status().is_success() {
                 let reply = self.read_answer(response).await?;
                 Ok(answered(reply, sent, began.elapsed()))

@@ -13,6 +13,8 @@ pub struct Failure {
     pub why: String,
     /// When the server wants to be asked again.
     pub retry_after: Option<Duration>,
+    /// Whether the server did not take the call, for which too many calls at once may be the reason.
+    pub turned_away: bool,
 }
 
 /// The kinds of failures.
@@ -97,7 +99,7 @@ impl FailureKind {
 impl Failure {
     /// Creates a failure without a response.
     pub fn new(kind: FailureKind, why: String) -> Self {
-        Self { kind, status: None, why, retry_after: None }
+        Self { kind, status: None, why, retry_after: None, turned_away: kind == FailureKind::Busy }
     }
 
     /// Classifies a response. `body` is searched for codes; `message` is what people read.
@@ -120,9 +122,17 @@ impl Failure {
             FailureKind::TooLarge => " (lower mllm.image_max_edge, or raise the server's limit)",
             _ => "",
         };
+        let words = format!("{body} {message}").to_lowercase();
+        let turned_away = kind == FailureKind::Busy
+            || (kind == FailureKind::Server && is_overloaded(status, &words));
         let message = if message.is_empty() { "no explanation" } else { message };
-        Self { kind, status, why: format!("{answered}: {message}{hint}"), retry_after }
+        Self { kind, status, why: format!("{answered}: {message}{hint}"), retry_after, turned_away }
     }
+}
+
+/// Whether a server that failed says that it has too much to do.
+fn is_overloaded(status: Option<u16>, words: &str) -> bool {
+    matches!(status, Some(503 | 529)) || OVERLOADED.iter().any(|wanted| words.contains(wanted))
 }
 
 fn kind_of(status: Option<u16>, words: &str) -> FailureKind {
@@ -204,6 +214,15 @@ const NO_MODEL: [&str; 8] = [
     "is not available",
 ];
 
+const OVERLOADED: [&str; 6] = [
+    "overloaded",
+    "server busy",
+    "pending requests exceeded",
+    "no slots available",
+    "no slot available",
+    "queue is full",
+];
+
 const BUSY: [&str; 4] = ["rate limit", "rate_limit", "too many requests", "overloaded"];
 
 #[cfg(test)]
@@ -212,6 +231,28 @@ mod tests {
 
     fn kind(status: u16, message: &str) -> FailureKind {
         Failure::of_response(Some(status).filter(|s| *s > 0), message, message, None).kind
+    }
+
+    #[test]
+    fn a_server_that_has_too_much_to_do_turns_calls_away() {
+        let turned_away = |status, message: &str| {
+            Failure::of_response(Some(status), message, message, None).turned_away
+        };
+        for (status, message) in [
+            (429, ""),
+            (503, "Service Unavailable"),
+            (529, "Overloaded"),
+            (500, "server busy, please try again. maximum pending requests exceeded"),
+            (500, "unexpected server status: llm busy - no slots available"),
+            (500, "The engine is currently overloaded, please try again later"),
+        ] {
+            assert!(turned_away(status, message), "{status} {message}");
+        }
+        for (status, message) in
+            [(500, "CUDA out of memory"), (502, "Bad Gateway"), (401, ""), (400, "overloaded word")]
+        {
+            assert!(!turned_away(status, message), "{status} {message}");
+        }
     }
 
     #[test]

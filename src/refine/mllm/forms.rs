@@ -30,6 +30,8 @@ impl MllmClient {
                 Err(failure) => failure,
             };
             let next = match failure.kind {
+                // Not the form is the reason.
+                _ if failure.turned_away => return Err(failure),
                 FailureKind::Request => capabilities.after(&failure.why, sent, false),
                 FailureKind::Server => self.after_fault(&capabilities, &failure, sent),
                 // A server that has answered other calls may refuse the format of an answer in this way.
@@ -91,7 +93,7 @@ impl MllmClient {
             }
             *known = Capabilities {
                 two_pictures: known.two_pictures,
-                at_once: known.at_once,
+                slots: known.slots,
                 checked_at: known.checked_at,
                 ..form
             };

@@ -6,19 +6,21 @@
 //! | `settings` | the section `[mllm]` of the configuration |
 //! | `prompts` | the prompts |
 //! | `run` | the state of one refinement |
-//! | `describe`, `judge`, `pictures` | one description for each pair, and what is none |
+//! | `describe`, `judge`, `pictures`, `kept`, `side_by_side` | one description for each pair, and what is none |
 //! | `buy_once`, `single_flight`, `lease` | a description is bought once: in this process, across processes |
 //! | `rank`, `labels`, `conclude` | the reasoning call, and from its answer to a ranking |
 //! | `answer`, `order`, `loose_json`, `schema` | what the reasoning model is asked to write, and what it writes |
-//! | `client`, `forms`, `exchange`, `endpoint` | calls to a server over HTTP |
+//! | `client`, `attempt`, `forms`, `exchange`, `endpoint` | calls to a server over HTTP |
 //! | `wire`, `response`, `error_body`, `thinking`, `tokens` | the chat-completions format, in all its dialects |
 //! | `capability`, `check`, `check_calls`, `server_facts` | what a server can do, found out by trying |
 //! | `spend`, `budget`, `reservation` | limits on spend: in this process, across processes |
 //! | `failure`, `retry`, `breaker`, `rate` | kinds of failures, retries, circuit breaker, rate limits |
+//! | `gate`, `limit` | which call is next, and how many at once a server bears |
 //!
 //! A model's answer is untrusted input: it can change the order of these candidates, and nothing else.
 
 mod answer;
+mod attempt;
 mod breaker;
 mod budget;
 mod buy_once;
@@ -33,9 +35,12 @@ mod error_body;
 mod exchange;
 mod failure;
 mod forms;
+mod gate;
 mod judge;
+mod kept;
 mod labels;
 mod lease;
+mod limit;
 mod loose_json;
 mod order;
 mod pictures;
@@ -49,6 +54,7 @@ mod run;
 mod schema;
 mod server_facts;
 mod settings;
+mod side_by_side;
 mod single_flight;
 mod spend;
 mod thinking;
@@ -83,7 +89,8 @@ pub use settings::{
 use self::buy_once::BuyOnce;
 use self::client::MllmClient;
 use self::conclude::Order;
-use self::describe::DescribedPair;
+use self::describe::{DescribedPair, DescribedPairs};
+use self::limit::CallPurpose;
 use self::pictures::Pictures;
 use self::retry::CallError;
 use self::run::RefineRun;
@@ -171,8 +178,13 @@ impl MllmRefiner {
             true => client(&settings.reasoning())?,
             false => Arc::clone(&describer),
         };
-        let pictures = Pictures::new(parts.blobs, parts.limits, settings.image_max_edge)
-            .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
+        let pictures = Pictures::new(
+            parts.blobs,
+            parts.limits,
+            settings.image_max_edge,
+            settings.pictures_bytes,
+        )
+        .map_err(|error| MllmSettingsError::Client(error.to_string()))?;
         Ok(Self {
             maps: parts.maps,
             descriptions: BuyOnce::new(Arc::clone(&parts.cache), parts.metrics),
@@ -207,6 +219,7 @@ impl MllmRefiner {
         run: &RefineRun<'_>,
         why: &CallError,
     ) -> Result<Refinement, RefineError> {
+        run.progress.waiting(false);
         let refinement = fallback.refine(run.input, run.progress).await?;
         let degraded = format!("refined by `{}` instead of `mllm`: {why}", fallback.kind());
         Ok(Refinement {
@@ -239,14 +252,29 @@ impl MllmRefiner {
         run: &RefineRun<'_>,
         described: &[DescribedPair],
     ) -> Result<Order, RefineError> {
-        let why = match self.rank(run, described).await {
-            Ok(ranking) => return Ok(Order::Model(ranking)),
-            Err(why @ CallError::NoAnswer(_)) => return Ok(Order::Coarse(why)),
+        let wanted = self.reasoner.gate().want(1);
+        let ranked = self.rank(run, described).await;
+        drop(wanted);
+        let why = match ranked {
+            Ok(ranking) => {
+                self.reasoner.answers_are(CallPurpose::Rank, None);
+                return Ok(Order::Model(ranking));
+            }
+            Err(why @ CallError::NoAnswer(_)) => {
+                self.reasoner.answers_are(CallPurpose::Rank, Some(&why.to_string()));
+                return Ok(Order::Coarse(why));
+            }
             Err(why) => why,
         };
         tracing::warn!(job = %run.input.id, error = %why, "the reasoning call failed");
         self.deferred(&why)?;
+        if run.input.attempts_left > 0 && matches!(why, CallError::Transient(_)) {
+            return Err(RefineError::Transient(format!(
+                "the reasoning call failed ({why}); it is tried again, and the descriptions are kept"
+            )));
+        }
         let Some(fallback) = &self.fallback else { return Ok(Order::Coarse(why)) };
+        run.progress.waiting(false);
         match fallback.refine(run.input, run.progress).await {
             Ok(refinement) => {
                 Ok(Order::Fallback { refinement: Box::new(refinement), by: fallback.kind(), why })
@@ -255,6 +283,17 @@ impl MllmRefiner {
                 tracing::warn!(job = %run.input.id, %error, "the fallback failed, too");
                 Ok(Order::Coarse(why))
             }
+        }
+    }
+
+    /// Notes if the model described no pair although it answered: it refuses, or cannot see.
+    fn judge_describer(&self, pairs: &DescribedPairs) {
+        if pairs.described.iter().any(DescribedPair::is_bought) {
+            self.describer.answers_are(CallPurpose::Describe, None);
+        } else if pairs.described.is_empty()
+            && let Some(CallError::NoAnswer(why)) = conclude::most_serious(&pairs.failed)
+        {
+            self.describer.answers_are(CallPurpose::Describe, Some(&why));
         }
     }
 
@@ -288,6 +327,16 @@ impl Refiner for MllmRefiner {
         Some(self)
     }
 
+    async fn room(&self) {
+        loop {
+            self.reasoner.gate().room().await;
+            self.describer.gate().room().await;
+            if self.reasoner.gate().has_room() {
+                return;
+            }
+        }
+    }
+
     async fn refine(
         &self,
         input: &RefineInput,
@@ -302,6 +351,7 @@ impl Refiner for MllmRefiner {
         let run = RefineRun::new(input, budget, similar, progress);
         let pairs = self.pairs(input).await?;
         let pairs = self.describe_all(&run, &pairs).await;
+        self.judge_describer(&pairs);
         let order = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
             ([], None) => Order::Nothing,
             ([], Some(why)) => return self.without_descriptions(&run, &why).await,
@@ -313,7 +363,13 @@ impl Refiner for MllmRefiner {
 
 impl PaidCalls for MllmRefiner {
     fn levels(&self) -> PaidCallLevels {
+        let mut gates = vec![self.describer.gate().levels()];
+        if self.settings.has_two_servers() {
+            gates.push(self.reasoner.gate().levels());
+        }
         PaidCallLevels {
+            calls_in_flight: gates.iter().map(|gate| gate.sent).sum(),
+            calls_at_once: gates.iter().map(|gate| gate.limit).sum(),
             suspended: self.describer.is_suspended() || self.reasoner.is_suspended(),
             spent_today: self.spend.budget.spent(Timestamp::now()),
             limit: self.spend.daily_limit(),

@@ -8,6 +8,9 @@ use bytes::Bytes;
 use image::RgbImage;
 use tokio::sync::Semaphore;
 
+use super::kept::KeptPictures;
+use super::side_by_side::side_by_side;
+use super::single_flight::SingleFlight;
 use whereabouts_core::Digest;
 use whereabouts_store::{BlobStore, StoreError};
 use whereabouts_vision::decode::{Needed, decode, encode_jpeg};
@@ -52,6 +55,8 @@ pub struct Pictures {
     pool: CpuPool,
     /// One permit for each place in the pool's queue, so that the queue never overflows.
     permits: Arc<Semaphore>,
+    kept: KeptPictures,
+    in_preparation: SingleFlight<SentPicture>,
 }
 
 impl Pictures {
@@ -60,9 +65,32 @@ impl Pictures {
         blobs: Arc<dyn BlobStore>,
         limits: ImageLimits,
         max_edge: u32,
+        kept_bytes: usize,
     ) -> std::io::Result<Self> {
         let pool = CpuPool::new("mllm-pictures", THREADS, THREADS)?;
-        Ok(Self { blobs, limits, max_edge, pool, permits: Arc::new(Semaphore::new(THREADS)) })
+        let (permits, kept) = (Arc::new(Semaphore::new(THREADS)), KeptPictures::new(kept_bytes));
+        Ok(Self {
+            blobs,
+            limits,
+            max_edge,
+            pool,
+            permits,
+            kept,
+            in_preparation: SingleFlight::default(),
+        })
+    }
+
+    /// Prepares the picture of an image in a map, or returns the one that was prepared for another pair.
+    pub async fn of_image(&self, digest: &Digest) -> Result<SentPicture, PictureError> {
+        let prepare = || async {
+            if let Some(kept) = self.kept.get(digest) {
+                return Ok(kept);
+            }
+            let picture = self.picture(digest).await?;
+            self.kept.keep(*digest, picture.clone());
+            Ok(picture)
+        };
+        self.in_preparation.join(*digest, prepare).await
     }
 
     /// Fetches and prepares the picture with that digest.
@@ -79,17 +107,46 @@ impl Pictures {
         };
         self.pool.run(work).await.map_err(|error| undone(&error))?
     }
+
+    /// Fetches the pictures with these digests and prepares one of both, each as large as it would be sent alone.
+    pub async fn both(
+        &self,
+        frame: &Digest,
+        candidate: &Digest,
+    ) -> Result<SentPicture, PictureError> {
+        let undone = |error: &dyn std::error::Error| PictureError::Undone(error.to_string());
+        let frame = self.blobs.blob(frame).await?.ok_or(PictureError::Missing)?;
+        let candidate = self.blobs.blob(candidate).await?.ok_or(PictureError::Missing)?;
+        let permit =
+            Arc::clone(&self.permits).acquire_owned().await.map_err(|error| undone(&error))?;
+        let (limits, max_edge) = (self.limits, self.max_edge);
+        let work = move || {
+            let _permit = permit;
+            let [frame, candidate] =
+                [frame, candidate].map(|bytes| scaled(&bytes, limits, max_edge));
+            encoded(&side_by_side(&frame?, &candidate?))
+        };
+        self.pool.run(work).await.map_err(|error| undone(&error))?
+    }
 }
 
 /// Decodes, scales and encodes; blocks. Even a JPEG that is small enough is encoded again, because its EXIF
 /// data may contain the position, which must not leave the service.
 fn prepare(bytes: &Bytes, limits: ImageLimits, max_edge: u32) -> Result<SentPicture, PictureError> {
+    encoded(&scaled(bytes, limits, max_edge)?)
+}
+
+fn scaled(bytes: &Bytes, limits: ImageLimits, max_edge: u32) -> Result<RgbImage, PictureError> {
     let unfit = |error: &dyn std::error::Error| PictureError::Unfit(error.to_string());
     let needed = Needed::LongestEdge(max_edge);
     let picture = decode(bytes, limits, needed).map_err(|error| unfit(&error))?;
     let pixels = shrink_to(&picture.pixels, max_edge).map_err(|error| unfit(&error))?;
-    let jpeg = encode_jpeg(&pixels).map_err(|error| unfit(&error))?;
-    Ok(SentPicture { url: data_url(&jpeg), tokens: estimate_tokens(&pixels) })
+    Ok(pixels)
+}
+
+fn encoded(pixels: &RgbImage) -> Result<SentPicture, PictureError> {
+    let jpeg = encode_jpeg(pixels).map_err(|error| PictureError::Unfit(error.to_string()))?;
+    Ok(SentPicture { url: data_url(&jpeg), tokens: estimate_tokens(pixels) })
 }
 
 /// Returns the data URL of a JPEG.

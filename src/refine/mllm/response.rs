@@ -57,7 +57,7 @@ const QUOTED: usize = 120;
 /// Reads a body.
 pub fn read(body: &[u8]) -> Result<Reply, Unreadable> {
     let text = String::from_utf8_lossy(body);
-    let start = text.trim_start_matches('\u{feff}');
+    let start = without_keep_alives(text.trim_start_matches('\u{feff}'));
     // The first value counts: some gateways append the end of a stream.
     let value = match serde_json::Deserializer::from_str(start).into_iter::<Value>().next() {
         Some(Ok(value)) => value,
@@ -97,6 +97,16 @@ pub fn read(body: &[u8]) -> Result<Reply, Unreadable> {
         text => text,
     };
     Ok(reply(&value, choice, message, content))
+}
+
+/// Skips what gateways send to keep a connection alive while the model works: blank lines, and comments of event
+/// streams.
+fn without_keep_alives(mut text: &str) -> &str {
+    loop {
+        text = text.trim_start();
+        let Some(comment) = text.strip_prefix(':') else { return text };
+        text = comment.split_once('\n').map_or("", |(_, rest)| rest);
+    }
 }
 
 /// Whether a body is a chat completion. For fuzzing.

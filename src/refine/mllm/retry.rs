@@ -2,7 +2,6 @@
 
 use std::time::Duration;
 
-use backon::{ExponentialBuilder, Retryable};
 use jiff::Timestamp;
 use jiff::fmt::rfc2822::DateTimeParser;
 use uuid::Uuid;
@@ -53,6 +52,9 @@ pub enum CallError {
 pub enum AttemptError {
     /// The attempt failed. If that opened the circuit breaker at once, the time until the next try.
     Failed(Failure, Option<Duration>),
+    /// The server turned the call away while it worked on others of ours. That was one too many, and says nothing
+    /// about this call.
+    Crowded(Failure),
     /// The circuit breaker is open.
     Open {
         /// Time until it lets a call through.
@@ -64,12 +66,16 @@ pub enum AttemptError {
 
 impl AttemptError {
     fn is_transient(&self) -> bool {
-        matches!(self, Self::Failed(failure, None) if failure.kind.is_transient())
+        match self {
+            Self::Failed(failure, None) => failure.kind.is_transient(),
+            Self::Crowded(_) => true,
+            Self::Failed(_, Some(_)) | Self::Open { .. } => false,
+        }
     }
 
     fn retry_after(&self) -> Option<Duration> {
         match self {
-            Self::Failed(failure, _) => failure.retry_after,
+            Self::Failed(failure, _) | Self::Crowded(failure) => failure.retry_after,
             Self::Open { .. } => None,
         }
     }
@@ -90,42 +96,47 @@ pub struct CallRetryPolicy {
 /// The longest pause of exponential backoff.
 const LONGEST_BACKOFF: Duration = Duration::from_secs(20);
 
+/// How often a call may be turned away because of our other calls, besides its attempts, and how often the pause after
+/// that doubles. The limit on calls at once follows what the server bears, so this is rare.
+const MOST_CROWDED: u32 = 64;
+const CROWDED_DOUBLINGS: u32 = 2;
+
 impl CallRetryPolicy {
     /// Calls `attempt` until it succeeds or is not to be retried.
     pub async fn run<T, F>(&self, mut attempt: impl FnMut() -> F) -> Result<T, CallError>
     where
         F: Future<Output = Result<T, AttemptError>>,
     {
-        let mut attempts = 0;
-        let counted = || {
-            attempts += 1;
-            attempt()
-        };
-        let outcome = counted
-            .retry(self.pauses())
-            .when(AttemptError::is_transient)
-            .adjust(|failure, pause| match failure.retry_after() {
-                Some(asked) if asked > self.longest_retry_after => None,
-                asked => pause.map(|pause| pause.max(asked.unwrap_or_default())),
-            })
-            .await;
-        outcome.map_err(|failure| self.give_up(failure, attempts))
-    }
-
-    /// backon adds its jitter to the pause, and so starts from half of it.
-    fn pauses(&self) -> ExponentialBuilder {
-        ExponentialBuilder::new()
-            .with_factor(2.0)
-            .with_min_delay(self.backoff / 2)
-            .with_max_delay(LONGEST_BACKOFF / 2)
-            .with_max_times(self.attempts.saturating_sub(1) as usize)
-            .with_jitter()
+        let (mut attempts, mut crowded) = (0, 0);
+        loop {
+            let error = match attempt().await {
+                Ok(answer) => return Ok(answer),
+                Err(error) => error,
+            };
+            let doublings = if matches!(error, AttemptError::Crowded(_)) {
+                crowded += 1;
+                crowded.min(CROWDED_DOUBLINGS + 1) - 1
+            } else {
+                attempts += 1;
+                attempts - 1
+            };
+            let is_last = attempts >= self.attempts || crowded >= MOST_CROWDED;
+            let asked = error.retry_after();
+            let is_too_late = asked.is_some_and(|asked| asked > self.longest_retry_after);
+            if is_last || is_too_late || !error.is_transient() {
+                return Err(self.give_up(error, attempts + crowded));
+            }
+            let pause = self.backoff.saturating_mul(2_u32.saturating_pow(doublings));
+            let pause = pause.min(LONGEST_BACKOFF).mul_f64(1.0 - random_fraction() / 2.0);
+            tokio::time::sleep(pause.max(asked.unwrap_or_default())).await;
+        }
     }
 
     fn give_up(&self, error: AttemptError, attempts: u32) -> CallError {
         let (failure, stopped) = match error {
             AttemptError::Open { wait, cause } => return CallError::Suspended { wait, cause },
             AttemptError::Failed(failure, stopped) => (failure, stopped),
+            AttemptError::Crowded(failure) => (failure, None),
         };
         let why = failure.why;
         if let Some(wait) = stopped {
@@ -137,7 +148,7 @@ impl CallRetryPolicy {
         if !failure.kind.is_transient() {
             return CallError::Permanent(why);
         }
-        match failure.retry_after.filter(|_| attempts < self.attempts) {
+        match failure.retry_after.filter(|asked| *asked > self.longest_retry_after) {
             Some(asked) => CallError::Transient(format!(
                 "{why}; it asks for a retry after {} s, later than mllm.retry_after_max_s",
                 asked.as_secs_f64().ceil()
@@ -219,6 +230,19 @@ mod tests {
         let (outcome, attempts, _) = run(vec![busy(None); 9]).await;
         assert_eq!(outcome, Err(CallError::Transient("429 (tried 4 times)".into())));
         assert_eq!(attempts, 4);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_call_that_was_one_too_many_keeps_its_attempts() {
+        let busy = Failure::new(FailureKind::Busy, "429".into());
+        let (outcome, attempts, took) = run(vec![AttemptError::Crowded(busy.clone()); 20]).await;
+        assert_eq!((outcome, attempts), (Ok(7), 21));
+        // 0.5 + 1 + 18 × 2 s, each cut by up to a half.
+        assert!((18.75..37.51).contains(&took.as_secs_f64()), "{took:?}");
+        // But not for ever.
+        let (outcome, attempts, _) = run(vec![AttemptError::Crowded(busy); 200]).await;
+        assert!(matches!(outcome, Err(CallError::Transient(_))), "{outcome:?}");
+        assert_eq!(attempts, MOST_CROWDED as usize);
     }
 
     #[tokio::test(start_paused = true)]

@@ -5,6 +5,7 @@ use tokio::sync::OnceCell;
 use whereabouts_core::{SimilarFrame, Usage};
 
 use super::budget::JobBudget;
+use super::gate::CallPlace;
 use super::pictures::SentPicture;
 use crate::{Progress, RefineInput};
 
@@ -30,6 +31,11 @@ impl<'a> RefineRun<'a> {
     ) -> Self {
         let (frame, usage) = (OnceCell::new(), Mutex::default());
         Self { input, budget, progress, similar, frame, usage }
+    }
+
+    /// Returns the place of its calls among those that wait.
+    pub fn place(&self) -> CallPlace {
+        CallPlace::new(self.input.priority, self.input.id)
     }
 
     /// Returns what this attempt has spent so far.

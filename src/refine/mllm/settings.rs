@@ -39,6 +39,8 @@ pub struct MllmSettings {
     pub concurrency: usize,
     /// The longest edge of a sent picture, in pixels.
     pub image_max_edge: u32,
+    /// The most memory for pictures that are kept for other pairs, in bytes.
+    pub pictures_bytes: usize,
     /// Sampling temperature, 0 to 2; a negative number sends none.
     pub temperature: f64,
     /// The longest answer, in tokens.

@@ -10,6 +10,7 @@ use whereabouts_store::SharedLimits;
 use super::MllmRefiner;
 use super::budget::{Budget, Exceeded, JobBudget, Reservation, SpendLimits};
 use super::client::{Answer, Call, MllmClient};
+use super::gate::Turn;
 use super::reservation::SharedReservation;
 use super::retry::CallError;
 use super::run::RefineRun;
@@ -91,16 +92,31 @@ pub(super) fn cost_of(answer: &Answer) -> Usage {
 }
 
 impl MllmRefiner {
-    /// Makes a call if the limits on spend allow the longest answer it may get.
+    /// Makes a call when it is its turn, if the limits on spend allow the longest answer it may get.
     pub(super) async fn paid_call(
         &self,
         run: &RefineRun<'_>,
         client: &MllmClient,
         call: &Call<'_>,
     ) -> Result<Answer, CallError> {
+        client.ready().await;
+        let turn = client.gate().queue(run.place());
+        self.paid_call_in_turn(run, client, call, turn).await
+    }
+
+    /// Makes a call whose turn was queued before.
+    pub(super) async fn paid_call_in_turn(
+        &self,
+        run: &RefineRun<'_>,
+        client: &MllmClient,
+        call: &Call<'_>,
+        turn: Turn,
+    ) -> Result<Answer, CallError> {
+        let place = turn.place();
+        let permit = turn.passed().await;
         let max_tokens = call.max_tokens.into();
         let reserved = self.spend.reserve(&run.budget, call.prompt_tokens, max_tokens).await?;
-        let answer = client.call(call).await?;
+        let answer = client.call(call, place, permit).await?;
         reserved.settle(answer.prompt_tokens, answer.completion_tokens);
         run.charge(cost_of(&answer));
         Ok(answer)

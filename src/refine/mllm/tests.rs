@@ -4,6 +4,7 @@ mod check;
 mod faults;
 mod habits;
 mod limits;
+mod load;
 pub(crate) mod shelf;
 
 use shelf::{Bench, Steps};

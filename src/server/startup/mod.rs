@@ -70,7 +70,7 @@ pub async fn run(
     let (idempotency, usage_days) = (config.idempotency, config.data.usage_days);
     let counted = Arc::clone(&metrics.service);
     let building = tokio::task::spawn_blocking(move || build(&config, metrics));
-    let Parts { service, workers, pools, .. } = building.await.context("the start failed")??;
+    let Parts { service, worker, pools, .. } = building.await.context("the start failed")??;
     let janitor = Janitor {
         store: Arc::clone(&service.retention),
         answers: Arc::clone(&service.idempotency.store),
@@ -91,9 +91,8 @@ pub async fn run(
         let until = shutdown.clone();
         running.spawn(async move { service.calibrator.run(until).await });
     }
-    for worker in workers {
-        let shutdown = shutdown.clone();
-        running.spawn(async move { worker.run(shutdown).await });
+    if let Some(worker) = worker {
+        running.spawn(worker.run(shutdown.clone()));
     }
     on_ready(address)?;
     tracing::info!(%address, tls = encrypted, "ready");
@@ -160,8 +159,8 @@ fn service_settings(config: &Config) -> ServiceSettings {
 pub struct Parts {
     /// The use cases.
     pub service: Service,
-    /// Workers that refine jobs.
-    pub workers: Vec<Worker>,
+    /// Refines jobs, if this process is to.
+    pub worker: Option<Worker>,
     /// Pools that decode and compare. The process waits for them before it exits.
     pub pools: [CpuPool; 2],
     /// The parts that further refiners can be built from.
@@ -177,7 +176,8 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     // Every task of this pool holds a permit, so its queue never overflows.
     let pool = CpuPool::new("frames", config.image.decode_threads(), admission.permits)?;
     let job_service_time = JobServiceTime::default();
-    // Besides the workers, calibration and the display of matches use it, one task at a time each.
+    // Besides jobs, of which as many as there are threads use it, by themselves or in place of another refiner,
+    // calibration and the display of matches use it, one task at a time each.
     let refining = CpuPool::new("refine", config.jobs.workers.max(1), config.jobs.workers + 2)?;
     let pools = [pool.clone(), refining.clone()];
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
@@ -194,18 +194,16 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         Some(entry) => Some(Handle::current().block_on((entry.build)(&refiners))?),
         None => None,
     };
-    let workers = refiner.iter().flat_map(|refiner| {
-        (0..config.jobs.workers).map(|_| Worker {
-            jobs: store.clone(),
-            maps: store.clone(),
-            refiner: Arc::clone(refiner),
-            metrics: Arc::clone(&metrics.refine),
-            service_time: Arc::clone(&job_service_time),
-            settings: config.jobs,
-            known_confidence: config.localize.known_confidence,
-        })
+    let refines = refiner.as_ref().filter(|_| config.jobs.workers > 0);
+    let worker = refines.map(|refiner| Worker {
+        jobs: store.clone(),
+        maps: store.clone(),
+        refiner: Arc::clone(refiner),
+        metrics: Arc::clone(&metrics.refine),
+        service_time: Arc::clone(&job_service_time),
+        settings: config.jobs,
+        known_confidence: config.localize.known_confidence,
     });
-    let workers = workers.collect();
     let mut keys = Handle::current().block_on(Keys::load(store.clone()))?;
     keys.limits = Limits::new(TokenBuckets::new(shared));
     check_keys(config, &keys)?;
@@ -226,7 +224,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     tracing::info!(model, %why, "the model of maps that name none");
     service.maps.imaging.models.manifest(model)?;
     Handle::current().block_on(service.maps.imaging.installed_model(model))?;
-    Ok(Parts { service, workers, pools, refiners })
+    Ok(Parts { service, worker, pools, refiners })
 }
 
 /// Logs whether callers need an API key. Fails if they need one and there is none.

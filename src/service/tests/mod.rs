@@ -149,6 +149,7 @@ fn job_settings() -> JobSettings {
         queue: 3,
         shed_at: 0.4,
         workers: 1,
+        in_progress: 8,
         lease: Duration::from_secs(60),
         timeout: Duration::from_secs(30),
         attempts: 3,

@@ -8,7 +8,7 @@ use whereabouts_schedules::{JoinHandle, block_on, check, spawn, yield_now};
 use super::*;
 
 fn pool(threads: usize, capacity: usize) -> (CpuPool, Vec<JoinHandle<()>>) {
-    let pool = CpuPool::without_threads(capacity);
+    let pool = CpuPool::without_threads(0, capacity);
     let thread = |_| {
         let queue = Arc::clone(&pool.0.0);
         spawn(move || queue.work())

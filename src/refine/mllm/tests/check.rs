@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde_json::{Value, json};
-use whereabouts_testkit::mock_mllm::{MockMllm, RawCall};
+use whereabouts_testkit::mock_mllm::{MockMllm, Purpose, RawCall};
 
 use super::super::settings::tests::defaults;
 use super::*;
@@ -37,7 +37,7 @@ async fn a_server_that_can_do_everything_is_asked_a_few_times() {
     let can = checked.server.capabilities;
     assert_eq!((can.two_pictures, can.answer_format.as_str()), (Some(true), "bounded_schema"));
     assert!(can.temperature && can.system_message && can.checked_at.is_some());
-    assert_eq!((can.calls_at_once, checked.server.trouble), (10, None));
+    assert_eq!((can.calls_at_once, checked.server.trouble), (32, None));
     assert!(mock.checks() <= 6, "{}", mock.checks());
 }
 
@@ -76,17 +76,36 @@ async fn a_server_that_turns_calls_away_while_it_is_busy_gets_one_at_a_time() {
     assert_eq!(checked.server.capabilities.calls_at_once, 1, "{:?}", checked.findings);
 }
 
+fn pictures(body: &Value) -> usize {
+    body.to_string().matches("\"image_url\":{").count()
+}
+
+#[tokio::test]
+async fn a_server_that_takes_one_picture_gets_both_side_by_side_in_one() {
+    let script = Script {
+        intercept: Box::new(|call| match (call.purpose, pictures(call.body)) {
+            (_, 2) => Some(refusal(400, "At most 1 image(s) may be provided in one request.")),
+            (Purpose::Describe, 1) => Some(Reply::Said(notes("walls"))),
+            _ => None,
+        }),
+        ..Script::default()
+    };
+    let bench = Bench::new(script).await;
+    bench.refiner.check_in_background();
+    let refinement = bench.refine(4).await.unwrap();
+    assert_eq!((refinement.degraded, refinement.descriptions.len()), (None, 4));
+    assert_eq!(bench.mock.arrived(Purpose::Describe), 4);
+    let [server] = bench.refiner.servers().try_into().unwrap();
+    assert_eq!((server.capabilities.two_pictures, server.suspended), (Some(false), false));
+}
+
 #[tokio::test]
 async fn a_server_that_cannot_be_used_says_what_to_do() {
-    for (refused, told) in [(2, "limit-mm-per-prompt"), (1, "the model takes no pictures")] {
-        let script = refusing(400, "At most", move |body| {
-            body.to_string().matches("\"image_url\":{").count() >= refused
-        });
-        let (_, checked) = checked(script).await;
-        let finding = checked.findings.iter().find(|finding| !finding.ok).unwrap();
-        assert!(finding.detail.contains(told) && finding.detail.contains("At most"), "{finding:?}");
-        assert!(checked.server.suspended);
-    }
+    let (_, blind) = checked(refusing(400, "At most", |body| pictures(body) >= 1)).await;
+    let finding = blind.findings.iter().find(|finding| !finding.ok).unwrap();
+    let told = "the model takes no pictures";
+    assert!(finding.detail.contains(told) && finding.detail.contains("At most"), "{finding:?}");
+    assert!(blind.server.suspended);
     let (mock, checked) = checked(refusing(401, "no such key", |_| true)).await;
     assert_eq!(checked.server.trouble.unwrap().kind, "key");
     assert_eq!((checked.findings.len(), mock.checks()), (1, 0));

@@ -70,10 +70,17 @@ async fn an_answer_above_the_size_limit_is_rejected() {
 
 #[tokio::test]
 async fn a_pair_without_a_description_keeps_its_coarse_place() {
+    let refused = std::sync::OnceLock::new();
     let script = Script {
-        describe: Box::new(|call| match call.number {
-            // The pair is asked for twice.
-            2 | 3 => Reply::Said("I'm sorry, but I can't help with that.".into()),
+        // The pair is asked for twice.
+        describe: Box::new(move |call| match call.number {
+            2 => {
+                refused.set(call.pair.clone()).unwrap();
+                Reply::Said("I'm sorry, but I can't help with that.".into())
+            }
+            number if number < 5 && refused.get() == Some(&call.pair) => {
+                Reply::Said("I'm sorry, but I can't help with that.".into())
+            }
             number => Reply::Text(format!("notes number {number}.")),
         }),
         reason: Box::new(|call| ranking(&call.labels_with_first("number 5."))),
@@ -177,4 +184,55 @@ async fn an_unreachable_server_is_a_transient_error() {
     bench.rebuild(|settings| settings.base_url = "http://127.0.0.1:1/v1".into());
     let error = bench.refine(1).await.unwrap_err();
     assert!(matches!(&error, RefineError::Transient(why) if why.contains("cannot be reached")));
+}
+
+#[tokio::test]
+async fn a_model_that_refuses_every_pair_is_trouble_until_it_describes_one() {
+    let refuses = Arc::new(std::sync::atomic::AtomicBool::new(true));
+    let refusing = Arc::clone(&refuses);
+    let script = Script {
+        describe: Box::new(move |_| match refusing.load(std::sync::atomic::Ordering::Relaxed) {
+            true => Reply::Said("I'm sorry, but I can't help with that.".into()),
+            false => Reply::Text("notes".into()),
+        }),
+        ..Script::default()
+    };
+    let mut bench = Bench::new(script).await;
+    bench.fallback = Some(Arc::new(limits::Reverse));
+    bench.rebuild(|_| {});
+    bench.refine(3).await.unwrap();
+    let [server] = bench.refiner.servers().try_into().unwrap();
+    let trouble = server.trouble.unwrap();
+    assert_eq!((trouble.kind.as_str(), server.suspended), ("no_answer", false));
+    assert!(trouble.message.contains("refused"), "{trouble:?}");
+
+    refuses.store(false, std::sync::atomic::Ordering::Relaxed);
+    bench.refine(3).await.unwrap();
+    let [server] = bench.refiner.servers().try_into().unwrap();
+    assert_eq!(server.trouble, None);
+}
+
+#[tokio::test]
+async fn a_failed_reasoning_call_is_tried_again_with_the_job_at_no_new_description() {
+    let script = Script {
+        reason: Box::new(|call| match call.number {
+            // Four attempts, and one more without a format of the answer.
+            number if number <= 5 => status(500),
+            _ => ranking(&call.labels()),
+        }),
+        ..Script::default()
+    };
+    let mut bench = Bench::with(script, |settings| settings.breaker_failures = 100).await;
+    bench.fallback = Some(Arc::new(limits::Reverse));
+    bench.rebuild(|_| {});
+    let mut input = bench.input(3);
+    input.attempts_left = 1;
+    let error = bench.refiner.refine(&input, &Steps::default()).await.unwrap_err();
+    assert!(
+        matches!(&error, RefineError::Transient(why) if why.contains("descriptions are kept")),
+        "{error}"
+    );
+    input.attempts_left = 0;
+    let refinement = bench.refiner.refine(&input, &Steps::default()).await.unwrap();
+    assert_eq!((refinement.degraded, bench.mock.describe_calls()), (None, 3));
 }

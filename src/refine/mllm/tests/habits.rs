@@ -3,6 +3,8 @@
 //! Each row has its own server, with a real socket. A job of four candidates, which are labelled in coarse order,
 //! meets the habit; what the habit does not touch goes well, and the model's ranking is then `BADC`.
 
+use std::sync::OnceLock;
+
 use serde::Deserialize;
 use serde_json::{Value, json};
 use whereabouts_testkit::mock_mllm::{Purpose, RawCall, ranking};
@@ -63,6 +65,9 @@ struct Habit {
     /// How many calls have estimated tokens.
     #[serde(default)]
     estimated: u32,
+    /// The pictures of the second pair, once it is known.
+    #[serde(skip)]
+    pair: OnceLock<Vec<String>>,
 }
 
 fn stop() -> String {
@@ -82,14 +87,28 @@ impl Habit {
         let number = call.number;
         let at = match self.at.as_str() {
             "describe" => call.purpose == Purpose::Describe && number == 1,
-            // At one call at a time.
-            "pair" => call.purpose == Purpose::Describe && (number == 2 || number == 3),
+            "pair" => call.purpose == Purpose::Describe && self.is_the_pair(call),
             "reason" => call.purpose == Purpose::Reason && number == 1,
             "reasons" => call.purpose == Purpose::Reason,
             "every" => call.purpose != Purpose::Check,
             at => panic!("{}: at {at}", self.name),
         };
         at && (self.refuses.is_empty() || contains(call.body, &self.refuses))
+    }
+
+    /// Whether a call describes the pair that the second call of all describes, which is the second at one call at a
+    /// time.
+    fn is_the_pair(&self, call: &RawCall<'_>) -> bool {
+        let pictures = || {
+            let parts = call.body["messages"].as_array().into_iter().flatten();
+            let parts = parts.filter_map(|message| message["content"].as_array()).flatten();
+            let pictures = parts.filter_map(|part| part["image_url"]["url"].as_str());
+            pictures.map(str::to_owned).collect::<Vec<String>>()
+        };
+        if call.number == 2 {
+            let _ = self.pair.set(pictures());
+        }
+        self.pair.get() == Some(&pictures())
     }
 
     fn reply(&self) -> Reply {

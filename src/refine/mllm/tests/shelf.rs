@@ -17,8 +17,8 @@ use crate::QueryFrame;
 use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, Secret, SimilarFrame};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, CoordinateFrame, DayUsage, Descriptor,
-    DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose, Precision, StandIn,
-    Usage,
+    DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose, Precision, Priority,
+    StandIn, Usage,
 };
 use whereabouts_index::SearchMode;
 use whereabouts_store::{
@@ -148,6 +148,8 @@ impl Shelf {
                 descriptor: None,
             },
             candidates: (0..candidates).map(candidate).collect(),
+            priority: Priority::Normal,
+            attempts_left: 0,
             spent: Usage::default(),
             fresh_since: None,
         }
@@ -276,6 +278,13 @@ pub struct MemoryCache {
     descriptions: Mutex<HashMap<Digest, CachedDescription>>,
     frames: Mutex<Vec<DescribedFrame>>,
     pub spent: Mutex<Vec<DayUsage>>,
+}
+
+impl MemoryCache {
+    /// Forgets the descriptions.
+    pub fn forget(&self) {
+        self.descriptions.lock().clear();
+    }
 }
 
 #[async_trait]
