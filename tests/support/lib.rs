@@ -1,5 +1,5 @@
 //! What tests and benchmarks share: the real server as a child process ([`server`]), the store that it uses
-//! ([`deployment`]), waiting for a condition ([`wait`]), and scripted peers: a multimodal LLM ([`mock_mllm`]), a
+//! ([`deployment`]), waiting for a condition ([`wait`]), drives and the baselines of tracks ([`drives`]), and scripted peers: a multimodal LLM ([`mock_mllm`]), a
 //! model hub ([`mock_hub`]) and a webhook receiver ([`receiver`]).
 
 #![allow(
@@ -11,6 +11,7 @@
 )]
 
 pub mod deployment;
+pub mod drives;
 pub mod mock_hub;
 pub mod mock_mllm;
 pub mod receiver;
