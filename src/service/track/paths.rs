@@ -168,6 +168,8 @@ impl Paths {
         }
         let first = way.len();
         self.follow(grid, start, reach, way);
+        // The stop and the image of each link taken.
+        let mut taken: Vec<(usize, u32)> = Vec::new();
         for passed in first..way.len() {
             let at = way[passed];
             if at.metres > reach {
@@ -177,6 +179,14 @@ impl Paths {
                 if branches.len() == MAX_LINKS {
                     return;
                 }
+                // A path that runs beside this one is entered once.
+                let is_beside = |(stop, image): &(usize, u32)| {
+                    link.abs_diff(*image) <= (passed - stop) as u32 + MIN_STEPS
+                };
+                if taken.iter().any(is_beside) {
+                    continue;
+                }
+                taken.push((passed, *link));
                 let [x, y] = grid.offset(at.image, *link);
                 let course = self.course(at.image, at.ahead);
                 let metres = at.metres + x.hypot(y).min(self.spacing);
