@@ -2,7 +2,7 @@
 
 use super::belief::{Belief, Habits, Numbered, Roads};
 use super::paths::Stop;
-use super::speeds::{METRIC, SPEEDS, nearest_speed, speed_of, state};
+use super::speeds::{METRIC, nearest_speed, speed_of, state};
 
 /// The position after a move is off by this share of the usual distance of neighbours: no path is as straight as its
 /// images, and no robot is exactly at an image.
