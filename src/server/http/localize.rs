@@ -40,8 +40,8 @@ pub(super) struct LocalizeParams {
     /// `_`, `.` and `:`. The field `track` of the answer then estimates where the robot is, given all its
     /// frames. The images of the map need poses. A track expires when no frame arrives for a while.
     track: Option<String>,
-    /// When the frame was taken, for a frame with `track`: RFC 3339 with an offset, or seconds since 1970; by
-    /// default now.
+    /// When the frame was taken, for a frame with `track`: RFC 3339 with an offset, or seconds since 1970. By
+    /// default unknown: frames are then followed at their own rate, and not by the clock.
     #[param(value_type = Option<String>)]
     #[serde(default, deserialize_with = "moment::optional")]
     captured_at: Option<Timestamp>,
