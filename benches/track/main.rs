@@ -171,6 +171,7 @@ impl Robots {
             dim: images.first().context("no images")?.0.as_slice().len(),
             revision: 0,
             description: None,
+            created_at: Timestamp::now(),
         };
         let (map, _) = store.put_map(map).await?;
         let digest = Digest::of(b"picture");

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use image::RgbImage;
 use rayon::prelude::*;
 use whereabouts_core::{Descriptor, DescriptorKind};
 use whereabouts_testkit::drives::{behind_a_van, is_blocked};
@@ -97,7 +98,7 @@ fn traverse(name: &str, map: &[Descriptor], queries: &[Descriptor], order: &[usi
 /// The places of a town in four lights, three in ten behind a van, with odometry that is five metres off.
 fn town(extractor: &Extractor, seed: u64, places: usize) -> anyhow::Result<Drive> {
     let town = Town::new(TownSpec { seed, places, width: 320, height: 240 });
-    let described = |picture| described_picture(extractor, &encode_jpeg(picture)?);
+    let described = |picture: &RgbImage| described_picture(extractor, &encode_jpeg(picture)?);
     let drawn: Vec<_> = (0..places)
         .into_par_iter()
         .map(|place| {

@@ -9,7 +9,7 @@ use super::speeds::{METRIC, nearest_speed, speed_of, state};
 const SPREAD: f64 = 0.15;
 
 /// Probabilities below this are not worth moving.
-pub(super) const NEGLIGIBLE: f32 = 1e-7;
+pub(super) const NEGLIGIBLE: f32 = 1e-6;
 
 /// Distance, in units of the usual one, beyond which the filter does not follow a robot.
 const LOST: f64 = 200.0;
