@@ -178,6 +178,7 @@ class RealServer(unittest.TestCase):
             track = answer.track
             assert track
             self.assertEqual(track.is_late, seconds == 2)
+        assert track
         self.assertEqual(track.image_id, "place-0002.jpg")
         self.assertIsInstance(track.pose, GeographicPose)
         self.assertIsNone(self.service.localize("town", self.frame(2), refine="off").track)

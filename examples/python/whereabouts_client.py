@@ -251,7 +251,7 @@ class RelativePose:
     dyaw: float
     """Radians turned to the left."""
     covariance: tuple[float, ...] = ()
-    """Of the three, in m², m·rad and rad²: 9 numbers row by row, or the 3 of its diagonal; empty if unknown."""
+    """In m², m·rad and rad²: 9 numbers row by row, or the 3 of the diagonal; empty if unknown."""
 
 
 @dataclass(frozen=True)
@@ -581,8 +581,9 @@ class Whereabouts:
         if it cannot meet the deadline, and aborts it (504) if it takes longer.
 
         With a `track`, an id chosen by the robot, the answer also contains the robot's place given all frames
-        of that track. `captured_at` is when the frame was taken (default: unknown), and `moved_m` the distance
-        travelled since the previous frame in metres, from odometry; or, better, `moved` the relative pose.
+        of that track. `captured_at` is when the frame was taken (default: unknown), and `moved_m` the
+        distance travelled since the previous frame in metres, from odometry; or, better, `moved` the
+        relative pose.
 
         With a unique `idempotency_key`, the same frame can be sent again after its answer was lost, and gets
         the first answer instead of a second job. `retry_for_s` then also covers 503.

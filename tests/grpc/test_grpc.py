@@ -231,7 +231,7 @@ class Contract(unittest.TestCase):
             odometry = {"moved": moved, **({"moved_m": 1.0} if wrong else {})}
             track = self.message("Track", id="robot-7", **odometry)
             request = self.message("LocalizeRequest", map="town", image=frame, refine=3, track=track)
-            call = lambda request=request: self.call("LocalizationService", "Localize", request)  # noqa: E731
+            call = lambda request=request: self.call("LocalizationService", "Localize", request)
             if wrong:
                 self.refused(grpc.StatusCode.INVALID_ARGUMENT, call)
             else:
