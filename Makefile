@@ -80,7 +80,7 @@ format: ## Format the code
 
 bench: build ## Run the benchmarks against their peers (downloads some gigabytes)
 	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked --bench preprocess --bench inference \
-		--bench search --bench localize --bench refine --bench mllm --bench store --bench town
+		--bench search --bench localize --bench refine --bench mllm --bench store --bench town --bench track
 
 load: build ## Overload test: ten times the load the server can handle
 	$(CARGO) bench --locked --bench overload

@@ -169,6 +169,15 @@ class RealServer(unittest.TestCase):
             track = answer.track
             assert track
             self.assertEqual((track.id, track.frames), ("robot-7", frames))
+        for seconds in (4, 2):
+            moved = client.RelativePose(0.1, 0.0, 0.0, (0.01, 0.01, 0.001))
+            at = taken + timedelta(seconds=seconds)
+            answer = self.service.localize(
+                "town", self.frame(2), refine="off", track="robot-7", captured_at=at, moved=moved
+            )
+            track = answer.track
+            assert track
+            self.assertEqual(track.is_late, seconds == 2)
         assert track
         self.assertEqual(track.image_id, "place-0002.jpg")
         self.assertIsInstance(track.pose, GeographicPose)

@@ -242,6 +242,29 @@ class TimingMs:
 
 
 @dataclass(frozen=True)
+class RelativePose:
+    """How a robot has moved in the plane since its last frame, in its own axes at that frame."""
+
+    dx: float
+    """Metres ahead."""
+    dy: float
+    """Metres to the left."""
+    dyaw: float
+    """Radians turned to the left."""
+    covariance: tuple[float, ...] = ()
+    """In m², m·rad and rad²: 9 numbers row by row, or the 3 of the diagonal; empty if unknown."""
+
+
+@dataclass(frozen=True)
+class TrackHypothesis:
+    """A place where a robot may be."""
+
+    image_id: str
+    probability: float
+    pose: Pose | None = None
+
+
+@dataclass(frozen=True)
 class TrackEstimate:
     """A robot's place given all frames of its track."""
 
@@ -249,11 +272,15 @@ class TrackEstimate:
     frames: int
     """Number of frames in the track so far, including this one."""
     probability: float
-    """The filter's probability that the robot is within one place radius of the image, 0 to 1."""
+    """The probability that the robot is at the image or one next to it, 0 to 1."""
     known: bool
     image_id: str | None = None
     """The most probable image; None while none is likely."""
     pose: Pose | None = None
+    others: tuple[TrackHypothesis, ...] = ()
+    """Up to two other places where the robot may be, the most probable first."""
+    is_late: bool = False
+    """Whether the frame is older than the last one of the track."""
 
 
 @dataclass(frozen=True)
@@ -544,6 +571,7 @@ class Whereabouts:
         track: str | None = None,
         captured_at: datetime | None = None,
         moved_m: float | None = None,
+        moved: RelativePose | None = None,
         deadline_ms: int | None = None,
         idempotency_key: str | None = None,
     ) -> Answer:
@@ -554,8 +582,9 @@ class Whereabouts:
         if it cannot meet the deadline, and aborts it (504) if it takes longer.
 
         With a `track`, an id chosen by the robot, the answer also contains the robot's place given all frames
-        of that track. `captured_at` is when the frame was taken (default: its time of arrival), and `moved_m`
-        the distance travelled since the previous frame in metres, from odometry.
+        of that track. `captured_at` is when the frame was taken (default: unknown), and `moved_m` the
+        distance travelled since the previous frame in metres, from odometry; or, better, `moved` the
+        relative pose.
 
         With a unique `idempotency_key`, the same frame can be sent again after its answer was lost, and gets
         the first answer instead of a second job. `retry_for_s` then also covers 503.
@@ -574,6 +603,7 @@ class Whereabouts:
                 track=track,
                 captured_at=_rfc3339(captured_at) if captured_at else None,
                 moved_m=moved_m,
+                **(_relative(moved) if moved else {}),
             ),
             headers={
                 "Content-Type": media_type,
@@ -763,6 +793,11 @@ def _instant(text: str) -> datetime:
     """Parses an RFC 3339 time, to the microsecond."""
     text = re.sub(r"\.(\d+)", lambda digits: "." + digits[1].ljust(6, "0")[:6], text)
     return datetime.fromisoformat(text.replace("Z", "+00:00"))
+
+
+def _relative(moved: RelativePose) -> dict[str, object]:
+    covariance = ",".join(map(repr, moved.covariance)) or None
+    return _given(dx=moved.dx, dy=moved.dy, dyaw=moved.dyaw, covariance=covariance)
 
 
 def _rfc3339(moment: datetime) -> str:

@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timedelta, timezone
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from typing import Generic, Protocol, TypeAlias, TypedDict, TypeVar
 
 from whereabouts_client import (
     Answer,
@@ -35,6 +35,7 @@ from whereabouts_client import (
     Pose,
     Problem,
     RefineMode,
+    RelativePose,
     TrackEstimate,
 )
 
@@ -251,17 +252,19 @@ def instant(sec: int, nanosec: int) -> datetime | None:
 
 
 class Odometer:
-    """The path length of a robot from its odometry. Thread-safe."""
+    """How a robot has moved, from its odometry. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._readings: deque[tuple[datetime, float]] = deque(maxlen=MOST_READINGS)
         """Times and path lengths in metres since the start of the path, in order and without a gap."""
+        self._poses: deque[tuple[datetime, Vector]] = deque(maxlen=MOST_READINGS)
+        """Times, and x, y and yaw, of those readings that have an orientation."""
         self._position: Vector = (0.0, 0.0, 0.0)
         """The position of the newest reading."""
 
-    def add(self, at: datetime, position: Vector) -> None:
-        """Adds a position in metres, in the odometry's own frame.
+    def add(self, at: datetime, position: Vector, orientation: Quaternion | None = None) -> None:
+        """Adds a position in metres, and an orientation if it is known, in the odometry's own frame.
 
         A late reading is dropped. After a gap, a jump, or a clock that was set back, a new path starts.
         """
@@ -276,10 +279,15 @@ class Odometer:
                 step = math.dist(position, self._position)
                 if abs(at - newest) > LONGEST_GAP or step > LONGEST_STEP_M:
                     self._readings.clear()
+                    self._poses.clear()
                 else:
                     metres = before + step
             self._readings.append((at, metres))
             self._position = position
+            if orientation and any(orientation) and all(map(math.isfinite, orientation)):
+                x, y, z, w = orientation
+                yaw = math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+                self._poses.append((at, (position[0], position[1], yaw)))
 
     def metres(self, start: datetime, end: datetime) -> float | None:
         """The path length between two times, in either order; None if the path does not cover both."""
@@ -290,6 +298,32 @@ class Odometer:
             return None
         # Rounding must not make it negative, which the service refuses.
         return max(0.0, _metres_at(readings, end) - _metres_at(readings, start))
+
+    def relative_pose(self, start: datetime, end: datetime) -> RelativePose | None:
+        """The pose at a time relative to that at an earlier one; None if it is not known for both."""
+        with self._lock:
+            poses = list(self._poses)
+        if not poses or not poses[0][0] <= start <= end <= poses[-1][0] + LATEST:
+            return None
+        (x, y, yaw), (end_x, end_y, end_yaw) = _pose_at(poses, start), _pose_at(poses, end)
+        cos, sin, east, north = math.cos(yaw), math.sin(yaw), end_x - x, end_y - y
+        return RelativePose(cos * east + sin * north, cos * north - sin * east, _turn(yaw, end_yaw))
+
+
+def _pose_at(poses: Sequence[tuple[datetime, Vector]], moment: datetime) -> Vector:
+    """x, y and yaw at a time not before the first reading, interpolated between readings."""
+    after = bisect_left(poses, moment, key=lambda reading: reading[0])
+    if after == len(poses) or after == 0:
+        return poses[min(after, len(poses) - 1)][1]
+    (earlier, low), (later, high) = poses[after - 1], poses[after]
+    share = (moment - earlier) / (later - earlier)
+    x, y = (low[axis] + (high[axis] - low[axis]) * share for axis in (0, 1))
+    return (x, y, low[2] + _turn(low[2], high[2]) * share)
+
+
+def _turn(start: float, end: float) -> float:
+    """The shorter turn from one angle to another, in radians."""
+    return math.remainder(end - start, 2 * math.pi)
 
 
 def _metres_at(readings: Sequence[tuple[datetime, float]], moment: datetime) -> float:
@@ -367,6 +401,13 @@ class Newest(Generic[T]):
             self._changed.notify_all()
 
 
+class Motion(TypedDict):
+    """The parameters of a frame that say how the robot has moved."""
+
+    moved_m: float | None
+    moved: RelativePose | None
+
+
 class Service(Protocol):
     """The part of `whereabouts_client.Whereabouts` that the localizer uses."""
 
@@ -381,6 +422,7 @@ class Service(Protocol):
         track: str | None,
         captured_at: datetime | None,
         moved_m: float | None,
+        moved: RelativePose | None,
     ) -> Answer: ...
 
     def wait_for_job(self, id: str, timeout_s: float) -> Job: ...
@@ -487,7 +529,7 @@ class Localizer(Generic[T]):
                 deadline_ms=wishes.deadline_ms,
                 track=wishes.track,
                 captured_at=shot.taken_at if wishes.track else None,
-                moved_m=self._moved_m(shot),
+                **self._motion(shot),
             )
         except Problem as problem:
             if not 400 <= problem.status < 500:
@@ -504,11 +546,13 @@ class Localizer(Generic[T]):
         if answer.track and answer.track.pose:
             self._tell(self._sink.tracked, shot.stamp, answer.track, answer)
 
-    def _moved_m(self, shot: Shot[T]) -> float | None:
-        """Distance travelled since the last frame of the track, in metres, if known."""
+    def _motion(self, shot: Shot[T]) -> Motion:
+        """How the robot has moved since the last frame of the track, as far as that is known."""
         if self._odometer is None or self._last is None or shot.taken_at is None:
-            return None
-        return self._odometer.metres(self._last, shot.taken_at)
+            return {"moved_m": None, "moved": None}
+        moved = self._odometer.relative_pose(self._last, shot.taken_at)
+        metres = None if moved else self._odometer.metres(self._last, shot.taken_at)
+        return {"moved_m": metres, "moved": moved}
 
     def _follow(self) -> None:
         while item := self._jobs.take():

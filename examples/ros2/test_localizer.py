@@ -48,6 +48,7 @@ from whereabouts_client import (
     Problem,
     RankedCandidate,
     RefineMode,
+    RelativePose,
     TimingMs,
     TrackEstimate,
     Usage,
@@ -254,6 +255,24 @@ class Odometry(unittest.TestCase):
         self.metres(odometer, 1, 1.2, None)
         self.metres(odometer, 1.1, 1.2, 1)
 
+    def test_a_relative_pose_is_in_the_axes_of_the_robot(self) -> None:
+        odometer = Odometer()
+        # It drives north, and turns to the left: from north to west.
+        for tenth in range(11):
+            yaw = math.radians(90 + 9 * tenth)
+            turn = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+            odometer.add(at(tenth / 10), (5.0, tenth / 10, 0.0), turn)
+        moved = odometer.relative_pose(at(0), at(1))
+        assert moved
+        self.assertAlmostEqual(moved.dx, 1)
+        self.assertAlmostEqual(moved.dy, 0)
+        self.assertAlmostEqual(moved.dyaw, math.pi / 2)
+        half = odometer.relative_pose(at(0), at(0.55))
+        assert half
+        self.assertAlmostEqual(half.dyaw, math.pi / 2 * 0.55)
+        self.assertIsNone(odometer.relative_pose(at(-1), at(1)))
+        self.assertIsNone(driven(0, 1).relative_pose(at(0), at(1)))
+
     def test_late_and_invalid_readings_are_dropped(self) -> None:
         odometer = driven(0, 1)
         odometer.add(at(0.45), (900, 0, 0))
@@ -348,6 +367,7 @@ class Client:
         """Track, time and distance of each frame."""
         self.waited: list[str] = []
         self.may_answer = threading.Semaphore(0)
+        self.moved: list[RelativePose | None] = []
         self.answers: Callable[[int], Answer] = answer
         self.jobs: Callable[[str], Job] = job
 
@@ -362,9 +382,11 @@ class Client:
         track: str | None,
         captured_at: datetime | None,
         moved_m: float | None,
+        moved: RelativePose | None,
     ) -> Answer:
         assert map == "town"
         self.steps.append((track, captured_at, moved_m))
+        self.moved.append(moved)
         self.asked.append((frame, k, refine, deadline_ms))
         assert self.may_answer.acquire(timeout=10)
         return self.answers(len(self.asked))
@@ -759,12 +781,14 @@ class NodeWithStubs(unittest.TestCase):
         self.assertIn("16UC1", node.warnings[0])
         self.assertEqual(self.client.asked, [])
 
-    def test_frames_of_a_track_carry_the_odometry_distance(self) -> None:
+    def test_frames_of_a_track_carry_the_odometry(self) -> None:
         node = self.node(track="robot-7", odometry_topic="/odom")
         self.client.answers = tracked
         for tenth in range(21):
             stamp = Anything(sec=100 + tenth // 10, nanosec=tenth % 10 * 100_000_000)
-            pose = Anything(pose=Anything(position=Anything(x=0.0, y=tenth / 2, z=0.0)))
+            # It faces north.
+            turn = Anything(x=0.0, y=0.0, z=HALF, w=HALF)
+            pose = Anything(pose=Anything(position=Anything(x=0.0, y=tenth / 2, z=0.0), orientation=turn))
             node.subscriptions["/odom"](Anything(header=Anything(stamp=stamp), pose=pose))
         for number, stamp in enumerate(
             (Anything(sec=100, nanosec=500_000_000), Anything(sec=102, nanosec=0)), start=1
@@ -774,8 +798,12 @@ class NodeWithStubs(unittest.TestCase):
             self.until(lambda number=number: len(node.published["~/track_pose"]) == number)  # type: ignore[misc]
         (_, first, _), (track, second, way) = self.client.steps
         self.assertEqual((track, first, second), ("robot-7", instant(100, 500_000_000), instant(102, 0)))
-        assert way is not None
-        self.assertAlmostEqual(way, 7.5)
+        self.assertIsNone(way)
+        moved = self.client.moved[1]
+        assert moved
+        self.assertAlmostEqual(moved.dx, 7.5)
+        self.assertAlmostEqual(moved.dy, 0)
+        self.assertAlmostEqual(moved.dyaw, 0)
         self.assertEqual(node.published["~/track_pose"][1].pose.pose.position.y, 2)
         self.assertIs(node.published["~/track_pose"][1].header.stamp, stamp)
 

@@ -102,9 +102,10 @@ class WhereaboutsNode(Node):
 
     def _odometry(self, message: Odometry) -> None:
         at = instant(message.header.stamp.sec, message.header.stamp.nanosec)
-        position = message.pose.pose.position
+        position, turn = message.pose.pose.position, message.pose.pose.orientation
         if at:
-            self._odometer.add(at, (position.x, position.y, position.z))
+            orientation = (turn.x, turn.y, turn.z, turn.w)
+            self._odometer.add(at, (position.x, position.y, position.z), orientation)
 
     def _report(self) -> None:
         at = self._localizer

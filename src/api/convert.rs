@@ -6,7 +6,10 @@ use whereabouts_core::{
     RankedCandidate, RefinerKind, Scene, Usage,
 };
 
-use crate::{Answer, IndexKind, MapState, NoJob, NoJobReason, TimingMs, TrackEstimate, proto};
+use crate::{
+    Answer, IndexKind, MapState, NoJob, NoJobReason, TimingMs, TrackEstimate, TrackHypothesis,
+    proto,
+};
 
 /// Converts a job state to its gRPC message.
 pub fn job_state_to(state: JobState) -> proto::JobState {
@@ -115,6 +118,18 @@ impl From<TrackEstimate> for proto::TrackEstimate {
             pose: track.pose.map(Into::into),
             probability: track.probability,
             known: track.known,
+            others: track.others.into_iter().map(Into::into).collect(),
+            is_late: track.is_late,
+        }
+    }
+}
+
+impl From<TrackHypothesis> for proto::TrackHypothesis {
+    fn from(hypothesis: TrackHypothesis) -> Self {
+        Self {
+            image_id: hypothesis.image_id.into(),
+            pose: hypothesis.pose.map(Into::into),
+            probability: hypothesis.probability,
         }
     }
 }

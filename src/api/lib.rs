@@ -26,7 +26,7 @@ pub use self::images::{ExportPage, ImageAnswer, ImageMeta, ImagePage, ImagePatch
 pub use self::jobs::{JobChange, JobPage, JobStatus, Missed, PairDescribed, PairRegions};
 pub use self::keys::{MadeKey, NewKey};
 pub use self::localize::{
-    Answer, JobLink, NoJob, NoJobReason, RefineMode, TimingMs, TrackEstimate,
+    Answer, JobLink, NoJob, NoJobReason, RefineMode, TimingMs, TrackEstimate, TrackHypothesis,
 };
 pub use self::maps::{
     CalibrationState, IndexKind, MapChange, MapState, Reindex, ReindexRequest, ReindexState,

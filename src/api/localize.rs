@@ -124,9 +124,28 @@ pub struct TrackEstimate {
     /// Pose of that image.
     #[schema(nullable)]
     pub pose: Option<Pose>,
-    /// Probability, 0 to 1, that the robot is within `confidence.place_m` of that image, assuming that the
-    /// motion and the share of useless frames match the settings.
+    /// Probability, 0 to 1, that the robot is at that image or one next to it: within 2.5 times the usual distance of
+    /// neighbouring images, and within `confidence.place_m`.
     pub probability: f64,
     /// Whether the probability reaches the configured threshold.
     pub known: bool,
+    /// Up to two other places where the robot may be, each with a probability of at least 0.1; the most probable first.
+    #[serde(default)]
+    pub others: Vec<TrackHypothesis>,
+    /// Whether the frame is older than the last one of the track. The estimate is for its own time, and the track
+    /// continues from the last one.
+    #[serde(default)]
+    pub is_late: bool,
+}
+
+/// A place where a robot may be.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct TrackHypothesis {
+    /// The image of the place.
+    pub image_id: ImageId,
+    /// Pose of that image.
+    #[schema(nullable)]
+    pub pose: Option<Pose>,
+    /// Probability, 0 to 1, that the robot is there.
+    pub probability: f64,
 }

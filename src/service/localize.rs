@@ -129,11 +129,15 @@ impl Localizer {
             self.maps.imaging.metrics.uninformative_frame(why);
         }
         let uninformative = lack.map(|why| why.to_string());
+        let mut warnings = extraction.warnings;
         let track = match request.track {
             Some(step) => {
                 // A frame that shows nothing moves the belief, but is no evidence.
-                let evidence = if lack.is_some() { &[] } else { candidates.as_slice() };
-                Some(self.tracks.follow(&map, step, evidence, &calibration).await?)
+                let evidence = lack.is_none().then_some(candidates.as_slice());
+                let following = self.tracks.follow(&map, step, &extraction.descriptor, evidence);
+                let (track, warning) = following.instrument(traces::stage("track")).await?;
+                warnings.extend(warning);
+                Some(track)
             }
             None => None,
         };
@@ -188,7 +192,7 @@ impl Localizer {
                 state: job.state,
             }),
             no_job,
-            warnings: extraction.warnings,
+            warnings,
             timing_ms: TimingMs {
                 decode: ms(extraction.times.decode),
                 extract: ms(extraction.times.extract),

@@ -33,7 +33,7 @@ pub use self::jobs::{Claim, JobRecord, JobStore, Query, Release, Step};
 pub use self::keys::KeyStore;
 pub use self::limits::{SharedLimits, TokenBuckets, TokenGrant, TokenRequest};
 pub use self::listing::{JobFilter, JobList};
-pub use self::maps::{Added, ExportStore, HardNegatives, IndexState, MapStore};
+pub use self::maps::{Added, ExportStore, HardNegatives, IndexState, LocatedImage, MapStore};
 #[cfg(feature = "postgres")]
 pub use self::objects::{ObjectSettings, Objects};
 pub use self::retention::{JobRetention, RemovedJobs, Retention};

@@ -45,6 +45,17 @@ pub struct HardNegatives {
     pub others: Vec<Candidate>,
 }
 
+/// An image that has a pose.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LocatedImage {
+    /// The position of its descriptor in the store, which stays the same as long as the image exists.
+    pub slot: usize,
+    /// Its id.
+    pub id: ImageId,
+    /// Where it was taken.
+    pub pose: Pose,
+}
+
 /// Maps, their images and their descriptors.
 #[async_trait]
 pub trait MapStore: Send + Sync {
@@ -107,7 +118,7 @@ pub trait MapStore: Send + Sync {
         limit: usize,
     ) -> Result<Vec<Image>, StoreError>;
     /// Returns the images that have a pose, in insertion order.
-    async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError>;
+    async fn positions(&self, map: &Map) -> Result<Vec<LocatedImage>, StoreError>;
     /// Deletes an image. Returns `false` if there was no such image.
     async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError>;
 
@@ -122,6 +133,25 @@ pub trait MapStore: Send + Sync {
         k: usize,
         mode: SearchMode,
     ) -> Result<Vec<Candidate>, StoreError>;
+
+    /// Returns the descriptors in some slots: one entry for each, in the order of `slots`, and `None` for a slot whose
+    /// image is gone.
+    ///
+    /// # Errors
+    /// [`StoreError::Superseded`] if the map was reindexed after the caller read it.
+    async fn descriptors(
+        &self,
+        map: &Map,
+        slots: Vec<usize>,
+    ) -> Result<Vec<Option<Descriptor>>, StoreError>;
+    /// Returns the dot products of a vector of any length and the descriptors in some slots, as
+    /// [`descriptors`](Self::descriptors) does.
+    async fn similarities(
+        &self,
+        map: &Map,
+        vector: Vec<f32>,
+        slots: Vec<usize>,
+    ) -> Result<Vec<Option<f32>>, StoreError>;
 
     /// Samples images evenly across the map and returns the `k` hardest negatives of each.
     /// [`CalibrationSettings`] sets the number of samples and what counts as another place.

@@ -43,4 +43,6 @@ mod traces;
 mod track;
 mod webhooks;
 
-use whereabouts_testkit::{deployment, mock_hub, mock_mllm, receiver, server as support, wait};
+use whereabouts_testkit::{
+    deployment, drives, mock_hub, mock_mllm, receiver, server as support, wait,
+};

@@ -1,10 +1,10 @@
 //! Tracks: a robot that drives through the town.
 
-use image::{Rgb, RgbImage};
 use jiff::{SignedDuration, Timestamp};
 use serde_json::{Value, json};
 use whereabouts_town::{Town, TownSpec};
 
+use super::drives::{self, behind_a_van, is_blocked};
 use super::support::{Answer, Server, frame, jpeg, shared_server};
 use super::wait::{eventually, until};
 
@@ -35,61 +35,191 @@ async fn metric_map(server: &Server, map: &str, town: &Town) {
     .await;
 }
 
-/// The side of a van that fills nearly all of the picture.
-fn occluded(mut picture: RgbImage, number: usize) -> RgbImage {
-    let (width, height) = picture.dimensions();
-    let paint = [40, 90, 140, 190, 220].map(|level| (level + 13 * number as u32 % 35) as u8);
-    let body = Rgb([paint[number % 5], paint[number / 2 % 5], paint[number / 3 % 5]]);
-    for (x, y, pixel) in picture.enumerate_pixels_mut() {
-        let (u, v) = (x as f32 / width as f32, y as f32 / height as f32);
-        let window = (0.2..0.45).contains(&v) && (u * 5.0).fract() > 0.2;
-        if u > 0.05 && v > 0.08 {
-            *pixel = if window { Rgb(body.0.map(|level| level / 3)) } else { body };
-        }
+/// A place that a robot passes, with the number of its visit.
+type Visit = (usize, u32);
+
+/// The answers to the frames of a drive, one after another, with what the robot says of its way.
+async fn drive(
+    server: &Server,
+    town: &Town,
+    visits: &[Visit],
+    query: impl Fn(&Step) -> String,
+) -> Vec<Value> {
+    let mut answers = Vec::new();
+    let mut at: Timestamp = "2026-03-01T12:00:00Z".parse().unwrap();
+    let mut before: Option<[f64; 2]> = None;
+    for (place, visit) in visits {
+        let shot = town.query(*place, *visit);
+        let here = [shot.x, shot.y];
+        let way = before.map_or(0.0, |[x, y]| (here[0] - x).hypot(here[1] - y));
+        let pause = if way < 5.0 { 1.0 } else { 0.0 };
+        at += SignedDuration::from_secs_f64(way / SPEED + pause);
+        before = Some(here);
+        let blocked = is_blocked(*place);
+        let picture = if blocked { behind_a_van(shot.image, *place) } else { shot.image };
+        let path = format!("/localize?refine=off&{}", query(&Step { at, way }));
+        answers.push(server.post_jpeg(&path, jpeg(&picture)).await.expect(200));
     }
-    picture
+    answers
 }
 
-/// Three frames in ten, both isolated and in a row.
-fn is_occluded(place: usize) -> bool {
-    matches!(place % 20, 3 | 4 | 8 | 12 | 13 | 17)
+/// What a robot says of its way to a frame.
+struct Step {
+    at: Timestamp,
+    /// Metres from the frame before.
+    way: f64,
+}
+
+/// How many answers name the right image.
+fn right(answers: impl IntoIterator<Item = String>, visits: &[Visit]) -> usize {
+    answers.into_iter().zip(visits).filter(|(answer, (place, _))| *answer == id(*place)).count()
+}
+
+fn tracked(answers: &[Value]) -> Vec<String> {
+    let image = |answer: &Value| answer["track"]["image_id"].as_str().unwrap().to_owned();
+    answers.iter().map(image).collect()
+}
+
+fn names(places: Vec<usize>) -> Vec<String> {
+    places.into_iter().map(id).collect()
 }
 
 #[tokio::test]
-async fn a_track_is_located_better_than_its_frames() {
+async fn a_track_is_located_better_than_its_frames_and_than_simple_filters() {
     let town = Town::new(TownSpec { seed: 11, places: PLACES, width: 320, height: 240 });
     let (server, map) = shared_server();
     metric_map(server, &map, &town).await;
-    let (mut single, mut filtered, mut with_odometry) = (0, 0, 0);
+    let visits: Vec<Visit> = (0..PLACES).map(|place| (place, (place / 8) as u32)).collect();
+    let by_time = |step: &Step| format!("map={map}&k={PLACES}&track=a&captured_at={}", step.at);
+    let plain = drive(server, &town, &visits, by_time).await;
+    // Odometry with an error of five metres.
+    let by_way = |step: &Step| {
+        format!("map={map}&track=b&captured_at={}&moved_m={}", step.at, step.way + 5.0)
+    };
+    let moved = drive(server, &town, &visits, by_way).await;
+    let similarities: Vec<Vec<f32>> = plain.iter().map(all_similarities).collect();
+    let counted = |places: Vec<usize>| right(names(places), &visits);
+    let alone = counted(drives::alone(&similarities));
+    let a = counted(drives::with_odometry(&similarities));
+    let b = counted(drives::without_odometry(&similarities));
+    let line = counted(drives::best_line(&similarities));
+    let filtered = right(tracked(&plain), &visits);
+    let with_odometry = right(tracked(&moved), &visits);
+    println!(
+        "R@1 of {PLACES} frames, three in ten blocked: frame alone {alone}, track {filtered}, with odometry \
+         {with_odometry}; A {a}, B {b}, SeqSLAM {line}"
+    );
+    assert!(
+        filtered > alone && filtered >= a.max(b),
+        "{filtered} of {PLACES}, {alone} alone, A {a}, B {b}"
+    );
+    assert!(with_odometry > alone && with_odometry >= a, "{with_odometry}, {alone} alone, A {a}");
+    let mut sure = [0; 2];
+    for (answer, (place, _)) in plain.iter().chain(&moved).zip(visits.iter().chain(&visits)) {
+        let probability = answer["track"]["probability"].as_f64().unwrap();
+        assert!((0.0..=1.0 + 1e-9).contains(&probability), "{probability}");
+        assert_eq!(answer["track"]["known"], probability >= 0.5);
+        if probability >= 0.9 {
+            sure[usize::from(answer["track"]["image_id"] == id(*place))] += 1;
+        }
+    }
+    assert_eq!(plain[PLACES - 1]["track"]["frames"], PLACES);
+    println!(
+        "of answers with probability 0.9 or more, {} are right and {} wrong",
+        sure[1], sure[0]
+    );
+    assert!(sure[1] >= 19 * sure[0], "{sure:?}");
+}
+
+/// The similarity of a frame to each image of the map, in order.
+fn all_similarities(answer: &Value) -> Vec<f32> {
+    let mut row = vec![0.0; PLACES];
+    for candidate in answer["candidates"].as_array().unwrap() {
+        let name = candidate["image_id"].as_str().unwrap();
+        let place: usize = name.trim_start_matches("place-").parse().unwrap();
+        row[place] = candidate["similarity"].as_f64().unwrap() as f32;
+    }
+    row
+}
+
+/// A town of six streets, and its map.
+async fn small_town(server: &Server, map: &str) -> Town {
+    let town = Town::new(TownSpec { seed: 11, places: 48, width: 320, height: 240 });
+    metric_map(server, map, &town).await;
+    town
+}
+
+#[tokio::test]
+async fn a_robot_that_turns_round_is_followed_with_odometry_and_without() {
+    let (server, map) = shared_server();
+    let town = small_town(server, &map).await;
+    let visits: Vec<Visit> = (8..24).chain((8..23).rev()).map(|place| (place, 1)).collect();
+    let by_time = |step: &Step| format!("map={map}&track=a&captured_at={}", step.at);
+    let turn = 16;
+    let by_pose = |step: &Step| {
+        let dyaw =
+            if step.at == turn_time(&town, &visits, turn) { std::f64::consts::PI } else { 0.0 };
+        let Step { at, way } = step;
+        format!("map={map}&track=b&captured_at={at}&dx={way}&dy=0&dyaw={dyaw}&covariance=4,4,0.1")
+    };
+    let plain = drive(server, &town, &visits, by_time).await;
+    let posed = drive(server, &town, &visits, by_pose).await;
+    let back = &visits[turn..];
+    let single = plain[turn..]
+        .iter()
+        .map(|answer| answer["candidates"][0]["image_id"].as_str().unwrap().to_owned());
+    let single = right(single.collect::<Vec<_>>(), back);
+    let [by_time, by_pose] = [&plain, &posed].map(|answers| right(tracked(&answers[turn..]), back));
+    println!(
+        "on the way back, of {}: frame alone {single}, track {by_time}, odometry {by_pose}",
+        back.len()
+    );
+    assert!(by_time >= single, "{by_time}, {single} alone");
+    assert!(by_pose * 10 >= back.len() * 8, "{by_pose} of {}", back.len());
+}
+
+/// When a drive is at its `number`th frame.
+fn turn_time(town: &Town, visits: &[Visit], number: usize) -> Timestamp {
     let mut at: Timestamp = "2026-03-01T12:00:00Z".parse().unwrap();
     let mut before: Option<[f64; 2]> = None;
-    for place in 0..PLACES {
-        let shot = town.query(place, (place / 8) as u32);
+    for (place, visit) in &visits[..=number] {
+        let shot = town.query(*place, *visit);
         let here = [shot.x, shot.y];
         let way = before.map_or(0.0, |[x, y]| (here[0] - x).hypot(here[1] - y));
+        let pause = if way < 5.0 { 1.0 } else { 0.0 };
+        at += SignedDuration::from_secs_f64(way / SPEED + pause);
         before = Some(here);
-        at += SignedDuration::from_secs_f64(way / SPEED);
-        let picture = if is_occluded(place) { occluded(shot.image, place) } else { shot.image };
-        let bytes = jpeg(&picture);
-        let path = format!("/localize?map={map}&refine=off&captured_at={at}&track=");
-        let plain = server.post_jpeg(&format!("{path}a"), bytes.clone()).await.expect(200);
-        // Odometry with an error of five metres.
-        let moved = format!("{path}b&moved_m={}", way + 5.0);
-        let moved = server.post_jpeg(&moved, bytes).await.expect(200);
-        single += usize::from(plain["candidates"][0]["image_id"] == id(place));
-        filtered += usize::from(plain["track"]["image_id"] == id(place));
-        with_odometry += usize::from(moved["track"]["image_id"] == id(place));
-        assert_eq!(plain["track"]["frames"], place + 1);
-        let probability = plain["track"]["probability"].as_f64().unwrap();
-        assert!((0.0..=1.0 + 1e-9).contains(&probability), "{probability}");
-        assert_eq!(plain["track"]["known"], probability >= 0.5);
     }
-    println!(
-        "R@1 of {PLACES} frames, three in ten occluded: single {single}, track {filtered}, track with \
-         odometry {with_odometry}"
-    );
-    assert!(filtered * 10 >= single * 10 + PLACES, "{filtered} of {PLACES}, {single} alone");
-    assert!(with_odometry >= filtered, "{with_odometry}, {filtered} without odometry");
+    at
+}
+
+#[tokio::test]
+async fn a_robot_that_stands_still_stays_where_it_is() {
+    let (server, map) = shared_server();
+    let town = small_town(server, &map).await;
+    let standing = 15;
+    let visits: Vec<Visit> = (8..standing).chain([standing; 12]).map(|place| (place, 1)).collect();
+    let answers =
+        drive(server, &town, &visits, |step| format!("map={map}&track=a&captured_at={}", step.at))
+            .await;
+    let there = &tracked(&answers)[visits.len() - 8..];
+    assert!(there.iter().all(|image| *image == id(standing)), "{there:?}");
+}
+
+#[tokio::test]
+async fn a_kidnapped_robot_is_found_again() {
+    let (server, map) = shared_server();
+    let town = small_town(server, &map).await;
+    let visits: Vec<Visit> = (0..16).chain(32..48).map(|place| (place, 1)).collect();
+    // Neither the clock nor odometry sees that it was carried.
+    let by_way = |step: &Step| {
+        let way = step.way.min(17.0);
+        format!("map={map}&track=a&moved_m={way}")
+    };
+    let answers = drive(server, &town, &visits, by_way).await;
+    let end = visits.len() - 6;
+    let found = right(tracked(&answers[end..]), &visits[end..]);
+    assert!(found >= 5, "{:?}", tracked(&answers[16..]));
 }
 
 #[tokio::test]
@@ -128,6 +258,12 @@ async fn an_invalid_track_is_rejected_with_a_hint() {
         ("&track=a&moved_m=-1", "moved_m"),
         ("&track=a&moved_m=NaN", "moved_m"),
         ("&moved_m=1", "track"),
+        ("&dx=1&dy=0&dyaw=0", "track"),
+        ("&track=a&dx=1", "together"),
+        ("&track=a&moved_m=1&dx=1&dy=0&dyaw=0", "alone"),
+        ("&track=a&dx=1&dy=0&dyaw=NaN", "dyaw"),
+        ("&track=a&dx=1&dy=0&dyaw=0&covariance=1,2", "9"),
+        ("&track=a&dx=1&dy=0&dyaw=0&covariance=1,2,x", "number"),
         ("&captured_at=2026-01-01T00:00:00Z", "track"),
     ] {
         let problem = ask(query).await.problem(422);

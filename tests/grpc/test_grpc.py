@@ -225,6 +225,17 @@ class Contract(unittest.TestCase):
             request = self.message("LocalizeRequest", map="town", image=frame, refine=3, track=track)
             answer = self.call("LocalizationService", "Localize", request)
             self.assertEqual((answer.track.id, answer.track.frames), ("robot-7", number))
+        frame = pictures("frames")[3][1]
+        moved = self.message("RelativePose", dx=1.0, dy=0.0, dyaw=0.1, covariance=[0.1, 0.1, 0.01])
+        for wrong in (False, True):
+            odometry = {"moved": moved, **({"moved_m": 1.0} if wrong else {})}
+            track = self.message("Track", id="robot-7", **odometry)
+            request = self.message("LocalizeRequest", map="town", image=frame, refine=3, track=track)
+            call = lambda request=request: self.call("LocalizationService", "Localize", request)
+            if wrong:
+                self.refused(grpc.StatusCode.INVALID_ARGUMENT, call)
+            else:
+                self.assertEqual(call().track.frames, 4)
 
     def test_a_job_can_be_watched_until_it_ends(self) -> None:
         frame = pictures("frames")[1][1]

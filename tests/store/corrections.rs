@@ -9,7 +9,7 @@ use whereabouts_core::{
     Scene,
 };
 use whereabouts_index::SearchMode;
-use whereabouts_store::{Store, StoreError};
+use whereabouts_store::{LocatedImage, Store, StoreError};
 
 use crate::support::{Fixture, add, descriptor, fill, image, is_kept, map, next, odd_texts};
 
@@ -57,7 +57,9 @@ async fn a_corrected_image_is_found_everywhere_and_after_a_restart(fixture: &Fix
         let by_id = store.images_by_id(&map, std::slice::from_ref(&a.id)).await.unwrap();
         assert_eq!(by_id, [Some(image.clone())]);
         let positions: Vec<_> = pose.map(|pose| (a.id.clone(), pose)).into_iter().collect();
-        assert_eq!(store.positions(&map).await.unwrap(), positions);
+        let located = store.positions(&map).await.unwrap().into_iter();
+        let located: Vec<_> = located.map(|located| (located.id, located.pose)).collect();
+        assert_eq!(located, positions);
         let query = descriptor(&a, 3);
         let found = store.search(&map, query, 1, SearchMode::Fast).await.unwrap();
         assert_eq!((&found[0].image_id, found[0].pose), (&a.id, pose));
@@ -89,8 +91,8 @@ async fn a_correction_changes_neither_descriptor_nor_bytes_nor_order(fixture: &F
     let kept: Vec<_> = after.iter().map(|exported| exported.descriptor.clone()).collect();
     assert_eq!(kept, descriptors);
     assert!(is_kept(&*store, b"a").await);
-    let ids = |positions: Vec<(_, Pose)>| -> Vec<String> {
-        positions.into_iter().map(|(id, _): (whereabouts_core::ImageId, _)| id.into()).collect()
+    let ids = |located: Vec<LocatedImage>| -> Vec<String> {
+        located.into_iter().map(|located| located.id.into()).collect()
     };
     assert_eq!(ids(store.positions(&map).await.unwrap()), ["b", "a"]);
     // Its bytes go with it.

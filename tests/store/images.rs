@@ -5,7 +5,9 @@ use std::sync::Arc;
 use bytes::Bytes;
 use futures_util::future::join_all;
 use whereabouts_core::ExportedImage;
-use whereabouts_core::{CoordinateFrame, GeographicPose, Image, ImageId, Map, MetricPose, Pose};
+use whereabouts_core::{
+    CoordinateFrame, GeographicPose, Image, ImageId, Map, MetricPose, Pose, dot,
+};
 use whereabouts_index::SearchMode;
 use whereabouts_store::{Added, Store, StoreError};
 
@@ -17,6 +19,7 @@ contract!(
     images_are_looked_up_by_id_in_the_order_asked_for,
     all_fields_of_an_image_are_kept,
     poses_are_returned_in_the_order_of_addition,
+    descriptors_and_similarities_are_those_of_the_slots_in_their_order,
     the_count_and_the_changes_follow_every_addition_and_removal,
     of_concurrent_additions_of_an_image_one_creates_it,
     of_concurrent_additions_of_different_bytes_under_one_id_one_succeeds,
@@ -144,11 +147,46 @@ async fn all_fields_of_an_image_are_kept(fixture: &Fixture) {
     let store = fixture.open().await;
     assert_eq!(store.image(&map, &image.id).await.unwrap(), Some(image.clone()));
     assert_eq!(store.images(&map, None, 9).await.unwrap(), std::slice::from_ref(&image));
-    assert_eq!(store.positions(&map).await.unwrap(), [(image.id.clone(), pose)]);
+    let located = store.positions(&map).await.unwrap();
+    assert_eq!((&located[0].id, located[0].pose, located.len()), (&image.id, pose, 1));
     let found = store.search(&map, query, 1, SearchMode::Exact).await.unwrap();
     assert_eq!((&found[0].image_id, found[0].pose), (&image.id, Some(pose)));
     let exported = store.export(&map, None, 1).await.unwrap();
     assert_eq!(exported[0].image, image);
+}
+
+async fn descriptors_and_similarities_are_those_of_the_slots_in_their_order(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let in_metres = Map { frame: CoordinateFrame::Metric, ..map("m", 3) };
+    let (map, _) = store.put_map(in_metres).await.unwrap();
+    let mut expected = Vec::new();
+    for (number, id) in ["z", "a", "q"].into_iter().enumerate() {
+        let (z, qx, qy, qz, qw) = (None, None, None, None, None);
+        let pose = Pose::Metric(MetricPose { x: number as f64, y: 0.0, z, qx, qy, qz, qw });
+        let image = Image { pose: Some(pose), ..image(id, id.as_bytes()) };
+        let _pin =
+            store.put_blob(image.digest, Bytes::copy_from_slice(id.as_bytes())).await.unwrap();
+        store.add_image(&map, image.clone(), descriptor(&image, 3)).await.unwrap();
+        expected.push(descriptor(&image, 3));
+    }
+    let slots: Vec<usize> =
+        store.positions(&map).await.unwrap().into_iter().map(|located| located.slot).collect();
+    assert!(store.delete_image(&map, &"a".parse().unwrap()).await.unwrap());
+    let asked = vec![slots[2], slots[1], slots[0], 999_999, slots[2]];
+    let found = store.descriptors(&map, asked.clone()).await.unwrap();
+    let [first, last] = [&expected[0], &expected[2]].map(|descriptor| Some(descriptor.clone()));
+    assert_eq!(found, [last.clone(), None, first, None, last]);
+    let vector = vec![2.0, -1.0, 0.5];
+    let similarities = store.similarities(&map, vector.clone(), asked).await.unwrap();
+    for (similarity, descriptor) in similarities.iter().zip(&found) {
+        let exact = descriptor.as_ref().map(|descriptor| dot(&vector, descriptor.as_slice()));
+        assert_eq!(similarity.is_some(), exact.is_some());
+        let off = similarity.unwrap_or_default() - exact.unwrap_or_default();
+        assert!(off.abs() < 1e-5, "{similarity:?} {exact:?}");
+    }
+    let reindexed = Map { revision: 7, ..map.clone() };
+    let refused = store.similarities(&reindexed, vector, slots).await.unwrap_err();
+    assert!(matches!(refused, StoreError::Superseded(_)), "{refused}");
 }
 
 async fn poses_are_returned_in_the_order_of_addition(fixture: &Fixture) {
@@ -171,7 +209,7 @@ async fn poses_are_returned_in_the_order_of_addition(fixture: &Fixture) {
     }
     let positions = async || -> Vec<(String, Pose)> {
         let positions = store.positions(&map).await.unwrap();
-        positions.into_iter().map(|(id, pose)| (id.into(), pose)).collect()
+        positions.into_iter().map(|located| (located.id.into(), located.pose)).collect()
     };
     let expected = |of: &[(&str, f64)]| -> Vec<(String, Pose)> {
         of.iter().map(|(id, x)| ((*id).to_owned(), at(*x))).collect()

@@ -14,7 +14,7 @@ use super::proto::{
 };
 use super::streams::{ResponseStream, until_over};
 use super::{Api, CallContext, convert, status};
-use whereabouts_service::{ServiceError, TrackStep};
+use whereabouts_service::{Odometry, ServiceError, TrackStep};
 
 #[tonic::async_trait]
 impl LocalizationService for Api {
@@ -70,7 +70,20 @@ impl CallContext {
 
     fn step(&self, track: proto::Track) -> Result<TrackStep, ServiceError> {
         let captured_at = track.captured_at.map(convert::moment).transpose()?;
-        TrackStep::new(&self.caller, track.id, captured_at, track.moved_m)
+        let odometry = match (track.moved_m, track.moved) {
+            (Some(metres), None) => Some(Odometry::distance(metres)?),
+            (None, Some(moved)) => {
+                let pose = [moved.dx, moved.dy, moved.dyaw];
+                Some(Odometry::relative_pose(pose, &moved.covariance)?)
+            }
+            (None, None) => None,
+            (Some(_), Some(_)) => {
+                return Err(ServiceError::unprocessable(
+                    "odometry is either moved_m or moved; leave one of them out",
+                ));
+            }
+        };
+        TrackStep::new(&self.caller, track.id, captured_at, odometry)
     }
 }
 

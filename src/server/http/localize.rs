@@ -15,7 +15,9 @@ use crate::gate::Problem;
 use crate::gate::Ready;
 use whereabouts_api::{Answer, RefineMode};
 use whereabouts_core::{Priority, moment};
-use whereabouts_service::{Deadline, LocalizeRequest, Principal, ServiceError, TrackStep};
+use whereabouts_service::{
+    Deadline, LocalizeRequest, Odometry, Principal, ServiceError, TrackStep,
+};
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -38,14 +40,24 @@ pub(super) struct LocalizeParams {
     /// `_`, `.` and `:`. The field `track` of the answer then estimates where the robot is, given all its
     /// frames. The images of the map need poses. A track expires when no frame arrives for a while.
     track: Option<String>,
-    /// When the frame was taken, for a frame with `track`: RFC 3339 with an offset, or seconds since 1970; by
-    /// default now.
+    /// When the frame was taken, for a frame with `track`: RFC 3339 with an offset, or seconds since 1970. By
+    /// default unknown: frames are then followed at their own rate, and not by the clock.
     #[param(value_type = Option<String>)]
     #[serde(default, deserialize_with = "moment::optional")]
     captured_at: Option<Timestamp>,
     /// Metres that the robot has moved since the previous frame, by its odometry, for a frame with
     /// `track`; by default, any distance up to the maximum speed (`track.max_speed_m_s`) is possible.
     moved_m: Option<f64>,
+    /// Instead of `moved_m`: metres that the robot has moved ahead since the previous frame, in its own axes at that
+    /// frame. `dy` and `dyaw` must be given too.
+    dx: Option<f64>,
+    /// Metres moved to the left.
+    dy: Option<f64>,
+    /// Radians turned to the left.
+    dyaw: Option<f64>,
+    /// The covariance of `dx`, `dy` and `dyaw`, in m², m·rad and rad²: 9 numbers row by row, or the 3 of its diagonal,
+    /// separated by commas.
+    covariance: Option<String>,
     /// If the body is pixels without a file format, their layout: `mono8`, `mono16` (little-endian), `rgb8`, `bgr8`,
     /// `rgba8` or `bgra8`.
     encoding: Option<String>,
@@ -60,13 +72,52 @@ pub(super) struct LocalizeParams {
 impl LocalizeParams {
     fn step(&mut self, caller: &Principal) -> Result<Option<TrackStep>, ServiceError> {
         match self.track.take() {
-            Some(id) => TrackStep::new(caller, id, self.captured_at, self.moved_m).map(Some),
-            None if self.captured_at.is_some() || self.moved_m.is_some() => Err(
-                ServiceError::unprocessable("captured_at and moved_m need a track; set track too"),
-            ),
+            Some(id) => {
+                let odometry = self.odometry()?;
+                TrackStep::new(caller, id, self.captured_at, odometry).map(Some)
+            }
+            None if self.captured_at.is_some() || self.has_odometry() => {
+                Err(ServiceError::unprocessable(
+                    "captured_at, moved_m, dx, dy, dyaw and covariance need a track; set track too",
+                ))
+            }
             None => Ok(None),
         }
     }
+
+    fn has_odometry(&self) -> bool {
+        let numbers = [self.moved_m, self.dx, self.dy, self.dyaw];
+        numbers.iter().any(Option::is_some) || self.covariance.is_some()
+    }
+
+    fn odometry(&self) -> Result<Option<Odometry>, ServiceError> {
+        if !self.has_odometry() {
+            return Ok(None);
+        }
+        match (self.moved_m, self.dx, self.dy, self.dyaw, &self.covariance) {
+            (Some(metres), None, None, None, None) => Odometry::distance(metres).map(Some),
+            (None, Some(dx), Some(dy), Some(dyaw), covariance) => {
+                let covariance = numbers(covariance.as_deref().unwrap_or_default())?;
+                Odometry::relative_pose([dx, dy, dyaw], &covariance).map(Some)
+            }
+            _ => Err(ServiceError::unprocessable(
+                "odometry is either moved_m alone, or dx, dy and dyaw together, with covariance if it is known",
+            )),
+        }
+    }
+}
+
+/// Numbers separated by commas.
+fn numbers(text: &str) -> Result<Vec<f64>, ServiceError> {
+    let parts = text.split(',').filter(|part| !part.trim().is_empty());
+    let number = |part: &str| {
+        part.trim().parse().map_err(|_| {
+            ServiceError::unprocessable(format!(
+                "{part:?} in covariance is not a number; send 9 or 3 numbers separated by commas"
+            ))
+        })
+    };
+    parts.map(number).collect()
 }
 
 /// The form of a frame.

@@ -2,11 +2,14 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::{Fixture, candidates, image_id};
-use crate::{Principal, TrackStep};
+use super::{DIM, Fixture, candidates, image, image_id, map};
+use crate::{Odometry, Principal, TrackStep};
 use whereabouts_api::{ErrorKind, TrackEstimate};
-use whereabouts_core::{ApiKey, Calibration, KeyLimits, Map, Role};
-use whereabouts_store::MapStore;
+use whereabouts_core::{ApiKey, Descriptor, KeyLimits, Map, Role};
+use whereabouts_store::{BlobStore, MapStore};
+
+/// Places with views that differ from each other.
+const VIEWS: usize = 64;
 
 /// A step that is taken `seconds` after the epoch.
 fn step(caller: &Principal, id: &str, seconds: i64) -> TrackStep {
@@ -14,19 +17,48 @@ fn step(caller: &Principal, id: &str, seconds: i64) -> TrackStep {
     TrackStep::new(caller, id.into(), Some(at), None).unwrap()
 }
 
-async fn follow(
+fn robot(seconds: i64) -> TrackStep {
+    step(&Principal::Anonymous, "robot", seconds)
+}
+
+/// What a camera sees at a place: all views have something in common, and neighbours a little more.
+fn view(place: usize) -> Descriptor {
+    let mut numbers = vec![0.1; VIEWS];
+    numbers[place % VIEWS] += 1.0;
+    numbers[(place + 1) % VIEWS] += 0.3;
+    Descriptor::normalised(numbers).unwrap()
+}
+
+/// What a camera sees that is halfway between two places in looks.
+fn between(one: usize, other: usize) -> Descriptor {
+    let sum = view(one).as_slice().iter().zip(view(other).as_slice()).map(|(a, b)| a + b).collect();
+    Descriptor::normalised(sum).unwrap()
+}
+
+/// A map of views every ten metres along a road.
+async fn road(fixture: &Fixture, places: usize) -> Map {
+    let map = Map { dim: VIEWS, ..map("road") };
+    let (map, _) = fixture.store.put_map(map).await.unwrap();
+    for place in 0..places {
+        let (bytes, image) = image(place, Some(place as f64 * 10.0));
+        let _pin = fixture.store.put_blob(image.digest, bytes.into()).await.unwrap();
+        fixture.store.add_image(&map, image, view(place)).await.unwrap();
+    }
+    map
+}
+
+async fn follow(fixture: &Fixture, map: &Map, step: TrackStep, view: &Descriptor) -> TrackEstimate {
+    follow_with_warning(fixture, map, step, view).await.0
+}
+
+async fn follow_with_warning(
     fixture: &Fixture,
     map: &Map,
     step: TrackStep,
-    similar: &[(usize, f32)],
-) -> TrackEstimate {
+    view: &Descriptor,
+) -> (TrackEstimate, Option<String>) {
     let tracks = &fixture.service.localizer.tracks;
-    tracks.follow(map, step, &candidates(similar), &Calibration::default()).await.unwrap()
-}
-
-/// Images every ten metres along a road.
-fn road(count: usize) -> Vec<Option<f64>> {
-    (0..count).map(|number| Some(number as f64 * 10.0)).collect()
+    tracks.follow(map, step, view, Some(&[])).await.unwrap()
 }
 
 #[tokio::test]
@@ -34,31 +66,102 @@ async fn a_track_in_a_map_without_poses_is_unprocessable() {
     let fixture = Fixture::new().await;
     let map = fixture.map("yard", &[None, None]).await;
     let tracks = &fixture.service.localizer.tracks;
-    let step = step(&Principal::Anonymous, "robot", 0);
     let found = candidates(&[(0, 0.9), (1, 0.8)]);
-    let refused = tracks.follow(&map, step, &found, &Calibration::default()).await.unwrap_err();
+    let frame = Descriptor::normalised(vec![1.0; DIM]).unwrap();
+    let refused = tracks.follow(&map, robot(0), &frame, Some(&found)).await.unwrap_err();
     assert_eq!(refused.kind, ErrorKind::Unprocessable);
     assert!(refused.detail.contains("poses"), "{refused}");
 }
 
 #[tokio::test]
-async fn the_second_frame_of_a_track_decides_between_places_that_look_alike() {
+async fn the_frames_before_decide_between_places_that_look_alike() {
     let fixture = Fixture::new().await;
-    let map = fixture.map("road", &road(40)).await;
-    let robot = |seconds| step(&Principal::Anonymous, "robot", seconds);
-    let first = follow(&fixture, &map, robot(0), &[(10, 0.9), (3, 0.5), (4, 0.5)]).await;
-    assert_eq!((first.frames, first.image_id), (1, Some(image_id(10))));
-    let alike = [(30, 0.91), (11, 0.9), (3, 0.5), (4, 0.5)];
-    let second = follow(&fixture, &map, robot(1), &alike).await;
-    assert_eq!((second.frames, second.image_id), (2, Some(image_id(11))));
-    let alone = follow(&fixture, &map, step(&Principal::Anonymous, "new", 1), &alike).await;
-    assert_eq!(alone.image_id, Some(image_id(30)));
+    let map = road(&fixture, 40).await;
+    for place in 7..=10 {
+        follow(&fixture, &map, robot(place as i64), &view(place)).await;
+    }
+    let alike = between(11, 30);
+    let estimate = follow(&fixture, &map, robot(11), &alike).await;
+    assert_eq!((estimate.frames, estimate.image_id), (5, Some(image_id(11))));
+}
+
+#[tokio::test]
+async fn a_robot_that_may_be_at_either_of_two_places_is_told_both() {
+    let fixture = Fixture::new().await;
+    let map = road(&fixture, 40).await;
+    let estimate = follow(&fixture, &map, robot(0), &between(11, 30)).await;
+    let other = &estimate.others[0];
+    let mut places = [estimate.image_id.unwrap(), other.image_id.clone()];
+    places.sort();
+    assert_eq!(places, [image_id(11), image_id(30)]);
+    assert!((0.1..0.5).contains(&other.probability), "{}", other.probability);
+}
+
+#[tokio::test]
+async fn a_late_frame_answers_for_its_own_time_and_does_not_move_the_track_back() {
+    let fixture = Fixture::new().await;
+    let map = road(&fixture, 40).await;
+    for place in 5..15 {
+        follow(&fixture, &map, robot(place as i64), &view(place)).await;
+    }
+    let late = follow(&fixture, &map, robot(9), &view(9)).await;
+    assert_eq!((late.is_late, late.image_id), (true, Some(image_id(9))));
+    let very_late = follow(&fixture, &map, robot(-900), &view(3)).await;
+    assert_eq!((very_late.is_late, very_late.image_id), (true, Some(image_id(3))));
+    let next = follow(&fixture, &map, robot(15), &between(15, 9)).await;
+    assert_eq!((next.is_late, next.image_id), (false, Some(image_id(15))));
+    assert!(next.probability > 0.8, "{}", next.probability);
+}
+
+#[tokio::test(start_paused = true)]
+async fn frames_without_times_that_arrive_too_fast_are_followed_and_the_answer_says_what_to_send() {
+    let fixture = Fixture::new().await;
+    let map = road(&fixture, 40).await;
+    let mut warnings = 0;
+    for place in 3..30 {
+        tokio::time::advance(Duration::from_millis(50)).await;
+        let step = TrackStep::new(&Principal::Anonymous, "replay".into(), None, None).unwrap();
+        let (estimate, warning) = follow_with_warning(&fixture, &map, step, &view(place)).await;
+        assert_eq!(estimate.image_id, Some(image_id(place)));
+        assert!(warning.as_ref().is_none_or(|text| text.contains("captured_at")), "{warning:?}");
+        warnings += usize::from(warning.is_some());
+    }
+    assert!(warnings > 15, "{warnings}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_in_real_time_is_not_warned() {
+    let fixture = Fixture::new().await;
+    let map = road(&fixture, 40).await;
+    for place in 3..30 {
+        tokio::time::advance(Duration::from_secs(5)).await;
+        let step = TrackStep::new(&Principal::Anonymous, "live".into(), None, None).unwrap();
+        let (_, warning) = follow_with_warning(&fixture, &map, step, &view(place)).await;
+        assert_eq!(warning, None);
+    }
+}
+
+#[tokio::test]
+async fn a_frame_that_shows_nothing_moves_the_track_on() {
+    let fixture = Fixture::new().await;
+    let map = road(&fixture, 40).await;
+    let moved = |place: i64| {
+        let odometry = Some(Odometry::distance(10.0).unwrap());
+        let at = Some(Timestamp::UNIX_EPOCH + SignedDuration::from_secs(place));
+        TrackStep::new(&Principal::Anonymous, "robot".into(), at, odometry).unwrap()
+    };
+    for place in 5..10 {
+        follow(&fixture, &map, moved(place as i64), &view(place)).await;
+    }
+    let tracks = &fixture.service.localizer.tracks;
+    let (blind, _) = tracks.follow(&map, moved(10), &view(30), None).await.unwrap();
+    assert_eq!(blind.image_id, Some(image_id(10)));
 }
 
 #[tokio::test]
 async fn tracks_of_two_api_keys_are_separate_even_if_their_ids_are_equal() {
     let fixture = Fixture::new().await;
-    let map = fixture.map("road", &road(5)).await;
+    let map = road(&fixture, 5).await;
     let key = |id: &str| {
         Principal::ApiKey(
             ApiKey {
@@ -74,9 +177,8 @@ async fn tracks_of_two_api_keys_are_separate_even_if_their_ids_are_equal() {
             .into(),
         )
     };
-    let found = [(1, 0.9), (2, 0.5)];
     for (caller, frames) in [("one", 1), ("one", 2), ("two", 1), ("one", 3)] {
-        let estimate = follow(&fixture, &map, step(&key(caller), "robot", 0), &found).await;
+        let estimate = follow(&fixture, &map, step(&key(caller), "robot", 0), &view(1)).await;
         assert_eq!(estimate.frames, frames, "{caller}");
     }
 }
@@ -84,10 +186,10 @@ async fn tracks_of_two_api_keys_are_separate_even_if_their_ids_are_equal() {
 #[tokio::test]
 async fn the_least_recently_used_track_is_evicted() {
     let fixture = Fixture::with(0, |settings| settings.track.max = 2).await;
-    let map = fixture.map("road", &road(5)).await;
+    let map = road(&fixture, 5).await;
     for (id, frames) in [("a", 1), ("b", 1), ("a", 2), ("c", 1), ("a", 3), ("b", 1)] {
         let step = step(&Principal::Anonymous, id, 0);
-        let estimate = follow(&fixture, &map, step, &[(1, 0.9), (2, 0.5)]).await;
+        let estimate = follow(&fixture, &map, step, &view(1)).await;
         assert_eq!(estimate.frames, frames, "{id}");
     }
 }
@@ -95,11 +197,10 @@ async fn the_least_recently_used_track_is_evicted() {
 #[tokio::test(start_paused = true)]
 async fn an_idle_track_starts_over() {
     let fixture = Fixture::with(0, |settings| settings.track.idle_s = 600).await;
-    let map = fixture.map("road", &road(5)).await;
+    let map = road(&fixture, 5).await;
     for (idle_s, frames) in [(0, 1), (500, 2), (500, 3), (601, 1)] {
         tokio::time::advance(Duration::from_secs(idle_s)).await;
-        let step = step(&Principal::Anonymous, "robot", 0);
-        let estimate = follow(&fixture, &map, step, &[(1, 0.9), (2, 0.5)]).await;
+        let estimate = follow(&fixture, &map, robot(0), &view(1)).await;
         assert_eq!(estimate.frames, frames, "after {idle_s} s");
     }
 }
@@ -107,32 +208,21 @@ async fn an_idle_track_starts_over() {
 #[tokio::test]
 async fn a_deleted_image_is_never_the_estimate() {
     let fixture = Fixture::new().await;
-    let map = fixture.map("road", &road(20)).await;
-    let found = [(5, 0.9), (15, 0.8), (1, 0.3)];
-    let robot = || step(&Principal::Anonymous, "robot", 0);
-    let before = follow(&fixture, &map, robot(), &found).await;
+    let map = road(&fixture, 20).await;
+    let before = follow(&fixture, &map, robot(0), &view(5)).await;
     assert_eq!(before.image_id, Some(image_id(5)));
     fixture.store.delete_image(&map, &image_id(5)).await.unwrap();
-    let after = follow(&fixture, &map, robot(), &found).await;
+    let after = follow(&fixture, &map, robot(1), &view(5)).await;
     assert!(after.image_id.is_some_and(|id| id != image_id(5)));
     assert!((0.0..=1.0).contains(&after.probability), "{}", after.probability);
 }
 
 #[test]
-fn a_step_with_an_unusable_id_or_distance_is_unprocessable() {
-    let new = |id: &str, moved_m| TrackStep::new(&Principal::Anonymous, id.into(), None, moved_m);
-    assert!(new("robot-1_a.b:c", Some(0.0)).is_ok());
+fn a_step_with_an_unusable_id_is_unprocessable() {
+    let new = |id: &str| TrackStep::new(&Principal::Anonymous, id.into(), None, None);
+    assert!(new("robot-1_a.b:c").is_ok());
     let long = "x".repeat(65);
-    for (id, moved_m) in [
-        ("", None),
-        ("a b", None),
-        ("ö", None),
-        (long.as_str(), None),
-        ("robot", Some(-1.0)),
-        ("robot", Some(f64::NAN)),
-        ("robot", Some(1e7)),
-    ] {
-        let refused = new(id, moved_m).unwrap_err();
-        assert_eq!(refused.kind, ErrorKind::Unprocessable, "{id} {moved_m:?}");
+    for id in ["", "a b", "ö", long.as_str()] {
+        assert_eq!(new(id).unwrap_err().kind, ErrorKind::Unprocessable, "{id}");
     }
 }

@@ -1,192 +1,219 @@
-//! A discrete Bayes filter over the images of a map (Thrun, Burgard and Fox, *Probabilistic Robotics*,
-//! 2005, chapter 4): where a robot is, given all its frames so far.
+//! A discrete Bayes filter over where a robot is on the paths of a map, in which direction it moves, and how fast
+//! (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, chapter 4).
 //!
-//! Every frame takes two steps. *Predict*: for images i and j of the map,
+//! A state is an image, a direction on its path, and one of [`SPEEDS`] [speeds](super::speeds). Every frame takes two
+//! steps. *Predict*: each state moves along the path, and through links to other paths, as far as odometry says, or as
+//! its speed and the time say; the speed changes a little; with a small probability the robot turns round, or is carried
+//! anywhere. *Update*: each state is weighted by how well its image fits the frame
+//! ([`Weights`](super::evidence::Weights)).
 //!
-//! > p′(j) = (1 − ε) Σ p(i) T(i → j) + ε / N
-//!
-//! where T falls off as a Gaussian beyond the distance that the robot can have moved, or around the distance
-//! of its odometry, and ε is the probability that it was carried anywhere. *Update*:
-//!
-//! > p(j) ∝ p′(j) · (ω + (1 − ω) e(j) / ē),  e(j) = exp(β (s(j) − s₁) / g)
-//!
-//! with the similarity s(j) of the frame and the image, s₁ the highest, ē the mean of e over all images,
-//! and g the gap expected by chance between the first wrong answer and the median of the next ones, which is
-//! measured in the map ([`Evidence`](whereabouts_core::Evidence)). ω is the share of outliers, frames without
-//! information because, for example, a bus blocks the camera; it bounds the weight of a single frame.
-//!
-//! Only the most likely images are kept; the rest of the probability is spread evenly over the map.
+//! States of the most likely images are stored; the rest of the probability is spread evenly over the map.
 
-use super::TrackSettings;
-use super::places::Places;
-use whereabouts_core::ImageId;
+use super::evidence::Weights;
+use super::grid::Grid;
+use super::moves::{Motion, move_states};
+use super::paths::{Paths, Stop};
+use super::speeds::{SPEEDS, STATES, change_speeds, pace, state, turn_round};
 
-/// A Gaussian is cut off beyond this many standard deviations.
-const TAIL: f64 = 3.0;
+/// Images less probable than this are not told apart.
+const TRACE: f64 = 1e-6;
 
-/// Maximum number of images that a robot may have moved to from one image; if more are in reach, the probability
-/// is spread over the whole map.
-const MAX_REACHED: usize = 512;
-
-/// How far a robot has moved since its last frame.
+/// What the filter assumes about a robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Motion {
-    /// At most this many metres.
-    Within(f64),
-    /// This many metres, by its odometry.
-    By(f64),
+pub(super) struct Habits {
+    /// The highest of the speeds, in metres per unit of time.
+    pub max_speed: f64,
+    /// Probability that the robot has turned round since the last frame.
+    pub turn: f64,
+    /// Probability that it was carried anywhere.
+    pub jump: f64,
 }
 
-/// A probability distribution over the images of a map.
+/// A map as the filter sees it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Roads<'a> {
+    pub grid: &'a Grid,
+    pub paths: &'a Paths,
+    /// How much each image of the belief differs from its neighbours, in units of the usual difference.
+    pub changes: &'a [f32],
+}
+
+/// A probability distribution over the states of a map.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Belief {
-    /// The most likely images by number, in ascending order, each with its probability in addition to its share
-    /// of `elsewhere`.
-    likely: Vec<(u32, f64)>,
-    /// The probability that is spread evenly over all images.
-    elsewhere: f64,
+    /// The images that are told apart.
+    images: Vec<u32>,
+    /// The probability of each of their states, in addition to its share of `elsewhere`.
+    pub states: Vec<[f32; STATES]>,
+    /// The probability that is spread evenly over the map.
+    pub elsewhere: f64,
+}
+
+/// A belief while it is changed, with the place of each image of the map in it.
+pub(super) struct Numbered {
+    pub belief: Belief,
+    at: Vec<u32>,
+}
+
+/// No place.
+const NOWHERE: u32 = u32::MAX;
+
+impl Numbered {
+    fn new(belief: Belief, count: usize) -> Self {
+        let mut at = vec![NOWHERE; count];
+        for (place, image) in (0..).zip(&belief.images) {
+            at[*image as usize] = place;
+        }
+        Self { belief, at }
+    }
+
+    /// Returns the place of an image, which is added if it is new.
+    pub fn place(&mut self, image: u32) -> usize {
+        let at = &mut self.at[image as usize];
+        if *at == NOWHERE {
+            *at = self.belief.images.len() as u32;
+            self.belief.images.push(image);
+            self.belief.states.push([0.0; STATES]);
+        }
+        *at as usize
+    }
 }
 
 impl Belief {
     /// The uniform distribution, before the first frame.
     pub fn uniform() -> Self {
-        Self { likely: Vec::new(), elsewhere: 1.0 }
+        Self { images: Vec::new(), states: Vec::new(), elsewhere: 1.0 }
+    }
+
+    /// The images that are told apart.
+    pub fn images(&self) -> &[u32] {
+        &self.images
     }
 
     /// The prediction step: the belief after the robot has moved.
-    pub fn predicted(&self, motion: Motion, places: &Places, settings: &TrackSettings) -> Self {
-        let width = places.spacing() / 2.0;
-        let (low, high, width) = match motion {
-            Motion::Within(reach) => (0.0, reach, width),
-            // Odometry drifts, and the path may have been curved.
-            Motion::By(distance) => {
-                (distance, distance, width + settings.odometry_error * distance)
-            }
-        };
-        let mut moved = Vec::new();
-        let mut elsewhere = self.elsewhere;
-        for &(image, probability) in &self.likely {
-            let reached = places.near(image, high + TAIL * width, MAX_REACHED).unwrap_or_default();
-            let weight = |distance: f64| {
-                let off = (low - distance).max(distance - high).max(0.0) / width;
-                // Cut off, or the normalisation would make the nearest image certain, however far it is.
-                if off > TAIL { 0.0 } else { (-0.5 * off * off).exp() }
-            };
-            let total: f64 = reached.iter().map(|(_, distance)| weight(*distance)).sum();
-            if total > f64::MIN_POSITIVE {
-                let share =
-                    |(to, distance): (u32, f64)| (to, probability * weight(distance) / total);
-                moved.extend(reached.into_iter().map(share));
-            } else {
-                elsewhere += probability;
+    pub fn predicted(&self, motion: Motion, habits: Habits, roads: Roads) -> Self {
+        let empty = Self { images: Vec::new(), states: Vec::new(), elsewhere: self.elsewhere };
+        let mut moved = Numbered::new(empty, roads.grid.len());
+        let mut ways = (Vec::new(), Vec::new());
+        for (at, (image, states)) in self.images.iter().zip(&self.states).enumerate() {
+            let change = roads.changes.get(at).copied().unwrap_or(0.0);
+            for ahead in [true, false] {
+                let speeds = &states[state(ahead, 0)..state(ahead, SPEEDS)];
+                let from = (Stop { image: *image, ahead, metres: 0.0 }, change);
+                move_states(from, speeds, (motion, habits), roads, &mut ways, &mut moved);
             }
         }
-        for (_, probability) in &mut moved {
-            *probability *= 1.0 - settings.jump;
+        let mut belief = moved.belief;
+        for states in &mut belief.states {
+            let is_free = matches!(motion, Motion::Elapsed { .. });
+            change_speeds(&mut states[..SPEEDS], is_free);
+            change_speeds(&mut states[SPEEDS..], is_free);
+            turn_round(states, habits);
         }
-        Self { likely: merged(moved), elsewhere: elsewhere + settings.jump * (1.0 - elsewhere) }
+        belief.elsewhere += habits.jump * (1.0 - belief.elsewhere);
+        belief.normalised()
     }
 
-    /// The update step: the belief after a frame. `similarities` are those of the most similar images; every other
-    /// image counts as if it had the lowest of them. `gap` is g above.
-    pub fn updated(
-        &self,
-        similarities: &[(u32, f32)],
-        gap: f32,
-        places: &Places,
-        settings: &TrackSettings,
-    ) -> Self {
-        let count = places.len() as f64;
-        let [mut first, mut last] = [f32::NEG_INFINITY, f32::INFINITY];
-        for (_, similarity) in similarities {
-            first = first.max(*similarity);
-            last = last.min(*similarity);
+    /// The update step: the belief after a frame. At most `max` images are kept.
+    pub fn updated(&self, weights: &Weights, count: usize, max: usize) -> Self {
+        let share = self.elsewhere / count.max(1) as f64;
+        let mut belief = Numbered::new(self.clone(), count);
+        let mut weight_of = vec![weights.rest(); belief.belief.images.len()];
+        for (image, weight) in weights.known() {
+            let place = belief.place(*image);
+            weight_of.resize(belief.belief.images.len(), weights.rest());
+            weight_of[place] = *weight;
         }
-        if similarities.is_empty() || count < 1.0 {
-            return self.clone();
+        let mut belief = belief.belief;
+        for (weight, states) in weight_of.iter().zip(&mut belief.states) {
+            for probability in states {
+                *probability = ((f64::from(*probability) + share / STATES as f64) * weight) as f32;
+            }
         }
-        let likelihood_of = |similarity: f32| {
-            f64::from(settings.sharpness as f32 * (similarity - first) / gap).exp()
-        };
-        let rest = likelihood_of(last);
-        let sum: f64 = similarities.iter().map(|(_, similarity)| likelihood_of(*similarity)).sum();
-        let mean = (sum + (count - similarities.len() as f64).max(0.0) * rest) / count;
-        let weight =
-            |likelihood: f64| settings.outliers + (1.0 - settings.outliers) * likelihood / mean;
+        let rest = count.saturating_sub(belief.images.len()) as f64;
+        belief.elsewhere = share * rest * weights.rest();
+        belief.pruned(max)
+    }
 
-        let share = self.elsewhere / count;
-        // Every likely and every similar image, with its prior probability.
-        let mut weighed: Vec<(u32, f64)> = self.likely.clone();
-        weighed.extend(similarities.iter().map(|(image, _)| (*image, 0.0)));
-        let mut weighed = merged(weighed);
-        let mut sorted = similarities.to_vec();
-        sorted.sort_by_key(|(image, _)| *image);
-        for (image, probability) in &mut weighed {
-            let found = sorted.binary_search_by_key(image, |(similar, _)| *similar);
-            let likelihood = found.map_or(rest, |at| likelihood_of(sorted[at].1));
-            *probability = (*probability + share) * weight(likelihood);
-        }
-        let elsewhere = share * (count - weighed.len() as f64).max(0.0) * weight(rest);
-        Self { likely: weighed, elsewhere }.pruned(settings.states)
+    /// The probability of each image that is told apart.
+    pub fn masses(&self) -> Vec<(u32, f64)> {
+        let sum = |states: &[f32; STATES]| states.iter().map(|p| f64::from(*p)).sum();
+        self.images.iter().copied().zip(self.states.iter().map(sum)).collect()
+    }
+
+    /// The probability that is spread evenly over the map.
+    pub fn elsewhere(&self) -> f64 {
+        self.elsewhere
+    }
+
+    /// The probability that the robot is faster than a speed. Speeds are in units of the highest one; `image` is that of
+    /// an image a frame.
+    pub fn faster_than(&self, speed: f64, image: f64) -> f64 {
+        let is_faster: [bool; STATES] = std::array::from_fn(|at| pace(at % SPEEDS, image) > speed);
+        let states = self.states.iter().flat_map(|states| states.iter().zip(&is_faster));
+        states.filter(|(_, faster)| **faster).map(|(probability, _)| f64::from(*probability)).sum()
+    }
+
+    /// The expected speed, in the same units.
+    pub fn speed(&self, image: f64) -> f64 {
+        let states = self.states.iter().flat_map(|states| states.iter().enumerate());
+        states.map(|(at, probability)| f64::from(*probability) * pace(at % SPEEDS, image)).sum()
+    }
+
+    /// The same belief in a map whose images have other numbers. The probability of images that were deleted is spread
+    /// over the map.
+    pub fn renumbered(&self, number: &dyn Fn(u32) -> Option<u32>) -> Self {
+        let kept = self.images.iter().zip(&self.states);
+        let kept = kept.filter_map(|(image, states)| Some((number(*image)?, *states)));
+        let (images, states): (Vec<_>, Vec<_>) = kept.unzip();
+        let belief = Self { images, states, elsewhere: 0.0 };
+        let known: f64 = belief.masses().iter().map(|(_, mass)| mass).sum();
+        Self { elsewhere: (1.0 - known).max(0.0), ..belief }.normalised()
     }
 
     /// Keeps the `max` most likely images, moves the rest of the probability elsewhere, and normalises the sum.
     fn pruned(mut self, max: usize) -> Self {
-        if self.likely.len() > max {
-            self.likely.sort_by(|a, b| b.1.total_cmp(&a.1));
-            self.elsewhere += self.likely.drain(max..).map(|(_, p)| p).sum::<f64>();
-            self.likely.sort_by_key(|(image, _)| *image);
+        self = self.normalised().without_traces();
+        if self.images.len() > max {
+            let mut masses: Vec<(usize, f64)> =
+                self.masses().into_iter().map(|(_, mass)| mass).enumerate().collect();
+            masses.select_nth_unstable_by(max, |a, b| b.1.total_cmp(&a.1));
+            self.elsewhere += masses[max..].iter().map(|(_, mass)| mass).sum::<f64>();
+            let mut kept: Vec<usize> = masses[..max].iter().map(|(at, _)| *at).collect();
+            kept.sort_unstable();
+            self.images = kept.iter().map(|at| self.images[*at]).collect();
+            self.states = kept.iter().map(|at| self.states[*at]).collect();
         }
-        let total = self.elsewhere + self.likely.iter().map(|(_, p)| p).sum::<f64>();
+        self.normalised()
+    }
+
+    /// Moves the probability of images that are hardly possible elsewhere.
+    fn without_traces(mut self) -> Self {
+        let masses = self.masses();
+        let (mut at, mut elsewhere) = (0, 0.0);
+        self.states.retain(|_| {
+            at += 1;
+            masses[at - 1].1 >= TRACE
+        });
+        self.images.clear();
+        for (image, mass) in masses {
+            if mass >= TRACE { self.images.push(image) } else { elsewhere += mass }
+        }
+        self.elsewhere += elsewhere;
+        self
+    }
+
+    fn normalised(mut self) -> Self {
+        let total = self.elsewhere + self.masses().iter().map(|(_, mass)| mass).sum::<f64>();
         if !total.is_normal() {
             return Self::uniform();
         }
         self.elsewhere /= total;
-        self.likely.iter_mut().for_each(|(_, probability)| *probability /= total);
+        for probability in self.states.iter_mut().flatten() {
+            *probability = (f64::from(*probability) / total) as f32;
+        }
         self
     }
-
-    /// Returns the most likely image, and the probability that the robot is within `radius` metres of it.
-    pub fn best(&self, places: &Places, radius: f64) -> Option<(u32, f64)> {
-        let (best, _) =
-            self.likely.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)))?;
-        let near = self.likely.iter().filter(|(image, _)| places.distance(*best, *image) <= radius);
-        Some((*best, near.map(|(_, probability)| probability).sum()))
-    }
-
-    /// Returns the likely images by their ids, which stay valid when the map changes.
-    pub fn by_id(&self, places: &Places) -> Vec<(ImageId, f64)> {
-        self.likely.iter().map(|(image, p)| (places.id(*image).clone(), *p)).collect()
-    }
-
-    /// Restores a belief from [`by_id`](Self::by_id). The probability of images that were deleted is spread over the
-    /// map.
-    pub fn from_ids(by_id: &[(ImageId, f64)], places: &Places) -> Self {
-        let known = by_id.iter().filter_map(|(id, p)| Some((places.number(id)?, *p)));
-        let likely = merged(known.collect());
-        let elsewhere = (1.0 - likely.iter().map(|(_, p)| p).sum::<f64>()).max(0.0);
-        Self { likely, elsewhere }
-    }
-
-    /// Removes an image.
-    pub fn without(mut self, image: u32) -> Self {
-        self.likely.retain(|(other, _)| *other != image);
-        let max = self.likely.len();
-        self.pruned(max)
-    }
-}
-
-/// Sorts by image and adds up the probabilities of equal ones.
-fn merged(mut parts: Vec<(u32, f64)>) -> Vec<(u32, f64)> {
-    parts.sort_by_key(|(image, _)| *image);
-    parts.dedup_by(|next, kept| {
-        let same = next.0 == kept.0;
-        if same {
-            kept.1 += next.1;
-        }
-        same
-    });
-    parts
 }
 
 #[cfg(test)]

@@ -1,12 +1,22 @@
 //! Tracks: sequences of frames of one robot, whose estimates are filtered over time.
 //!
-//! [`belief`] is the filter, [`places`] the positions of the map's images. This file keeps the tracks in memory,
-//! bounded in number and age; they do not survive a restart. The map of tracks is a plain one with strict LRU: moka and
-//! quick_cache would evict newcomers first.
+//! [`belief`] is the filter over the [`paths`] of a map, [`moves`] and [`speeds`] are its motion model, [`evidence`] is
+//! what a frame says, [`odometry`] how the robot says that it moved, [`session`] one track, [`ground`] what all tracks in
+//! a map share, and [`mod@estimate`] the answer. This file keeps the tracks in memory, bounded in number and age; they do
+//! not survive a restart. The map of tracks is a plain one with strict LRU: moka and quick_cache would evict newcomers
+//! first.
 
 mod belief;
-mod places;
+mod estimate;
+mod evidence;
+mod grid;
+mod ground;
+mod moves;
+mod odometry;
+mod paths;
+mod session;
 mod settings;
+mod speeds;
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -18,25 +28,18 @@ use tokio::sync::Mutex as AsyncMutex;
 use tokio::time::Instant;
 use uuid::Uuid;
 
-use self::belief::{Belief, Motion};
-use self::places::Places;
+use self::estimate::estimate;
+use self::ground::{Ground, Known};
+pub use self::odometry::Odometry;
+use self::session::{Frame, Prediction, Track};
 pub use self::settings::TrackSettings;
 use super::{Principal, ServiceError};
 use whereabouts_api::{ErrorKind, TrackEstimate};
-use whereabouts_core::{Calibration, Candidate, ImageId, Map};
-use whereabouts_store::MapStore;
+use whereabouts_core::{Candidate, Descriptor, Map};
+use whereabouts_store::{MapStore, StoreError};
 
 /// Minimum age of the cached positions of a map before they are read again, for maps that grow.
 const POSITIONS_REFRESH: Duration = Duration::from_secs(2);
-
-/// Minimum gap between the similarities of wrong answers; keeps the filter defined where all are equal.
-const MIN_GAP: f32 = 1e-4;
-
-/// Longest time between two frames that limits how far a robot may have moved.
-const MAX_PAUSE_S: f64 = 86_400.0;
-
-/// Maximum distance between two frames, in metres.
-const MAX_MOVED_M: f64 = 1e6;
 
 /// A frame's place in a track, as the robot states it.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,22 +48,22 @@ pub struct TrackStep {
     id: String,
     /// The scope of the caller: tracks of different API keys are separate.
     owner: String,
-    /// When the frame was taken.
-    captured_at: Timestamp,
-    /// How far the robot has moved since the previous frame, in metres, if it has odometry.
-    moved_m: Option<f64>,
+    /// When the frame was taken, if the robot says so.
+    captured_at: Option<Timestamp>,
+    /// How the robot has moved since the previous frame, if it has odometry.
+    odometry: Option<Odometry>,
 }
 
 impl TrackStep {
-    /// Validates a step; a frame without a time counts as taken now.
+    /// Validates a step.
     ///
     /// # Errors
-    /// [`ErrorKind::Unprocessable`](whereabouts_api::ErrorKind) for an invalid id or distance.
+    /// [`ErrorKind::Unprocessable`](whereabouts_api::ErrorKind) for an invalid id.
     pub fn new(
         caller: &Principal,
         id: String,
         captured_at: Option<Timestamp>,
-        moved_m: Option<f64>,
+        odometry: Option<Odometry>,
     ) -> Result<Self, ServiceError> {
         let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.:".contains(&byte);
         if !(1..=64).contains(&id.len()) || !id.bytes().all(plain) {
@@ -69,22 +72,8 @@ impl TrackStep {
                 "track {shown:?} must have 1 to 64 letters, digits, '-', '_', '.' and ':'"
             )));
         }
-        if let Some(moved) = moved_m.filter(|moved| !(0.0..=MAX_MOVED_M).contains(moved)) {
-            return Err(ServiceError::unprocessable(format!(
-                "moved_m is {moved}; it must be the metres moved since the previous frame, 0 to {MAX_MOVED_M}"
-            )));
-        }
-        let captured_at = captured_at.unwrap_or_else(Timestamp::now);
-        Ok(Self { id, owner: caller.scope().to_owned(), captured_at, moved_m })
+        Ok(Self { id, owner: caller.scope().to_owned(), captured_at, odometry })
     }
-}
-
-/// The state of a track between two frames.
-#[derive(Debug)]
-struct Track {
-    belief: Vec<(ImageId, f64)>,
-    last: Timestamp,
-    frames: u64,
 }
 
 /// A track with the time of its last use.
@@ -94,13 +83,13 @@ struct TrackEntry {
     track: Arc<AsyncMutex<Track>>,
 }
 
-/// The cached positions of the images of one map.
+/// What tracks know of one map.
 #[derive(Debug, Clone)]
-struct CachedPlaces {
+struct CachedGround {
     /// The revision of the map, and the number of changes of its images.
     version: (u32, u64),
     read_at: Instant,
-    places: Arc<Places>,
+    ground: Arc<Ground>,
 }
 
 /// All tracks, in memory.
@@ -111,7 +100,7 @@ pub struct Tracks {
     settings: Arc<TrackSettings>,
     /// By map, owner and id.
     tracks: Mutex<HashMap<Key, TrackEntry>>,
-    maps: Mutex<HashMap<Uuid, CachedPlaces>>,
+    maps: Mutex<HashMap<Uuid, CachedGround>>,
     /// Locked while positions are read, so that concurrent frames read them once.
     loading: AsyncMutex<()>,
 }
@@ -160,112 +149,171 @@ impl Tracks {
             );
             tracks.remove(&oldest);
         }
-        let track = Track { belief: Vec::new(), last: Timestamp::UNIX_EPOCH, frames: 0 };
-        let track = Arc::new(AsyncMutex::new(track));
+        let track = Arc::new(AsyncMutex::new(Track::new()));
         tracks.insert(key.clone(), TrackEntry { last_used: now, track: Arc::clone(&track) });
         track
     }
 
-    fn cached(&self, map: &Map, version: (u32, u64)) -> Option<Arc<Places>> {
+    fn cached(&self, map: &Map, version: (u32, u64)) -> Option<Arc<Ground>> {
         let maps = self.maps.lock();
         let known = maps.get(&map.uid)?;
-        let fresh = known.version == version || known.read_at.elapsed() < POSITIONS_REFRESH;
-        fresh.then(|| Arc::clone(&known.places))
+        // Descriptors of another revision cannot be compared.
+        let fresh = known.version == version
+            || (known.version.0 == version.0 && known.read_at.elapsed() < POSITIONS_REFRESH);
+        fresh.then(|| Arc::clone(&known.ground))
     }
 
-    /// Caches the positions of a map, and drops those of maps without tracks.
-    fn cache(&self, map: &Map, version: (u32, u64), places: &Arc<Places>) {
+    /// Caches what tracks know of a map, and drops those of maps without tracks.
+    fn cache(&self, map: &Map, version: (u32, u64), ground: &Arc<Ground>) {
         let used: Vec<Uuid> = {
             let tracks = self.tracks.lock();
             tracks.keys().map(|(uid, ..)| *uid).collect()
         };
         let mut maps = self.maps.lock();
         maps.retain(|uid, _| used.contains(uid));
-        let known = CachedPlaces { version, read_at: Instant::now(), places: Arc::clone(places) };
+        let known = CachedGround { version, read_at: Instant::now(), ground: Arc::clone(ground) };
         maps.insert(map.uid, known);
     }
 }
 
 impl Tracks {
-    /// Updates a track with a frame and estimates the place. `candidates` are the images most similar to the frame.
+    /// Updates a track with a frame and estimates the place; returns also what the robot should send instead.
+    /// `candidates` are the images most similar to the frame, `None` if it shows nothing.
     ///
     /// # Errors
     /// [`ErrorKind::Unprocessable`] in a map whose images have no poses.
-    pub(super) async fn follow(
+    pub async fn follow(
         &self,
         map: &Map,
         step: TrackStep,
-        candidates: &[Candidate],
-        calibration: &Calibration,
-    ) -> Result<TrackEstimate, ServiceError> {
-        let places = self.places(map).await?;
-        if places.len() == 0 && !candidates.is_empty() {
+        frame: &Descriptor,
+        candidates: Option<&[Candidate]>,
+    ) -> Result<(TrackEstimate, Option<String>), ServiceError> {
+        let ground = self.ground(map).await?;
+        if ground.len() == 0 && candidates.is_some_and(|candidates| !candidates.is_empty()) {
             return Err(ServiceError::unprocessable(format!(
                 "a track needs poses, and no image of the map {} has one; index them with poses, or \
                  leave track out",
                 map.name
             )));
         }
-        // The caller may have asked for more than the filter uses.
-        let candidates = &candidates[..candidates.len().min(self.candidates())];
-        let similarities: Vec<(u32, f32)> = candidates
-            .iter()
-            .filter_map(|candidate| {
-                Some((places.number(&candidate.image_id)?, candidate.similarity))
-            })
-            .collect();
-        let gap = calibration
-            .similarity
-            .mean()
-            .unwrap_or_else(|| similarity_spread(candidates))
-            .max(MIN_GAP);
-        let TrackStep { id, owner, captured_at, .. } = step.clone();
+        let TrackStep { id, owner, .. } = step.clone();
         let track = self.track(&(map.uid, owner, id.clone()));
         // Concurrent frames of one track are processed one after another.
         let mut track = track.lock_owned().await;
-        let (filtered, settings) = (Arc::clone(&places), Arc::clone(&self.settings));
-        let (mut belief, frames) = on_blocking_thread(move || {
-            let belief = track.predicted(&step, &filtered, &settings);
-            let belief = belief.updated(&similarities, gap, &filtered, &settings);
-            track.belief = belief.by_id(&filtered);
-            (track.last, track.frames) = (captured_at, track.frames + 1);
-            (belief, track.frames)
+        // A frame that fails leaves the track as it was.
+        let mut next = track.clone();
+        next.enter(&ground, map.revision);
+        let is_informative = candidates.is_some();
+        let (frame, on, settings) =
+            (frame.clone(), Arc::clone(&ground), Arc::clone(&self.settings));
+        let (mut next, prediction) = on_blocking_thread(move || {
+            let frame = Frame { descriptor: frame.as_slice(), is_informative };
+            let prediction = next.predict(&step, frame, &on, &settings);
+            (next, prediction)
         })
         .await?;
-        let place_m = self.place_m;
-        let mut best = belief.best(&places, place_m);
-        while let Some((image, _)) = best
-            && self.store.image(map, places.id(image)).await?.is_none()
-        {
-            // Deleted since the positions were read.
-            belief = belief.without(image);
-            best = belief.best(&places, place_m);
-        }
-        let probability = best.map_or(0.0, |(_, probability)| probability);
-        Ok(TrackEstimate {
-            id,
-            frames,
-            image_id: best.map(|(image, _)| places.id(image).clone()),
-            pose: best.map(|(image, _)| places.pose(image)),
-            probability,
-            known: probability >= self.settings.known_probability,
+        let similar = match candidates {
+            Some(candidates) => self.similarities(map, &ground, &prediction, candidates).await?,
+            None => Similar::default(),
+        };
+        let (on, settings) = (Arc::clone(&ground), Arc::clone(&self.settings));
+        let (warning, is_late) = (prediction.warning.clone(), prediction.is_late);
+        let (next, belief) = on_blocking_thread(move || {
+            let Similar { images, similarities } = similar;
+            let weights = prediction.weights((&images, &similarities), &on, &settings);
+            let belief = next.update(prediction, weights.as_ref(), &on, &settings);
+            (next, belief)
         })
+        .await?;
+        let frames = next.frames;
+        *track = next;
+        drop(track);
+        let mut belief = belief;
+        loop {
+            let place = (id.clone(), frames);
+            let (on, settings, place_m) =
+                (Arc::clone(&ground), Arc::clone(&self.settings), self.place_m);
+            let whole = Arc::clone(&belief);
+            let estimate =
+                on_blocking_thread(move || estimate(place, &whole, &on, place_m, &settings))
+                    .await?;
+            let Some(image) = estimate.image_id.as_ref().and_then(|id| ground.number(id)) else {
+                return Ok((estimate, warning));
+            };
+            if self.store.image(map, ground.id(image)).await?.is_some() {
+                return Ok((TrackEstimate { is_late, ..estimate }, warning));
+            }
+            // Deleted since the positions were read.
+            belief = Arc::new(belief.renumbered(&|other| (other != image).then_some(other)));
+        }
     }
 
-    async fn places(&self, map: &Map) -> Result<Arc<Places>, ServiceError> {
+    /// How similar the images are that matter to a track.
+    async fn similarities(
+        &self,
+        map: &Map,
+        ground: &Arc<Ground>,
+        prediction: &Prediction,
+        candidates: &[Candidate],
+    ) -> Result<Similar, ServiceError> {
+        // The caller may have asked for more than the filter uses.
+        let candidates = &candidates[..candidates.len().min(self.candidates())];
+        let candidates: Vec<u32> =
+            candidates.iter().filter_map(|candidate| ground.number(&candidate.image_id)).collect();
+        let images = prediction.images(&candidates, ground);
+        let read = async {
+            let unknown = ground.unknown(&images);
+            if !unknown.is_empty() {
+                let known = self.descriptors(map, ground, &unknown).await?;
+                ground.learn(&images, &known);
+            }
+            self.store.similarities(map, prediction.frame.clone(), ground.slots(&images)).await
+        };
+        match read.await {
+            Ok(similarities) => Ok(Similar { images, similarities }),
+            // A reindex ended meanwhile: this frame only moves the belief.
+            Err(StoreError::Superseded(_)) => Ok(Similar::default()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    async fn descriptors(
+        &self,
+        map: &Map,
+        ground: &Ground,
+        images: &[u32],
+    ) -> Result<Known, StoreError> {
+        let descriptors = self.store.descriptors(map, ground.slots(images)).await?;
+        let known = images.iter().copied().zip(descriptors);
+        Ok(known.filter_map(|(image, descriptor)| Some((image, descriptor?))).collect())
+    }
+
+    async fn ground(&self, map: &Map) -> Result<Arc<Ground>, ServiceError> {
         let version = (map.revision, self.store.index_state(map).await?.changes);
-        if let Some(places) = self.cached(map, version) {
-            return Ok(places);
+        if let Some(ground) = self.cached(map, version) {
+            return Ok(ground);
         }
         let _guard = self.loading.lock().await;
-        if let Some(places) = self.cached(map, version) {
-            return Ok(places);
+        if let Some(ground) = self.cached(map, version) {
+            return Ok(ground);
         }
         let images = self.store.positions(map).await?;
-        let places = Arc::new(on_blocking_thread(move || Places::new(images)).await?);
-        self.cache(map, version, &places);
-        Ok(places)
+        let mut ground = on_blocking_thread(move || Ground::new(images)).await?;
+        let sample = ground.sample_with_neighbours();
+        let known = self.descriptors(map, &ground, &sample).await?;
+        ground.learn_common(&known);
+        let ground = Arc::new(ground);
+        self.cache(map, version, &ground);
+        Ok(ground)
     }
+}
+
+/// Images and the similarity of each to a frame.
+#[derive(Default)]
+struct Similar {
+    images: Vec<u32>,
+    similarities: Vec<Option<f32>>,
 }
 
 /// Runs CPU-bound work outside the async threads.
@@ -275,28 +323,4 @@ async fn on_blocking_thread<T: Send + 'static>(
     tokio::task::spawn_blocking(work).await.map_err(|error| {
         ServiceError::new(ErrorKind::Internal, format!("the track could not be computed: {error}"))
     })
-}
-
-impl Track {
-    /// The belief when the next frame is taken.
-    fn predicted(&self, step: &TrackStep, places: &Places, settings: &TrackSettings) -> Belief {
-        if self.frames == 0 {
-            return Belief::uniform();
-        }
-        let motion = step.moved_m.map_or_else(
-            || {
-                let elapsed = step.captured_at.duration_since(self.last).as_secs_f64();
-                Motion::Within(settings.max_speed_m_s * elapsed.abs().min(MAX_PAUSE_S))
-            },
-            Motion::By,
-        );
-        Belief::from_ids(&self.belief, places).predicted(motion, places, settings)
-    }
-}
-
-/// Estimates the gap of wrong answers in a map that is not calibrated yet: from the second candidate to the tenth.
-fn similarity_spread(candidates: &[Candidate]) -> f32 {
-    let similarity = |at: usize| candidates.get(at).map(|candidate| candidate.similarity);
-    let last = candidates.len().min(10).saturating_sub(1);
-    similarity(1).zip(similarity(last)).map_or(0.0, |(second, tenth)| second - tenth)
 }

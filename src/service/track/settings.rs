@@ -25,11 +25,13 @@ pub struct TrackSettings {
     pub odometry_error: f64,
     /// Share of frames that carry no information about the place: ω of the filter.
     pub outliers: f64,
+    /// Probability that a robot has turned round since its last frame.
+    pub turn: f64,
     /// Probability that a robot was carried anywhere since its last frame: ε of the filter.
     pub jump: f64,
     /// Weight of similarity: β of the filter.
     pub sharpness: f64,
-    /// Most similar images of a frame whose similarities are told apart; the others count as the last of these.
+    /// Most similar images of a frame that are always considered, however unlikely they were before it.
     pub candidates: usize,
     /// Maximum number of likely images that are kept between frames.
     pub states: usize,
@@ -55,6 +57,7 @@ impl TrackSettings {
         let zero = counts.into_iter().find(|(_, count)| *count == 0);
         zero.map(|(name, _)| format!("track.{name} must be at least 1"))
             .or_else(|| share("outliers", self.outliers))
+            .or_else(|| share("turn", self.turn))
             .or_else(|| share("jump", self.jump))
             .or_else(|| above_zero("max_speed_m_s", self.max_speed_m_s))
             .or_else(|| above_zero("odometry_error", self.odometry_error))

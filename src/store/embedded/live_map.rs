@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
-use super::super::{HardNegatives, StoreError};
+use super::super::{HardNegatives, LocatedImage, StoreError};
 use super::blobs::replace_durably;
 use super::segments::VectorFiles;
 use super::trees::{StoredImage, Trees};
@@ -191,9 +191,30 @@ impl LiveMap {
     }
 
     /// Returns the images that have a pose, in insertion order.
-    pub fn positions(&self) -> Vec<(ImageId, Pose)> {
+    pub fn positions(&self) -> Vec<LocatedImage> {
         let entries = self.entries.read();
-        entries.iter().flatten().filter_map(|entry| Some((entry.id.clone(), entry.pose?))).collect()
+        let located = |(slot, entry): (usize, &Option<Entry>)| {
+            let entry = entry.as_ref()?;
+            Some(LocatedImage { slot, id: entry.id.clone(), pose: entry.pose? })
+        };
+        entries.iter().enumerate().filter_map(located).collect()
+    }
+
+    /// Calls `read` with the descriptor in each slot. Returns `None` for a slot without an image.
+    pub fn read_slots<T>(&self, slots: &[usize], read: impl Fn(&[f32]) -> T) -> Vec<Option<T>> {
+        let has_image: Vec<bool> = {
+            let entries = self.entries.read();
+            slots.iter().map(|slot| matches!(entries.get(*slot), Some(Some(_)))).collect()
+        };
+        let mut all = Vec::with_capacity(slots.len());
+        for (slot, has_image) in slots.iter().zip(has_image) {
+            let mut result = None;
+            if has_image {
+                self.vectors.scan(*slot..*slot + 1, &mut |_, numbers| result = Some(read(numbers)));
+            }
+            all.push(result);
+        }
+        all
     }
 
     pub fn search(&self, query: &[f32], k: usize, mode: SearchMode) -> Vec<Candidate> {

@@ -8,7 +8,9 @@ use sled::Transactional;
 use uuid::Uuid;
 
 use super::super::changes::{changed_map, check_dim, check_frame, removed, same_bytes};
-use super::super::{Added, BlobPin, BlobStore, HardNegatives, IndexState, MapStore, StoreError};
+use super::super::{
+    Added, BlobPin, BlobStore, HardNegatives, IndexState, LocatedImage, MapStore, StoreError,
+};
 use super::corrections::content;
 use super::live_map::{LiveMap, folder_of};
 use super::orphans::{remove_folder, sweep};
@@ -19,7 +21,7 @@ use super::trees::{
 use super::{EmbeddedStore, Inner, blocking};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Digest, Image, ImageId, Map, MapName,
-    Pose,
+    dot,
 };
 use whereabouts_index::SearchMode;
 
@@ -225,7 +227,7 @@ impl MapStore for EmbeddedStore {
         .await
     }
 
-    async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
+    async fn positions(&self, map: &Map) -> Result<Vec<LocatedImage>, StoreError> {
         Ok(self.inner.live(map)?.positions())
     }
 
@@ -265,6 +267,29 @@ impl MapStore for EmbeddedStore {
         let live = self.inner.live_revision(map)?;
         check_dim(map, &query)?;
         blocking(move || Ok(live.search(query.as_slice(), k, mode))).await
+    }
+
+    async fn descriptors(
+        &self,
+        map: &Map,
+        slots: Vec<usize>,
+    ) -> Result<Vec<Option<Descriptor>>, StoreError> {
+        let live = self.inner.live_revision(map)?;
+        blocking(move || {
+            let read = live.read_slots(&slots, |numbers| Descriptor::stored(numbers.to_vec()).ok());
+            Ok(read.into_iter().map(Option::flatten).collect())
+        })
+        .await
+    }
+
+    async fn similarities(
+        &self,
+        map: &Map,
+        vector: Vec<f32>,
+        slots: Vec<usize>,
+    ) -> Result<Vec<Option<f32>>, StoreError> {
+        let live = self.inner.live_revision(map)?;
+        blocking(move || Ok(live.read_slots(&slots, |numbers| dot(&vector, numbers)))).await
     }
 
     async fn hard_negatives(

@@ -376,6 +376,50 @@ impl Inner {
         Ok(samples)
     }
 
+    /// The descriptors in some slots.
+    pub(super) async fn descriptors_in(
+        &self,
+        map: &Map,
+        slots: &[usize],
+    ) -> Result<Vec<Option<Descriptor>>, StoreError> {
+        let table = table(map.uid, map.revision);
+        let sql = format!(
+            "SELECT d.descriptor::real[] FROM unnest($1) WITH ORDINALITY wanted (slot, place)
+             LEFT JOIN {table} d USING (slot) ORDER BY wanted.place"
+        );
+        let slots: Vec<i64> = slots.iter().map(|slot| count(*slot)).collect();
+        let found = sqlx::query_scalar(AssertSqlSafe(sql)).bind(slots).fetch_all(&self.pool).await;
+        match found {
+            Ok(found) => {
+                let numbers = found.into_iter().map(|numbers: Option<Vec<f32>>| numbers);
+                Ok(numbers.map(|numbers| numbers.and_then(descriptor_of)).collect())
+            }
+            Err(error) => Err(self.explain(map, error).await),
+        }
+    }
+
+    /// The dot products of a vector and the descriptors in some slots.
+    pub(super) async fn similarities_to(
+        &self,
+        map: &Map,
+        vector: &[f32],
+        slots: &[usize],
+    ) -> Result<Vec<Option<f32>>, StoreError> {
+        let table = table(map.uid, map.revision);
+        // <#> is the negative dot product.
+        let sql = format!(
+            "SELECT (-(d.descriptor <#> $2::real[]::vector))::real
+             FROM unnest($1) WITH ORDINALITY wanted (slot, place)
+             LEFT JOIN {table} d USING (slot) ORDER BY wanted.place"
+        );
+        let slots: Vec<i64> = slots.iter().map(|slot| count(*slot)).collect();
+        let found = sqlx::query_scalar(AssertSqlSafe(sql)).bind(slots).bind(vector);
+        match found.fetch_all(&self.pool).await {
+            Ok(found) => Ok(found),
+            Err(error) => Err(self.explain(map, error).await),
+        }
+    }
+
     async fn descriptor(&self, map: &Map, slot: i64) -> Result<Option<Descriptor>, StoreError> {
         let table = table(map.uid, map.revision);
         let sql = format!("SELECT descriptor::real[] FROM {table} WHERE slot = $1");

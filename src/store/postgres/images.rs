@@ -11,7 +11,7 @@ use sqlx::types::Json;
 use uuid::Uuid;
 
 use super::super::changes::{check_frame, removed, same_bytes};
-use super::super::{Added, ExportStore, StoreError};
+use super::super::{Added, ExportStore, LocatedImage, StoreError};
 use super::descriptors::{descriptor_of, image_id, table};
 use super::{Inner, PostgresStore, blobs, count, is_missing_table, record};
 use whereabouts_core::ExportedImage;
@@ -181,9 +181,9 @@ impl Inner {
         Ok(images.into_iter().map(|Json(image)| image).collect())
     }
 
-    pub(super) async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
-        let positions: Vec<(String, Json<Pose>)> = sqlx::query_as(
-            "SELECT i.id, i.pose FROM images i JOIN maps m ON m.uid = i.map_uid
+    pub(super) async fn positions(&self, map: &Map) -> Result<Vec<LocatedImage>, StoreError> {
+        let positions: Vec<(i64, String, Json<Pose>)> = sqlx::query_as(
+            "SELECT i.slot, i.id, i.pose FROM images i JOIN maps m ON m.uid = i.map_uid
              WHERE i.map_uid = $1 AND i.pose IS NOT NULL ORDER BY i.slot",
         )
         .bind(map.uid)
@@ -192,7 +192,10 @@ impl Inner {
         if positions.is_empty() {
             self.check_exists(map).await?;
         }
-        positions.into_iter().map(|(id, Json(pose))| Ok((image_id(id)?, pose))).collect()
+        let located = |(slot, id, Json(pose)): (i64, String, Json<Pose>)| {
+            Ok(LocatedImage { slot: slot as usize, id: image_id(id)?, pose })
+        };
+        positions.into_iter().map(located).collect()
     }
 
     pub(super) async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {

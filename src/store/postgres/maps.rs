@@ -8,11 +8,11 @@ use sqlx::{PgConnection, Row};
 use uuid::Uuid;
 
 use super::super::changes::{MapContent, changed_map, check_dim, removed};
-use super::super::{Added, HardNegatives, IndexState, MapStore, StoreError};
+use super::super::{Added, HardNegatives, IndexState, LocatedImage, MapStore, StoreError};
 use super::descriptors::create_table;
 use super::{Inner, PostgresStore, counted, record};
 use whereabouts_core::{
-    Calibration, CalibrationSettings, Candidate, Descriptor, Image, ImageId, Map, MapName, Pose,
+    Calibration, CalibrationSettings, Candidate, Descriptor, Image, ImageId, Map, MapName,
 };
 use whereabouts_index::SearchMode;
 
@@ -107,7 +107,7 @@ impl MapStore for PostgresStore {
         self.inner.call(self.inner.images(map, after, limit)).await
     }
 
-    async fn positions(&self, map: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
+    async fn positions(&self, map: &Map) -> Result<Vec<LocatedImage>, StoreError> {
         self.inner.call(self.inner.positions(map)).await
     }
 
@@ -124,6 +124,23 @@ impl MapStore for PostgresStore {
     ) -> Result<Vec<Candidate>, StoreError> {
         check_dim(map, &query)?;
         self.inner.call(self.inner.candidates(map, &query, k, mode)).await
+    }
+
+    async fn descriptors(
+        &self,
+        map: &Map,
+        slots: Vec<usize>,
+    ) -> Result<Vec<Option<Descriptor>>, StoreError> {
+        self.inner.call(self.inner.descriptors_in(map, &slots)).await
+    }
+
+    async fn similarities(
+        &self,
+        map: &Map,
+        vector: Vec<f32>,
+        slots: Vec<usize>,
+    ) -> Result<Vec<Option<f32>>, StoreError> {
+        self.inner.call(self.inner.similarities_to(map, &vector, &slots)).await
     }
 
     async fn hard_negatives(

@@ -17,12 +17,12 @@ use crate::QueryFrame;
 use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, Secret, SimilarFrame};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, CoordinateFrame, DayUsage, Descriptor,
-    DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Pose, Precision, Priority,
-    StandIn, Usage,
+    DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Precision, Priority, StandIn,
+    Usage,
 };
 use whereabouts_index::SearchMode;
 use whereabouts_store::{
-    Added, BlobPin, DescriptionFilter, HardNegatives, IndexState, Step, StoreError,
+    Added, BlobPin, DescriptionFilter, HardNegatives, IndexState, LocatedImage, Step, StoreError,
 };
 use whereabouts_telemetry::metrics::registry;
 use whereabouts_testkit::mock_mllm::{MockMllm, Script};
@@ -214,7 +214,24 @@ impl MapStore for Shelf {
         unused()
     }
 
-    async fn positions(&self, _: &Map) -> Result<Vec<(ImageId, Pose)>, StoreError> {
+    async fn positions(&self, _: &Map) -> Result<Vec<LocatedImage>, StoreError> {
+        unused()
+    }
+
+    async fn descriptors(
+        &self,
+        _: &Map,
+        _: Vec<usize>,
+    ) -> Result<Vec<Option<Descriptor>>, StoreError> {
+        unused()
+    }
+
+    async fn similarities(
+        &self,
+        _: &Map,
+        _: Vec<f32>,
+        _: Vec<usize>,
+    ) -> Result<Vec<Option<f32>>, StoreError> {
         unused()
     }
 

@@ -1,266 +1,247 @@
+use super::super::moves::fit;
 use super::*;
 use proptest::prelude::*;
-use whereabouts_core::{MetricPose, Pose};
 
-/// Images every ten metres along a road.
-fn road(count: usize) -> Places {
-    let at = |x: f64| {
-        Pose::Metric(MetricPose { x, y: 0.0, z: None, qx: None, qy: None, qz: None, qw: None })
-    };
-    let image = |i: usize| (format!("i{i}").parse().unwrap(), at(i as f64 * 10.0));
-    Places::new((0..count).map(image).collect())
+const HABITS: Habits = Habits { max_speed: 10.0, turn: 0.005, jump: 0.01 };
+
+/// A map with an image every ten metres along a road.
+#[derive(Debug)]
+struct Road {
+    grid: Grid,
+    paths: Paths,
 }
 
-fn settings() -> TrackSettings {
-    TrackSettings {
-        outliers: 0.4,
-        jump: 0.05,
-        sharpness: 1.5,
-        odometry_error: 0.1,
-        states: 64,
-        max: 1,
-        idle_s: 1,
-        max_speed_m_s: 1.0,
-        candidates: 1,
-        known_probability: 0.5,
+impl Road {
+    fn new(count: usize) -> Self {
+        Self::at((0..count).map(|number| [10.0 * number as f64, 0.0]).collect())
     }
+
+    fn at(positions: Vec<[f64; 2]>) -> Self {
+        let grid = Grid::new(positions);
+        let paths = Paths::new(&grid, 0.1);
+        Self { grid, paths }
+    }
+
+    fn roads(&self) -> Roads<'_> {
+        Roads { grid: &self.grid, paths: &self.paths, changes: &[] }
+    }
+
+    /// The weights of a frame that looks like these images, and like no other.
+    fn looks_like(&self, images: &[u32]) -> Weights {
+        let count = self.grid.len() as u32;
+        let similar = |image: u32| if images.contains(&image) { 0.9 } else { 0.5 };
+        let all: Vec<(u32, f32)> = (0..count).map(|image| (image, similar(image))).collect();
+        let sample: Vec<f32> = all.iter().map(|(_, s)| *s).collect();
+        Weights::new(&all, &sample, all.len(), (1.0, 0.1))
+    }
+
+    fn updated(&self, belief: &Belief, images: &[u32]) -> Belief {
+        belief.updated(&self.looks_like(images), self.grid.len(), 512)
+    }
+
+    /// The belief after frames that look like these images, one a second.
+    fn driven(&self, images: impl IntoIterator<Item = u32>) -> Belief {
+        let mut belief = Belief::uniform();
+        for (number, image) in images.into_iter().enumerate() {
+            if number > 0 {
+                belief = belief.predicted(second(), HABITS, self.roads());
+            }
+            belief = self.updated(&belief, &[image]);
+        }
+        belief
+    }
+}
+
+fn second() -> Motion {
+    Motion::Elapsed { time: 1.0, novelty: None }
+}
+
+fn measured(metres: f64) -> Motion {
+    Motion::Measured { metres, error: 0.1 * metres, speed: metres }
+}
+
+fn best(belief: &Belief) -> u32 {
+    belief.masses().into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap().0
+}
+
+fn mass(belief: &Belief, image: u32) -> f64 {
+    belief.masses().into_iter().filter(|(other, _)| *other == image).map(|(_, mass)| mass).sum()
 }
 
 fn total(belief: &Belief) -> f64 {
-    belief.elsewhere + belief.likely.iter().map(|(_, p)| p).sum::<f64>()
-}
-
-/// The formula of the module's documentation, over all images.
-fn reference(
-    before: &[f64],
-    motion: Option<Motion>,
-    similarities: &[f32],
-    gap: f32,
-    settings: &TrackSettings,
-) -> Vec<f64> {
-    let n = before.len();
-    let mut moved = before.to_vec();
-    if let Some(motion) = motion {
-        moved = vec![settings.jump / n as f64; n];
-        for (i, held) in before.iter().enumerate() {
-            let weight = |j: usize| {
-                let d = 10.0 * i.abs_diff(j) as f64;
-                let off = match motion {
-                    Motion::Within(reach) => (d - reach).max(0.0) / 5.0,
-                    Motion::By(moved) => (d - moved) / (5.0 + settings.odometry_error * moved),
-                };
-                if off.abs() > TAIL { 0.0 } else { (-0.5 * off * off).exp() }
-            };
-            let sum: f64 = (0..n).map(weight).sum();
-            for (j, part) in moved.iter_mut().enumerate() {
-                *part += (1.0 - settings.jump) * held * weight(j) / sum;
-            }
-        }
-    }
-    let first = similarities.iter().copied().fold(f32::MIN, f32::max);
-    let e: Vec<f64> = similarities
-        .iter()
-        .map(|s| f64::from(settings.sharpness as f32 * (s - first) / gap).exp())
-        .collect();
-    let mean = e.iter().sum::<f64>() / n as f64;
-    let product: Vec<f64> = (0..n)
-        .map(|j| moved[j] * (settings.outliers + (1.0 - settings.outliers) * e[j] / mean))
-        .collect();
-    let sum: f64 = product.iter().sum();
-    product.iter().map(|p| p / sum).collect()
+    belief.elsewhere + belief.masses().iter().map(|(_, mass)| mass).sum::<f64>()
 }
 
 #[test]
-fn the_filter_follows_its_formula() {
-    let (places, settings) = (road(20), settings());
-    let similarity = |seed: usize| -> Vec<f32> {
-        (0..20).map(|i| 0.5 + ((i * 7 + seed * 3) % 11) as f32 / 40.0).collect()
-    };
-    let mut belief = Belief::uniform();
-    let mut expected = vec![1.0 / 20.0; 20];
-    for (seed, motion) in
-        [None, Some(Motion::Within(12.0)), Some(Motion::By(20.0)), Some(Motion::Within(0.0))]
-            .into_iter()
-            .enumerate()
+fn a_robot_is_expected_ahead_of_where_it_drove_and_not_behind() {
+    let road = Road::new(60);
+    for (way, next, behind) in
+        [((10..20).collect::<Vec<_>>(), 20, 18), ((10..20).rev().collect(), 9, 11)]
     {
-        let similarities = similarity(seed);
-        expected = reference(&expected, motion, &similarities, 0.05, &settings);
-        if let Some(motion) = motion {
-            belief = belief.predicted(motion, &places, &settings);
-            assert!((total(&belief) - 1.0).abs() < 1e-9);
-        }
-        let numbered: Vec<(u32, f32)> = (0..).zip(similarities).collect();
-        belief = belief.updated(&numbered, 0.05, &places, &settings);
-        for (image, probability) in &belief.likely {
-            let expected = expected[*image as usize];
-            assert!(
-                (probability - expected).abs() < 1e-6,
-                "{seed} {image} {probability} {expected}"
-            );
-        }
+        let belief = road.driven(way).predicted(second(), HABITS, road.roads());
+        assert_eq!(best(&belief), next);
+        assert!(mass(&belief, next) > 10.0 * mass(&belief, behind), "{behind}");
     }
-    assert!((total(&belief) - 1.0).abs() < 1e-9);
 }
 
 #[test]
-fn one_outlier_does_not_outvote_the_track_but_three_relocate_it() {
-    let (places, settings) = (road(100), settings());
-    let mut belief = Belief::uniform();
-    for at in 10..16 {
-        belief = belief.predicted(Motion::Within(15.0), &places, &settings);
-        belief = belief.updated(&[(at, 0.9), (50, 0.8), (70, 0.79)], 0.05, &places, &settings);
+fn the_direction_decides_between_places_that_look_alike() {
+    let road = Road::new(60);
+    let belief = road.driven(10..20).predicted(second(), HABITS, road.roads());
+    assert_eq!(best(&road.updated(&belief, &[18, 20, 50])), 20);
+}
+
+#[test]
+fn odometry_decides_between_places_that_look_alike() {
+    let road = Road::new(60);
+    let start = road.updated(&Belief::uniform(), &[10]);
+    let moved =
+        road.updated(&start.predicted(measured(200.0), HABITS, road.roads()), &[18, 30, 42]);
+    assert_eq!(best(&moved), 30);
+}
+
+#[test]
+fn a_turn_is_expected_when_odometry_has_seen_one() {
+    let road = Road::new(60);
+    let habits = Habits { turn: 0.8, ..HABITS };
+    let mut belief = road.driven(10..20);
+    belief = belief.predicted(measured(0.0), habits, road.roads());
+    belief = belief.predicted(measured(10.0), HABITS, road.roads());
+    assert_eq!(best(&belief), 18);
+}
+
+#[test]
+fn one_misleading_frame_does_not_outvote_the_track_but_a_few_relocate_it() {
+    let road = Road::new(100);
+    let mut belief = road.driven(10..20).predicted(second(), HABITS, road.roads());
+    belief = road.updated(&belief, &[80]);
+    assert_eq!(best(&belief), 20);
+    for image in 81..86 {
+        belief = road.updated(&belief.predicted(second(), HABITS, road.roads()), &[image]);
     }
-    assert_eq!(belief.best(&places, 15.0).unwrap().0, 15);
-    belief = belief.predicted(Motion::Within(15.0), &places, &settings);
-    let misled = belief.updated(&[(80, 0.95), (50, 0.8), (70, 0.79)], 0.05, &places, &settings);
-    let (best, probability) = misled.best(&places, 15.0).unwrap();
-    assert!((14..=17).contains(&best), "{best} {probability}");
-    // Three in a row mean that the robot was carried away.
-    let mut carried = misled;
-    for _ in 0..3 {
-        carried = carried.predicted(Motion::Within(15.0), &places, &settings);
-        carried = carried.updated(&[(80, 0.95), (50, 0.8), (70, 0.79)], 0.05, &places, &settings);
+    assert_eq!(best(&belief), 85);
+}
+
+#[test]
+fn a_pause_in_which_the_robot_may_have_passed_the_whole_map_spreads_the_belief() {
+    let road = Road::new(400);
+    let driven = road.driven(10..20);
+    let paused = Motion::Elapsed { time: 7200.0, novelty: None };
+    let later = driven.predicted(paused, HABITS, road.roads());
+    assert!(later.elsewhere > 0.5, "{}", later.elsewhere);
+    assert!((total(&later) - 1.0).abs() < 1e-5);
+}
+
+#[test]
+fn who_sees_something_else_has_moved_and_who_sees_the_same_has_not() {
+    assert!(fit(0.0, 1.0, 1.0) < fit(1.0, 1.0, 1.0));
+    assert!(fit(1.0, 0.01, 1.0) < fit(0.0, 0.01, 1.0));
+    // In a tunnel neighbours look the same.
+    assert_eq!(fit(1.0, 0.01, 0.0), fit(0.0, 0.01, 0.0));
+}
+
+#[test]
+fn a_robot_may_take_either_way_where_a_road_branches() {
+    // From (0, 0) to (200, 0), and from there north and south.
+    let mut positions: Vec<[f64; 2]> = (0..=20).map(|n| [10.0 * f64::from(n), 0.0]).collect();
+    positions.extend((1..=10).map(|n| [200.0, 10.0 * f64::from(n)]));
+    positions.extend((1..=10).map(|n| [200.0, -10.0 * f64::from(n)]));
+    let road = Road::at(positions);
+    for (look, name) in [(25, "north"), (35, "south")] {
+        let belief = road.driven(10..=20).predicted(measured(50.0), HABITS, road.roads());
+        let belief = road.updated(&belief, &[look]);
+        assert_eq!(best(&belief), look, "{name}");
+        assert!(mass(&belief, look) > 0.5, "{name}: {}", mass(&belief, look));
     }
-    let (best, probability) = carried.best(&places, 15.0).unwrap();
-    assert_eq!(best, 80);
-    assert!(probability > 0.5, "{probability}");
 }
 
 #[test]
-fn odometry_tells_apart_two_places_that_look_alike() {
-    let (places, settings) = (road(60), settings());
-    let alike = [(20, 0.9), (40, 0.9), (3, 0.7)];
-    let start = Belief::uniform().updated(&[(10, 0.9), (3, 0.7)], 0.05, &places, &settings);
-    let moved = start.predicted(Motion::By(300.0), &places, &settings);
-    let moved = moved.updated(&alike, 0.05, &places, &settings);
-    assert_eq!(moved.best(&places, 5.0).unwrap().0, 40);
+fn a_loop_is_driven_round_and_round() {
+    let count = 36;
+    let angle = |n: usize| n as f64 / count as f64 * std::f64::consts::TAU;
+    let road =
+        Road::at((0..count).map(|n| [57.3 * angle(n).cos(), 57.3 * angle(n).sin()]).collect());
+    let belief = road.driven((20..60).map(|n| n % count as u32));
+    let belief = belief.predicted(second(), HABITS, road.roads());
+    assert_eq!(best(&belief), 60 % count as u32);
 }
 
 #[test]
-fn odometry_out_of_the_map_resets_the_belief() {
-    let (places, settings) = (road(20), settings());
-    let start = Belief::uniform().updated(&[(0, 0.9), (10, 0.7)], 0.05, &places, &settings);
-    let lost = start.predicted(Motion::By(900.0), &places, &settings);
-    assert_eq!(lost.likely, []);
-    assert!((lost.elsewhere - 1.0).abs() < 1e-9);
+fn images_in_no_order_are_driven_past_by_their_positions() {
+    let count = 60;
+    let place = |n: u32| n * 23 % count;
+    let number = |wanted: u32| (0..count).find(|n| place(*n) == wanted).unwrap();
+    let road = Road::at((0..count).map(|n| [10.0 * f64::from(place(n)), 0.0]).collect());
+    let belief = road.driven((10..20).map(number)).predicted(second(), HABITS, road.roads());
+    assert_eq!(best(&belief), number(20));
 }
 
 #[test]
-fn the_number_of_states_is_bounded_and_the_sum_stays_one() {
-    let (places, settings) = (road(500), TrackSettings { states: 10, ..settings() });
-    let similarities: Vec<(u32, f32)> =
-        (0..200).map(|image| (image, 0.5 + image as f32 / 1000.0)).collect();
-    let belief = Belief::uniform().updated(&similarities, 0.05, &places, &settings);
-    assert_eq!(belief.likely.len(), 10);
-    assert!((total(&belief) - 1.0).abs() < 1e-9);
-    assert_eq!(belief.best(&places, 1.0).unwrap().0, 199);
-    let far = belief.predicted(Motion::Within(1e7), &places, &settings);
-    assert!((total(&far) - 1.0).abs() < 1e-9);
+fn the_number_of_images_is_bounded_and_the_sum_stays_one() {
+    let road = Road::new(500);
+    let all: Vec<u32> = (0..500).step_by(3).collect();
+    let belief = Belief::uniform().updated(&road.looks_like(&all), 500, 10);
+    assert_eq!(belief.images.len(), 10);
+    assert!((total(&belief) - 1.0).abs() < 1e-5);
 }
 
 #[test]
 fn a_belief_survives_a_change_of_the_map_without_the_deleted_images() {
-    let (places, settings) = (road(20), settings());
-    let belief = Belief::uniform().updated(&[(5, 0.9), (6, 0.85)], 0.05, &places, &settings);
-    let (by_id, larger) = (belief.by_id(&places), road(30));
-    assert_eq!(Belief::from_ids(&by_id, &larger).best(&larger, 1.0).unwrap().0, 5);
-    let smaller = Belief::from_ids(&by_id, &road(6)).without(5);
-    assert_eq!(smaller.best(&places, 1.0), None);
-    assert!((total(&smaller) - 1.0).abs() < 1e-9);
-    assert_eq!(belief.without(5).best(&places, 1.0).unwrap().0, 6);
-}
-
-/// A robot's frame: how it has moved since the one before, and which images it looks like.
-#[derive(Debug, Clone)]
-struct RandomFrame {
-    motion: Option<Motion>,
-    similarities: Vec<(u32, f32)>,
+    let road = Road::new(40);
+    let belief = road.driven(5..10);
+    let shifted = belief.renumbered(&|image| image.checked_sub(3));
+    assert_eq!(best(&shifted), 6);
+    assert!((total(&shifted) - 1.0).abs() < 1e-5);
+    let without = belief.renumbered(&|image| (image != 9).then_some(image));
+    assert_ne!(best(&without), 9);
+    assert!((total(&without) - 1.0).abs() < 1e-5);
 }
 
 /// A map of up to 60 images within a kilometre.
-fn random_places() -> impl Strategy<Value = Places> {
+fn random_road() -> impl Strategy<Value = Road> {
     let position = (-500.0..500.0_f64, -500.0..500.0_f64);
-    proptest::collection::vec(position, 1..60).prop_map(|positions| {
-        let image = |(number, (x, y)): (usize, (f64, f64))| {
-            let pose = MetricPose { x, y, z: None, qx: None, qy: None, qz: None, qw: None };
-            (format!("i{number}").parse().unwrap(), Pose::Metric(pose))
-        };
-        Places::new(positions.into_iter().enumerate().map(image).collect())
-    })
+    proptest::collection::vec(position, 1..60)
+        .prop_map(|positions| Road::at(positions.into_iter().map(|(x, y)| [x, y]).collect()))
 }
 
-fn random_settings() -> impl Strategy<Value = TrackSettings> {
-    let share = || 0.001..0.999_f64;
-    (share(), share(), 0.01..1000.0_f64, 0.001..10.0_f64, 1..40_usize).prop_map(
-        |(outliers, jump, sharpness, odometry_error, states)| TrackSettings {
-            outliers,
-            jump,
-            sharpness,
-            odometry_error,
-            states,
-            ..settings()
-        },
-    )
-}
-
-fn random_frame() -> impl Strategy<Value = RandomFrame> {
-    let motion = prop_oneof![
-        Just(None),
-        (0.0..1e8_f64).prop_map(|metres| Some(Motion::Within(metres))),
-        (0.0..2000.0_f64).prop_map(|metres| Some(Motion::Within(metres))),
-        (0.0..2000.0_f64).prop_map(|metres| Some(Motion::By(metres))),
-        (0.0..1e6_f64).prop_map(|metres| Some(Motion::By(metres))),
-    ];
-    let similarities = proptest::collection::btree_map(0..60_u32, -1.0..1.0_f32, 0..20);
-    (motion, similarities).prop_map(|(motion, similarities)| RandomFrame {
-        motion,
-        similarities: similarities.into_iter().collect(),
-    })
-}
-
-/// Whether these are probabilities of each image once, and of the rest of the map.
-fn check(belief: &Belief) -> Result<(), TestCaseError> {
-    let sum = total(belief);
-    prop_assert!((sum - 1.0).abs() < 1e-9, "the sum is {}", sum);
-    let valid = 0.0..=1.0 + 1e-9;
-    prop_assert!(valid.contains(&belief.elsewhere), "{} elsewhere", belief.elsewhere);
-    for (image, probability) in &belief.likely {
-        prop_assert!(valid.contains(probability), "{} at {}", probability, image);
-    }
-    prop_assert!(belief.likely.is_sorted_by(|one, next| one.0 < next.0));
-    Ok(())
+fn random_motion() -> impl Strategy<Value = Motion> {
+    prop_oneof![
+        (0.0..1e6_f64, 0.0..1e3_f64).prop_map(|(metres, error)| Motion::Measured {
+            metres,
+            error,
+            speed: metres
+        }),
+        (0.0..100.0_f64).prop_map(measured),
+        (0.0..1e5_f64).prop_map(|time| Motion::Elapsed { time, novelty: None }),
+        (0.0..20.0_f64, 0.0..3.0_f64)
+            .prop_map(|(time, seen)| Motion::Elapsed { time, novelty: Some(seen) }),
+    ]
 }
 
 proptest! {
     #[test]
     fn a_belief_is_a_bounded_probability_distribution_after_any_frames(
-        places in random_places(),
-        settings in random_settings(),
-        gap in 1e-4..1.0_f32,
-        frames in proptest::collection::vec(random_frame(), 1..12),
+        road in random_road(),
+        shares in (0.001..0.999_f64, 0.001..0.999_f64),
+        most in 1..40_usize,
+        frames in proptest::collection::vec(
+            (random_motion(), proptest::collection::btree_set(0..60_u32, 0..20)),
+            1..12,
+        ),
     ) {
+        let habits = Habits { turn: shares.0, jump: shares.1, ..HABITS };
+        let count = road.grid.len();
         let mut belief = Belief::uniform();
-        for RandomFrame { motion, mut similarities } in frames {
-            similarities.retain(|(image, _)| (*image as usize) < places.len());
-            if let Some(motion) = motion {
-                belief = belief.predicted(motion, &places, &settings);
-                check(&belief)?;
-                prop_assert!(belief.likely.len() <= places.len());
+        for (motion, images) in frames {
+            belief = belief.predicted(motion, habits, road.roads());
+            prop_assert!((total(&belief) - 1.0).abs() < 1e-4, "{}", total(&belief));
+            let images: Vec<u32> = images.into_iter().filter(|i| (*i as usize) < count).collect();
+            belief = belief.updated(&road.looks_like(&images), count, most);
+            prop_assert!((total(&belief) - 1.0).abs() < 1e-4, "{}", total(&belief));
+            prop_assert!(belief.images.len() <= most);
+            for (_, mass) in belief.masses() {
+                prop_assert!((0.0..=1.0 + 1e-4).contains(&mass), "{}", mass);
             }
-            let before = belief.clone();
-            belief = belief.updated(&similarities, gap, &places, &settings);
-            check(&belief)?;
-            match similarities.is_empty() {
-                true => prop_assert_eq!(&belief, &before),
-                false => prop_assert!(belief.likely.len() <= settings.states),
-            }
-            if let Some((best, probability)) = belief.best(&places, 25.0) {
-                prop_assert!((0.0..=1.0 + 1e-9).contains(&probability), "{}", probability);
-                check(&belief.clone().without(best))?;
-            }
-            let restored = Belief::from_ids(&belief.by_id(&places), &places);
-            check(&restored)?;
-            prop_assert_eq!(&restored.likely, &belief.likely);
         }
     }
 }
