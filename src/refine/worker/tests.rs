@@ -267,6 +267,10 @@ async fn jobs_that_wait_for_a_network_leave_their_turn_to_others() {
 async fn as_many_jobs_use_this_machine_as_there_are_workers_the_oldest_first() {
     let (fixture, jobs) = Fixture::with(2, 100, Told::new(false), 4).await;
     fixture.until(&jobs, &[Running, Running, Queued, Queued]).await;
+    // A job is running a moment before it is refined.
+    while fixture.refiner.in_progress.load(Ordering::SeqCst) < 2 {
+        tokio::task::yield_now().await;
+    }
     fixture.refiner.permits.add_permits(4);
     fixture.until(&jobs, &[Succeeded; 4]).await;
     assert_eq!(fixture.refiner.most.load(Ordering::SeqCst), 2);
@@ -290,6 +294,9 @@ async fn no_more_jobs_are_in_progress_than_the_settings_allow() {
             break;
         }
         changes.recv().await.unwrap();
+    }
+    while fixture.refiner.in_progress.load(Ordering::SeqCst) < 3 {
+        tokio::task::yield_now().await;
     }
     assert_eq!(fixture.refiner.most.load(Ordering::SeqCst), 3);
 }
@@ -335,6 +342,9 @@ async fn at_shutdown_all_jobs_in_progress_go_back_to_the_queue() {
 async fn a_cancelled_job_ends_and_the_others_go_on() {
     let (fixture, jobs) = Fixture::with(1, 100, Told::new(true), 3).await;
     fixture.until(&jobs, &[Running; 3]).await;
+    while fixture.refiner.in_progress.load(Ordering::SeqCst) < 3 {
+        tokio::task::yield_now().await;
+    }
     fixture.store.cancel(jobs[1]).await.unwrap();
     while fixture.refiner.in_progress.load(Ordering::SeqCst) > 2 {
         tokio::task::yield_now().await;
