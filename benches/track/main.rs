@@ -44,7 +44,7 @@ fn main() -> anyhow::Result<()> {
         |name: &str| names.is_empty() || names.iter().any(|wanted| name.contains(wanted.as_str()));
     let runtime = Runtime::new()?;
     println!(
-        "{:<28}{:>7}{:>7}{:>7}{:>7}{:>10}{:>10}   ≥ 0.9: right of     known: right wrong",
+        "{:<28}{:>7}{:>7}{:>7}{:>9}{:>8}{:>10}   ≥ 0.9: right of     known: right wrong",
         "R@1 in percent", "alone", "A", "B", "SeqSLAM", "times", "odometry"
     );
     let mut total = Tally::default();
@@ -58,7 +58,7 @@ fn main() -> anyhow::Result<()> {
             tally.add(&drive, &answers);
         }
         println!(
-            "{:<28}{:>7.1}{:>7.1}{:>7.1}{:>7.1}{:>10.1}{:>10.1}   {}",
+            "{:<28}{:>7.1}{:>7.1}{:>7.1}{:>9.1}{:>8.1}{:>10.1}   {}",
             drive.name, others.alone, others.a, others.b, others.line, ours[0], ours[1], tally
         );
         total.merge(&tally);
