@@ -149,6 +149,8 @@ class CalibrationState:
     """Images that were queried as if they were frames."""
     refined: int
     """How many of those were also refined."""
+    model_asked: int = 0
+    """About how many of those the model was asked."""
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,10 @@ pub struct CalibrationState {
     /// Number of these queries that were also refined, which bounds the confidence of a refined estimate in
     /// the same way. If it is 0, the confidence of a refined estimate is based on similarity.
     pub refined: usize,
+    /// Number of these queries about which the model was asked (`confidence.model_calls`). If it is 0, the model counts
+    /// as one that is certain of every wrong image.
+    #[serde(default)]
+    pub model_asked: usize,
 }
 
 impl From<&Calibration> for CalibrationState {
@@ -144,6 +148,7 @@ impl From<&Calibration> for CalibrationState {
             images: calibration.images,
             asked: calibration.similarity.len(),
             refined: calibration.agreement.len(),
+            model_asked: calibration.model_asked,
         }
     }
 }

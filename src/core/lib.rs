@@ -21,6 +21,7 @@ mod service_time;
 mod spend;
 pub mod units;
 mod utm;
+mod verdict;
 mod webhook;
 
 pub use self::image::{ExportedImage, Image, ImageField, ImageId, MediaType};
@@ -43,6 +44,7 @@ pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;
 pub use utm::UtmZone;
+pub use verdict::{Agreement, Certainty};
 pub use webhook::{
     Attempt, Delivery, DeliveryState, Disposition, Message, StoredWebhook, Webhook, WebhookEvent,
     WebhookSecret,

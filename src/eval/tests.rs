@@ -126,6 +126,7 @@ async fn outcome(
         digest: Digest::of(b""),
         predictions: predictions.collect(),
         confidence: 0.0,
+        alternatives: None,
         descriptions: Vec::new(),
         reasoning: None,
         usage: Usage::default(),

@@ -30,8 +30,8 @@ pub use job_settings::JobSettings;
 pub use local::LocalRefiner;
 pub use metrics::{CacheLookup, RefineMetrics};
 pub use refiner::{
-    NegativeEvidence, PaidCallLevels, PaidCalls, Progress, RefineError, Refinement, Refiner,
-    RegionMatcher,
+    NegativeEvidence, PaidCallLevels, PaidCalls, PaidMeasurement, PaidNegatives, Progress,
+    RefineError, Refinement, Refiner, RegionMatcher,
 };
 pub use registry::{BuildError, REFINERS, RefinerContext, RefinerEntry, RefinerSettings};
 pub use store_retry::retry_for;

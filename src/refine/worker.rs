@@ -178,7 +178,8 @@ impl Worker {
         );
         let known_from = self.known_confidence;
         let estimate = Estimate::new(&first.image_id, first.pose, confidence, known_from);
-        Some(estimate.unless(record.query.uninformative.as_deref()))
+        let unknown = record.query.uninformative.as_deref().or(refinement.why_unknown());
+        Some(estimate.unless(unknown))
     }
 
     fn record_time(&self, took: Duration) {

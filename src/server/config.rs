@@ -204,6 +204,9 @@ impl Config {
         if let Some(why) = sections.or_else(|| self.jobs.validate()) {
             return Some(why);
         }
+        if let Some(why) = self.confidence.validate(self.refine.candidates) {
+            return Some(why);
+        }
         if self.bulk.memory_bytes < self.server.body_limit_bytes {
             return Some("bulk.memory_bytes must not be less than server.body_limit_bytes".into());
         }

@@ -13,6 +13,7 @@
 //! | `client`, `forms`, `exchange`, `endpoint` | calls to a server over HTTP |
 //! | `wire`, `response`, `error_body`, `thinking`, `tokens` | the chat-completions format, in all its dialects |
 //! | `capability`, `check`, `check_calls`, `server_facts` | what a server can do, found out by trying |
+//! | `negatives` | the model's verdicts on images of other places, for calibration |
 //! | `spend`, `budget`, `reservation` | limits on spend: in this process, across processes |
 //! | `failure`, `retry`, `breaker`, `rate` | kinds of failures, retries, circuit breaker, rate limits |
 //!
@@ -37,6 +38,7 @@ mod judge;
 mod labels;
 mod lease;
 mod loose_json;
+mod negatives;
 mod order;
 mod pictures;
 mod prompts;
@@ -64,13 +66,15 @@ use std::time::Duration;
 use async_trait::async_trait;
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
-use whereabouts_core::{DayUsage, ModelServer, RefinerKind, Spent, utc_day};
+use whereabouts_core::{
+    Agreement, Calibration, DayUsage, ModelServer, RefinerKind, Spent, utc_day,
+};
 use whereabouts_store::{
     BlobStore, DescriptionCache, MapStore, SharedLimits, TokenBuckets, UsageStore,
 };
 use whereabouts_vision::ImageLimits;
 
-pub use answer::{AnswerError, Certainty};
+pub use answer::AnswerError;
 pub use check::{CheckedServer, Finding, check};
 pub use labels::{Labels, Verdict};
 pub use prompts::PROMPT_VERSION;
@@ -89,8 +93,8 @@ use self::retry::CallError;
 use self::run::RefineRun;
 use self::spend::SpendControl;
 use crate::{
-    BuildError, NegativeEvidence, PaidCallLevels, PaidCalls, Progress, RefineError, RefineInput,
-    RefineMetrics, Refinement, Refiner, RefinerContext, RefinerSettings, local,
+    BuildError, NegativeEvidence, PaidCallLevels, PaidCalls, PaidNegatives, Progress, RefineError,
+    RefineInput, RefineMetrics, Refinement, Refiner, RefinerContext, RefinerSettings, local,
 };
 
 /// The parts that an [`MllmRefiner`] is built from.
@@ -156,7 +160,8 @@ pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, 
 /// Returns a text that changes with everything that decides what the refiner finds.
 pub(crate) fn fingerprint(settings: &RefinerSettings) -> Result<String, BuildError> {
     let mllm = serde_json::to_string(&settings.mllm)?;
-    Ok(format!("{PROMPT_VERSION} {mllm} {}", local::fingerprint(settings)?))
+    let evidence = Calibration::EVIDENCE;
+    Ok(format!("{PROMPT_VERSION} {evidence} {mllm} {}", local::fingerprint(settings)?))
 }
 
 impl MllmRefiner {
@@ -258,6 +263,18 @@ impl MllmRefiner {
         }
     }
 
+    /// Returns how far the regions of the frame and its candidates agree; `None` if that cannot be found out.
+    async fn agreement(&self, input: &RefineInput) -> Option<Agreement> {
+        let matcher = self.fallback.as_ref()?.region_matcher()?;
+        matcher
+            .agreement(input)
+            .await
+            .inspect_err(
+                |error| tracing::warn!(job = %input.id, %error, "a verdict could not be checked"),
+            )
+            .ok()
+    }
+
     /// Returns an error that defers the job, if the settings say so and it is known for how long.
     fn deferred(&self, why: &CallError) -> Result<(), RefineError> {
         match available_after(why) {
@@ -284,6 +301,10 @@ impl Refiner for MllmRefiner {
         self.fallback.as_ref()?.negative_evidence()
     }
 
+    fn paid_negatives(&self) -> Option<&dyn PaidNegatives> {
+        Some(self)
+    }
+
     fn paid_calls(&self) -> Option<&dyn PaidCalls> {
         Some(self)
     }
@@ -307,7 +328,11 @@ impl Refiner for MllmRefiner {
             ([], Some(why)) => return self.without_descriptions(&run, &why).await,
             (described, _) => self.order(&run, described).await?,
         };
-        conclude::conclude(&run, &pairs, order)
+        let agreement = match &order {
+            Order::Model(_) => self.agreement(input).await,
+            _ => None,
+        };
+        conclude::conclude(&run, &pairs, order, agreement.as_ref())
     }
 }
 

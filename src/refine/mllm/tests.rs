@@ -3,8 +3,9 @@
 mod check;
 mod faults;
 mod habits;
-mod limits;
+pub(crate) mod limits;
 pub(crate) mod shelf;
+mod verdicts;
 
 use shelf::{Bench, Steps};
 

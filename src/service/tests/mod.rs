@@ -32,7 +32,10 @@ use whereabouts_core::{
     MediaType, MetricPose, Pose, Precision, RefinerKind, Scene,
 };
 use whereabouts_index::IndexSettings;
-use whereabouts_refine::{NegativeEvidence, Progress, RefineError, RefineInput, Refinement};
+use whereabouts_refine::{
+    NegativeEvidence, PaidMeasurement, PaidNegatives, Progress, RefineError, RefineInput,
+    Refinement,
+};
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
 use whereabouts_store::{
     BlobStore, DescriptionBounds, HardNegatives, JobRecord, JobStore, MapStore, Query,
@@ -175,7 +178,13 @@ fn settings() -> ServiceSettings {
             states: 64,
             known_probability: 0.5,
         },
-        confidence: ConfidenceSettings { images: 100, refined: 100, place_images: 0, place_m: 5.0 },
+        confidence: ConfidenceSettings {
+            images: 100,
+            refined: 100,
+            place_images: 0,
+            place_m: 5.0,
+            model_calls: 0,
+        },
         jobs: job_settings(),
         compared: 5,
         recall_check: None,
@@ -282,6 +291,8 @@ struct ScriptedRefiner {
     measurements: Mutex<VecDeque<RefineError>>,
     /// Images that were measured, failed attempts included.
     measured: Mutex<Vec<whereabouts_core::ImageId>>,
+    /// How often the model was asked.
+    verdicts: Mutex<usize>,
 }
 
 #[async_trait]
@@ -297,6 +308,10 @@ impl Refiner for ScriptedRefiner {
     fn negative_evidence(&self) -> Option<&dyn NegativeEvidence> {
         Some(self)
     }
+
+    fn paid_negatives(&self) -> Option<&dyn PaidNegatives> {
+        Some(self)
+    }
 }
 
 #[async_trait]
@@ -305,11 +320,23 @@ impl NegativeEvidence for ScriptedRefiner {
         &self,
         _: &Map,
         negatives: &HardNegatives,
-    ) -> Result<Option<Evidence>, RefineError> {
+    ) -> Result<Vec<Evidence>, RefineError> {
         self.measured.lock().push(negatives.image_id.clone());
         match self.measurements.lock().pop_front() {
             Some(error) => Err(error),
-            None => Ok(Some(Evidence::Agreement(0.5))),
+            None => Ok(vec![Evidence::Agreement(0.5), Evidence::Verdict(0.5)]),
         }
+    }
+}
+
+#[async_trait]
+impl PaidNegatives for ScriptedRefiner {
+    fn cost(&self, candidates: usize) -> PaidMeasurement {
+        PaidMeasurement { calls: candidates + 1, tokens: 1000, money: 0.0 }
+    }
+
+    async fn verdict(&self, _: &Map, _: &HardNegatives) -> Result<Option<Evidence>, RefineError> {
+        *self.verdicts.lock() += 1;
+        Ok(Some(Evidence::Verdict(-2.0)))
     }
 }

@@ -24,6 +24,8 @@ impl Refiner for Reverse {
             descriptions: vec![],
             ranking: Ranking::new(&input.candidates, &order).unwrap(),
             evidence: None,
+            certainty: None,
+            agreement: None,
             reasoning: None,
             reasoning_took_ms: None,
             ordered_by: None,
