@@ -1,5 +1,5 @@
-//! How much refiners find, what they call known, and what they cost: `whereabouts eval` with the refiners `local` and
-//! `mllm` on sets of which half serves as the map and half as places outside it.
+//! How much refiners find, what they call known, and what they cost: `whereabouts eval` with the refiners `local`,
+//! `mllm` and `cascade` on sets of which half serves as the map and half as places outside it.
 //!
 //! The model is a *mock* that is told the truth, with habits: always right, wrong in a fifth of the frames, always
 //! certain, always wrong. The peers of the calibrated confidence are in the table: `local` alone, the similarity of the
@@ -10,6 +10,8 @@
 //! cargo bench --bench refiners -- 800                # a larger one
 //! cargo bench --bench refiners -- FOLDER DB QUERIES  # a folder with ground_truth.csv and these two folders
 //! REFINERS_MODEL_CALLS=220 cargo bench --bench refiners   # confidence.model_calls
+//! REFINERS_HOLD_OUT=0 cargo bench --bench refiners        # all of the set is the map
+//! WHEREABOUTS_CASCADE__CANDIDATES=3 cargo bench --bench refiners   # any setting of the service
 //! ```
 
 #![allow(
@@ -36,7 +38,7 @@ use oracle::{Habit, Truth, script};
 use sets::TestSet;
 
 /// The refiners, in the order of the table.
-const REFINERS: &str = "local,mllm";
+const REFINERS: &str = "local,mllm,cascade";
 
 fn main() -> anyhow::Result<()> {
     let folder = TempDir::new()?;
@@ -67,9 +69,11 @@ fn main() -> anyhow::Result<()> {
 }
 
 fn evaluate(set: &TestSet, url: &str, work: &Path) -> anyhow::Result<Value> {
-    let calls = std::env::var("REFINERS_MODEL_CALLS").unwrap_or_else(|_| "0".into());
+    let given = |name: &str, default: &str| std::env::var(name).unwrap_or_else(|_| default.into());
+    let calls = given("REFINERS_MODEL_CALLS", "0");
+    let hold_out = given("REFINERS_HOLD_OUT", "0.5");
     let output = Command::new(&*BINARY)
-        .args(["eval", "--json", "--model", "xfeat", "--hold-out", "0.5", "-k", "10"])
+        .args(["eval", "--json", "--model", "xfeat", "-k", "10", "--hold-out", &hold_out])
         .args(["--refine", REFINERS, "--mllm-base-url", url])
         .arg("--database")
         .arg(&set.database)
@@ -115,7 +119,9 @@ fn print(set: &TestSet, habit: Habit, summary: &Value) {
         println!("{name:<22} {recall:>6} {right:>12} {wrong:>12} {outside:>14} {calls:>12}");
     };
     for method in summary["methods"].as_array().unwrap() {
-        let calls = method["usage"]["calls"].as_f64().unwrap() / frames;
+        // `cascade` finds descriptions that `mllm` has bought: they count as calls.
+        let count = |kind: &str| method["usage"][kind].as_f64().unwrap();
+        let calls = (count("calls") + count("cached")) / frames;
         let recall = format!("{:.1}", method["recall"]["1"].as_f64().unwrap());
         let name = method["name"].as_str().unwrap();
         row(name, &recall, &method["known"]["called"], &format!("{calls:.2}"));

@@ -132,7 +132,7 @@ fn rank(truth: &Truth, habit: Habit, call: &ReasonCall) -> Reply {
     wrong.sort_by_key(|(_, frame, candidate)| dice(&[*frame, *candidate]));
     let lies = match habit {
         Habit::Truthful | Habit::OverConfident => false,
-        Habit::ErrsInAFifth => dice(&[frame]) % 5 == 0,
+        Habit::ErrsInAFifth => dice(&[frame]).is_multiple_of(5),
         Habit::Liar => true,
     };
     let certainty = match (habit, right.is_empty(), lies) {

@@ -4,7 +4,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use whereabouts_core::{
-    Calibration, CoordinateFrame, DescriptorKind, Digest, MapName, Precision, Scene,
+    Calibration, CoordinateFrame, DescriptorKind, Digest, MapName, Precision, RefinerKind, Scene,
 };
 
 /// A change of a map. Omitted fields keep their value, or get their default in a new map.
@@ -24,9 +24,39 @@ pub struct MapChange {
     /// images, only a reindex changes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub model: Option<String>,
+    /// The refiner of the map's jobs, of those that the server allows (`refine.refiner`, `refine.allowed`): `local`,
+    /// `cascade`, `mllm`, or `default` (the server's). Requests may choose one that costs no more.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub refiner: Option<MapRefiner>,
     /// Free text for people, up to 2,000 characters.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub description: Option<String>,
+}
+
+/// The refiner that a map is set to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum MapRefiner {
+    /// The server's.
+    Default,
+    /// `local`.
+    Local,
+    /// `cascade`.
+    Cascade,
+    /// `mllm`.
+    Mllm,
+}
+
+impl MapRefiner {
+    /// Returns the refiner; `None` for the server's.
+    pub fn kind(self) -> Option<RefinerKind> {
+        match self {
+            Self::Default => None,
+            Self::Local => Some(RefinerKind::Local),
+            Self::Cascade => Some(RefinerKind::Cascade),
+            Self::Mllm => Some(RefinerKind::Mllm),
+        }
+    }
 }
 
 /// The state of a map.
@@ -62,6 +92,10 @@ pub struct MapState {
     #[serde(default)]
     #[schema(nullable)]
     pub calibration: Option<CalibrationState>,
+    /// The refiner that the map is set to; null for the server's.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub refiner: Option<RefinerKind>,
     /// Free text for people.
     pub description: Option<String>,
     /// When the map was created.

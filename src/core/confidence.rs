@@ -37,7 +37,7 @@ pub enum Evidence {
     Agreement(f32),
     /// The evidence of a model's verdict, see [`Agreement::verdict`](crate::Agreement::verdict).
     Verdict(f32),
-    /// The same where the regions alone put the same candidate first: either evidence counts.
+    /// The same where the regions put the same candidate first, or nearly: either evidence counts.
     Concurring {
         /// The evidence of the verdict.
         verdict: f32,
@@ -111,6 +111,11 @@ impl NullDistribution {
     /// Whether there are no samples.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
+    }
+
+    /// The highest confidence that evidence can have: n / (n + 1).
+    pub fn highest_confidence(&self) -> f32 {
+        self.confidence(f32::INFINITY)
     }
 
     /// Mean of the samples; `None` if there are none.

@@ -34,7 +34,8 @@ pub use description::{
 pub use descriptor::{Descriptor, DescriptorError, dot};
 pub use digest::Digest;
 pub use job::{
-    DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage, utc_day,
+    DayUsage, Description, Job, JobState, JobVerdict, Priority, RefinerKind, StandIn, Usage,
+    utc_day,
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use map::{CoordinateFrame, DescriptorKind, Map, MapName, Precision, Scene};

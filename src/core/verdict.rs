@@ -10,7 +10,8 @@
 //! candidates, b its maximum, c is [`CHANCE_SHARE`](super::confidence::CHANCE_SHARE) of the regions of the frame, and
 //! d is the model's doubt. The second term is the contradiction: another candidate matches the frame better.
 //!
-//! Where the regions alone put the same candidate first, the model concurs, and the evidence of the regions counts too.
+//! Where the regions put the same candidate first, or nearly, as they do with neighbours that show the same place, the
+//! model concurs, and the evidence of the regions counts too.
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -21,6 +22,9 @@ use super::confidence::chance;
 /// The weight of a contradiction: as strong a match of another candidate turns evidence for the first one into as much
 /// against it.
 const CONTRADICTION: f32 = 2.0;
+
+/// The share of the regions of the first candidate from which another is nearly as good.
+const NEARLY: f32 = 0.7;
 
 /// How sure a model is that its first candidate shows the place of the frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -37,6 +41,16 @@ pub enum Certainty {
 }
 
 impl Certainty {
+    /// Returns its name in the API.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Certain => "certain",
+            Self::Likely => "likely",
+            Self::Unsure => "unsure",
+            Self::None => "none",
+        }
+    }
+
     /// Returns how much the evidence is lowered, in units of the logarithm. A model that says nothing of its certainty
     /// counts as one that takes its candidate for likely.
     fn doubt(certainty: Option<Self>) -> f32 {
@@ -76,10 +90,19 @@ impl Agreement {
         let best = self.matches.iter().copied().max()? as f32;
         let contradiction = ((best + chance) / (one + chance)).ln();
         let verdict = agreement - CONTRADICTION * contradiction - Certainty::doubt(certainty);
-        Some(match self.first == Some(of) && certainty != Some(Certainty::Unsure) {
+        let concurs = self.first.is_some_and(|first| self.share(of, first) >= NEARLY);
+        Some(match concurs && certainty != Some(Certainty::Unsure) {
             true => Evidence::Concurring { verdict, agreement },
             false => Evidence::Verdict(verdict),
         })
+    }
+
+    /// Returns how many regions match the candidate at index `of`, as a share of those that match `other`, with as many
+    /// added as match by chance. An index out of range counts as no match.
+    pub fn share(&self, of: usize, other: usize) -> f32 {
+        let matches = |index: usize| self.matches.get(index).copied().unwrap_or_default() as f32;
+        let chance = chance(self.regions);
+        (matches(of) + chance) / (matches(other) + chance)
     }
 
     /// Returns the strongest evidence that any verdict of this certainty on these candidates can have.
@@ -126,7 +149,10 @@ mod tests {
             Some(Evidence::Agreement(agreement))
         );
         assert!(verdict < agreement);
-        for (of, certainty) in [(1, Certainty::Certain), (0, Certainty::Unsure)] {
+        // Neighbours show the same place.
+        let nearly = regions.verdict(1, Some(Certainty::Certain));
+        assert!(matches!(nearly, Some(Evidence::Concurring { .. })), "{nearly:?}");
+        for (of, certainty) in [(2, Certainty::Certain), (0, Certainty::Unsure)] {
             let evidence = regions.verdict(of, Some(certainty));
             assert!(matches!(evidence, Some(Evidence::Verdict(_))), "{evidence:?}");
         }

@@ -156,7 +156,12 @@ impl Evaluator<'_> {
         let refiners = self.refiners.iter().map(AsRef::as_ref);
         // One with a paid model measures what the others do, too.
         let refiner = refiners.max_by_key(|refiner: &&dyn Refiner| {
-            (refiner.paid_negatives().is_some(), refiner.negative_evidence().is_some())
+            let asks_about_all = refiner.kind() == RefinerKind::Mllm;
+            (
+                refiner.paid_negatives().is_some(),
+                asks_about_all,
+                refiner.negative_evidence().is_some(),
+            )
         });
         self.service.calibrator.calibrate(map, refiner).await?;
         Ok(self.service.maps.store.calibration(map).await?.unwrap_or_default())
@@ -180,7 +185,7 @@ impl Evaluator<'_> {
         }
         let k = self.settings.k.max(MIN_PREDICTIONS);
         let refines_locally =
-            self.refiners.iter().any(|refiner| refiner.kind() == RefinerKind::Local);
+            self.refiners.iter().any(|refiner| refiner.kind() != RefinerKind::Mllm);
         let features = match refines_locally {
             true => FeatureSet::DescriptorAndDense,
             false => FeatureSet::DescriptorOnly,
@@ -224,6 +229,7 @@ impl Evaluator<'_> {
         RefineInput {
             id: Uuid::now_v7(),
             map: map.clone(),
+            refiner: None,
             frame: QueryFrame {
                 query_id: Uuid::now_v7(),
                 digest,

@@ -80,7 +80,8 @@ fn write_known_table(summary: &Summary, out: &mut String) -> fmt::Result {
     };
     for method in &summary.methods {
         let queries = (summary.queries + summary.unknown).max(1);
-        let calls = f64::from(method.usage.calls) / queries as f64;
+        // A cached description is a call that another method of the run, or an earlier run, has made.
+        let calls = f64::from(method.usage.calls + method.usage.cached) / queries as f64;
         row(&method.name, &method.known.called, &format!("{calls:.2}"))?;
         if let Some(alternatives) = &method.alternatives {
             row("  by similarity alone", &alternatives.similarity, "")?;
@@ -90,7 +91,7 @@ fn write_known_table(summary: &Summary, out: &mut String) -> fmt::Result {
     writeln!(
         out,
         "in percent of correct first answers, of wrong ones, and of places outside the map, at a\n\
-         confidence of {} or more\n",
+         confidence of {} or more; cached descriptions count as calls\n",
         summary.conditions.known_confidence
     )
 }

@@ -71,6 +71,7 @@ async fn map_of(store: &EmbeddedStore, descriptors: &[Descriptor]) -> Map {
         precision: Precision::Full,
         dim: DIM,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: now,
     };

@@ -3,9 +3,11 @@
 //!
 //! A [`Refiner`] does this for one [`RefineInput`]; [`REFINERS`] is the table of all refiners. The
 //! [`Worker`] claims jobs from the queue and has them refined. [`local`] compares dense features on this
-//! machine, [`mllm`] asks a multimodal LLM.
+//! machine, [`mllm`] asks a multimodal LLM, [`cascade`] does the second only where the first does not suffice.
 
 mod attempts;
+pub mod cascade;
+mod choice;
 mod dense_cache;
 mod input;
 mod job_settings;
@@ -24,6 +26,7 @@ use parking_lot::Mutex;
 use whereabouts_core::ServiceTime;
 
 pub use attempts::{AttemptPolicy, NextAttempt};
+pub use choice::RefinerSet;
 pub use dense_cache::{DenseCache, DenseKey};
 pub use input::{QueryFrame, RefineInput};
 pub use job_settings::JobSettings;

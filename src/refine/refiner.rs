@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use whereabouts_core::{
-    Agreement, CacheLevels, Certainty, Description, Evidence, ImageId, Map, ModelServer,
-    PairRegion, Ranking, RefinerKind, Spent, Usage,
+    Agreement, CacheLevels, Certainty, Description, Evidence, ImageId, JobVerdict, Map,
+    ModelServer, PairRegion, Ranking, RefinerKind, Spent, Usage,
 };
 use whereabouts_store::{HardNegatives, Step, StoreError};
 
@@ -131,6 +131,8 @@ pub struct Refinement {
     pub descriptions: Vec<Description>,
     /// How far the regions of the frame and each candidate agree, if that was measured.
     pub agreement: Option<Agreement>,
+    /// What each refiner found, if there was more than one.
+    pub verdicts: Vec<JobVerdict>,
     /// The candidates in refined order.
     pub ranking: Ranking,
     /// The refiner whose order it is, if that is not the one that was asked.

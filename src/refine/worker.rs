@@ -227,13 +227,14 @@ fn from_now(pause: Duration) -> Timestamp {
 }
 
 fn succeeded(job: Job, refinement: Refinement, estimate: Option<Estimate>) -> Job {
-    let Refinement { descriptions, ranking, reasoning, usage, degraded, .. } = refinement;
+    let Refinement { descriptions, ranking, verdicts, reasoning, usage, degraded, .. } = refinement;
     let reasoning_took_ms = refinement.reasoning_took_ms;
     Job {
         state: if degraded.is_some() { JobState::Degraded } else { JobState::Succeeded },
         finished_at: Some(Timestamp::now()),
         descriptions,
         ranking: Some(ranking),
+        verdicts,
         estimate,
         reasoning,
         reasoning_took_ms,

@@ -81,6 +81,8 @@ pub struct Calibrator {
     pub refiner: Option<Arc<dyn Refiner>>,
     /// How many images are measured, and which count as the same place.
     pub settings: CalibrationSettings,
+    /// Number of candidates about which a paid model is asked.
+    pub model_candidates: usize,
 }
 
 impl Calibrator {
@@ -191,7 +193,7 @@ impl Calibrator {
         asked: &[HardNegatives],
     ) -> Vec<Evidence> {
         let settings = self.settings;
-        let cost = model.cost(settings.candidates);
+        let cost = model.cost(self.model_candidates);
         let count = (settings.model_calls / cost.calls.max(1)).min(asked.len());
         if count < FEWEST_VERDICTS {
             return Vec::new();
@@ -203,7 +205,7 @@ impl Calibrator {
         );
         let mut verdicts = Vec::new();
         for mut asked in sampled(asked, count).take(count) {
-            asked.others.truncate(settings.candidates);
+            asked.others.truncate(self.model_candidates);
             match model.verdict(map, &asked).await {
                 Ok(verdict) => verdicts.extend(verdict),
                 Err(error) => {

@@ -281,6 +281,7 @@ fn conclude(candidates: &[Candidate], comparison: &Comparison) -> Result<Refinem
         ordered_by: None,
         evidence: ranked.first().and_then(|&first| agreement(pairs, first)),
         certainty: None,
+        verdicts: Vec::new(),
         agreement: Some(agreement_of_all(candidates.len(), present, pairs)),
         ranking,
         usage: Usage::default(),

@@ -48,6 +48,7 @@ pub(super) fn conclude(
         evidence: None,
         certainty: None,
         agreement: agreement.cloned(),
+        verdicts: Vec::new(),
         reasoning: None,
         reasoning_took_ms: None,
         ordered_by: None,

@@ -137,6 +137,16 @@ pub struct MllmRefiner {
 
 /// Builds the refiner `mllm`, with `local` as its fallback.
 pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, BuildError> {
+    Ok(shared(context).await?)
+}
+
+/// Returns the one instance of a process, so that all refiners that ask the model share its budgets, rates and circuit
+/// breaker.
+pub(crate) async fn shared(context: &RefinerContext) -> Result<Arc<MllmRefiner>, BuildError> {
+    context.model.get_or_try_init(|| build_model(context)).await.cloned()
+}
+
+async fn build_model(context: &RefinerContext) -> Result<Arc<MllmRefiner>, BuildError> {
     let store = &context.store;
     let parts = MllmParts {
         maps: store.clone(),
@@ -228,12 +238,13 @@ impl MllmRefiner {
     /// Refines a job of which no pair was described.
     async fn without_descriptions(
         &self,
+        fallback: Option<&dyn Refiner>,
         run: &RefineRun<'_>,
         why: &CallError,
     ) -> Result<Refinement, RefineError> {
         self.deferred(why)?;
-        match &self.fallback {
-            Some(fallback) => self.fall_back(fallback.as_ref(), run, why).await,
+        match fallback {
+            Some(fallback) => self.fall_back(fallback, run, why).await,
             None => Err(conclude::failure(why)),
         }
     }
@@ -241,6 +252,7 @@ impl MllmRefiner {
     /// Returns the order of the described candidates, from the model if it gives one.
     async fn order(
         &self,
+        fallback: Option<&dyn Refiner>,
         run: &RefineRun<'_>,
         described: &[DescribedPair],
     ) -> Result<Order, RefineError> {
@@ -251,7 +263,7 @@ impl MllmRefiner {
         };
         tracing::warn!(job = %run.input.id, error = %why, "the reasoning call failed");
         self.deferred(&why)?;
-        let Some(fallback) = &self.fallback else { return Ok(Order::Coarse(why)) };
+        let Some(fallback) = fallback else { return Ok(Order::Coarse(why)) };
         match fallback.refine(run.input, run.progress).await {
             Ok(refinement) => {
                 Ok(Order::Fallback { refinement: Box::new(refinement), by: fallback.kind(), why })
@@ -263,9 +275,50 @@ impl MllmRefiner {
         }
     }
 
+    /// Refines like [`Refiner::refine`], but does without the fallback: what the model cannot do is an error, or the
+    /// coarse order.
+    pub(crate) async fn refine_without_fallback(
+        &self,
+        input: &RefineInput,
+        progress: &dyn Progress,
+    ) -> Result<Refinement, RefineError> {
+        self.refine_with(None, input, progress).await
+    }
+
+    async fn refine_with(
+        &self,
+        fallback: Option<&dyn Refiner>,
+        input: &RefineInput,
+        progress: &dyn Progress,
+    ) -> Result<Refinement, RefineError> {
+        if self.settings.check_at_start {
+            check::again(&self.describer, &self.reasoner, &self.settings);
+        }
+        let budget =
+            self.spend.budget.for_job(input.spent.prompt_tokens, input.spent.completion_tokens);
+        let similar = self.similar_frames(input).await?;
+        let run = RefineRun::new(input, budget, similar, progress);
+        let pairs = self.pairs(input).await?;
+        let pairs = self.describe_all(&run, &pairs).await;
+        let order = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
+            ([], None) => Order::Nothing,
+            ([], Some(why)) => return self.without_descriptions(fallback, &run, &why).await,
+            (described, _) => self.order(fallback, &run, described).await?,
+        };
+        let agreement = match &order {
+            Order::Model(_) => self.agreement(fallback, input).await,
+            _ => None,
+        };
+        conclude::conclude(&run, &pairs, order, agreement.as_ref())
+    }
+
     /// Returns how far the regions of the frame and its candidates agree; `None` if that cannot be found out.
-    async fn agreement(&self, input: &RefineInput) -> Option<Agreement> {
-        let matcher = self.fallback.as_ref()?.region_matcher()?;
+    async fn agreement(
+        &self,
+        fallback: Option<&dyn Refiner>,
+        input: &RefineInput,
+    ) -> Option<Agreement> {
+        let matcher = fallback?.region_matcher()?;
         matcher
             .agreement(input)
             .await
@@ -314,25 +367,7 @@ impl Refiner for MllmRefiner {
         input: &RefineInput,
         progress: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        if self.settings.check_at_start {
-            check::again(&self.describer, &self.reasoner, &self.settings);
-        }
-        let budget =
-            self.spend.budget.for_job(input.spent.prompt_tokens, input.spent.completion_tokens);
-        let similar = self.similar_frames(input).await?;
-        let run = RefineRun::new(input, budget, similar, progress);
-        let pairs = self.pairs(input).await?;
-        let pairs = self.describe_all(&run, &pairs).await;
-        let order = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
-            ([], None) => Order::Nothing,
-            ([], Some(why)) => return self.without_descriptions(&run, &why).await,
-            (described, _) => self.order(&run, described).await?,
-        };
-        let agreement = match &order {
-            Order::Model(_) => self.agreement(input).await,
-            _ => None,
-        };
-        conclude::conclude(&run, &pairs, order, agreement.as_ref())
+        self.refine_with(self.fallback.as_deref(), input, progress).await
     }
 }
 

@@ -42,6 +42,7 @@ impl PaidNegatives for MllmRefiner {
         let input = RefineInput {
             id,
             map: map.clone(),
+            refiner: None,
             frame: QueryFrame { query_id: id, digest: image.digest, descriptor: None },
             candidates: negatives.others.clone(),
             spent: Usage::default(),

@@ -186,6 +186,10 @@ fn settings() -> ServiceSettings {
             model_calls: 0,
         },
         jobs: job_settings(),
+        refiners: AllowedRefiners {
+            default: Some(RefinerKind::Local),
+            allowed: vec![(RefinerKind::Local, 5)],
+        },
         compared: 5,
         recall_check: None,
         usage_days: 30,
@@ -201,7 +205,7 @@ fn settings() -> ServiceSettings {
     }
 }
 
-fn map(name: &str) -> Map {
+pub(crate) fn map(name: &str) -> Map {
     Map {
         uid: Uuid::now_v7(),
         name: name.parse().unwrap(),
@@ -213,6 +217,7 @@ fn map(name: &str) -> Map {
         precision: Precision::Full,
         dim: DIM,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::now(),
     }

@@ -25,6 +25,7 @@ impl Refiner for Reverse {
             ranking: Ranking::new(&input.candidates, &order).unwrap(),
             evidence: None,
             certainty: None,
+            verdicts: Vec::new(),
             agreement: None,
             reasoning: None,
             reasoning_took_ms: None,
