@@ -223,6 +223,7 @@ async fn map_of(images: usize) {
         precision: Precision::Full,
         dim: DIM,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::now(),
     };

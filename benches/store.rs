@@ -106,6 +106,7 @@ async fn new_map(store: &EmbeddedStore) -> anyhow::Result<Map> {
         precision: Precision::Full,
         dim: DIM,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::now(),
     };

@@ -240,6 +240,7 @@ fn map(dim: usize) -> anyhow::Result<Map> {
         precision: Precision::Full,
         dim,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::now(),
     })

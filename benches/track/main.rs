@@ -2,7 +2,8 @@
 //! one run on drives through the town; on real traverses too, if there are any in `../shared/data` or
 //! `WHEREABOUTS_DATA`. Then how long a step takes in a map of 100,000 images.
 //!
-//! The arguments name the drives to run; by default all. `tests/support/drives.rs` describes the other methods.
+//! The arguments name the drives to run, by default all, and `kind=gem` the kind of descriptor, by default the model's.
+//! `tests/support/drives.rs` describes the other methods.
 
 mod sets;
 
@@ -38,17 +39,20 @@ const LARGE_DIM: usize = 512;
 const STEPS: usize = 300;
 
 fn main() -> anyhow::Result<()> {
-    let names: Vec<String> =
+    let mut names: Vec<String> =
         std::env::args().skip(1).filter(|arg| !arg.starts_with("--")).collect();
+    let kind = names.iter().find_map(|name| name.strip_prefix("kind="));
+    let kind: Option<DescriptorKind> = kind.map(str::parse).transpose()?;
+    names.retain(|name| !name.starts_with("kind="));
     let is_named =
         |name: &str| names.is_empty() || names.iter().any(|wanted| name.contains(wanted.as_str()));
     let runtime = Runtime::new()?;
     println!(
-        "{:<28}{:>7}{:>7}{:>7}{:>7}{:>10}{:>10}   ≥ 0.9: right of     known: right wrong",
+        "{:<28}{:>7}{:>7}{:>7}{:>9}{:>8}{:>10}   ≥ 0.9: right of     known: right wrong",
         "R@1 in percent", "alone", "A", "B", "SeqSLAM", "times", "odometry"
     );
     let mut total = Tally::default();
-    for drive in sets::all()?.into_iter().filter(|drive| is_named(&drive.name)) {
+    for drive in sets::all(kind)?.into_iter().filter(|drive| is_named(&drive.name)) {
         let others = Others::of(&drive);
         let mut tally = Tally::default();
         let mut ours = Vec::new();
@@ -58,7 +62,7 @@ fn main() -> anyhow::Result<()> {
             tally.add(&drive, &answers);
         }
         println!(
-            "{:<28}{:>7.1}{:>7.1}{:>7.1}{:>7.1}{:>10.1}{:>10.1}   {}",
+            "{:<28}{:>7.1}{:>7.1}{:>7.1}{:>9.1}{:>8.1}{:>10.1}   {}",
             drive.name, others.alone, others.a, others.b, others.line, ours[0], ours[1], tally
         );
         total.merge(&tally);
@@ -163,13 +167,14 @@ impl Robots {
             uid: Uuid::now_v7(),
             name: "drive".parse()?,
             scene: Scene::Outdoor,
-            descriptor: DescriptorKind::Gem,
+            descriptor: DescriptorKind::GEM,
             frame: CoordinateFrame::Metric,
             model: "xfeat".into(),
             model_digest: Digest::of(b"model"),
             precision: Precision::Full,
             dim: images.first().context("no images")?.0.as_slice().len(),
             revision: 0,
+            refiner: None,
             description: None,
             created_at: Timestamp::now(),
         };

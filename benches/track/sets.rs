@@ -48,11 +48,26 @@ impl Drive {
     }
 }
 
-/// All drives: two towns, and real traverses that are driven forwards, backwards, at twice the speed, and there and back.
-pub fn all() -> anyhow::Result<Vec<Drive>> {
+/// The built-in model with one of its kinds of descriptors.
+struct Describer {
+    extractor: Extractor,
+    kind: DescriptorKind,
+}
+
+impl Describer {
+    fn describe(&self, picture: &[u8]) -> anyhow::Result<Descriptor> {
+        Ok(self.extractor.extract(picture, self.kind, FeatureSet::DescriptorOnly)?.descriptor)
+    }
+}
+
+/// All drives, described by `kind` or the model's default: two towns, and real traverses that are driven forwards, backwards, at twice the speed, and there and back.
+pub fn all(kind: Option<DescriptorKind>) -> anyhow::Result<Vec<Drive>> {
     let assets = Assets::locate(Some(&Path::new(env!("CARGO_MANIFEST_DIR")).join("assets")));
     let extractor = Extractor::load(&assets, &ExtractorSettings::plain("xfeat", 1, LIMITS))?;
-    let mut drives = vec![town(&extractor, 11, 96)?, town(&extractor, 5, 160)?];
+    let kind = kind.unwrap_or(extractor.manifest().default_kind());
+    println!("descriptors: {}", kind.as_str());
+    let describer = Describer { extractor, kind };
+    let mut drives = vec![town(&describer, 11, 96)?, town(&describer, 5, 160)?];
     let data =
         std::env::var_os("WHEREABOUTS_DATA").map_or_else(|| "../shared/data".into(), PathBuf::from);
     for (name, map, queries) in [
@@ -64,7 +79,7 @@ pub fn all() -> anyhow::Result<Vec<Drive>> {
             println!("{name} is left out: there is no {}", map.display());
             continue;
         }
-        let [map, queries] = [described(&extractor, &map)?, described(&extractor, &queries)?];
+        let [map, queries] = [described(&describer, &map)?, described(&describer, &queries)?];
         let count = queries.len();
         let drive = |kind: &str, order: Vec<usize>| {
             traverse(&format!("{name}{kind}"), &map, &queries, &order)
@@ -96,9 +111,9 @@ fn traverse(name: &str, map: &[Descriptor], queries: &[Descriptor], order: &[usi
 }
 
 /// The places of a town in four lights, three in ten behind a van, with odometry that is five metres off.
-fn town(extractor: &Extractor, seed: u64, places: usize) -> anyhow::Result<Drive> {
+fn town(describer: &Describer, seed: u64, places: usize) -> anyhow::Result<Drive> {
     let town = Town::new(TownSpec { seed, places, width: 320, height: 240 });
-    let described = |picture: &RgbImage| described_picture(extractor, &encode_jpeg(picture)?);
+    let described = |picture: &RgbImage| describer.describe(&encode_jpeg(picture)?);
     let drawn: Vec<_> = (0..places)
         .into_par_iter()
         .map(|place| {
@@ -123,21 +138,16 @@ fn town(extractor: &Extractor, seed: u64, places: usize) -> anyhow::Result<Drive
 }
 
 /// The descriptors of the pictures of a folder, in the order of their names.
-fn described(extractor: &Extractor, folder: &Path) -> anyhow::Result<Vec<Descriptor>> {
+fn described(describer: &Describer, folder: &Path) -> anyhow::Result<Vec<Descriptor>> {
     let mut files: Vec<PathBuf> = std::fs::read_dir(folder)?
         .map(|entry| Ok(entry?.path()))
         .collect::<std::io::Result<_>>()?;
     files.sort();
     let described = |file: &PathBuf| {
         let bytes = std::fs::read(file)?;
-        described_picture(extractor, &bytes).with_context(|| file.display().to_string())
+        describer.describe(&bytes).with_context(|| file.display().to_string())
     };
     files.par_iter().map(described).collect()
-}
-
-fn described_picture(extractor: &Extractor, bytes: &[u8]) -> anyhow::Result<Descriptor> {
-    let kind = DescriptorKind::Gem;
-    Ok(extractor.extract(bytes, kind, FeatureSet::DescriptorOnly)?.descriptor)
 }
 
 /// Images every metre along a spiral, each a little like the one before.

@@ -36,6 +36,7 @@ Frame: TypeAlias = Literal["wgs84", "metric"]
 DescriptorKind: TypeAlias = str
 """A kind of descriptor that the model declares, such as `gem`, `cls` or `vlad`."""
 RefineMode: TypeAlias = Literal["async", "wait", "off"]
+Refiner: TypeAlias = Literal["local", "cascade", "mllm"]
 Priority: TypeAlias = Literal["low", "normal", "high"]
 JobState: TypeAlias = Literal["queued", "running", "succeeded", "degraded", "failed", "cancelled"]
 
@@ -150,6 +151,8 @@ class CalibrationState:
     """Images that were queried as if they were frames."""
     refined: int
     """How many of those were also refined."""
+    model_asked: int = 0
+    """About how many of those the model was asked."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +188,8 @@ class MapState:
     reindex: Reindex | None = None
     calibration: CalibrationState | None = None
     """None until the map is calibrated, shortly after images are added; until then every confidence is 0."""
+    refiner: Refiner | None = None
+    """The refiner that the map is set to; None for the server's."""
     description: str | None = None
 
 
@@ -349,13 +354,28 @@ class RankedCandidate:
 
 
 @dataclass(frozen=True)
+class JobVerdict:
+    """What one of the refiners of a cascade found."""
+
+    refiner: Refiner
+    image_id: str
+    confidence: float
+    compared: int
+    """Number of candidates that it compared."""
+    certainty: Literal["certain", "likely", "unsure", "none"] | None = None
+    """How certain a model says it is."""
+    then: str | None = None
+    """Whether the answer stands or goes on to the model, and why."""
+
+
+@dataclass(frozen=True)
 class Job:
     """A refinement job."""
 
     id: str
     map: str
     query_id: str
-    refiner: Literal["local", "mllm"]
+    refiner: Refiner
     state: JobState
     created_at: datetime
     attempts: int
@@ -376,6 +396,8 @@ class Job:
     """Trace id of its request and refinement, if the server exports traces."""
     fresh_since: datetime | None = None
     """Descriptions from before this time are bought again."""
+    verdicts: tuple[JobVerdict, ...] = ()
+    """What each refiner of a cascade found: `local`, and the model if it was asked."""
 
     @property
     def ended(self) -> bool:
@@ -472,11 +494,17 @@ class Whereabouts:
         frame: Frame | None = None,
         descriptor: DescriptorKind | None = None,
         model: str | None = None,
+        refiner: Literal["default", "local", "cascade", "mllm"] | None = None,
         description: str | None = None,
     ) -> MapState:
         """Creates or updates a map. Omitted fields keep their values, or get defaults in a new map."""
         change = _given(
-            scene=scene, frame=frame, descriptor=descriptor, model=model, description=description
+            scene=scene,
+            frame=frame,
+            descriptor=descriptor,
+            model=model,
+            refiner=refiner,
+            description=description,
         )
         return self._call(MapState, "PUT", f"/maps/{_segment(map)}", json=change)
 
@@ -567,6 +595,7 @@ class Whereabouts:
         *,
         k: int | None = None,
         refine: RefineMode = "async",
+        refiner: Refiner | None = None,
         priority: Priority | None = None,
         track: str | None = None,
         captured_at: datetime | None = None,
@@ -577,7 +606,8 @@ class Whereabouts:
     ) -> Answer:
         """Localizes a frame: returns the `k` most similar images of the map and a job that re-ranks them.
 
-        `refine="wait"` waits for the job to end; `"off"` creates none. `deadline_ms` is how long the answer
+        `refine="wait"` waits for the job to end; `"off"` creates none. `refiner` chooses among those that the
+        server allows and that cost no more than the map's. `deadline_ms` is how long the answer
         is useful, counted from the arrival of the request: the server rejects the request immediately (429)
         if it cannot meet the deadline, and aborts it (504) if it takes longer.
 
@@ -599,6 +629,7 @@ class Whereabouts:
                 map=map,
                 k=k,
                 refine=refine,
+                refiner=refiner,
                 priority=priority,
                 track=track,
                 captured_at=_rfc3339(captured_at) if captured_at else None,

@@ -2,8 +2,8 @@
 
 use jiff::Timestamp;
 use whereabouts_core::{
-    Candidate, CoordinateFrame, Description, Estimate, Image, Job, JobState, Pose, Priority,
-    RankedCandidate, RefinerKind, Scene, Usage,
+    Candidate, Certainty, CoordinateFrame, Description, Estimate, Image, Job, JobState, JobVerdict,
+    Pose, Priority, RankedCandidate, RefinerKind, Scene, Usage,
 };
 
 use crate::{
@@ -186,12 +186,37 @@ impl From<Description> for proto::Description {
     }
 }
 
+/// Converts a refiner.
+pub fn refiner_to(refiner: RefinerKind) -> proto::Refiner {
+    match refiner {
+        RefinerKind::Local => proto::Refiner::Local,
+        RefinerKind::Cascade => proto::Refiner::Cascade,
+        RefinerKind::Mllm => proto::Refiner::Mllm,
+    }
+}
+
+impl From<JobVerdict> for proto::JobVerdict {
+    fn from(verdict: JobVerdict) -> Self {
+        let certainty = match verdict.certainty {
+            None => proto::Certainty::Unspecified,
+            Some(Certainty::Certain) => proto::Certainty::Certain,
+            Some(Certainty::Likely) => proto::Certainty::Likely,
+            Some(Certainty::Unsure) => proto::Certainty::Unsure,
+            Some(Certainty::None) => proto::Certainty::NoneOfThese,
+        };
+        Self {
+            refiner: refiner_to(verdict.refiner).into(),
+            image_id: verdict.image_id.into(),
+            confidence: verdict.confidence,
+            certainty: certainty.into(),
+            compared: verdict.compared as u32,
+            then: verdict.then.unwrap_or_default(),
+        }
+    }
+}
+
 impl From<Job> for proto::Job {
     fn from(job: Job) -> Self {
-        let refiner = match job.refiner {
-            RefinerKind::Local => proto::Refiner::Local,
-            RefinerKind::Mllm => proto::Refiner::Mllm,
-        };
         let priority = match job.priority {
             Priority::Low => proto::Priority::Low,
             Priority::Normal => proto::Priority::Normal,
@@ -202,7 +227,7 @@ impl From<Job> for proto::Job {
             id: job.id.to_string(),
             map: job.map.into(),
             query_id: job.query_id.to_string(),
-            refiner: refiner.into(),
+            refiner: refiner_to(job.refiner).into(),
             priority: priority.into(),
             state: job_state_to(job.state).into(),
             created_at: Some(moment_to(job.created_at)),
@@ -218,6 +243,7 @@ impl From<Job> for proto::Job {
             error: job.error.unwrap_or_default(),
             trace_id: job.trace_id.unwrap_or_default(),
             fresh_since: job.fresh_since.map(moment_to),
+            verdicts: job.verdicts.into_iter().map(Into::into).collect(),
         }
     }
 }
@@ -264,6 +290,7 @@ impl From<MapState> for proto::Map {
             index: index.into(),
             description: map.description.unwrap_or_default(),
             created_at: Some(moment_to(map.created_at)),
+            refiner: map.refiner.map_or(proto::Refiner::Unspecified, refiner_to).into(),
         }
     }
 }

@@ -29,7 +29,8 @@ pub use self::localize::{
     Answer, JobLink, NoJob, NoJobReason, RefineMode, TimingMs, TrackEstimate, TrackHypothesis,
 };
 pub use self::maps::{
-    CalibrationState, IndexKind, MapChange, MapState, Reindex, ReindexRequest, ReindexState,
+    CalibrationState, IndexKind, MapChange, MapRefiner, MapState, Reindex, ReindexRequest,
+    ReindexState,
 };
 pub use self::usage::{Today, Total, UsageReport};
 pub use self::webhooks::{DeliveryPage, MadeWebhook, NewWebhook};

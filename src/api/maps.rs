@@ -4,7 +4,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use whereabouts_core::{
-    Calibration, CoordinateFrame, DescriptorKind, Digest, MapName, Precision, Scene,
+    Calibration, CoordinateFrame, DescriptorKind, Digest, MapName, Precision, RefinerKind, Scene,
 };
 
 /// A change of a map. Omitted fields keep their value, or get their default in a new map.
@@ -25,9 +25,39 @@ pub struct MapChange {
     /// images, only a reindex changes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub model: Option<String>,
+    /// The refiner of the map's jobs, of those that the server allows (`refine.refiner`, `refine.allowed`): `local`,
+    /// `cascade`, `mllm`, or `default` (the server's). Requests may choose one that costs no more.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub refiner: Option<MapRefiner>,
     /// Free text for people, up to 2,000 characters.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub description: Option<String>,
+}
+
+/// The refiner that a map is set to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum MapRefiner {
+    /// The server's.
+    Default,
+    /// `local`.
+    Local,
+    /// `cascade`.
+    Cascade,
+    /// `mllm`.
+    Mllm,
+}
+
+impl MapRefiner {
+    /// Returns the refiner; `None` for the server's.
+    pub fn kind(self) -> Option<RefinerKind> {
+        match self {
+            Self::Default => None,
+            Self::Local => Some(RefinerKind::Local),
+            Self::Cascade => Some(RefinerKind::Cascade),
+            Self::Mllm => Some(RefinerKind::Mllm),
+        }
+    }
 }
 
 /// The state of a map.
@@ -63,6 +93,10 @@ pub struct MapState {
     #[serde(default)]
     #[schema(nullable)]
     pub calibration: Option<CalibrationState>,
+    /// The refiner that the map is set to; null for the server's.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub refiner: Option<RefinerKind>,
     /// Free text for people.
     pub description: Option<String>,
     /// When the map was created.
@@ -138,6 +172,10 @@ pub struct CalibrationState {
     /// Number of these queries that were also refined, which bounds the confidence of a refined estimate in
     /// the same way. If it is 0, the confidence of a refined estimate is based on similarity.
     pub refined: usize,
+    /// Number of these queries about which the model was asked (`confidence.model_calls`). If it is 0, the model counts
+    /// as one that is certain of every wrong image.
+    #[serde(default)]
+    pub model_asked: usize,
 }
 
 impl From<&Calibration> for CalibrationState {
@@ -146,6 +184,7 @@ impl From<&Calibration> for CalibrationState {
             images: calibration.images,
             asked: calibration.similarity.len(),
             refined: calibration.agreement.len(),
+            model_asked: calibration.model_asked,
         }
     }
 }

@@ -23,6 +23,7 @@ pub(super) fn map(name: &str) -> Map {
         precision: Precision::Full,
         dim: 2,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::UNIX_EPOCH,
     }

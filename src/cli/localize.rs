@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::client::{ServerArg, segment};
 use whereabouts_api::Answer;
-use whereabouts_core::{Job, MapName, MediaType, Pose};
+use whereabouts_core::{Job, MapName, MediaType, Pose, RefinerKind};
 
 /// Localize an image on a server
 #[derive(Debug, clap::Args)]
@@ -23,6 +23,9 @@ pub struct Args {
     /// Wait for the refinement and show its ranking
     #[arg(long)]
     refine: bool,
+    /// Refiner to use, of those that the server allows; with --refine
+    #[arg(long, requires = "refine")]
+    refiner: Option<RefinerKind>,
     /// Print the server's answer as JSON
     #[arg(long)]
     json: bool,
@@ -38,7 +41,12 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let media_type = MediaType::sniff(&frame).map_or("application/octet-stream", MediaType::as_str);
     let mode = if args.refine { "wait" } else { "off" };
     let path = format!("/localize?map={}&k={}&refine={mode}", segment(args.map.as_str()), args.k);
-    let request = client.post(&path).header("content-type", media_type).body(frame);
+    let refiner = args.refiner.map(|refiner| ("refiner", refiner.as_str()));
+    let request = client
+        .post(&path)
+        .query(&Vec::from_iter(refiner))
+        .header("content-type", media_type)
+        .body(frame);
     let answer: Value = client.json(request).await?;
     if args.json {
         println!("{answer}");
@@ -99,6 +107,17 @@ pub(super) fn print_job(job: &Job) {
             candidate.coarse_rank,
             candidate.image_id,
             format_pose(candidate.pose)
+        );
+    }
+    for verdict in &job.verdicts {
+        let certainty = verdict.certainty.map_or("", |certainty| certainty.as_str());
+        println!(
+            "  {}: {} of {} candidates, confidence {:.3} {certainty}{}",
+            verdict.refiner,
+            verdict.image_id,
+            verdict.compared,
+            verdict.confidence,
+            verdict.then.as_ref().map_or(String::new(), |then| format!("; {then}"))
         );
     }
     if let Some(reasoning) = &job.reasoning {

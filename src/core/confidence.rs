@@ -35,9 +35,21 @@ pub enum Evidence {
     /// ln((a + c) / (m + c)), where a regions of the candidate match the frame, m is the median of that count over
     /// the other candidates, and c is [`CHANCE_SHARE`] of the regions of the frame.
     Agreement(f32),
+    /// The evidence of a model's verdict, see [`Agreement::verdict`](crate::Agreement::verdict).
+    Verdict(f32),
+    /// The same where the regions put the same candidate first, or nearly: either evidence counts.
+    Concurring {
+        /// The evidence of the verdict.
+        verdict: f32,
+        /// The evidence of the regions, as of [`Self::Agreement`].
+        agreement: f32,
+    },
 }
 
 impl Evidence {
+    /// The evidence of a verdict that none of the candidates shows the place. Finite, so that it can be stored.
+    pub const NONE_OF_THESE: Self = Self::Verdict(f32::MIN);
+
     /// Computes the evidence for the image `of` from the similarities of the first [`COMPARED`]
     /// candidates. Returns `None` if the image is not among them or is the only one.
     pub fn similarity(candidates: &[Candidate], of: &ImageId) -> Option<Self> {
@@ -54,9 +66,14 @@ impl Evidence {
         let one = *matches.get(of)?;
         let others = matches.iter().enumerate().filter(|(index, _)| *index != of);
         let median = median(others.map(|(_, &count)| count as f32).collect())?;
-        let chance = (CHANCE_SHARE * regions as f32).max(1.0);
+        let chance = chance(regions);
         Some(Self::Agreement(((one as f32 + chance) / (median + chance)).ln()))
     }
+}
+
+/// How many of that many regions of a frame match a picture of another place by chance.
+pub(super) fn chance(regions: usize) -> f32 {
+    (CHANCE_SHARE * regions as f32).max(1.0)
 }
 
 /// The median; `None` if `values` is empty.
@@ -96,6 +113,11 @@ impl NullDistribution {
         self.0.is_empty()
     }
 
+    /// The highest confidence that evidence can have: n / (n + 1).
+    pub fn highest_confidence(&self) -> f32 {
+        self.confidence(f32::INFINITY)
+    }
+
     /// Mean of the samples; `None` if there are none.
     pub fn mean(&self) -> Option<f32> {
         let sum: f32 = self.0.iter().sum();
@@ -128,6 +150,13 @@ pub struct Calibration {
     pub similarity: NullDistribution,
     /// Null distribution of [`Evidence::Agreement`]; empty without a refiner or until it is measured.
     pub agreement: NullDistribution,
+    /// Null distribution of [`Evidence::Verdict`]. Unless the model was asked, it is that of a model that is certain of
+    /// whichever wrong image agrees most, so that no model can do worse.
+    #[serde(default)]
+    pub verdict: NullDistribution,
+    /// Number of images about which the model was asked for that; 0 if it was not.
+    #[serde(default)]
+    pub model_asked: usize,
 }
 
 /// How a map is calibrated.
@@ -145,6 +174,9 @@ pub struct CalibrationSettings {
     pub place_images: usize,
     /// Images whose poses are within this many metres count as the same place.
     pub place_m: f64,
+    /// Maximum number of calls to a paid model; 0 for none.
+    #[serde(default)]
+    pub model_calls: usize,
 }
 
 impl CalibrationSettings {
@@ -174,26 +206,42 @@ impl CalibrationSettings {
 
 impl Calibration {
     /// The present definition of [`Evidence`].
-    pub const EVIDENCE: u32 = 1;
+    pub const EVIDENCE: u32 = 2;
 
     /// Confidence that the image `of` shows the place of the frame. Uses the evidence of the refiner if
-    /// there is any and agreement is calibrated, and similarity otherwise.
+    /// there is any and its kind is calibrated, and similarity otherwise.
     pub fn refined_confidence(
         &self,
         candidates: &[Candidate],
         of: &ImageId,
         refined: Option<Evidence>,
     ) -> f32 {
-        let refined = refined.filter(|_| !self.agreement.is_empty());
-        let evidence = refined.or_else(|| Evidence::similarity(candidates, of));
-        evidence.map_or(0.0, |evidence| self.confidence(evidence))
+        if refined == Some(Evidence::NONE_OF_THESE) {
+            return 0.0;
+        }
+        let refined = refined.and_then(|evidence| self.calibrated(evidence));
+        let similarity = || Evidence::similarity(candidates, of).map(|one| self.confidence(one));
+        refined.or_else(similarity).unwrap_or_default()
     }
 
     /// Confidence of an answer with this evidence, in [0, 1); 0 in a map that is not calibrated.
     pub fn confidence(&self, evidence: Evidence) -> f32 {
+        self.calibrated(evidence).unwrap_or_default()
+    }
+
+    /// The same; `None` if evidence of its kind is not calibrated.
+    fn calibrated(&self, evidence: Evidence) -> Option<f32> {
+        let of =
+            |null: &NullDistribution, value| (!null.is_empty()).then(|| null.confidence(value));
         match evidence {
-            Evidence::Similarity(value) => self.similarity.confidence(value),
-            Evidence::Agreement(value) => self.agreement.confidence(value),
+            Evidence::Similarity(value) => of(&self.similarity, value),
+            Evidence::Agreement(value) => of(&self.agreement, value),
+            Evidence::Verdict(value) => of(&self.verdict, value),
+            Evidence::Concurring { verdict, agreement } => {
+                let verdict = of(&self.verdict, verdict);
+                let agreement = of(&self.agreement, agreement);
+                verdict.into_iter().chain(agreement).reduce(f32::max)
+            }
         }
     }
 }
@@ -290,6 +338,29 @@ mod tests {
         });
         assert!(confident.count() <= 10);
         assert_eq!(NullDistribution::default().confidence(1.0), 0.0);
+    }
+
+    #[test]
+    fn a_model_that_says_none_of_these_makes_nothing_known() {
+        let some = candidates(&[0.9, 0.1, 0.1]);
+        let null = NullDistribution::from(vec![0.0; 99]);
+        let similarity = null.clone();
+        let calibration = Calibration { similarity, verdict: null, ..Calibration::default() };
+        let of =
+            |refined| calibration.refined_confidence(&some, &"0".parse().unwrap(), Some(refined));
+        assert_eq!(of(Evidence::Verdict(1.0)), 0.99);
+        assert_eq!(of(Evidence::NONE_OF_THESE), 0.0);
+        // What is not calibrated is not used: the similarity decides.
+        assert_eq!(of(Evidence::Agreement(-5.0)), 0.99);
+        let agreement = NullDistribution::from(vec![5.0; 99]);
+        let both = Calibration { agreement, ..calibration.clone() };
+        let concurring = |agreement| Evidence::Concurring { verdict: 1.0, agreement };
+        assert_eq!(both.confidence(concurring(0.0)), 0.99);
+        assert_eq!(both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 6.0 }), 0.99);
+        assert_eq!(both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 4.0 }), 0.0);
+        let stored = serde_json::to_string(&NullDistribution::from(vec![f32::MIN, 1.0])).unwrap();
+        let read: NullDistribution = serde_json::from_str(&stored).unwrap();
+        assert_eq!(read, NullDistribution::from(vec![f32::MIN, 1.0]));
     }
 
     #[test]

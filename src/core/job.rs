@@ -13,7 +13,7 @@ use uuid::Uuid;
 
 use super::confidence::Estimate;
 use super::map::display_as_written;
-use super::{ImageId, InvalidName, MapName, Ranking};
+use super::{Certainty, ImageId, InvalidName, MapName, Ranking};
 
 /// The method that refines candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
@@ -22,8 +22,21 @@ pub enum RefinerKind {
     /// Geometric matching of dense features, computed locally.
     #[default]
     Local,
+    /// `local` first, and a multimodal LLM only where its answer is in question.
+    Cascade,
     /// A multimodal LLM.
     Mllm,
+}
+
+impl RefinerKind {
+    /// Returns the refiner's place in the order of cost: one that comes later may cost more.
+    pub fn cost(self) -> u8 {
+        match self {
+            Self::Local => 0,
+            Self::Cascade => 1,
+            Self::Mllm => 2,
+        }
+    }
 }
 
 /// The state of a job.
@@ -60,7 +73,7 @@ pub enum Priority {
 }
 
 display_as_written!(Priority { Low => "low", Normal => "normal", High => "high" });
-display_as_written!(RefinerKind { Local => "local", Mllm => "mllm" });
+display_as_written!(RefinerKind { Local => "local", Cascade => "cascade", Mllm => "mllm" });
 display_as_written!(JobState {
     Queued => "queued",
     Running => "running",
@@ -107,6 +120,26 @@ pub struct StandIn {
     pub query_id: Uuid,
     /// Cosine similarity of the two frames' descriptors, −1 to 1.
     pub similarity: f32,
+}
+
+/// What one of the refiners of a cascade found.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct JobVerdict {
+    /// The refiner.
+    pub refiner: RefinerKind,
+    /// The image that it puts first.
+    pub image_id: ImageId,
+    /// The calibrated confidence that this image shows the place.
+    pub confidence: f32,
+    /// How certain a model says it is; null for `local`.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub certainty: Option<Certainty>,
+    /// Number of candidates that it compared.
+    pub compared: usize,
+    /// Whether the answer stands or goes on to the model, and why; null for the last verdict.
+    #[serde(default)]
+    pub then: Option<String>,
 }
 
 /// Model calls and tokens used by a refinement.
@@ -202,6 +235,9 @@ pub struct Job {
     #[serde(default)]
     #[schema(nullable)]
     pub estimate: Option<Estimate>,
+    /// The verdicts of a job of `cascade`, in order: that of `local`, and that of the model if it was asked.
+    #[serde(default)]
+    pub verdicts: Vec<JobVerdict>,
     /// Descriptions from before this time are bought again; null if cached ones of any age are used.
     #[serde(default)]
     #[schema(nullable)]
@@ -240,6 +276,7 @@ impl Job {
             reasoning: None,
             reasoning_took_ms: None,
             estimate: None,
+            verdicts: Vec::new(),
             fresh_since: None,
             usage: Usage::default(),
             error: None,

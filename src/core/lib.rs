@@ -23,6 +23,7 @@ mod service_time;
 mod spend;
 pub mod units;
 mod utm;
+mod verdict;
 mod webhook;
 
 pub use self::image::{ExportedImage, Image, ImageField, ImageId, MediaType};
@@ -36,7 +37,8 @@ pub use descriptor::{Descriptor, DescriptorError, dot};
 pub use descriptor_kind::DescriptorKind;
 pub use digest::Digest;
 pub use job::{
-    DayUsage, Description, Job, JobState, Priority, RefinerKind, StandIn, Usage, utc_day,
+    DayUsage, Description, Job, JobState, JobVerdict, Priority, RefinerKind, StandIn, Usage,
+    utc_day,
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use leftovers::Leftover;
@@ -47,6 +49,7 @@ pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;
 pub use utm::{UtmZone, UtmZoneError};
+pub use verdict::{Agreement, Certainty};
 pub use webhook::{
     Attempt, Delivery, DeliveryState, Disposition, Message, StoredWebhook, Webhook, WebhookEvent,
     WebhookSecret,

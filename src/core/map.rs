@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-use super::{DescriptorKind, Digest, InvalidName};
+use super::{DescriptorKind, Digest, InvalidName, RefinerKind};
 
 /// The name of a map: 1 to 64 of `a-z 0-9 . _ -`, starting with a letter or a digit.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, ToSchema)]
@@ -155,6 +155,9 @@ pub struct Map {
     /// Number of completed reindexes.
     #[serde(default)]
     pub revision: u32,
+    /// The refiner of its jobs; the server's if it names none. Requests may choose one that costs no more.
+    #[serde(default)]
+    pub refiner: Option<RefinerKind>,
     /// Free text for people.
     #[serde(default)]
     pub description: Option<String>,

@@ -43,13 +43,15 @@ impl CacheKey<'_> {
                 format!("Some(({scene}, {}))", quoted(settings))
             },
         );
-        let CalibrationSettings { images, refined, candidates, place_images, place_m } =
+        let CalibrationSettings { images, refined, candidates, place_images, place_m, model_calls } =
             calibration;
+        let model_calls =
+            if *model_calls > 0 { format!("\nmodel_calls: {model_calls}") } else { String::new() };
         let place_m = float(*place_m);
         format!(
             "{version}\n{map}\n{references}\n{search}\n{k}\n{refinement}\nCalibrationSettings {{ \
              images: {images}, refined: {refined}, candidates: {candidates}, place_images: \
-             {place_images}, place_m: {place_m} }}"
+             {place_images}, place_m: {place_m} }}{model_calls}"
         )
     }
 }
@@ -78,6 +80,7 @@ mod tests {
                 candidates: 10,
                 place_images: 5,
                 place_m: 25.0,
+                model_calls: 0,
             };
             let map = "references-gem".parse().unwrap();
             CacheKey {

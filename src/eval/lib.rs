@@ -35,11 +35,11 @@ mod tests;
 
 pub use dataset::{Dataset, EvaluatedQuery, Folders, LeftOut, QueryKind, Sampling};
 pub use folder::{Folder, PictureFile, SkippedFile};
-pub use outcome::{MethodOutcomes, Prediction, QueryOutcome, StageTimes};
+pub use outcome::{AlternativeConfidence, MethodOutcomes, Prediction, QueryOutcome, StageTimes};
 pub use poses::{
     FolderPoses, FoundPose, LooseRow, MatchKind, PoseSource, RowAccount, UnmatchedRow, zone_in_name,
 };
 pub use run::{Evaluator, Method, Observer, RunSettings};
-pub use summary::{MethodSummary, RunConditions, Summary};
+pub use summary::{KnownAlternatives, MethodSummary, RunConditions, Summary};
 pub use table::table;
 pub use truth::{GroundTruth, TruthSource};

@@ -129,7 +129,8 @@ pub struct KnownRates {
 }
 
 impl KnownRates {
-    fn at(predictions: &[TopPrediction], threshold: f64) -> Self {
+    /// Computes the fractions.
+    pub fn at(predictions: &[TopPrediction], threshold: f64) -> Self {
         let rate = |is_kind: fn(&TopPrediction) -> bool| {
             let (all, known) = predictions.iter().filter(|prediction| is_kind(prediction)).fold(
                 (0, 0),

@@ -24,6 +24,9 @@ pub struct QueryOutcome {
     pub predictions: Vec<Prediction>,
     /// Confidence in the first prediction, 0 to 1.
     pub confidence: f32,
+    /// What else could be taken for the confidence of a model's answer.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub alternatives: Option<AlternativeConfidence>,
     /// The refiner's descriptions of the pairs.
     pub descriptions: Vec<Description>,
     /// The refiner's explanation of its ranking.
@@ -34,6 +37,16 @@ pub struct QueryOutcome {
     pub times: StageTimes,
     /// Why the refined ranking is the coarse one, in part or as a whole; `None` if it was refined fully.
     pub degraded: Option<String>,
+}
+
+/// What else could be taken for the confidence of a model's answer, 0 to 1.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct AlternativeConfidence {
+    /// The calibrated confidence of the similarity of the first prediction, as if no model had been asked.
+    pub similarity: f32,
+    /// The model's certainty taken at its word: `certain` is 1, `likely` 0.75, `unsure` 0.25, `none` 0; 0.5 if it says
+    /// nothing.
+    pub stated: f32,
 }
 
 /// A reference predicted to show the query's place.
@@ -132,6 +145,7 @@ mod tests {
             digest: Digest::of(query.as_bytes()),
             predictions: Vec::new(),
             confidence: 0.0,
+            alternatives: None,
             descriptions: Vec::new(),
             reasoning: None,
             usage: Usage::default(),

@@ -13,9 +13,12 @@ use uuid::Uuid;
 use super::cache_key::CacheKey;
 use super::map::ReferenceMap;
 use super::outcome::OutcomeCache;
-use super::{Dataset, EvaluatedQuery, MethodOutcomes, Prediction, QueryOutcome, StageTimes};
+use super::{
+    AlternativeConfidence, Dataset, EvaluatedQuery, MethodOutcomes, Prediction, QueryOutcome,
+    StageTimes,
+};
 use whereabouts_core::{
-    Calibration, DescriptorKind, Digest, Map, Priority, RefinerKind, Scene, Usage,
+    Calibration, Certainty, DescriptorKind, Digest, Map, Priority, RefinerKind, Scene, Usage,
 };
 use whereabouts_index::SearchMode;
 use whereabouts_refine::{
@@ -150,8 +153,17 @@ impl Evaluator<'_> {
     /// Measures the null distribution of the map. A calibration in the store is not reused: it may be of
     /// other references.
     async fn calibrate(&self, map: &Map) -> anyhow::Result<Arc<Calibration>> {
-        let evidence = self.refiners.iter().find_map(|refiner| refiner.negative_evidence());
-        self.service.calibrator.calibrate(map, evidence).await?;
+        let refiners = self.refiners.iter().map(AsRef::as_ref);
+        // One with a paid model measures what the others do, too.
+        let refiner = refiners.max_by_key(|refiner: &&dyn Refiner| {
+            let asks_about_all = refiner.kind() == RefinerKind::Mllm;
+            (
+                refiner.paid_negatives().is_some(),
+                asks_about_all,
+                refiner.negative_evidence().is_some(),
+            )
+        });
+        self.service.calibrator.calibrate(map, refiner).await?;
         Ok(self.service.maps.store.calibration(map).await?.unwrap_or_default())
     }
 
@@ -173,7 +185,7 @@ impl Evaluator<'_> {
         }
         let k = self.settings.k.max(MIN_PREDICTIONS);
         let refines_locally =
-            self.refiners.iter().any(|refiner| refiner.kind() == RefinerKind::Local);
+            self.refiners.iter().any(|refiner| refiner.kind() != RefinerKind::Mllm);
         let features = match refines_locally {
             true => FeatureSet::DescriptorAndDense,
             false => FeatureSet::DescriptorOnly,
@@ -217,6 +229,7 @@ impl Evaluator<'_> {
         RefineInput {
             id: Uuid::now_v7(),
             map: map.clone(),
+            refiner: None,
             frame: QueryFrame {
                 query_id: Uuid::now_v7(),
                 digest,
@@ -246,14 +259,20 @@ impl Evaluator<'_> {
         };
         match self.settings.attempts.run(attempt).await {
             Ok((refinement, elapsed)) => {
-                let confidence = refinement.ranking.first().map_or(0.0, |first| {
-                    calibration.refined_confidence(
-                        &input.candidates,
-                        &first.image_id,
-                        refinement.evidence,
-                    )
+                let confidence = |evidence| {
+                    refinement.ranking.first().map_or(0.0, |first| {
+                        let first = &first.image_id;
+                        calibration.refined_confidence(&input.candidates, first, evidence)
+                    })
+                };
+                let (refined, similarity) = (confidence(refinement.evidence), confidence(None));
+                let asks_a_model = refiner.paid_negatives().is_some();
+                let alternatives = asks_a_model.then(|| AlternativeConfidence {
+                    similarity,
+                    stated: stated(refinement.certainty),
                 });
-                Ok(refined_outcome(coarse, refinement, confidence, elapsed))
+                let outcome = refined_outcome(coarse, refinement, refined, elapsed);
+                Ok(QueryOutcome { alternatives, ..outcome })
             }
             Err(RefineError::Deferred { why, after }) => bail!(
                 "{why}; the outcomes so far are saved: run the same command again in {} s",
@@ -263,6 +282,17 @@ impl Evaluator<'_> {
                 Ok(QueryOutcome { degraded: Some(why), ..coarse.clone() })
             }
         }
+    }
+}
+
+/// Takes a model's certainty at its word.
+fn stated(certainty: Option<Certainty>) -> f32 {
+    match certainty {
+        Some(Certainty::Certain) => 1.0,
+        Some(Certainty::Likely) => 0.75,
+        None => 0.5,
+        Some(Certainty::Unsure) => 0.25,
+        Some(Certainty::None) => 0.0,
     }
 }
 
@@ -286,6 +316,7 @@ fn coarse_outcome(
         confidence: candidates
             .first()
             .map_or(0.0, |first| calibration.refined_confidence(candidates, &first.image_id, None)),
+        alternatives: None,
         descriptions: Vec::new(),
         reasoning: None,
         usage: Usage::default(),

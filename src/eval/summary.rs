@@ -2,9 +2,12 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::open_set::{OpenSetMetrics, Thresholds, TopPrediction};
+use super::open_set::{KnownRates, OpenSetMetrics, Thresholds, TopPrediction};
 use super::recall::{AtK, Change, FirstCorrectRank, change, first_correct_rank, recall};
-use super::{Dataset, EvaluatedQuery, LeftOut, MethodOutcomes, QueryKind, QueryOutcome};
+use super::{
+    AlternativeConfidence, Dataset, EvaluatedQuery, LeftOut, MethodOutcomes, QueryKind,
+    QueryOutcome,
+};
 use whereabouts_core::Usage;
 
 /// The results of an evaluation and the conditions under which they were measured.
@@ -72,6 +75,18 @@ pub struct MethodSummary {
     pub degraded_why: Option<String>,
     /// How well the confidence separates known from unknown places.
     pub known: OpenSetMetrics,
+    /// How often queries would be called known by another confidence; only of a method that asks a model.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub alternatives: Option<KnownAlternatives>,
+}
+
+/// How often queries would be called known by another confidence.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct KnownAlternatives {
+    /// By the similarity of the first answer.
+    pub similarity: KnownRates,
+    /// By the model's certainty, taken at its word.
+    pub stated: KnownRates,
 }
 
 /// Duration of the stages of a query, in milliseconds.
@@ -149,11 +164,19 @@ fn first_correct_ranks(data: &Dataset, method: &MethodOutcomes) -> Vec<FirstCorr
 
 /// Returns the first prediction of each query, of every kind.
 pub(super) fn top_predictions(data: &Dataset, method: &MethodOutcomes) -> Vec<TopPrediction> {
+    scored(data, method, |outcome| outcome.confidence)
+}
+
+fn scored(
+    data: &Dataset,
+    method: &MethodOutcomes,
+    score: impl Fn(&QueryOutcome) -> f32,
+) -> Vec<TopPrediction> {
     query_outcomes(data, method)
         .filter_map(|(query, outcome)| {
             let prediction = outcome.predictions.first()?;
             Some(TopPrediction {
-                score: f64::from(outcome.confidence),
+                score: f64::from(score(outcome)),
                 correct: query.truth.contains(&prediction.image_id),
                 in_map: query.kind == QueryKind::InMap,
             })
@@ -191,6 +214,18 @@ fn summarize_method(
         degraded: outcomes.iter().filter(|outcome| outcome.degraded.is_some()).count(),
         degraded_why: outcomes.iter().find_map(|outcome| outcome.degraded.clone()),
         known: OpenSetMetrics::of(&top_predictions(data, method), thresholds),
+        alternatives: outcomes.iter().any(|outcome| outcome.alternatives.is_some()).then(|| {
+            let rates = |of: fn(AlternativeConfidence) -> f32| {
+                // A query that the model did not rank has the confidence of its coarse answer.
+                let score =
+                    |outcome: &QueryOutcome| outcome.alternatives.map_or(outcome.confidence, of);
+                KnownRates::at(&scored(data, method, score), thresholds.service)
+            };
+            KnownAlternatives {
+                similarity: rates(|alternatives| alternatives.similarity),
+                stated: rates(|alternatives| alternatives.stated),
+            }
+        }),
     }
 }
 

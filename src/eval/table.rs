@@ -2,6 +2,7 @@
 
 use std::fmt::{self, Write};
 
+use super::open_set::KnownRates;
 use super::recall::Change;
 use super::{MethodSummary, Summary};
 
@@ -58,7 +59,41 @@ fn write(summary: &Summary, out: &mut String) -> fmt::Result {
         writeln!(out, "{:<11} {:>14} {:>14} {:>14}", "", cells[0], cells[1], cells[2])?;
     }
     writeln!(out, "in percent, with the 95 % bootstrap interval below each\n")?;
+    write_known_table(summary, out)?;
     methods.iter().try_for_each(|method| write_method(method, conditions.k, out))
+}
+
+/// Writes what is called known, and what a model costs.
+fn write_known_table(summary: &Summary, out: &mut String) -> fmt::Result {
+    writeln!(
+        out,
+        "{:<27} {:>9} {:>9} {:>9} {:>12}",
+        "called known", "right", "wrong", "unknown", "calls/query"
+    )?;
+    let cell = |rate: Option<f64>| match rate {
+        Some(rate) => format!("{:.1}", 100.0 * rate),
+        None => "-".to_owned(),
+    };
+    let mut row = |name: &str, rates: &KnownRates, calls: &str| {
+        let cells = [rates.right, rates.wrong, rates.unknown].map(cell);
+        writeln!(out, "{name:<27} {:>9} {:>9} {:>9} {calls:>12}", cells[0], cells[1], cells[2])
+    };
+    for method in &summary.methods {
+        let queries = (summary.queries + summary.unknown).max(1);
+        // A cached description is a call that another method of the run, or an earlier run, has made.
+        let calls = f64::from(method.usage.calls + method.usage.cached) / queries as f64;
+        row(&method.name, &method.known.called, &format!("{calls:.2}"))?;
+        if let Some(alternatives) = &method.alternatives {
+            row("  by similarity alone", &alternatives.similarity, "")?;
+            row("  by the model's word", &alternatives.stated, "")?;
+        }
+    }
+    writeln!(
+        out,
+        "in percent of correct first answers, of wrong ones, and of places outside the map, at a\n\
+         confidence of {} or more; cached descriptions count as calls\n",
+        summary.conditions.known_confidence
+    )
 }
 
 fn write_method(method: &MethodSummary, k: usize, out: &mut String) -> fmt::Result {
@@ -104,21 +139,6 @@ fn write_method(method: &MethodSummary, k: usize, out: &mut String) -> fmt::Resu
 
 fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
     let (name, known) = (&method.name, &method.known);
-    let rates = &known.called;
-    let kinds = [
-        (rates.right, "correct first answers"),
-        (rates.wrong, "wrong ones"),
-        (rates.unknown, "unknown places"),
-    ];
-    let rates_by_kind = kinds
-        .iter()
-        .filter_map(|(rate, kind)| Some(format!("{:.1} % of {kind}", 100.0 * (*rate)?)));
-    writeln!(
-        out,
-        "{name}: called known at a confidence of {} or more: {}",
-        rates.threshold,
-        rates_by_kind.collect::<Vec<_>>().join(", ")
-    )?;
     for (point, origin) in [(&known.suggested, "best F1"), (&known.given, "requested")] {
         if let Some(point) = point {
             writeln!(
@@ -149,8 +169,9 @@ fn write_known(method: &MethodSummary, out: &mut String) -> fmt::Result {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
+    use crate::KnownAlternatives;
     use crate::LeftOut;
-    use crate::open_set::{KnownRates, OpenSetMetrics, OperatingPoint};
+    use crate::open_set::{OpenSetMetrics, OperatingPoint};
     use crate::recall::AtK;
     use crate::summary::{Quantiles, RunConditions, Timing};
     use whereabouts_core::Usage;
@@ -193,6 +214,7 @@ pub(super) mod tests {
                 at_99: None,
                 auc: None,
             },
+            alternatives: None,
         }
     }
 
@@ -231,6 +253,10 @@ pub(super) mod tests {
                 auc: Some(0.9531),
                 ..coarse.known
             },
+            alternatives: Some(KnownAlternatives {
+                similarity: KnownRates { right: Some(0.18), ..coarse.known.called },
+                stated: KnownRates { wrong: Some(1.0), ..coarse.known.called },
+            }),
             ..coarse
         }
     }

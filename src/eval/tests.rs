@@ -71,6 +71,7 @@ async fn map_of(store: &EmbeddedStore, descriptors: &[Descriptor]) -> Map {
         precision: Precision::Full,
         dim: DIM,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: now,
     };
@@ -126,6 +127,7 @@ async fn outcome(
         digest: Digest::of(b""),
         predictions: predictions.collect(),
         confidence: 0.0,
+        alternatives: None,
         descriptions: Vec::new(),
         reasoning: None,
         usage: Usage::default(),

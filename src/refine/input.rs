@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 use uuid::Uuid;
-use whereabouts_core::{Candidate, Descriptor, Digest, Map, Priority, Usage};
+use whereabouts_core::{Candidate, Descriptor, Digest, Map, Priority, RefinerKind, Usage};
 use whereabouts_store::{JobRecord, MapStore};
 
 use super::RefineError;
@@ -14,6 +14,8 @@ pub struct RefineInput {
     pub id: Uuid,
     /// The map that was searched.
     pub map: Map,
+    /// The refiner that was asked for; `None` for the first.
+    pub refiner: Option<RefinerKind>,
     /// The camera frame.
     pub frame: QueryFrame,
     /// The images to compare with the frame, in coarse order.
@@ -52,6 +54,7 @@ impl RefineInput {
         Ok(Self {
             id: record.job.id,
             map,
+            refiner: Some(record.job.refiner),
             frame: QueryFrame {
                 query_id: record.query.id,
                 digest: record.query.digest,
@@ -70,7 +73,7 @@ impl RefineInput {
 mod tests {
     use super::*;
     use crate::mllm::tests::shelf::Shelf;
-    use whereabouts_core::{Job, MediaType, RefinerKind};
+    use whereabouts_core::{Job, MediaType};
     use whereabouts_store::Query;
 
     fn record(map: &Map) -> JobRecord {

@@ -3,9 +3,11 @@
 //!
 //! A [`Refiner`] does this for one [`RefineInput`]; [`REFINERS`] is the table of all refiners. The
 //! [`Worker`] claims jobs from the queue and has them refined. [`local`] compares dense features on this
-//! machine, [`mllm`] asks a multimodal LLM.
+//! machine, [`mllm`] asks a multimodal LLM, [`cascade`] does the second only where the first does not suffice.
 
 mod attempts;
+pub mod cascade;
+mod choice;
 mod dense_cache;
 mod input;
 mod job_settings;
@@ -24,14 +26,15 @@ use parking_lot::Mutex;
 use whereabouts_core::ServiceTime;
 
 pub use attempts::{AttemptPolicy, NextAttempt};
+pub use choice::RefinerSet;
 pub use dense_cache::{DenseCache, DenseKey};
 pub use input::{QueryFrame, RefineInput};
 pub use job_settings::JobSettings;
 pub use local::LocalRefiner;
 pub use metrics::{CacheLookup, RefineMetrics};
 pub use refiner::{
-    NegativeEvidence, PaidCallLevels, PaidCalls, Progress, RefineError, Refinement, Refiner,
-    RegionMatcher,
+    NegativeEvidence, PaidCallLevels, PaidCalls, PaidMeasurement, PaidNegatives, Progress,
+    RefineError, Refinement, Refiner, RegionMatcher,
 };
 pub use registry::{BuildError, REFINERS, RefinerContext, RefinerEntry, RefinerSettings};
 pub use store_retry::retry_for;

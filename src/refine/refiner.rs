@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use whereabouts_core::{
-    CacheLevels, Description, Evidence, ImageId, Map, ModelServer, PairRegion, Ranking,
-    RefinerKind, Spent, Usage,
+    Agreement, CacheLevels, Certainty, Description, Evidence, ImageId, JobVerdict, Map,
+    ModelServer, PairRegion, Ranking, RefinerKind, Spent, Usage,
 };
 use whereabouts_store::{HardNegatives, Step, StoreError};
 
@@ -37,6 +37,10 @@ pub trait Refiner: Send + Sync {
     fn negative_evidence(&self) -> Option<&dyn NegativeEvidence> {
         None
     }
+    /// Returns the refiner's ability to ask its paid model about hard negatives, if it has one.
+    fn paid_negatives(&self) -> Option<&dyn PaidNegatives> {
+        None
+    }
     /// Returns the state of the refiner's calls to a paid model, if it makes any.
     fn paid_calls(&self) -> Option<&dyn PaidCalls> {
         None
@@ -53,19 +57,46 @@ pub trait RegionMatcher: Send + Sync {
         input: &RefineInput,
         image: &ImageId,
     ) -> Result<Option<Vec<PairRegion>>, RefineError>;
+    /// Returns how many regions the frame has in common with each of its candidates.
+    async fn agreement(&self, input: &RefineInput) -> Result<Agreement, RefineError>;
 }
 
-/// Measures how strong the evidence for a wrong candidate gets. Calibration builds the null distribution
+/// Measures how strong the evidence for a wrong candidate gets. Calibration builds the null distributions
 /// of a map from these measurements.
 #[async_trait]
 pub trait NegativeEvidence: Send + Sync {
-    /// Returns the evidence for the best of candidates that all show other places; `None` if their query
-    /// image is no longer in the map.
+    /// Returns the evidence for candidates that all show other places, of each kind that the refiner or a model that
+    /// relies on it can have; empty if their query image is no longer in the map.
     async fn best_negative(
         &self,
         map: &Map,
         negatives: &HardNegatives,
+    ) -> Result<Vec<Evidence>, RefineError>;
+}
+
+/// Asks a paid model about candidates that all show other places.
+#[async_trait]
+pub trait PaidNegatives: Send + Sync {
+    /// Returns the most that a measurement with that many candidates costs, retries and repairs left out.
+    fn cost(&self, candidates: usize) -> PaidMeasurement;
+    /// Returns the evidence of the model's verdict; `None` if it gave none, or if the query image is no longer in the
+    /// map.
+    async fn verdict(
+        &self,
+        map: &Map,
+        negatives: &HardNegatives,
     ) -> Result<Option<Evidence>, RefineError>;
+}
+
+/// The cost of one measurement with a paid model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PaidMeasurement {
+    /// Calls.
+    pub calls: usize,
+    /// Tokens sent and received, estimated.
+    pub tokens: u64,
+    /// Money at the configured prices; 0 without prices.
+    pub money: f64,
 }
 
 /// Reports on a refiner's calls to a paid model.
@@ -108,12 +139,18 @@ pub trait Progress: Send + Sync {
 pub struct Refinement {
     /// One text for each candidate that could be compared, in coarse order.
     pub descriptions: Vec<Description>,
+    /// How far the regions of the frame and each candidate agree, if that was measured.
+    pub agreement: Option<Agreement>,
+    /// What each refiner found, if there was more than one.
+    pub verdicts: Vec<JobVerdict>,
     /// The candidates in refined order.
     pub ranking: Ranking,
     /// The refiner whose order it is, if that is not the one that was asked.
     pub ordered_by: Option<RefinerKind>,
     /// The evidence for the first of the ranking, if the refiner measures it.
     pub evidence: Option<Evidence>,
+    /// How certain the model says it is of the first of the ranking, if a model says so.
+    pub certainty: Option<Certainty>,
     /// Why the candidates are in this order.
     pub reasoning: Option<String>,
     /// Duration of the call that gave the order, in milliseconds, if there was one.
@@ -141,6 +178,14 @@ pub enum RefineError {
         /// When to try again.
         after: Duration,
     },
+}
+
+impl Refinement {
+    /// Returns why the place of the frame cannot be known, if the refinement says so.
+    pub fn why_unknown(&self) -> Option<&'static str> {
+        (self.evidence == Some(Evidence::NONE_OF_THESE))
+            .then_some("the model says that none of the candidates shows the place")
+    }
 }
 
 impl From<StoreError> for RefineError {

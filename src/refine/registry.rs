@@ -7,12 +7,14 @@ use std::fmt;
 use std::sync::Arc;
 
 use futures_util::future::BoxFuture;
+use tokio::sync::OnceCell;
 use whereabouts_core::RefinerKind;
 use whereabouts_store::{SharedLimits, Store, StoreError};
 use whereabouts_vision::{CpuPool, LoadedModels};
 
-use super::mllm::{MllmSettings, MllmSettingsError};
-use super::{DenseCache, RefineMetrics, Refiner, local, mllm};
+use super::cascade::CascadeSettings;
+use super::mllm::{MllmRefiner, MllmSettings, MllmSettingsError};
+use super::{DenseCache, RefineMetrics, Refiner, cascade, local, mllm};
 
 /// All refiners.
 pub const REFINERS: &[RefinerEntry] = &[
@@ -23,6 +25,17 @@ pub const REFINERS: &[RefinerEntry] = &[
         validate: |_| None,
         fingerprint: local::fingerprint,
         build: |context| Box::pin(local::build(context)),
+    },
+    RefinerEntry {
+        kind: RefinerKind::Cascade,
+        summary: "`local`, then `mllm` where its answer is in question",
+        candidates: |settings| settings.local_candidates,
+        validate: |settings| {
+            let cascade = settings.cascade.validate();
+            cascade.or_else(|| settings.mllm.validate(settings.job_timeout_s))
+        },
+        fingerprint: cascade::fingerprint,
+        build: |context| Box::pin(cascade::build(context)),
     },
     RefinerEntry {
         kind: RefinerKind::Mllm,
@@ -64,6 +77,8 @@ pub struct RefinerSettings {
     pub local_candidates: usize,
     /// Candidates that `mllm` compares.
     pub mllm_candidates: usize,
+    /// The settings of `cascade`.
+    pub cascade: CascadeSettings,
     /// The settings of `mllm`.
     pub mllm: MllmSettings,
     /// The longest a job may take, in seconds. A refiner's own timeouts must be shorter.
@@ -87,6 +102,8 @@ pub struct RefinerContext {
     pub metrics: Arc<RefineMetrics>,
     /// The settings of all refiners.
     pub settings: RefinerSettings,
+    /// The one refiner that asks the model, once it is built.
+    pub model: Arc<OnceCell<Arc<MllmRefiner>>>,
 }
 
 /// Why a refiner could not be built.

@@ -232,7 +232,8 @@ impl Worker {
         );
         let known_from = self.known_confidence;
         let estimate = Estimate::new(&first.image_id, first.pose, confidence, known_from);
-        Some(estimate.unless(record.query.uninformative.as_deref()))
+        let unknown = record.query.uninformative.as_deref().or(refinement.why_unknown());
+        Some(estimate.unless(unknown))
     }
 
     fn record_time(&self, took: Duration) {
@@ -285,13 +286,14 @@ fn from_now(pause: Duration) -> Timestamp {
 }
 
 fn succeeded(job: Job, refinement: Refinement, estimate: Option<Estimate>) -> Job {
-    let Refinement { descriptions, ranking, reasoning, usage, degraded, .. } = refinement;
+    let Refinement { descriptions, ranking, verdicts, reasoning, usage, degraded, .. } = refinement;
     let reasoning_took_ms = refinement.reasoning_took_ms;
     Job {
         state: if degraded.is_some() { JobState::Degraded } else { JobState::Succeeded },
         finished_at: Some(Timestamp::now()),
         descriptions,
         ranking: Some(ranking),
+        verdicts,
         estimate,
         reasoning,
         reasoning_took_ms,

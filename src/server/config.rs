@@ -23,6 +23,7 @@ pub use crate::gate::ServerSettings;
 use crate::http::Tiles;
 use whereabouts_index::IndexSettings;
 use whereabouts_refine::JobSettings;
+use whereabouts_refine::cascade::CascadeSettings;
 use whereabouts_refine::mllm::MllmSettings;
 use whereabouts_service::{
     BulkSettings, ConfidenceSettings, IdempotencySettings, LocalizeSettings, TrackSettings,
@@ -70,6 +71,8 @@ pub struct Config {
     pub webhooks: WebhookSettings,
     /// The refiner.
     pub refine: Refine,
+    /// When the refiner `cascade` asks the multimodal LLM.
+    pub cascade: CascadeSettings,
     /// The multimodal LLM.
     pub mllm: MllmSettings,
     /// The operator's console.
@@ -204,6 +207,9 @@ impl Config {
         if let Some(why) = sections.or_else(|| self.jobs.validate()) {
             return Some(why);
         }
+        if let Some(why) = self.confidence.validate(self.refine.candidates) {
+            return Some(why);
+        }
         if self.bulk.memory_bytes < self.server.body_limit_bytes {
             return Some("bulk.memory_bytes must not be less than server.body_limit_bytes".into());
         }
@@ -256,10 +262,15 @@ impl Config {
         if let Some(why) = self.image.validate().or_else(|| self.index.validate()) {
             return Some(why);
         }
-        if let Some(refiner) = self.refine.refiner.entry()
-            && let Some(why) = (refiner.validate)(&self.refiner_settings())
-        {
+        let settings = self.refiner_settings();
+        let refiners = self.allowed_refiners().into_iter();
+        if let Some(why) = refiners.into_iter().find_map(|entry| (entry.validate)(&settings)) {
             return Some(why);
+        }
+        if self.refine.allowed.contains(&RefinerChoice::OFF) {
+            return Some(
+                "refine.allowed lists refiners; requests need no permission for refine=off".into(),
+            );
         }
         if let Some(why) = self.contradiction_of_a_section() {
             return Some(why);

@@ -12,8 +12,8 @@ use uuid::Uuid;
 use super::ServiceError;
 use whereabouts_core::confidence::{COMPARED, NullDistribution};
 use whereabouts_core::{Calibration, CalibrationSettings, Evidence, Map};
-use whereabouts_refine::{AttemptPolicy, NegativeEvidence, RefineError, Refiner};
-use whereabouts_store::{IndexState, MapStore};
+use whereabouts_refine::{AttemptPolicy, PaidNegatives, RefineError, Refiner};
+use whereabouts_store::{HardNegatives, IndexState, MapStore};
 
 /// Pause between two scans for maps that have changed.
 const SCAN_PAUSE: Duration = Duration::from_millis(500);
@@ -46,13 +46,30 @@ pub struct ConfidenceSettings {
     pub place_images: usize,
     /// Images whose poses are within this many metres count as the same place.
     pub place_m: f64,
+    /// Maximum number of calls to a paid model for the calibration of one map; 0 for none.
+    pub model_calls: usize,
 }
+
+/// The fewest verdicts of a model on images of other places from which its certainty is calibrated: fewer cannot give a
+/// confidence of 0.9.
+const FEWEST_VERDICTS: usize = 9;
 
 impl ConfidenceSettings {
     /// Returns how a map is calibrated if a job compares this many candidates.
     pub fn calibration(&self, candidates: usize) -> CalibrationSettings {
-        let Self { images, refined, place_images, place_m } = *self;
-        CalibrationSettings { images, refined, candidates, place_images, place_m }
+        let Self { images, refined, place_images, place_m, model_calls } = *self;
+        CalibrationSettings { images, refined, candidates, place_images, place_m, model_calls }
+    }
+
+    /// Returns what is invalid if the model compares this many candidates; `None` if the settings are valid.
+    pub fn validate(&self, candidates: usize) -> Option<String> {
+        let fewest = FEWEST_VERDICTS * (candidates + 1);
+        (self.model_calls > 0 && self.model_calls < fewest).then(|| {
+            format!(
+                "confidence.model_calls must be 0, or at least {fewest}: {FEWEST_VERDICTS} images at \
+                 {candidates} + 1 calls each (refine.candidates), or no answer could reach a confidence of 0.9"
+            )
+        })
     }
 }
 
@@ -64,6 +81,8 @@ pub struct Calibrator {
     pub refiner: Option<Arc<dyn Refiner>>,
     /// How many images are measured, and which count as the same place.
     pub settings: CalibrationSettings,
+    /// Number of candidates about which a paid model is asked.
+    pub model_candidates: usize,
 }
 
 impl Calibrator {
@@ -101,7 +120,7 @@ impl Calibrator {
             let settled = seen.insert(map.uid, (images, moved)) == Some((images, moved));
             if settled && self.is_due(&map, images, moved).await? {
                 let refiner = self.refiner.as_deref();
-                self.calibrate(&map, refiner.and_then(Refiner::negative_evidence)).await?;
+                self.calibrate(&map, refiner).await?;
             }
         }
         Ok(())
@@ -117,12 +136,12 @@ impl Calibrator {
             || changed.saturating_mul(CHANGED_SHARE) > known.images)
     }
 
-    /// Calibrates a map: first similarity, which is fast, then the agreement that `refiner` finds. Each is in effect
-    /// as soon as it is measured.
+    /// Calibrates a map: first similarity, which is fast, then the agreement that `refiner` finds, then the verdicts of
+    /// its model, if calls for that are allowed. Each is in effect as soon as it is measured.
     pub async fn calibrate(
         &self,
         map: &Map,
-        refiner: Option<&dyn NegativeEvidence>,
+        refiner: Option<&dyn Refiner>,
     ) -> Result<(), ServiceError> {
         let settings = self.settings;
         let IndexState { images, moved, .. } = self.store.index_state(map).await?;
@@ -135,31 +154,81 @@ impl Calibrator {
         let mut measured =
             Calibration { images, moved, settings, evidence, similarity, ..Calibration::default() };
         self.store.put_calibration(map, measured.clone()).await?;
-        if let Some(refiner) = refiner {
-            let step = asked.len().div_ceil(settings.refined.max(1)).max(1);
+        if let Some(refiner) = refiner.and_then(Refiner::negative_evidence) {
             let mut found = Vec::new();
-            for mut asked in asked.into_iter().step_by(step) {
+            for mut asked in sampled(&asked, settings.refined) {
                 asked.others.truncate(settings.candidates);
                 // A map that cannot be measured completely is measured as far as possible.
                 let measure =
                     || async { refiner.best_negative(map, &asked).await.map_err(retried_soon) };
-                found.extend(ATTEMPTS.run(measure).await.ok().flatten());
+                found.extend(ATTEMPTS.run(measure).await.into_iter().flatten());
             }
-            measured.agreement = NullDistribution::from(values(found.into_iter()));
+            let (verdicts, agreement): (Vec<Evidence>, Vec<Evidence>) =
+                found.into_iter().partition(|found| matches!(found, Evidence::Verdict(_)));
+            measured.agreement = NullDistribution::from(values(agreement.into_iter()));
+            measured.verdict = NullDistribution::from(values(verdicts.into_iter()));
+            self.store.put_calibration(map, measured.clone()).await?;
+        }
+        if let Some(model) = refiner.and_then(Refiner::paid_negatives) {
+            let verdicts = self.ask_the_model(map, model, &asked).await;
+            if verdicts.len() >= FEWEST_VERDICTS {
+                measured.model_asked = verdicts.len();
+                measured.verdict = NullDistribution::from(values(verdicts.into_iter()));
+            }
         }
         measured.complete = true;
         tracing::info!(
             map = %map.name, images, asked = measured.similarity.len(),
-            refined = measured.agreement.len(), "the map was calibrated"
+            refined = measured.agreement.len(), model = measured.model_asked, "the map was calibrated"
         );
         Ok(self.store.put_calibration(map, measured).await?)
     }
+
+    /// Returns the model's verdicts on images of other places, as far as the allowed number of calls goes. Ends with the
+    /// first failure: what it would cost to go on is not known.
+    async fn ask_the_model(
+        &self,
+        map: &Map,
+        model: &dyn PaidNegatives,
+        asked: &[HardNegatives],
+    ) -> Vec<Evidence> {
+        let settings = self.settings;
+        let cost = model.cost(self.model_candidates);
+        let count = (settings.model_calls / cost.calls.max(1)).min(asked.len());
+        if count < FEWEST_VERDICTS {
+            return Vec::new();
+        }
+        tracing::info!(
+            map = %map.name, images = count, calls = count * cost.calls,
+            tokens = count as u64 * cost.tokens, money = count as f64 * cost.money,
+            "the calibration asks the model; this is the most it should cost (confidence.model_calls)"
+        );
+        let mut verdicts = Vec::new();
+        for mut asked in sampled(asked, count).take(count) {
+            asked.others.truncate(self.model_candidates);
+            match model.verdict(map, &asked).await {
+                Ok(verdict) => verdicts.extend(verdict),
+                Err(error) => {
+                    tracing::warn!(map = %map.name, %error, done = verdicts.len(), "the model's certainty could not be calibrated");
+                    break;
+                }
+            }
+        }
+        verdicts
+    }
+}
+
+/// Returns a sample of at most about `count` of them, spread evenly.
+fn sampled(asked: &[HardNegatives], count: usize) -> impl Iterator<Item = HardNegatives> {
+    let step = asked.len().div_ceil(count.max(1)).max(1);
+    asked.iter().step_by(step).cloned()
 }
 
 fn values(evidence: impl Iterator<Item = Evidence>) -> Vec<f32> {
     evidence
         .map(|evidence| match evidence {
             Evidence::Similarity(value) | Evidence::Agreement(value) => value,
+            Evidence::Verdict(verdict) | Evidence::Concurring { verdict, .. } => verdict,
         })
         .collect()
 }

@@ -13,7 +13,7 @@ use uuid::Uuid;
 use super::images::page_size;
 use super::{Imaging, ServiceError};
 use whereabouts_api::{ErrorKind, JobPage, PairRegions};
-use whereabouts_core::{ImageId, Job, MediaType, PairRegion};
+use whereabouts_core::{ImageId, Job, MediaType, PairRegion, RefinerKind};
 use whereabouts_refine::{RefineError, RefineInput, Refiner, RegionMatcher};
 use whereabouts_store::{BlobStore, JobFilter, JobList, JobRecord, JobStore};
 
@@ -113,7 +113,8 @@ impl Jobs {
     /// regions. They are computed on request, from the pictures as they are now.
     pub async fn matches(&self, id: Uuid, image: &ImageId) -> Result<PairRegions, ServiceError> {
         let record = self.store.job(id).await?.ok_or_else(|| no_job(id))?;
-        let refiner = self.refiner.as_ref().filter(|refiner| refiner.kind() == record.job.refiner);
+        let compares_regions = record.job.refiner != RefinerKind::Mllm;
+        let refiner = self.refiner.as_ref().filter(|_| compares_regions);
         let _permit = self.matching.acquire().await;
         let regions = match refiner.and_then(|refiner| refiner.region_matcher()) {
             Some(matcher) => {
@@ -129,7 +130,7 @@ impl Jobs {
         let regions = regions.ok_or_else(|| {
             ServiceError::not_found(format!(
                 "the job {id} has no matches with {image}: the image is no longer one of its candidates, or \
-                 the refiner does not compare regions (only refine.refiner = \"local\" does)"
+                 the refiner does not compare regions (only local and cascade do)"
             ))
         })?;
         Ok(PairRegions { regions })

@@ -21,6 +21,7 @@ mod metrics;
 mod models;
 mod readiness;
 mod recall;
+mod refiners;
 mod reindex;
 mod rejections;
 mod retention;
@@ -55,6 +56,7 @@ pub use self::maps::Maps;
 pub use self::metrics::{AttemptOutcome, ServiceMetrics};
 pub use self::readiness::{Readiness, ReadinessPhase};
 pub use self::recall::RecallCheck;
+pub use self::refiners::{AllowedRefiners, Chosen};
 pub use self::reindex::{Reindexer, Reindexes};
 pub use self::rejections::{Rejection, Rejections};
 pub use self::retention::Janitor;
@@ -140,7 +142,9 @@ pub struct ServiceSettings {
     pub confidence: ConfidenceSettings,
     /// Refinement jobs.
     pub jobs: JobSettings,
-    /// Number of candidates that a job compares.
+    /// The refiners that maps and requests may choose.
+    pub refiners: AllowedRefiners,
+    /// Number of candidates that a measurement of the calibration compares.
     pub compared: usize,
     /// Pause between two comparisons of a search with exact search; `None` for none.
     pub recall_check: Option<Duration>,
@@ -167,8 +171,12 @@ impl Service {
             pool,
             metrics: Arc::clone(&metrics),
         };
-        let maps =
-            Maps { store: store.clone(), imaging: imaging.clone(), reindexes: Arc::default() };
+        let maps = Maps {
+            store: store.clone(),
+            imaging: imaging.clone(),
+            reindexes: Arc::default(),
+            refiners: settings.refiners.clone(),
+        };
         let jobs = Jobs {
             store: store.clone(),
             blobs: store.clone(),
@@ -203,7 +211,7 @@ impl Service {
                 jobs: jobs.clone(),
                 recall: RecallCheck::new(settings.recall_check),
                 settings: settings.localize,
-                compared: settings.compared,
+                refiners: settings.refiners.clone(),
             },
             jobs,
             reindexer: Reindexer {
@@ -215,6 +223,7 @@ impl Service {
                 store: store.clone(),
                 refiner: refiner.clone(),
                 settings: settings.confidence.calibration(settings.compared),
+                model_candidates: settings.refiners.model_candidates().unwrap_or(settings.compared),
             },
             transfer: Transfer { maps: maps.clone(), exports: store.clone(), blobs: store.clone() },
             usage: UsageReports { store: store.clone(), refiner, keep_days: settings.usage_days },

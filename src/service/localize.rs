@@ -8,13 +8,16 @@ use tracing::Instrument;
 use uuid::Uuid;
 
 use super::images::empty_body;
-use super::submit::{LocalizedFrame, Submission};
+use super::submit::{JobWish, LocalizedFrame, Submission};
 use super::{
-    Jobs, Maps, RecallCheck, SUPERSEDED_RETRIES, ServiceError, Submitter, TrackStep, Tracks,
+    AllowedRefiners, Chosen, Jobs, Maps, RecallCheck, SUPERSEDED_RETRIES, ServiceError, Submitter,
+    TrackStep, Tracks,
 };
 use whereabouts_api::{Answer, JobLink, RefineMode, TimingMs};
 use whereabouts_core::confidence::COMPARED;
-use whereabouts_core::{Calibration, Candidate, Digest, Estimate, Map, MapName, Priority};
+use whereabouts_core::{
+    Calibration, Candidate, Digest, Estimate, Map, MapName, Priority, RefinerKind,
+};
 use whereabouts_index::SearchMode;
 use whereabouts_store::StoreError;
 use whereabouts_telemetry::traces;
@@ -29,6 +32,8 @@ pub struct LocalizeRequest {
     pub k: Option<usize>,
     /// Whether the candidates are refined, and whether the caller waits for it.
     pub refine: RefineMode,
+    /// The refiner of the job; by default that of the map or of the server.
+    pub refiner: Option<RefinerKind>,
     /// The priority of the refinement job.
     pub priority: Priority,
     /// The bytes of the frame, in any format of [`MediaType`](whereabouts_core::MediaType).
@@ -96,8 +101,8 @@ pub struct Localizer {
     pub recall: RecallCheck,
     /// Bounds and defaults.
     pub settings: LocalizeSettings,
-    /// Number of candidates that a job compares.
-    pub compared: usize,
+    /// The refiners that maps and requests may choose.
+    pub refiners: AllowedRefiners,
 }
 
 impl Localizer {
@@ -108,13 +113,21 @@ impl Localizer {
         if request.frame.is_empty() {
             return Err(empty_body());
         }
+        if let Some(asked) = request.refiner {
+            if request.refine == RefineMode::Off {
+                return Err(ServiceError::malformed(
+                    "refiner contradicts refine=off; leave one of them out",
+                ));
+            }
+            self.refiners.check(asked)?;
+        }
         let is_refined = request.refine != RefineMode::Off && self.submitter.refiner.is_some();
         if request.refine == RefineMode::Wait {
             // Rejected before any work is done.
             self.submitter.check_capacity().await?;
         }
         let admission = AdmissionRequest { class: WorkClass::Localize, deadline: request.deadline };
-        let compared = if is_refined { self.compared } else { 0 };
+        let compared = if is_refined { self.refiners.most_candidates() } else { 0 };
         let tracked = request.track.as_ref().map_or(0, |_| self.tracks.candidates());
         let retrieved = k.max(compared).max(COMPARED).max(tracked);
         let features =
@@ -142,10 +155,16 @@ impl Localizer {
             None => None,
         };
         let query_id = Uuid::now_v7();
-        let (mut job, no_job) = if request.refine == RefineMode::Off {
-            (None, None)
-        } else {
-            let compared = candidates.iter().take(self.compared).cloned().collect();
+        let chosen = match request.refine {
+            RefineMode::Off => None,
+            _ => Some(self.refiners.choose(&map, request.refiner)?),
+        };
+        let (mut job, no_job) = if let Some(chosen) = chosen {
+            let compared = match &chosen {
+                Chosen::Refiner(kind) => self.refiners.candidates(*kind),
+                Chosen::None(_) => 0,
+            };
+            let compared = candidates.iter().take(compared).cloned().collect();
             let frame = LocalizedFrame {
                 query_id,
                 bytes: request.frame,
@@ -157,7 +176,8 @@ impl Localizer {
                 uninformative: uninformative.clone(),
             };
             let id = request.idempotency_id.as_deref();
-            let submit = self.submitter.submit(&map, frame, compared, request.priority, id);
+            let wish = JobWish { chosen, priority: request.priority };
+            let submit = self.submitter.submit(&map, frame, compared, wish, id);
             match submit.instrument(traces::stage("submit")).await? {
                 Submission::Queued(job) => (Some(*job), None),
                 Submission::Declined(why)
@@ -167,6 +187,8 @@ impl Localizer {
                 }
                 Submission::Declined(why) => (None, Some(why)),
             }
+        } else {
+            (None, None)
         };
         let estimate = self.estimate(&candidates, &calibration);
         let mut estimate = estimate.map(|estimate| estimate.unless(uninformative.as_deref()));

@@ -6,8 +6,8 @@ use jiff::Timestamp;
 use uuid::Uuid;
 
 use super::models::{descriptor_of, kind_of};
-use super::{Imaging, Reindexes, SUPERSEDED_RETRIES, ServiceError};
-use whereabouts_api::{CalibrationState, ErrorKind, IndexKind, MapChange, MapState};
+use super::{AllowedRefiners, Imaging, Reindexes, SUPERSEDED_RETRIES, ServiceError};
+use whereabouts_api::{CalibrationState, ErrorKind, IndexKind, MapChange, MapRefiner, MapState};
 use whereabouts_core::{Map, MapName};
 use whereabouts_store::{IndexState, MapStore, StoreError};
 
@@ -20,6 +20,8 @@ pub struct Maps {
     pub imaging: Imaging,
     /// The state of the last reindex of each map.
     pub reindexes: Arc<Reindexes>,
+    /// The refiners to which a map may be set.
+    pub refiners: AllowedRefiners,
 }
 
 impl Maps {
@@ -31,6 +33,9 @@ impl Maps {
     ) -> Result<(MapState, bool), ServiceError> {
         if change.description.as_ref().is_some_and(|text| text.chars().count() > 2000) {
             return Err(ServiceError::unprocessable("the description exceeds 2,000 characters"));
+        }
+        if let Some(kind) = change.refiner.and_then(MapRefiner::kind) {
+            self.refiners.check(kind)?;
         }
         let mut retries = SUPERSEDED_RETRIES;
         loop {
@@ -84,6 +89,10 @@ impl Maps {
             precision,
             dim,
             revision: known.map_or(0, |map| map.revision),
+            refiner: match change.refiner {
+                Some(refiner) => refiner.kind(),
+                None => known.and_then(|map| map.refiner),
+            },
             description: change
                 .description
                 .clone()
@@ -150,6 +159,7 @@ impl Maps {
             images,
             index,
             calibration: calibration.as_deref().map(CalibrationState::from),
+            refiner: map.refiner,
             description: map.description,
             reindex,
             created_at: map.created_at,

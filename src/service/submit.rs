@@ -7,7 +7,7 @@ use bytes::Bytes;
 use jiff::Timestamp;
 use uuid::Uuid;
 
-use super::{Rejection, ServiceError, ServiceMetrics};
+use super::{Chosen, Rejection, ServiceError, ServiceMetrics};
 use whereabouts_api::{ErrorKind, NoJob, NoJobReason};
 use whereabouts_core::{
     Candidate, DenseFeatures, Descriptor, Digest, Job, Map, MediaType, Priority,
@@ -35,6 +35,13 @@ pub(super) struct LocalizedFrame {
     pub dense: Option<DenseFeatures>,
     /// Why the frame cannot show a known place, if it cannot.
     pub uninformative: Option<String>,
+}
+
+/// How a job is to be refined.
+pub(super) struct JobWish {
+    /// The refiner.
+    pub chosen: Chosen,
+    pub priority: Priority,
 }
 
 /// Whether a frame got a refinement job.
@@ -83,9 +90,14 @@ impl Submitter {
         map: &Map,
         frame: LocalizedFrame,
         candidates: Vec<Candidate>,
-        priority: Priority,
+        wish: JobWish,
         request: Option<&str>,
     ) -> Result<Submission, ServiceError> {
+        let JobWish { chosen, priority } = wish;
+        let kind = match chosen {
+            Chosen::Refiner(kind) => kind,
+            Chosen::None(why) => return Ok(Submission::Declined(why)),
+        };
         let Some(refiner) = &self.refiner else {
             let detail = "the server has no refiner (refine.refiner)";
             return Ok(Submission::Declined(NoJob::new(NoJobReason::NoRefiner, detail)));
@@ -113,7 +125,7 @@ impl Submitter {
         let job = Job {
             priority,
             trace_id: trace.as_ref().map(|(_, id)| id.clone()),
-            ..Job::queued(map.name.clone(), query.id, refiner.kind(), query.created_at)
+            ..Job::queued(map.name.clone(), query.id, kind, query.created_at)
         };
         let record = JobRecord {
             traceparent: trace.map(|(traceparent, _)| traceparent),

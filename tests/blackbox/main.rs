@@ -32,6 +32,7 @@ mod localize;
 mod maps;
 mod mllm;
 mod odd_folders;
+mod refiner_choice;
 mod reindex;
 mod retention;
 mod scale_out;

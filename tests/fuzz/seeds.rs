@@ -128,6 +128,7 @@ pub fn archives() -> Vec<Vec<u8>> {
         precision: Precision::Full,
         dim: 2,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::UNIX_EPOCH,
     };

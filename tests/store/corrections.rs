@@ -201,6 +201,7 @@ async fn hard_negatives_follow_corrected_poses(fixture: &Fixture) {
         candidates: 3,
         place_images: 0,
         place_m: 25.0,
+        model_calls: 0,
     };
     let others = async || -> Vec<usize> {
         let asked = store.hard_negatives(&map, settings, 3).await.unwrap();

@@ -278,6 +278,7 @@ pub fn map(name: &str, dim: usize) -> Map {
         precision: Precision::Full,
         dim,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::now(),
     }

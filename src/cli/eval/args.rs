@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-use whereabouts_core::{DescriptorKind, Digest, Scene};
+use whereabouts_core::{DescriptorKind, Digest, RefinerKind, Scene};
 use whereabouts_eval::{RunSettings, TruthSource};
 use whereabouts_index::SearchMode;
 use whereabouts_refine::{REFINERS, RefinerSettings};
@@ -54,7 +54,7 @@ pub struct Args {
     /// model's default]
     #[arg(long, value_delimiter = ',', value_name = "KIND")]
     pub descriptor: Vec<DescriptorKind>,
-    /// Refiners to evaluate: local, mllm, both, or off
+    /// Refiners to evaluate: local, mllm, cascade, both (local and mllm), all, or off
     #[arg(long, value_delimiter = ',', default_value = "local", value_parser = refiners)]
     refine: Vec<Refiners>,
     /// Number of candidates to refine [default: as configured, which is 10 with mllm, otherwise 20]
@@ -105,11 +105,16 @@ pub struct Args {
 struct Refiners(Vec<RefinerChoice>);
 
 fn refiners(text: &str) -> Result<Refiners, String> {
-    if text == "both" {
-        return Ok(Refiners(REFINERS.iter().map(|entry| entry.kind.into()).collect()));
+    let of = |kinds: &[RefinerKind]| Refiners(kinds.iter().copied().map(Into::into).collect());
+    match text {
+        "both" => Ok(of(&[RefinerKind::Local, RefinerKind::Mllm])),
+        "all" => Ok(of(&[RefinerKind::Local, RefinerKind::Cascade, RefinerKind::Mllm])),
+        name => {
+            let choice = RefinerChoice::try_from(name.to_owned());
+            let choice = choice.map_err(|error| format!("{error}, both, all"))?;
+            Ok(Refiners(vec![choice]))
+        }
     }
-    let choice = RefinerChoice::try_from(text.to_owned());
-    choice.map(|choice| Refiners(vec![choice])).map_err(|error| format!("{error}, both"))
 }
 
 /// A threshold to evaluate in addition to the suggested one.

@@ -8,8 +8,8 @@ use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt, stream};
 use tokio::sync::Semaphore;
 use whereabouts_core::{
-    Candidate, DenseFeatures, Description, DescriptorKind, Digest, Evidence, ImageId, Map,
-    PairRegion, Ranking, RefinerKind, Usage,
+    Agreement, Candidate, Certainty, DenseFeatures, Description, DescriptorKind, Digest, Evidence,
+    ImageId, Map, PairRegion, Ranking, RefinerKind, Usage,
 };
 use whereabouts_store::{BlobStore, HardNegatives, MapStore};
 use whereabouts_vision::{CpuPool, ExtractError, Extractor, FeatureSet, LoadedModels, ModelError};
@@ -106,6 +106,11 @@ impl RegionMatcher for LocalRefiner {
         };
         Ok(matches.map(|matches| matches.into_iter().map(region).collect()))
     }
+
+    async fn agreement(&self, input: &RefineInput) -> Result<Agreement, RefineError> {
+        let Comparison { present, pairs, .. } = self.compare_input(input).await?;
+        Ok(agreement_of_all(input.candidates.len(), &present, &pairs))
+    }
 }
 
 #[async_trait]
@@ -114,7 +119,7 @@ impl NegativeEvidence for LocalRefiner {
         &self,
         map: &Map,
         negatives: &HardNegatives,
-    ) -> Result<Option<Evidence>, RefineError> {
+    ) -> Result<Vec<Evidence>, RefineError> {
         let extractor = self.models.of(map).await.map_err(no_model)?;
         let query = match self.maps.image(map, &negatives.image_id).await? {
             Some(image) => {
@@ -122,10 +127,15 @@ impl NegativeEvidence for LocalRefiner {
             }
             None => None,
         };
-        let Some(query) = query else { return Ok(None) };
+        let Some(query) = query else { return Ok(Vec::new()) };
         let Comparison { pairs, .. } =
             self.compare(map, extractor, query, &negatives.others).await?;
-        Ok(rank(&pairs).first().and_then(|&first| agreement(&pairs, first)))
+        let own = rank(&pairs).first().and_then(|&first| agreement(&pairs, first));
+        let all: Vec<usize> = (0..pairs.len()).collect();
+        // Of a model that was not asked, the worst is assumed.
+        let worst = agreement_of_all(pairs.len(), &all, &pairs);
+        let worst = worst.strongest_verdict(Some(Certainty::Certain));
+        Ok(own.into_iter().chain(worst).collect())
     }
 }
 
@@ -277,6 +287,9 @@ fn conclude(candidates: &[Candidate], comparison: &Comparison) -> Result<Refinem
         reasoning_took_ms: None,
         ordered_by: None,
         evidence: ranked.first().and_then(|&first| agreement(pairs, first)),
+        certainty: None,
+        verdicts: Vec::new(),
+        agreement: Some(agreement_of_all(candidates.len(), present, pairs)),
         ranking,
         usage: Usage::default(),
         degraded: (missing > 0).then(|| {
@@ -289,6 +302,19 @@ fn conclude(candidates: &[Candidate], comparison: &Comparison) -> Result<Refinem
 fn agreement(pairs: &[PairMatch], of: usize) -> Option<Evidence> {
     let agreeing: Vec<usize> = pairs.iter().map(|pair| pair.matches.len()).collect();
     Evidence::agreement(&agreeing, pairs.get(of)?.cells, of)
+}
+
+/// Returns how many regions of the query agree with each candidate; 0 for one that was removed.
+fn agreement_of_all(candidates: usize, present: &[usize], pairs: &[PairMatch]) -> Agreement {
+    let mut matches = vec![0; candidates];
+    for (&index, pair) in present.iter().zip(pairs) {
+        matches[index] = pair.matches.len();
+    }
+    Agreement {
+        regions: pairs.first().map_or(0, |pair| pair.cells),
+        matches,
+        first: rank(pairs).first().map(|&first| present[first]),
+    }
 }
 
 /// Explains in one sentence why the first candidate is first.

@@ -2,24 +2,10 @@
 //!
 //! The last complete answer counts, because drafts, quoted templates and quoted signs come before it.
 
-use serde::{Deserialize, Serialize};
+use whereabouts_core::Certainty;
 
 use super::loose_json::{FoundValue, Loose, value_at, values};
 use super::order::{Groups, Order, in_text, label, order, plain};
-
-/// How sure the model is that its first candidate shows the place of the frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Certainty {
-    /// It is the place.
-    Certain,
-    /// It is more likely than not.
-    Likely,
-    /// It may be.
-    Unsure,
-    /// None of the candidates shows the place.
-    None,
-}
 
 /// What an answer says.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -189,7 +175,7 @@ fn collect(value: &Loose, labels: &[String], end: usize, depth: usize, drafts: &
         drafts.push(Draft {
             order: order(ranking, labels),
             reasoning: of(&REASONING_KEYS).map(as_text).unwrap_or_default(),
-            certainty: certainty.and_then(|(_, value)| Certainty::of(value)),
+            certainty: certainty.and_then(|(_, value)| certainty_of(value)),
             end,
             is_object: true,
         });
@@ -291,17 +277,16 @@ fn as_text(value: &Loose) -> String {
     }
 }
 
-impl Certainty {
-    fn of(value: &Loose) -> Option<Self> {
-        let Loose::Text(text) = value else { return None };
-        Some(match plain(text).as_str() {
-            "certain" | "sure" => Self::Certain,
-            "likely" => Self::Likely,
-            "unsure" | "uncertain" | "unlikely" => Self::Unsure,
-            "none" | "noneofthese" => Self::None,
-            _ => return None,
-        })
-    }
+/// Returns how certain the model says it is; `None` if it says something else.
+fn certainty_of(value: &Loose) -> Option<Certainty> {
+    let Loose::Text(text) = value else { return None };
+    Some(match plain(text).as_str() {
+        "certain" | "sure" => Certainty::Certain,
+        "likely" => Certainty::Likely,
+        "unsure" | "uncertain" | "unlikely" => Certainty::Unsure,
+        "none" | "noneofthese" => Certainty::None,
+        _ => return None,
+    })
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! From descriptions and an order to a refinement. Whatever failed, the ranking contains every candidate.
 
-use whereabouts_core::{Ranking, RefinerKind};
+use whereabouts_core::{Agreement, Certainty, Evidence, Ranking, RefinerKind};
 
 use super::describe::{DescribedPairs, UndescribedPair};
 use super::labels::Verdict;
@@ -34,6 +34,7 @@ pub(super) fn conclude(
     run: &RefineRun<'_>,
     pairs: &DescribedPairs,
     order: Order,
+    agreement: Option<&Agreement>,
 ) -> Result<Refinement, RefineError> {
     let candidates = &run.input.candidates;
     let mut shortfalls = shortfalls(candidates.len(), pairs);
@@ -45,6 +46,9 @@ pub(super) fn conclude(
         descriptions: pairs.described.iter().map(|pair| pair.description(candidates)).collect(),
         ranking: ranked(&[])?,
         evidence: None,
+        certainty: None,
+        agreement: agreement.cloned(),
+        verdicts: Vec::new(),
         reasoning: None,
         reasoning_took_ms: None,
         ordered_by: None,
@@ -53,12 +57,17 @@ pub(super) fn conclude(
     };
     let refinement = match order {
         Order::Model(ModelRanking { verdict, took }) => {
-            let Verdict { order, left_out, reasoning, .. } = verdict;
+            let Verdict { order, left_out, reasoning, certainty } = verdict;
+            let places = placed(candidates.len(), pairs, &order);
+            // The model says nothing of a first candidate that keeps its coarse place.
+            let certainty = certainty.filter(|_| places.first() == order.first());
             if left_out > 0 {
                 shortfalls.push(format!("the model's ranking left out {left_out} candidates"));
             }
             Refinement {
                 ranking: ranked(&order)?,
+                evidence: evidence(agreement, places.first().copied(), certainty),
+                certainty,
                 reasoning_took_ms: Some(milliseconds(took)),
                 reasoning: Some(reasoning),
                 ..coarse
@@ -81,6 +90,18 @@ pub(super) fn conclude(
     };
     let degraded = (!shortfalls.is_empty()).then(|| shortfalls.join("; "));
     Ok(Refinement { degraded, ..refinement })
+}
+
+/// Returns the evidence of a verdict.
+fn evidence(
+    agreement: Option<&Agreement>,
+    first: Option<usize>,
+    certainty: Option<Certainty>,
+) -> Option<Evidence> {
+    if certainty == Some(Certainty::None) {
+        return Some(Evidence::NONE_OF_THESE);
+    }
+    agreement?.verdict(first?, certainty)
 }
 
 /// Puts the described candidates, in their order or in coarse order, into the places that they have among all.

@@ -4,8 +4,8 @@
 
 use uuid::Uuid;
 
-use super::answer::{AnswerError, Certainty, Reading, read};
-use whereabouts_core::Digest;
+use super::answer::{AnswerError, Reading, read};
+use whereabouts_core::{Certainty, Digest};
 
 /// Neutral names for the candidates.
 #[derive(Debug, Clone, PartialEq, Eq)]

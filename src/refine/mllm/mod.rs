@@ -13,6 +13,7 @@
 //! | `client`, `attempt`, `forms`, `exchange`, `endpoint` | calls to a server over HTTP |
 //! | `wire`, `response`, `error_body`, `thinking`, `tokens` | the chat-completions format, in all its dialects |
 //! | `capability`, `check`, `check_calls`, `server_facts` | what a server can do, found out by trying |
+//! | `negatives` | the model's verdicts on images of other places, for calibration |
 //! | `spend`, `budget`, `reservation` | limits on spend: in this process, across processes |
 //! | `failure`, `retry`, `breaker`, `rate` | kinds of failures, retries, circuit breaker, rate limits |
 //! | `gate`, `limit` | which call is next, and how many at once a server bears |
@@ -42,6 +43,7 @@ mod labels;
 mod lease;
 mod limit;
 mod loose_json;
+mod negatives;
 mod order;
 mod pictures;
 mod prompts;
@@ -70,13 +72,15 @@ use std::time::Duration;
 use async_trait::async_trait;
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
-use whereabouts_core::{DayUsage, ModelServer, RefinerKind, Spent, utc_day};
+use whereabouts_core::{
+    Agreement, Calibration, DayUsage, ModelServer, RefinerKind, Spent, utc_day,
+};
 use whereabouts_store::{
     BlobStore, DescriptionCache, MapStore, SharedLimits, TokenBuckets, UsageStore,
 };
 use whereabouts_vision::ImageLimits;
 
-pub use answer::{AnswerError, Certainty};
+pub use answer::AnswerError;
 pub use check::{CheckedServer, Finding, check};
 pub use labels::{Labels, Verdict};
 pub use prompts::PROMPT_VERSION;
@@ -96,8 +100,8 @@ use self::retry::CallError;
 use self::run::RefineRun;
 use self::spend::SpendControl;
 use crate::{
-    BuildError, NegativeEvidence, PaidCallLevels, PaidCalls, Progress, RefineError, RefineInput,
-    RefineMetrics, Refinement, Refiner, RefinerContext, RefinerSettings, local,
+    BuildError, NegativeEvidence, PaidCallLevels, PaidCalls, PaidNegatives, Progress, RefineError,
+    RefineInput, RefineMetrics, Refinement, Refiner, RefinerContext, RefinerSettings, local,
 };
 
 /// The parts that an [`MllmRefiner`] is built from.
@@ -140,6 +144,16 @@ pub struct MllmRefiner {
 
 /// Builds the refiner `mllm`, with `local` as its fallback.
 pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, BuildError> {
+    Ok(shared(context).await?)
+}
+
+/// Returns the one instance of a process, so that all refiners that ask the model share its budgets, rates and circuit
+/// breaker.
+pub(crate) async fn shared(context: &RefinerContext) -> Result<Arc<MllmRefiner>, BuildError> {
+    context.model.get_or_try_init(|| build_model(context)).await.cloned()
+}
+
+async fn build_model(context: &RefinerContext) -> Result<Arc<MllmRefiner>, BuildError> {
     let store = &context.store;
     let parts = MllmParts {
         maps: store.clone(),
@@ -163,7 +177,8 @@ pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, 
 /// Returns a text that changes with everything that decides what the refiner finds.
 pub(crate) fn fingerprint(settings: &RefinerSettings) -> Result<String, BuildError> {
     let mllm = serde_json::to_string(&settings.mllm)?;
-    Ok(format!("{PROMPT_VERSION} {mllm} {}", local::fingerprint(settings)?))
+    let evidence = Calibration::EVIDENCE;
+    Ok(format!("{PROMPT_VERSION} {evidence} {mllm} {}", local::fingerprint(settings)?))
 }
 
 impl MllmRefiner {
@@ -236,12 +251,13 @@ impl MllmRefiner {
     /// Refines a job of which no pair was described.
     async fn without_descriptions(
         &self,
+        fallback: Option<&dyn Refiner>,
         run: &RefineRun<'_>,
         why: &CallError,
     ) -> Result<Refinement, RefineError> {
         self.deferred(why)?;
-        match &self.fallback {
-            Some(fallback) => self.fall_back(fallback.as_ref(), run, why).await,
+        match fallback {
+            Some(fallback) => self.fall_back(fallback, run, why).await,
             None => Err(conclude::failure(why)),
         }
     }
@@ -249,6 +265,7 @@ impl MllmRefiner {
     /// Returns the order of the described candidates, from the model if it gives one.
     async fn order(
         &self,
+        fallback: Option<&dyn Refiner>,
         run: &RefineRun<'_>,
         described: &[DescribedPair],
     ) -> Result<Order, RefineError> {
@@ -273,7 +290,7 @@ impl MllmRefiner {
                 "the reasoning call failed ({why}); it is tried again, and the descriptions are kept"
             )));
         }
-        let Some(fallback) = &self.fallback else { return Ok(Order::Coarse(why)) };
+        let Some(fallback) = fallback else { return Ok(Order::Coarse(why)) };
         run.progress.waiting(false);
         match fallback.refine(run.input, run.progress).await {
             Ok(refinement) => {
@@ -295,6 +312,63 @@ impl MllmRefiner {
         {
             self.describer.answers_are(CallPurpose::Describe, Some(&why));
         }
+    }
+
+    /// Refines like [`Refiner::refine`], but does without the fallback: what the model cannot do is an error, or the
+    /// coarse order.
+    pub(crate) async fn refine_without_fallback(
+        &self,
+        input: &RefineInput,
+        progress: &dyn Progress,
+    ) -> Result<Refinement, RefineError> {
+        self.refine_with(None, input, progress).await
+    }
+
+    async fn refine_with(
+        &self,
+        fallback: Option<&dyn Refiner>,
+        input: &RefineInput,
+        progress: &dyn Progress,
+    ) -> Result<Refinement, RefineError> {
+        if self.settings.check_at_start {
+            check::again(&self.describer, &self.reasoner, &self.settings);
+        }
+        let budget =
+            self.spend.budget.for_job(input.spent.prompt_tokens, input.spent.completion_tokens);
+        let similar = self.similar_frames(input).await?;
+        let run = RefineRun::new(input, budget, similar, progress);
+        let pairs = self.pairs(input).await?;
+        let pairs = self.describe_all(&run, &pairs).await;
+        self.judge_describer(&pairs);
+        let order = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
+            ([], None) => Order::Nothing,
+            ([], Some(why)) => return self.without_descriptions(fallback, &run, &why).await,
+            (described, _) => self.order(fallback, &run, described).await?,
+        };
+        let agreement = match &order {
+            Order::Model(_) => {
+                run.progress.waiting(false);
+                self.agreement(fallback, input).await
+            }
+            _ => None,
+        };
+        conclude::conclude(&run, &pairs, order, agreement.as_ref())
+    }
+
+    /// Returns how far the regions of the frame and its candidates agree; `None` if that cannot be found out.
+    async fn agreement(
+        &self,
+        fallback: Option<&dyn Refiner>,
+        input: &RefineInput,
+    ) -> Option<Agreement> {
+        let matcher = fallback?.region_matcher()?;
+        matcher
+            .agreement(input)
+            .await
+            .inspect_err(
+                |error| tracing::warn!(job = %input.id, %error, "a verdict could not be checked"),
+            )
+            .ok()
     }
 
     /// Returns an error that defers the job, if the settings say so and it is known for how long.
@@ -323,6 +397,10 @@ impl Refiner for MllmRefiner {
         self.fallback.as_ref()?.negative_evidence()
     }
 
+    fn paid_negatives(&self) -> Option<&dyn PaidNegatives> {
+        Some(self)
+    }
+
     fn paid_calls(&self) -> Option<&dyn PaidCalls> {
         Some(self)
     }
@@ -342,22 +420,7 @@ impl Refiner for MllmRefiner {
         input: &RefineInput,
         progress: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        if self.settings.check_at_start {
-            check::again(&self.describer, &self.reasoner, &self.settings);
-        }
-        let budget =
-            self.spend.budget.for_job(input.spent.prompt_tokens, input.spent.completion_tokens);
-        let similar = self.similar_frames(input).await?;
-        let run = RefineRun::new(input, budget, similar, progress);
-        let pairs = self.pairs(input).await?;
-        let pairs = self.describe_all(&run, &pairs).await;
-        self.judge_describer(&pairs);
-        let order = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
-            ([], None) => Order::Nothing,
-            ([], Some(why)) => return self.without_descriptions(&run, &why).await,
-            (described, _) => self.order(&run, described).await?,
-        };
-        conclude::conclude(&run, &pairs, order)
+        self.refine_with(self.fallback.as_deref(), input, progress).await
     }
 }
 

@@ -2,11 +2,10 @@
 
 use std::time::Duration;
 
-use whereabouts_core::Digest;
+use whereabouts_core::{Certainty, Digest};
 use whereabouts_store::Step;
 
 use super::MllmRefiner;
-use super::answer::Certainty;
 use super::client::{Answer, Call};
 use super::describe::DescribedPair;
 use super::labels::{Labels, Verdict};

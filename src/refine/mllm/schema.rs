@@ -5,7 +5,7 @@
 
 use serde::Serialize;
 
-use super::answer::Certainty;
+use whereabouts_core::Certainty;
 
 /// The format that a request asks for.
 #[derive(Debug, Clone, Serialize)]

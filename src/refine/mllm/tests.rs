@@ -3,9 +3,10 @@
 mod check;
 mod faults;
 mod habits;
-mod limits;
+pub(crate) mod limits;
 mod load;
 pub(crate) mod shelf;
+mod verdicts;
 
 use shelf::{Bench, Steps};
 

@@ -78,9 +78,12 @@ impl Refiner for Told {
         progress.waiting(false);
         Ok(Refinement {
             descriptions: vec![],
+            agreement: None,
+            verdicts: vec![],
             ranking: Ranking::new(&input.candidates, &[0]).unwrap(),
             ordered_by: None,
             evidence: None,
+            certainty: None,
             reasoning: None,
             reasoning_took_ms: None,
             usage: Usage::default(),
@@ -192,13 +195,14 @@ fn map() -> Map {
         uid: Uuid::from_u128(1),
         name: "m".parse().unwrap(),
         scene: Scene::Outdoor,
-        descriptor: DescriptorKind::Gem,
+        descriptor: DescriptorKind::GEM,
         frame: CoordinateFrame::Metric,
         model: "none".into(),
         model_digest: Digest::of(b"none"),
         precision: Precision::Full,
         dim: 4,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::now(),
     }
@@ -267,6 +271,10 @@ async fn jobs_that_wait_for_a_network_leave_their_turn_to_others() {
 async fn as_many_jobs_use_this_machine_as_there_are_workers_the_oldest_first() {
     let (fixture, jobs) = Fixture::with(2, 100, Told::new(false), 4).await;
     fixture.until(&jobs, &[Running, Running, Queued, Queued]).await;
+    // A job is running a moment before it is refined.
+    while fixture.refiner.in_progress.load(Ordering::SeqCst) < 2 {
+        tokio::task::yield_now().await;
+    }
     fixture.refiner.permits.add_permits(4);
     fixture.until(&jobs, &[Succeeded; 4]).await;
     assert_eq!(fixture.refiner.most.load(Ordering::SeqCst), 2);
@@ -290,6 +298,9 @@ async fn no_more_jobs_are_in_progress_than_the_settings_allow() {
             break;
         }
         changes.recv().await.unwrap();
+    }
+    while fixture.refiner.in_progress.load(Ordering::SeqCst) < 3 {
+        tokio::task::yield_now().await;
     }
     assert_eq!(fixture.refiner.most.load(Ordering::SeqCst), 3);
 }
@@ -335,6 +346,9 @@ async fn at_shutdown_all_jobs_in_progress_go_back_to_the_queue() {
 async fn a_cancelled_job_ends_and_the_others_go_on() {
     let (fixture, jobs) = Fixture::with(1, 100, Told::new(true), 3).await;
     fixture.until(&jobs, &[Running; 3]).await;
+    while fixture.refiner.in_progress.load(Ordering::SeqCst) < 3 {
+        tokio::task::yield_now().await;
+    }
     fixture.store.cancel(jobs[1]).await.unwrap();
     while fixture.refiner.in_progress.load(Ordering::SeqCst) > 2 {
         tokio::task::yield_now().await;

@@ -10,6 +10,8 @@ use super::RefinerChoice;
 pub struct Refine {
     /// Who refines.
     pub refiner: RefinerChoice,
+    /// Further refiners that maps and requests may choose.
+    pub allowed: Vec<RefinerChoice>,
     /// Candidates that `mllm` compares.
     pub candidates: usize,
     /// Candidates that `local` compares.

@@ -81,9 +81,19 @@ impl Config {
         RefinerSettings {
             local_candidates: self.refine.local_candidates,
             mllm_candidates: self.refine.candidates,
+            cascade: self.cascade,
             mllm: self.mllm.clone(),
             job_timeout_s: self.jobs.timeout.as_secs(),
         }
+    }
+
+    /// Returns the refiners that maps and requests may choose, the configured one first.
+    pub fn allowed_refiners(&self) -> Vec<&'static RefinerEntry> {
+        let mut entries: Vec<&'static RefinerEntry> = Vec::new();
+        for choice in [self.refine.refiner].iter().chain(&self.refine.allowed) {
+            entries.extend(choice.entry().filter(|entry| !entries.contains(entry)));
+        }
+        entries
     }
 
     /// Returns how many candidates the configured refiner compares.
@@ -108,7 +118,7 @@ mod tests {
         }
         assert_eq!(RefinerChoice::try_from("off".to_owned()), Ok(RefinerChoice::OFF));
         let error = RefinerChoice::try_from("remote".to_owned()).unwrap_err();
-        assert_eq!(error, "unknown refiner \"remote\", expected one of local, mllm, off");
+        assert_eq!(error, "unknown refiner \"remote\", expected one of local, cascade, mllm, off");
     }
 
     #[test]
@@ -122,7 +132,7 @@ mod tests {
             })
             .collect();
         let names: Vec<&str> = help.iter().map(|(name, _)| name.as_str()).collect();
-        assert_eq!(names, ["local", "mllm", "off"]);
+        assert_eq!(names, ["local", "cascade", "mllm", "off"]);
         assert!(help.iter().all(|(_, help)| !help.is_empty()), "{help:?}");
     }
 }

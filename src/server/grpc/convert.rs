@@ -3,8 +3,8 @@
 use jiff::Timestamp;
 
 use super::proto;
-use whereabouts_api::RefineMode;
-use whereabouts_core::{CoordinateFrame, JobState, PoseInput, Priority, Scene};
+use whereabouts_api::{MapRefiner, RefineMode};
+use whereabouts_core::{CoordinateFrame, JobState, PoseInput, Priority, RefinerKind, Scene};
 use whereabouts_service::ServiceError;
 
 /// Converts the number of an enum; an unknown one is malformed.
@@ -28,6 +28,27 @@ pub(super) fn priority(number: i32) -> Result<Priority, ServiceError> {
         proto::Priority::Low => Priority::Low,
         proto::Priority::High => Priority::High,
     })
+}
+
+/// `None` stands for that of the map or of the server.
+pub(super) fn refiner(number: i32) -> Result<Option<RefinerKind>, ServiceError> {
+    Ok(match enum_value("refiner", number)? {
+        proto::Refiner::Unspecified => None,
+        proto::Refiner::Local => Some(RefinerKind::Local),
+        proto::Refiner::Cascade => Some(RefinerKind::Cascade),
+        proto::Refiner::Mllm => Some(RefinerKind::Mllm),
+    })
+}
+
+/// `None` leaves it unchanged.
+pub(super) fn map_refiner(number: Option<i32>) -> Result<Option<MapRefiner>, ServiceError> {
+    let Some(number) = number else { return Ok(None) };
+    Ok(Some(match refiner(number)? {
+        None => MapRefiner::Default,
+        Some(RefinerKind::Local) => MapRefiner::Local,
+        Some(RefinerKind::Cascade) => MapRefiner::Cascade,
+        Some(RefinerKind::Mllm) => MapRefiner::Mllm,
+    }))
 }
 
 /// `None` stands for any state.

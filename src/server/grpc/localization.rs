@@ -53,12 +53,13 @@ impl LocalizationService for Api {
 
 impl CallContext {
     async fn localize(&self, request: LocalizeRequest) -> Result<LocalizeResponse, ServiceError> {
-        let LocalizeRequest { map, image, k, refine, priority, track } = request;
+        let LocalizeRequest { map, image, k, refine, priority, track, refiner } = request;
         let track = track.map(|track| self.step(track)).transpose()?;
         let request = whereabouts_service::LocalizeRequest {
             map: self.map(&map)?,
             k: k.map(|k| k as usize),
             refine: convert::refine_mode(refine)?,
+            refiner: convert::refiner(refiner)?,
             priority: convert::priority(priority)?,
             frame: image,
             deadline: self.deadline.0,

@@ -102,12 +102,13 @@ impl CallContext {
     }
 
     async fn put_map(&self, request: PutMapRequest) -> Result<PutMapResponse, ServiceError> {
-        let PutMapRequest { map, scene, descriptor, frame, model, description } = request;
+        let PutMapRequest { map, scene, descriptor, frame, model, description, refiner } = request;
         let change = MapChange {
             scene: convert::scene(scene)?,
             descriptor: descriptor.map(|kind| kind.parse()).transpose()?,
             frame: convert::frame(frame)?,
             model,
+            refiner: convert::map_refiner(refiner)?,
             description,
         };
         let (map, created) = self.service.maps.put(self.map(&map)?, change).await?;

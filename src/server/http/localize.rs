@@ -14,7 +14,7 @@ use crate::gate::IdempotencyId;
 use crate::gate::Problem;
 use crate::gate::Ready;
 use whereabouts_api::{Answer, RefineMode};
-use whereabouts_core::{Priority, moment};
+use whereabouts_core::{Priority, RefinerKind, moment};
 use whereabouts_service::{
     Deadline, LocalizeRequest, Odometry, Principal, ServiceError, TrackStep,
 };
@@ -32,6 +32,9 @@ pub(super) struct LocalizeParams {
     /// job. `off`: no job.
     #[serde(default)]
     refine: RefineMode,
+    /// The refiner of the job: `local`, `cascade` or `mllm`, of those that the server allows (`refine.refiner`,
+    /// `refine.allowed`), and that costs no more than that of the map. By default that of the map, or of the server.
+    refiner: Option<RefinerKind>,
     /// Priority of the job: before all others (`high`), in its turn (`normal`, default), or
     /// when no other job is queued (`low`).
     #[serde(default)]
@@ -148,6 +151,7 @@ struct FrameForm {
     responses(
         (status = 200, body = Answer),
         (status = 400, body = Problem, description = "Malformed, or an empty body", content_type = "application/problem+json"),
+        (status = 403, body = Problem, description = "The refiner is not allowed, or may cost more than that of the map", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
         (status = 409, body = Problem, description = "The map's model is not installed, or has changed meanwhile", content_type = "application/problem+json"),
         (status = 408, body = Problem, description = "The body arrived too slowly", content_type = "application/problem+json"),
@@ -178,6 +182,7 @@ pub(super) async fn localize(
         map,
         k: params.k,
         refine: params.refine,
+        refiner: params.refiner,
         priority: params.priority,
         frame: body.picture,
         deadline,

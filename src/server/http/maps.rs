@@ -58,6 +58,7 @@ pub(super) async fn get_map(
         (status = 200, body = MapState, description = "Changed"),
         (status = 201, body = MapState, description = "Created"),
         (status = 400, body = Problem, description = "Malformed", content_type = "application/problem+json"),
+        (status = 403, body = Problem, description = "The refiner is not allowed on this server", content_type = "application/problem+json"),
         (status = 409, body = Problem, description = "The field is fixed, because the map has images", content_type = "application/problem+json"),
         (status = 422, body = Problem, description = "The model is not installed, or does not support this", content_type = "application/problem+json"),
     ))]

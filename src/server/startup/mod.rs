@@ -19,9 +19,10 @@ use crate::config::Config;
 use crate::gate::{Connections, Gate, GateSettings};
 use crate::http::{About, AppState};
 use crate::router::{router, worker_router};
-use whereabouts_refine::{DenseCache, JobServiceTime, Refiner, RefinerContext, Worker};
+use whereabouts_refine::{DenseCache, JobServiceTime, Refiner, RefinerContext, RefinerSet, Worker};
 use whereabouts_service::{
-    Dispatcher, Janitor, Keys, Limits, Service, ServiceParts, ServiceSettings, Webhooks,
+    AllowedRefiners, Dispatcher, Janitor, Keys, Limits, Service, ServiceParts, ServiceSettings,
+    Webhooks,
 };
 use whereabouts_store::TokenBuckets;
 use whereabouts_telemetry::LogIssues;
@@ -146,12 +147,23 @@ fn service_settings(config: &Config) -> ServiceSettings {
         track: config.track.clone(),
         confidence: config.confidence,
         jobs: config.jobs,
+        refiners: allowed_refiners(config),
         compared: config.compared_candidates(),
         recall_check: Some(recall_check).filter(|pause| !pause.is_zero()),
         usage_days: config.data.usage_days,
         idempotency: config.idempotency,
         bulk: config.bulk,
         webhooks: config.webhooks.clone(),
+    }
+}
+
+/// The refiners that maps and requests may choose.
+fn allowed_refiners(config: &Config) -> AllowedRefiners {
+    let settings = config.refiner_settings();
+    let allowed = config.allowed_refiners().into_iter();
+    AllowedRefiners {
+        default: config.refine.refiner.kind(),
+        allowed: allowed.map(|entry| (entry.kind, (entry.candidates)(&settings))).collect(),
     }
 }
 
@@ -189,11 +201,17 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         pool: refining,
         metrics: Arc::clone(&metrics.refine),
         settings: config.refiner_settings(),
+        model: Arc::default(),
     };
-    let refiner: Option<Arc<dyn Refiner>> = match config.refine.refiner.entry() {
-        Some(entry) => Some(Handle::current().block_on((entry.build)(&refiners))?),
-        None => None,
-    };
+    let mut built = Vec::new();
+    for entry in config.allowed_refiners() {
+        built.push(Handle::current().block_on((entry.build)(&refiners))?);
+    }
+    let mut built = built.into_iter();
+    let refiner: Option<Arc<dyn Refiner>> = built.next().map(|first| match built.len() {
+        0 => first,
+        _ => Arc::new(RefinerSet::new(first, built.collect())) as Arc<dyn Refiner>,
+    });
     let refines = refiner.as_ref().filter(|_| config.jobs.workers > 0);
     let worker = refines.map(|refiner| Worker {
         jobs: store.clone(),

@@ -4,7 +4,7 @@ use std::time::Duration;
 use super::Fixture;
 use tokio_util::sync::CancellationToken;
 use whereabouts_core::{Calibration, Image, Map};
-use whereabouts_refine::{NegativeEvidence, RefineError};
+use whereabouts_refine::{RefineError, Refiner};
 use whereabouts_store::MapStore;
 
 const IMAGES: usize = 6;
@@ -17,7 +17,7 @@ async fn road(fixture: &Fixture) -> Map {
 /// What a map's calibration is after it was measured with the scripted refiner, or with none.
 async fn calibrated(fixture: &Fixture, with_refiner: bool) -> Arc<Calibration> {
     let map = road(fixture).await;
-    let refiner: &dyn NegativeEvidence = fixture.refiner.as_ref();
+    let refiner: &dyn Refiner = fixture.refiner.as_ref();
     let refiner = Some(refiner).filter(|_| with_refiner);
     fixture.service.calibrator.calibrate(&map, refiner).await.unwrap();
     fixture.store.calibration(&map).await.unwrap().unwrap()
@@ -57,6 +57,47 @@ async fn an_image_on_which_the_refiner_fails_for_good_is_left_out() {
     assert!(measured.complete);
     assert_eq!(measured.agreement.len(), IMAGES - 1);
     assert_eq!(fixture.refiner.measured.lock().len(), IMAGES);
+}
+
+#[tokio::test]
+async fn a_model_is_not_asked_unless_calls_are_allowed() {
+    let fixture = Fixture::with(0, |settings| settings.confidence.model_calls = 0).await;
+    let measured = calibrated(&fixture, true).await;
+    assert_eq!((measured.model_asked, measured.verdict.len()), (0, IMAGES));
+    assert_eq!(measured.verdict.mean(), Some(0.5));
+    assert_eq!(*fixture.refiner.verdicts.lock(), 0);
+}
+
+#[tokio::test]
+async fn a_model_is_asked_about_as_many_images_as_the_calls_go_round() {
+    // A map of 6 images is too small: fewer than nine verdicts calibrate nothing.
+    let fixture = Fixture::with(0, |settings| settings.confidence.model_calls = 1000).await;
+    assert_eq!(calibrated(&fixture, true).await.model_asked, 0);
+    assert_eq!(*fixture.refiner.verdicts.lock(), 0);
+    // At 6 calls an image, 70 calls go round for 11.
+    let fixture = Fixture::with(0, |settings| settings.confidence.model_calls = 70).await;
+    let poses: Vec<_> = (0..40).map(|number| Some(number as f64 * 100.0)).collect();
+    let map = fixture.map("road", &poses).await;
+    fixture.service.calibrator.calibrate(&map, Some(fixture.refiner.as_ref())).await.unwrap();
+    let measured = fixture.store.calibration(&map).await.unwrap().unwrap();
+    let verdicts = *fixture.refiner.verdicts.lock();
+    assert!((9..=11).contains(&verdicts), "{verdicts}");
+    assert_eq!((measured.model_asked, measured.verdict.len()), (verdicts, verdicts));
+    assert_eq!(measured.verdict.mean(), Some(-2.0));
+}
+
+#[test]
+fn too_few_calls_to_calibrate_a_model_are_refused_with_the_number_that_is_enough() {
+    let settings = |model_calls| crate::ConfidenceSettings {
+        images: 100,
+        refined: 100,
+        place_images: 0,
+        place_m: 5.0,
+        model_calls,
+    };
+    assert_eq!(settings(0).validate(10), None);
+    assert_eq!(settings(99).validate(10), None);
+    assert!(settings(98).validate(10).unwrap().contains("at least 99"));
 }
 
 #[tokio::test]

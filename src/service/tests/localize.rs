@@ -3,13 +3,14 @@ use bytes::Bytes;
 use super::Fixture;
 use crate::LocalizeRequest;
 use whereabouts_api::{ErrorKind, RefineMode};
-use whereabouts_core::Priority;
+use whereabouts_core::{Priority, RefinerKind};
 
 fn request(k: Option<usize>, frame: &'static [u8]) -> LocalizeRequest {
     LocalizeRequest {
         map: "yard".parse().unwrap(),
         k,
         refine: RefineMode::Off,
+        refiner: None,
         priority: Priority::default(),
         frame: Bytes::from_static(frame),
         deadline: None,
@@ -29,6 +30,23 @@ async fn a_request_out_of_bounds_is_refused_before_its_frame_is_decoded() {
     }
     let refused = localizer.localize(request(None, b"")).await.unwrap_err();
     assert_eq!(refused.kind, ErrorKind::Malformed);
+}
+
+#[tokio::test]
+async fn a_refiner_that_is_not_allowed_is_refused_before_the_frame_is_decoded() {
+    let fixture = Fixture::new().await;
+    let localizer = &fixture.service.localizer;
+    let asking = |refiner, refine| LocalizeRequest {
+        refiner: Some(refiner),
+        refine,
+        ..request(None, b"frame")
+    };
+    let refused = localizer.localize(asking(RefinerKind::Mllm, RefineMode::Async)).await;
+    let refused = refused.unwrap_err();
+    assert_eq!(refused.kind, ErrorKind::Forbidden);
+    assert!(refused.detail.contains("allowed: local"), "{refused}");
+    let refused = localizer.localize(asking(RefinerKind::Local, RefineMode::Off)).await;
+    assert_eq!(refused.unwrap_err().kind, ErrorKind::Malformed);
 }
 
 #[tokio::test]

@@ -33,7 +33,10 @@ use whereabouts_core::{
     MediaType, MetricPose, Pose, Precision, RefinerKind, Scene,
 };
 use whereabouts_index::IndexSettings;
-use whereabouts_refine::{NegativeEvidence, Progress, RefineError, RefineInput, Refinement};
+use whereabouts_refine::{
+    NegativeEvidence, PaidMeasurement, PaidNegatives, Progress, RefineError, RefineInput,
+    Refinement,
+};
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
 use whereabouts_store::{
     BlobStore, DescriptionBounds, HardNegatives, JobRecord, JobStore, MapStore, Query,
@@ -178,8 +181,18 @@ fn settings() -> ServiceSettings {
             states: 64,
             known_probability: 0.5,
         },
-        confidence: ConfidenceSettings { images: 100, refined: 100, place_images: 0, place_m: 5.0 },
+        confidence: ConfidenceSettings {
+            images: 100,
+            refined: 100,
+            place_images: 0,
+            place_m: 5.0,
+            model_calls: 0,
+        },
         jobs: job_settings(),
+        refiners: AllowedRefiners {
+            default: Some(RefinerKind::Local),
+            allowed: vec![(RefinerKind::Local, 5)],
+        },
         compared: 5,
         recall_check: None,
         usage_days: 30,
@@ -195,7 +208,7 @@ fn settings() -> ServiceSettings {
     }
 }
 
-fn map(name: &str) -> Map {
+pub(crate) fn map(name: &str) -> Map {
     Map {
         uid: Uuid::now_v7(),
         name: name.parse().unwrap(),
@@ -207,6 +220,7 @@ fn map(name: &str) -> Map {
         precision: Precision::Full,
         dim: DIM,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::now(),
     }
@@ -285,6 +299,8 @@ struct ScriptedRefiner {
     measurements: Mutex<VecDeque<RefineError>>,
     /// Images that were measured, failed attempts included.
     measured: Mutex<Vec<whereabouts_core::ImageId>>,
+    /// How often the model was asked.
+    verdicts: Mutex<usize>,
 }
 
 #[async_trait]
@@ -300,6 +316,10 @@ impl Refiner for ScriptedRefiner {
     fn negative_evidence(&self) -> Option<&dyn NegativeEvidence> {
         Some(self)
     }
+
+    fn paid_negatives(&self) -> Option<&dyn PaidNegatives> {
+        Some(self)
+    }
 }
 
 #[async_trait]
@@ -308,11 +328,23 @@ impl NegativeEvidence for ScriptedRefiner {
         &self,
         _: &Map,
         negatives: &HardNegatives,
-    ) -> Result<Option<Evidence>, RefineError> {
+    ) -> Result<Vec<Evidence>, RefineError> {
         self.measured.lock().push(negatives.image_id.clone());
         match self.measurements.lock().pop_front() {
             Some(error) => Err(error),
-            None => Ok(Some(Evidence::Agreement(0.5))),
+            None => Ok(vec![Evidence::Agreement(0.5), Evidence::Verdict(0.5)]),
         }
+    }
+}
+
+#[async_trait]
+impl PaidNegatives for ScriptedRefiner {
+    fn cost(&self, candidates: usize) -> PaidMeasurement {
+        PaidMeasurement { calls: candidates + 1, tokens: 1000, money: 0.0 }
+    }
+
+    async fn verdict(&self, _: &Map, _: &HardNegatives) -> Result<Option<Evidence>, RefineError> {
+        *self.verdicts.lock() += 1;
+        Ok(Some(Evidence::Verdict(-2.0)))
     }
 }

@@ -2,10 +2,10 @@ use futures_util::FutureExt;
 use uuid::Uuid;
 
 use super::{Fixture, candidates, descriptor, map};
-use crate::submit::{LocalizedFrame, Submission};
-use crate::{ServiceError, Submitter};
+use crate::submit::{JobWish, LocalizedFrame, Submission};
+use crate::{Chosen, ServiceError, Submitter};
 use whereabouts_api::{ErrorKind, NoJobReason};
-use whereabouts_core::{DenseFeatures, Digest, MediaType, Priority};
+use whereabouts_core::{DenseFeatures, Digest, MediaType, Priority, RefinerKind};
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 fn frame() -> LocalizedFrame {
@@ -23,7 +23,11 @@ fn frame() -> LocalizedFrame {
 
 async fn submit(submitter: &Submitter, request: Option<&str>) -> Result<Submission, ServiceError> {
     let found = candidates(&[(0, 0.9)]);
-    submitter.submit(&map("yard"), frame(), found, Priority::default(), request).await
+    submitter.submit(&map("yard"), frame(), found, wish(), request).await
+}
+
+fn wish() -> JobWish {
+    JobWish { chosen: Chosen::Refiner(RefinerKind::Local), priority: Priority::default() }
 }
 
 fn reason(submission: Submission) -> Option<NoJobReason> {
@@ -53,7 +57,7 @@ async fn without_a_refiner_or_candidates_there_is_no_job() {
     let fixture = Fixture::new().await;
     let submitter = fixture.service.localizer.submitter.clone();
     let yard = map("yard");
-    let submission = submitter.submit(&yard, frame(), vec![], Priority::default(), None);
+    let submission = submitter.submit(&yard, frame(), vec![], wish(), None);
     assert_eq!(reason(submission.await.unwrap()), Some(NoJobReason::EmptyMap));
     let submitter = Submitter { refiner: None, ..submitter };
     let submission = submit(&submitter, None).await.unwrap();

@@ -106,7 +106,8 @@ async fn a_late_frame_answers_for_its_own_time_and_does_not_move_the_track_back(
     }
     let late = follow(&fixture, &map, robot(9), &view(9)).await;
     assert_eq!((late.is_late, late.image_id), (true, Some(image_id(9))));
-    let very_late = follow(&fixture, &map, robot(-900), &view(3)).await;
+    let (very_late, warning) = follow_with_warning(&fixture, &map, robot(-900), &view(3)).await;
+    assert!(warning.is_some_and(|text| text.contains("new track id")));
     assert_eq!((very_late.is_late, very_late.image_id), (true, Some(image_id(3))));
     let next = follow(&fixture, &map, robot(15), &between(15, 9)).await;
     assert_eq!((next.is_late, next.image_id), (false, Some(image_id(15))));

@@ -34,7 +34,7 @@ pub(super) enum Motion {
         /// The time, in the unit of the speeds.
         time: f64,
         /// How much the frame differs from the ones before it, in units of the usual difference of neighbours in the
-        /// map ([`Novelty`](super::evidence::Novelty)); `None` if there is none before it.
+        /// map ([`novelty`](super::evidence::Frames::novelty)); `None` if there is none before it.
         novelty: Option<f64>,
     },
 }

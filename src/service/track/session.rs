@@ -219,7 +219,13 @@ impl Track {
             belief.predicted(motion, habits, Changes::none().roads(ground))
         });
         let frame = self.seen.centred(frame, ground.mean());
-        Prediction { belief, fresh: 1.0, is_late: true, frame, warning: None }
+        // A recording that is replayed again would be late for ever.
+        let warning = before.is_none().then(|| {
+            "the frame is older than the last frames of its track, so it was localized alone; if the clock was set back \
+             or a recording starts again, use a new track id"
+                .to_owned()
+        });
+        Prediction { belief, fresh: 1.0, is_late: true, frame, warning }
     }
 
     /// What to tell a robot whose frames have no times and arrive faster than it can have moved.

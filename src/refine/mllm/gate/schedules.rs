@@ -20,7 +20,7 @@ fn call(gate: &Arc<CallGate>, passing: &AtomicUsize, job: u128) {
     permit.sent(CallPurpose::Describe);
     yield_now();
     passing.fetch_sub(1, Ordering::SeqCst);
-    if job % 2 == 0 {
+    if job.is_multiple_of(2) {
         permit.answered(Duration::from_secs(1));
     }
 }

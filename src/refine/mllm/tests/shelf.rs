@@ -37,6 +37,8 @@ pub struct Shelf {
     pub map: Map,
     /// Their bytes; the last picture is the frame.
     pictures: Arc<Vec<Bytes>>,
+    /// The calibration of the map, if there is one.
+    pub calibration: Arc<Mutex<Option<Arc<Calibration>>>>,
 }
 
 /// The mock server, and a refiner that calls it.
@@ -76,6 +78,11 @@ impl Bench {
 
     pub fn input(&self, candidates: usize) -> RefineInput {
         self.shelf.input(candidates)
+    }
+
+    /// Another instance, over the same cache.
+    pub fn model(&self) -> MllmRefiner {
+        refiner(&self.shelf, &self.cache, None, &self.settings)
     }
 
     pub async fn refine(&self, candidates: usize) -> Result<Refinement, RefineError> {
@@ -121,10 +128,12 @@ impl Shelf {
             precision: Precision::Full,
             dim: 1,
             revision: 0,
+            refiner: None,
             description: None,
             created_at: Timestamp::UNIX_EPOCH,
         };
-        Self { map, pictures: Arc::new((0..24).map(picture).collect()) }
+        let pictures = Arc::new((0..24).map(picture).collect());
+        Self { map, pictures, calibration: Arc::default() }
     }
 
     /// Returns the digest of a picture.
@@ -142,6 +151,7 @@ impl Shelf {
         RefineInput {
             id: Uuid::now_v7(),
             map: self.map.clone(),
+            refiner: None,
             frame: QueryFrame {
                 query_id: Uuid::now_v7(),
                 digest: self.digest(self.pictures.len() - 1),
@@ -259,7 +269,7 @@ impl MapStore for Shelf {
     }
 
     async fn calibration(&self, _: &Map) -> Result<Option<Arc<Calibration>>, StoreError> {
-        unused()
+        Ok(self.calibration.lock().clone())
     }
 
     async fn put_calibration(&self, _: &Map, _: Calibration) -> Result<(), StoreError> {

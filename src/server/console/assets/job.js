@@ -64,6 +64,9 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
             estimate ? h("p", { class: "big" }, percent(estimate.confidence), h("span", { class: "muted" }, " confidence")) : h("p", { class: "muted" }, ended() ? "None." : "Available when the job has ended."),
             estimate && h("p", {}, estimate.known ? "The place is known." : estimate.reason ?? "May not be in the map: the confidence is below the configured threshold."),
             estimate && h("p", {}, h("code", {}, estimate.image_id), h("br"), h("span", { class: "muted" }, pose(estimate.pose))),
+            job.verdicts?.length > 0 && h("div", {}, h("h2", {}, "Verdicts"), job.verdicts.map((verdict) => h("p", {},
+              h("strong", {}, verdict.refiner), ": ", h("code", {}, verdict.image_id), ` of ${plural(verdict.compared, "candidate")}, ${percent(verdict.confidence)} confidence`,
+              verdict.certainty && ` (the model says: ${verdict.certainty})`, verdict.then && h("span", { class: "muted" }, `; ${verdict.then}`)))),
             job.reasoning && h("div", {}, h("h2", {}, "Reasoning"), job.reasoning.split(/\n+/).map((part) => h("p", { class: "told" }, part))))),
         h("div", { class: "card" }, facts(
           ["Map", h("a", { href: `#/maps/${encodeURIComponent(job.map)}` }, job.map)],

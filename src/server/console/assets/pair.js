@@ -23,7 +23,7 @@ export function pictures(job, imageId, { signal }) {
     h("figure", {}, frame, h("figcaption", {}, "Frame")),
     h("figure", {}, image, h("figcaption", {}, "Candidate ", h("code", {}, imageId))), lines);
   const all = h("div", {}, stage, bar);
-  if (job.refiner !== "local") return all;
+  if (job.refiner === "mllm") return all;
 
   call(address(["jobs", job.id, "matches", imageId]), { signal }).then((matches) => {
     bar.hidden = false;

@@ -47,6 +47,7 @@ fn map() -> Map {
         precision: Precision::Full,
         dim: 3,
         revision: 0,
+        refiner: None,
         description: None,
         created_at: Timestamp::now(),
     }

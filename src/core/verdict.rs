@@ -1,0 +1,177 @@
+//! What a model's verdict is worth as evidence.
+//!
+//! A model says which candidate shows the place of a frame, and how certain it is. Neither can be taken at its word:
+//! models are over-confident, and some are wrong. What counts is how far the regions of the two pictures bear the
+//! verdict out, which costs no call, and how often the model says the same of wrong images:
+//!
+//! > e = ln((a + c) / (m + c)) − 2 · max(0, ln((b + c) / (a + c))) − d
+//!
+//! where a regions of the model's first candidate match the frame, m is the median of that count over the other
+//! candidates, b its maximum, c is [`CHANCE_SHARE`](super::confidence::CHANCE_SHARE) of the regions of the frame, and
+//! d is the model's doubt. The second term is the contradiction: another candidate matches the frame better.
+//!
+//! Where the regions put the same candidate first, or nearly, as they do with neighbours that show the same place, the
+//! model concurs, and the evidence of the regions counts too.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::Evidence;
+use super::confidence::chance;
+
+/// The weight of a contradiction: as strong a match of another candidate turns evidence for the first one into as much
+/// against it.
+const CONTRADICTION: f32 = 2.0;
+
+/// The share of the regions of the first candidate from which another is nearly as good.
+const NEARLY: f32 = 0.7;
+
+/// How sure a model is that its first candidate shows the place of the frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Certainty {
+    /// It is the place.
+    Certain,
+    /// It is more likely than not.
+    Likely,
+    /// It may be.
+    Unsure,
+    /// None of the candidates shows the place.
+    None,
+}
+
+impl Certainty {
+    /// Returns its name in the API.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Certain => "certain",
+            Self::Likely => "likely",
+            Self::Unsure => "unsure",
+            Self::None => "none",
+        }
+    }
+
+    /// Returns how much the evidence is lowered, in units of the logarithm. A model that says nothing of its certainty
+    /// counts as one that takes its candidate for likely.
+    fn doubt(certainty: Option<Self>) -> f32 {
+        match certainty {
+            Some(Self::Certain) => 0.0,
+            Some(Self::Likely) | None => 0.5,
+            Some(Self::Unsure) => 1.5,
+            Some(Self::None) => f32::INFINITY,
+        }
+    }
+}
+
+/// How many regions of a frame match each of its candidates.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Agreement {
+    /// The number of regions of the frame.
+    pub regions: usize,
+    /// The number of them that match, for each candidate in coarse order; 0 for one that was removed.
+    pub matches: Vec<usize>,
+    /// The candidate that the regions alone put first, if there is one.
+    pub first: Option<usize>,
+}
+
+impl Agreement {
+    /// Returns the evidence for the candidate at index `of`, which a model put first. `None` if there is no other
+    /// candidate.
+    pub fn verdict(&self, of: usize, certainty: Option<Certainty>) -> Option<Evidence> {
+        if certainty == Some(Certainty::None) {
+            return Some(Evidence::NONE_OF_THESE);
+        }
+        let Evidence::Agreement(agreement) = Evidence::agreement(&self.matches, self.regions, of)?
+        else {
+            return None;
+        };
+        let chance = chance(self.regions);
+        let one = *self.matches.get(of)? as f32;
+        let best = self.matches.iter().copied().max()? as f32;
+        let contradiction = ((best + chance) / (one + chance)).ln();
+        let verdict = agreement - CONTRADICTION * contradiction - Certainty::doubt(certainty);
+        let concurs = self.first.is_some_and(|first| self.share(of, first) >= NEARLY);
+        Some(match concurs && certainty != Some(Certainty::Unsure) {
+            true => Evidence::Concurring { verdict, agreement },
+            false => Evidence::Verdict(verdict),
+        })
+    }
+
+    /// Returns how many regions match the candidate at index `of`, as a share of those that match `other`, with as many
+    /// added as match by chance. An index out of range counts as no match.
+    pub fn share(&self, of: usize, other: usize) -> f32 {
+        let matches = |index: usize| self.matches.get(index).copied().unwrap_or_default() as f32;
+        let chance = chance(self.regions);
+        (matches(of) + chance) / (matches(other) + chance)
+    }
+
+    /// Returns the strongest evidence that any verdict of this certainty on these candidates can have.
+    pub fn strongest_verdict(&self, certainty: Option<Certainty>) -> Option<Evidence> {
+        let most = self.matches.iter().max()?;
+        let of = self.matches.iter().position(|matches| matches == most)?;
+        Self { first: None, ..self.clone() }.verdict(of, certainty)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn agreement(matches: &[usize]) -> Agreement {
+        Agreement { regions: 500, matches: matches.to_vec(), first: None }
+    }
+
+    fn value(evidence: Option<Evidence>) -> f32 {
+        match evidence {
+            Some(Evidence::Verdict(value)) => value,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_verdict_that_the_regions_contradict_is_evidence_against_itself() {
+        let agreement = agreement(&[300, 40, 30, 20]);
+        let certain = |of| value(agreement.verdict(of, Some(Certainty::Certain)));
+        assert!((certain(0) - (310.0_f32 / 40.0).ln()).abs() < 1e-6, "{}", certain(0));
+        assert!(certain(1) < -3.0 && certain(1) > certain(3));
+        let certainty = Some(Certainty::Certain);
+        assert_eq!(agreement.strongest_verdict(certainty), agreement.verdict(0, certainty));
+    }
+
+    #[test]
+    fn a_model_that_concurs_with_the_regions_is_believed_as_they_are() {
+        let regions = Agreement { first: Some(0), ..agreement(&[300, 310, 30, 20]) };
+        let Some(Evidence::Concurring { verdict, agreement }) = regions.verdict(0, None) else {
+            panic!("{:?}", regions.verdict(0, None))
+        };
+        assert_eq!(
+            Evidence::agreement(&regions.matches, 500, 0),
+            Some(Evidence::Agreement(agreement))
+        );
+        assert!(verdict < agreement);
+        // Neighbours show the same place.
+        let nearly = regions.verdict(1, Some(Certainty::Certain));
+        assert!(matches!(nearly, Some(Evidence::Concurring { .. })), "{nearly:?}");
+        for (of, certainty) in [(2, Certainty::Certain), (0, Certainty::Unsure)] {
+            let evidence = regions.verdict(of, Some(certainty));
+            assert!(matches!(evidence, Some(Evidence::Verdict(_))), "{evidence:?}");
+        }
+    }
+
+    #[test]
+    fn doubt_lowers_the_evidence_and_none_of_these_ends_it() {
+        let agreement = agreement(&[300, 40, 30, 20]);
+        let of = |certainty| value(agreement.verdict(0, certainty));
+        assert!(of(Some(Certainty::Certain)) > of(Some(Certainty::Likely)));
+        assert_eq!(of(None), of(Some(Certainty::Likely)));
+        assert!(of(None) > of(Some(Certainty::Unsure)));
+        assert_eq!(agreement.verdict(0, Some(Certainty::None)), Some(Evidence::NONE_OF_THESE));
+    }
+
+    #[test]
+    fn a_single_candidate_has_nothing_to_be_compared_with() {
+        assert_eq!(agreement(&[300]).verdict(0, None), None);
+        assert_eq!(agreement(&[]).strongest_verdict(None), None);
+        assert_eq!(agreement(&[300, 1]).verdict(2, None), None);
+    }
+}
