@@ -181,7 +181,7 @@ mod alone {
 
     use super::{CONCURRENCY, serve, settings, worker};
     use crate::deployment;
-    use crate::mock_mllm::{MockMllm, Reply, Script};
+    use crate::mock_mllm::{MockMllm, Script};
     use crate::support::{Server, frame};
     use crate::wait::eventually_within;
 
