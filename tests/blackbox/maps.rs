@@ -50,7 +50,7 @@ async fn an_unsupported_descriptor_or_model_is_rejected_with_a_hint() {
     assert!(why.contains("no descriptor \"cls\"") && why.contains("gem"), "{why}");
     for name in ["GEM", "", "a b", &"a".repeat(25)] {
         let body = json!({ "descriptor": name });
-        let why = server.put(&format!("/maps/{map}"), body).await.problem(422);
+        let why = server.put(&format!("/maps/{map}"), body).await.problem(400);
         assert!(why.contains("kind of descriptor"), "{why}");
     }
     let why =

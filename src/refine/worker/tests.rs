@@ -288,8 +288,9 @@ async fn no_more_jobs_are_in_progress_than_the_settings_allow() {
     let ended = |states: &[JobState]| states.iter().filter(|state| **state == Succeeded).count();
     let mut changes = fixture.store.changes();
     loop {
+        // The youngest first: if it runs, an older one has ended.
         let mut states = Vec::new();
-        for job in &jobs {
+        for job in jobs.iter().rev() {
             states.push(fixture.state(*job).await);
         }
         let running = states.iter().filter(|state| **state == Running).count();

@@ -68,7 +68,7 @@ fn a_wrong_model_is_refused_with_what_to_do_and_nothing_is_installed() {
         ("not-a-number", &["not finite", "damaged"]),
         ("half-overflow", &["not finite", "32 bits"]),
         ("same-for-all", &["same descriptor"]),
-        ("all-zero", &["no gem descriptor"]),
+        ("all-zero", &["no cls descriptor", "found no features"]),
         ("new-opset", &["cannot load", "999"]),
         ("unknown-operator", &["cannot load", "NoSuchOperator"]),
         ("external-missing", &["model.onnx.data", "is missing", "next to the ONNX file"]),

@@ -1,6 +1,7 @@
 //! What a verdict of the model is worth as evidence.
 
 use async_trait::async_trait;
+use parking_lot::Mutex;
 use serde_json::json;
 use whereabouts_core::{
     Agreement, Candidate, Certainty, Evidence, ImageId, PairRegion, RefinerKind,
@@ -103,12 +104,21 @@ async fn without_regions_a_verdict_is_no_evidence() {
 
 #[tokio::test]
 async fn a_first_candidate_that_was_not_described_has_no_certainty() {
+    let pairs = Mutex::new(Vec::new());
     let script = Script {
-        describe: Box::new(|call| match call.number {
-            1 | 2 => Reply::Said("I'm sorry, I can't help with that.".into()),
-            number => Reply::Text(format!("notes number {number}.")),
+        describe: Box::new(move |call| {
+            let mut pairs = pairs.lock();
+            let known = pairs.iter().position(|pair| *pair == call.pair);
+            let number = known.unwrap_or(pairs.len()) + 1;
+            if known.is_none() {
+                pairs.push(call.pair.clone());
+            }
+            match number {
+                1 => Reply::Said("I'm sorry, I can't help with that.".into()),
+                number => Reply::Text(format!("notes number {number}.")),
+            }
         }),
-        ..judging("number 4.", "certain")
+        ..judging("number 3.", "certain")
     };
     let mut bench = Bench::with(script, |settings| settings.concurrency = 1).await;
     bench.fallback = Some(Arc::new(Regions(vec![20, 200, 30])));
