@@ -11,10 +11,11 @@ arguments() {
             "target/$(basename "$(realpath "$folder")")-venv" >&2
         exit 2
     fi
+    # shellcheck disable=SC2034 # used by the sourcing script
     binary=$(realpath "$2")
     # shellcheck disable=SC2034 # used by the sourcing script
     venv=$(realpath -m "$3")
-    cd "$folder"
+    cd "$folder" || exit
 }
 
 # no_panic: fails if the server has panicked.

@@ -77,7 +77,7 @@ async fn a_frame_finds_its_place_in_every_format() {
                 let answer = server.post(&path, sent_as, bytes.clone()).await.expect(200);
                 let first = &answer["candidates"][0];
                 assert_eq!(first["image_id"], format!("place-{place}"), "{name}: {answer}");
-                assert!(first["similarity"].as_f64().unwrap() > 0.95, "{name}: {answer}");
+                assert!(first["similarity"].as_f64().unwrap() > 0.9, "{name}: {answer}");
                 assert_eq!(answer["warnings"], json!([]));
             }
         }

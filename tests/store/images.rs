@@ -178,6 +178,7 @@ async fn descriptors_and_similarities_are_those_of_the_slots_in_their_order(fixt
     assert_eq!(found, [last.clone(), None, first, None, last]);
     let vector = vec![2.0, -1.0, 0.5];
     let similarities = store.similarities(&map, vector.clone(), asked).await.unwrap();
+    assert!(store.similarities(&map, Vec::new(), Vec::new()).await.unwrap().is_empty());
     for (similarity, descriptor) in similarities.iter().zip(&found) {
         let exact = descriptor.as_ref().map(|descriptor| dot(&vector, descriptor.as_slice()));
         assert_eq!(similarity.is_some(), exact.is_some());

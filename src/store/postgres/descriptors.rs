@@ -405,6 +405,10 @@ impl Inner {
         vector: &[f32],
         slots: &[usize],
     ) -> Result<Vec<Option<f32>>, StoreError> {
+        if slots.is_empty() {
+            // The vector may be empty, too, which pgvector has none of.
+            return Ok(Vec::new());
+        }
         let table = table(map.uid, map.revision);
         // <#> is the negative dot product.
         let sql = format!(
