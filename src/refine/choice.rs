@@ -19,8 +19,8 @@ pub struct RefinerSet {
 }
 
 impl RefinerSet {
-    /// Creates a set. The first refines jobs that name none, and those whose refiner is no longer there: it may cost
-    /// less than that, and was chosen by the operator.
+    /// Creates a set. The first refines jobs that name none. Those whose refiner is no longer there are refined by the
+    /// costliest that costs less, or else by the first, and are marked as degraded.
     pub fn new(first: Arc<dyn Refiner>, others: Vec<Arc<dyn Refiner>>) -> Self {
         Self { first, others }
     }
@@ -41,8 +41,23 @@ impl Refiner for RefinerSet {
         input: &RefineInput,
         progress: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        let named = self.all().find(|refiner| Some(refiner.kind()) == input.refiner);
-        named.unwrap_or(self.first.as_ref()).refine(input, progress).await
+        let Some(wanted) = input.refiner else { return self.first.refine(input, progress).await };
+        if let Some(named) = self.all().find(|refiner| refiner.kind() == wanted) {
+            return named.refine(input, progress).await;
+        }
+        let cheaper = self.all().filter(|refiner| refiner.kind().cost() < wanted.cost());
+        let stand_in = cheaper.max_by_key(|refiner| refiner.kind().cost());
+        let stand_in = stand_in.unwrap_or(self.first.as_ref());
+        let refinement = stand_in.refine(input, progress).await?;
+        let why = format!(
+            "refined by `{}` instead of `{wanted}`, which this server no longer has (refine.allowed)",
+            stand_in.kind()
+        );
+        let degraded = Some(match refinement.degraded {
+            Some(also) => format!("{why}; {also}"),
+            None => why,
+        });
+        Ok(Refinement { ordered_by: Some(stand_in.kind()), degraded, ..refinement })
     }
 
     fn wants_descriptor(&self) -> bool {
@@ -92,7 +107,8 @@ mod tests {
             [(None, 0), (Some(RefinerKind::Local), 0), (gone, 0), (Some(RefinerKind::Mllm), 4)]
         {
             let input = RefineInput { refiner: named, ..bench.input(3) };
-            choice.refine(&input, &Steps::default()).await.unwrap();
+            let refinement = choice.refine(&input, &Steps::default()).await.unwrap();
+            assert_eq!(refinement.degraded.is_some(), named == gone, "{:?}", refinement.degraded);
             let made = bench.mock.describe_calls() + bench.mock.reason_calls();
             assert_eq!(made, calls, "{named:?}");
         }

@@ -118,7 +118,7 @@ async fn a_track_is_located_better_than_its_frames_and_than_simple_filters() {
     for (answer, (place, _)) in plain.iter().chain(&moved).zip(visits.iter().chain(&visits)) {
         let probability = answer["track"]["probability"].as_f64().unwrap();
         assert!((0.0..=1.0 + 1e-9).contains(&probability), "{probability}");
-        assert_eq!(answer["track"]["known"], probability >= 0.5);
+        assert_eq!(answer["track"]["known"], probability >= 0.9);
         if probability >= 0.9 {
             sure[usize::from(answer["track"]["image_id"] == id(*place))] += 1;
         }

@@ -1,7 +1,7 @@
 //! Prepares the map that a folder is added to: it is created, or its coordinate frame and that of the poses are
 //! brought together.
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, bail};
 use reqwest::StatusCode;
 use serde::Deserialize;
 
@@ -47,8 +47,10 @@ pub async fn prepare(
             }
         }
         _ => {
-            let is_put = put(client, args, &path, wanted).await?;
-            ensure!(is_put, "the map {} cannot be changed", args.map);
+            if !put(client, args, &path, wanted).await? {
+                // Without the frame of the folder, what else is refused is explained.
+                put(client, args, &path, None).await?;
+            }
             if let (None, Some(map)) = (wanted, &known) {
                 poses.convert_to(map.frame)?;
             }

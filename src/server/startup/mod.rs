@@ -208,10 +208,9 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         built.push(Handle::current().block_on((entry.build)(&refiners))?);
     }
     let mut built = built.into_iter();
-    let refiner: Option<Arc<dyn Refiner>> = built.next().map(|first| match built.len() {
-        0 => first,
-        _ => Arc::new(RefinerSet::new(first, built.collect())) as Arc<dyn Refiner>,
-    });
+    let refiner: Option<Arc<dyn Refiner>> = built
+        .next()
+        .map(|first| Arc::new(RefinerSet::new(first, built.collect())) as Arc<dyn Refiner>);
     let refines = refiner.as_ref().filter(|_| config.jobs.workers > 0);
     let worker = refines.map(|refiner| Worker {
         jobs: store.clone(),

@@ -81,11 +81,15 @@ pub(super) fn estimate(
         image_id: best.as_ref().map(|best| best.image_id.clone()),
         pose: best.and_then(|best| best.pose),
         probability,
-        known: probability >= settings.known_probability,
+        known: probability >= settings.known_probability && ground.len() >= MIN_IMAGES,
         others: places.collect(),
         is_late: false,
     }
 }
+
+/// Fewest located images of a map in which a place can be known: with fewer, nothing says how alike images of different
+/// places are. A single frame needs as many.
+const MIN_IMAGES: usize = 9;
 
 /// Number of images that may be the estimate.
 const RIVALS: usize = 64;

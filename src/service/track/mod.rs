@@ -158,8 +158,9 @@ impl Tracks {
         let maps = self.maps.lock();
         let known = maps.get(&map.uid)?;
         // Descriptors of another revision cannot be compared.
-        let fresh = known.version == version
-            || (known.version.0 == version.0 && known.read_at.elapsed() < POSITIONS_REFRESH);
+        // A map that had no poses may have some now.
+        let is_recent = known.ground.len() > 0 && known.read_at.elapsed() < POSITIONS_REFRESH;
+        let fresh = known.version == version || (known.version.0 == version.0 && is_recent);
         fresh.then(|| Arc::clone(&known.ground))
     }
 

@@ -10,6 +10,9 @@ const MAX_MOVED_M: f64 = 1e6;
 /// Maximum turn between two frames, in radians.
 const MAX_TURN: f64 = 1e3;
 
+/// How far a covariance may be off by rounding, as a share of what the variances allow.
+const ASYMMETRY: f64 = 1e-3;
+
 /// Maximum variance of a coordinate: beyond it, odometry says nothing.
 const MAX_VARIANCE: f64 = 1e12;
 
@@ -77,6 +80,22 @@ impl Odometry {
                 )));
             }
         };
+        if covariance.len() == 9 {
+            let is_pair = |row: usize, column: usize| {
+                let (one, other) = (covariance[3 * row + column], covariance[3 * column + row]);
+                let most = (covariance[4 * row] * covariance[4 * column]).sqrt();
+                (one - other).abs() <= ASYMMETRY * most && one.abs() <= most * (1.0 + ASYMMETRY)
+            };
+            let diagonal = variances.into_iter().flatten();
+            let is_sound =
+                diagonal.clone().all(|variance| (0.0..=MAX_VARIANCE).contains(&variance));
+            if is_sound && !(is_pair(0, 1) && is_pair(0, 2) && is_pair(1, 2)) {
+                return Err(ServiceError::unprocessable(
+                    "the covariance of dx, dy and dyaw must be symmetric, and no covariance may exceed what the \
+                     variances allow; send the 3 numbers of its diagonal if the others are not known",
+                ));
+            }
+        }
         if let Some(wrong) =
             variances.and_then(|all| all.into_iter().find(|v| !(0.0..=MAX_VARIANCE).contains(v)))
         {

@@ -95,7 +95,7 @@ fn a_town_is_evaluated_and_reported_as_json_csv_and_html() {
     folders.write("queries/@1.0@90000.0@<b>@.jpg", frame(13, 0));
     let summary = folders.eval(&["--out", "out"]);
     assert_eq!((&summary["queries"], &summary["skipped"]), (&12.into(), &1.into()));
-    assert_eq!(names(&summary), ["gem", "gem+local"]);
+    assert_eq!(names(&summary), ["vlad", "vlad+local"]);
     let [before, after] = recalls(&summary)[..] else { panic!("{summary}") };
     assert!(after[0] >= before[0] && after[0] >= 75.0, "{summary}");
     assert!(before[0] <= before[1] && before[1] <= before[2], "{summary}");
@@ -107,7 +107,8 @@ fn a_town_is_evaluated_and_reported_as_json_csv_and_html() {
     let csv = std::fs::read_to_string(folders.path("out/predictions.csv")).unwrap();
     // 13 queries, two methods, a line for each reference, and a header.
     assert_eq!(csv.lines().count(), 1 + 13 * 2 * 12);
-    let first = csv.lines().filter(|line| line.contains(",gem+local,1,") && line.contains(",yes,"));
+    let first =
+        csv.lines().filter(|line| line.contains(",vlad+local,1,") && line.contains(",yes,"));
     let share = 100.0 * first.count() as f64 / 12.0;
     assert!((share - after[0]).abs() < 1e-9, "the CSV says {share}");
 
@@ -126,7 +127,7 @@ fn a_sample_has_the_requested_size() {
     let folders = Folders::town(6);
     let summary = folders.eval(&["--sample", "4", "--seed", "3", "--refine", "off"]);
     assert_eq!(summary["queries"], 4);
-    assert_eq!(names(&summary), ["gem"]);
+    assert_eq!(names(&summary), ["vlad"]);
 }
 
 #[test]
@@ -204,7 +205,7 @@ async fn a_killed_run_is_resumed_and_pays_for_no_description_twice() {
     kill_when(child, || mock.reason_calls() >= 2).await;
 
     let summary = folders.eval(&args);
-    assert_eq!(names(&summary), ["gem", "gem+local", "gem+mllm"]);
+    assert_eq!(names(&summary), ["vlad", "vlad+local", "vlad+mllm"]);
     assert_eq!(mock.pairs().len(), 6 * 4);
     // Only pairs that were in flight at the kill are described again.
     assert!(mock.asked_again() <= 8, "{}", mock.asked_again());
@@ -235,9 +236,9 @@ async fn the_work_of_the_fallback_is_not_printed_as_the_models_and_the_exit_code
     let output = folders.command(&args).output().unwrap();
     let error = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{error}");
-    assert!(error.contains("4 of 4 queries were not fully refined by gem+mllm"), "{error}");
+    assert!(error.contains("4 of 4 queries were not fully refined by vlad+mllm"), "{error}");
     let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
-    assert_eq!(names(&summary), ["gem", "gem+local", "gem+mllm"]);
+    assert_eq!(names(&summary), ["vlad", "vlad+local", "vlad+mllm"]);
     let methods = &summary["methods"];
     assert_eq!(methods[2]["recall"], methods[0]["recall"]);
     assert_eq!(methods[2]["degraded"], 4);
