@@ -264,6 +264,9 @@ async fn an_invalid_track_is_rejected_with_a_hint() {
         ("&track=a&dx=1&dy=0&dyaw=NaN", "dyaw"),
         ("&track=a&dx=1&dy=0&dyaw=0&covariance=1,2", "9"),
         ("&track=a&dx=1&dy=0&dyaw=0&covariance=1,2,x", "number"),
+        ("&track=a&dx=1&dy=0&dyaw=0&covariance=1,nan,0,nan,1,0,0,0,1", "symmetric"),
+        ("&track=a&dx=1&dy=0&dyaw=0&covariance=1,0.5,0,0.1,1,0,0,0,1", "symmetric"),
+        ("&track=a&dx=1&dy=0&dyaw=0&covariance=1,5,0,5,1,0,0,0,1", "variances"),
         ("&captured_at=2026-01-01T00:00:00Z", "track"),
     ] {
         let problem = ask(query).await.problem(422);
