@@ -37,7 +37,8 @@ pub use dataset::{Dataset, EvaluatedQuery, Folders, LeftOut, QueryKind, Sampling
 pub use folder::{Folder, PictureFile, SkippedFile};
 pub use outcome::{AlternativeConfidence, MethodOutcomes, Prediction, QueryOutcome, StageTimes};
 pub use poses::{
-    FolderPoses, FoundPose, LooseRow, MatchKind, PoseSource, RowAccount, UnmatchedRow, zone_in_name,
+    FolderPoses, FoundPose, LooseRow, MatchKind, PoseSource, RowAccount, UNUSED_DESCRIPTION,
+    UnmatchedRow, zone_in_name,
 };
 pub use run::{Evaluator, Method, Observer, RunSettings};
 pub use summary::{KnownAlternatives, MethodSummary, RunConditions, Summary};

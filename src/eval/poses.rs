@@ -21,6 +21,7 @@ pub use self::account::{LooseRow, RowAccount, UnmatchedRow};
 pub use self::matching::MatchKind;
 use self::place::{Grid, Place};
 use self::rows::PoseRows;
+pub use self::sidecar::UNUSED_DESCRIPTION;
 use super::Folder;
 use whereabouts_core::{CoordinateFrame, ImageId, Pose, UtmZone};
 use whereabouts_vision::exif;

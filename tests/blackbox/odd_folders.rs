@@ -284,6 +284,17 @@ async fn an_image_that_has_a_pose_in_the_map_is_not_counted_without() {
 }
 
 #[tokio::test]
+async fn a_description_that_cannot_be_read_is_named_and_the_exit_code_tells() {
+    let (server, map) = shared_server();
+    let dir = folder(&["a.jpg", "b.jpg"]);
+    write(&dir, "a.jpg.json", r#"{"pose": {"lat": 45.0"#);
+    let (report, code) = indexed(server, &dir, &map, &[]);
+    assert_eq!((counts(&report)[0], code), (2, 1), "{report}");
+    let warnings = report["account"][0]["warnings"].to_string();
+    assert!(warnings.contains("description next to it is not used"), "{report}");
+}
+
+#[tokio::test]
 async fn a_description_without_its_picture_is_named() {
     let (server, map) = shared_server();
     let folder = folder(&["a.jpg"]);

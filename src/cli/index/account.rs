@@ -5,7 +5,7 @@ use serde::Serialize;
 use anyhow::bail;
 use whereabouts_core::{ImageField, ImageId, MapName};
 use whereabouts_eval::account::{bounded, skipped_lines, warning_lines};
-use whereabouts_eval::{PoseSource, RowAccount, SkippedFile};
+use whereabouts_eval::{PoseSource, RowAccount, SkippedFile, UNUSED_DESCRIPTION};
 
 /// Most names in one line, and lines of one kind, for people; JSON has all of them.
 const MOST: usize = 20;
@@ -150,6 +150,16 @@ impl IndexReport {
                 "{} of {} images were not added; repair or remove them, then run the same command again",
                 self.failed.len() + lost,
                 self.images + lost
+            );
+        }
+        let is_unused = |warning: &String| warning.starts_with(UNUSED_DESCRIPTION);
+        let undescribed =
+            self.account.iter().filter(|entry| entry.warnings.iter().any(is_unused)).count();
+        if undescribed > 0 {
+            bail!(
+                "the descriptions next to {undescribed} of {} images were not used; repair or remove them, then run \
+                 the same command again",
+                self.images
             );
         }
         Ok(())

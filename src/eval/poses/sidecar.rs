@@ -9,6 +9,9 @@ use whereabouts_api::ImageMeta;
 /// Largest description in bytes, as in a bulk upload.
 const MAX_BYTES: u64 = 64 << 10;
 
+/// How the warning begins that the file next to an image cannot be used: whatever pose it has is lost.
+pub const UNUSED_DESCRIPTION: &str = "the description next to it is not used";
+
 /// Reads what the file next to an image says. One that cannot be used is a warning.
 pub(super) fn read(picture: &Path) -> KnownImage {
     let mut name = picture.as_os_str().to_owned();
@@ -21,7 +24,7 @@ pub(super) fn read(picture: &Path) -> KnownImage {
     match described(&file, metadata.len()) {
         Ok(image) => image,
         Err(why) => KnownImage {
-            warnings: vec![format!("the description next to it is not used: {why}")],
+            warnings: vec![format!("{UNUSED_DESCRIPTION}: {why}")],
             ..KnownImage::default()
         },
     }
