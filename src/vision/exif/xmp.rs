@@ -153,7 +153,7 @@ impl<'a> Packet<'a> {
             .number(Vocabulary::Drone, YAW)
             .or_else(|| self.number(Vocabulary::Camera, &["Yaw"]))
             .or_else(|| self.number(Vocabulary::Panorama, &["PoseHeadingDegrees"]))?;
-        (-360.0..=360.0).contains(&yaw).then(|| if yaw < 0.0 { yaw + 360.0 } else { yaw })
+        (-360.0..=360.0).contains(&yaw).then_some(if yaw < 0.0 { yaw + 360.0 } else { yaw })
     }
 }
 
