@@ -53,11 +53,7 @@ impl Refiner for RefinerSet {
             "refined by `{}` instead of `{wanted}`, which this server no longer has (refine.allowed)",
             stand_in.kind()
         );
-        let degraded = Some(match refinement.degraded {
-            Some(also) => format!("{why}; {also}"),
-            None => why,
-        });
-        Ok(Refinement { ordered_by: Some(stand_in.kind()), degraded, ..refinement })
+        Ok(refinement.stands_in(stand_in.kind(), why))
     }
 
     fn wants_descriptor(&self) -> bool {

@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 use uuid::Uuid;
 use whereabouts_core::{Candidate, Descriptor, Digest, Map, Priority, RefinerKind, Usage};
-use whereabouts_store::{JobRecord, MapStore};
+use whereabouts_store::{HardNegatives, JobRecord, MapStore};
 
 use super::RefineError;
 
@@ -66,6 +66,27 @@ impl RefineInput {
             spent: record.job.usage,
             fresh_since: record.job.fresh_since,
         })
+    }
+    /// Returns the input that has an image of the map compared with images of other places, as if it were a frame;
+    /// `None` if the image is no longer in the map.
+    pub async fn of_negatives(
+        map: &Map,
+        negatives: &HardNegatives,
+        maps: &dyn MapStore,
+    ) -> Result<Option<Self>, RefineError> {
+        let image = maps.image(map, &negatives.image_id).await?;
+        let id = Uuid::now_v7();
+        Ok(image.map(|image| Self {
+            id,
+            map: map.clone(),
+            refiner: None,
+            frame: QueryFrame { query_id: id, digest: image.digest, descriptor: None },
+            candidates: negatives.others.clone(),
+            priority: Priority::Low,
+            attempts_left: 0,
+            spent: Usage::default(),
+            fresh_since: None,
+        }))
     }
 }
 

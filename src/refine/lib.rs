@@ -40,7 +40,7 @@ pub use registry::{BuildError, REFINERS, RefinerContext, RefinerEntry, RefinerSe
 pub use store_retry::retry_for;
 pub use worker::Worker;
 
-pub(crate) use refiner::milliseconds;
+pub(crate) use refiner::{Unwatched, milliseconds};
 
 /// Moving average of the time that jobs take.
 pub type JobServiceTime = Arc<Mutex<ServiceTime>>;

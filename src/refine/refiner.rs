@@ -134,6 +134,14 @@ pub trait Progress: Send + Sync {
     fn waiting(&self, _waits: bool) {}
 }
 
+/// Watches a refinement whose steps are not kept, as that of a measurement.
+pub(crate) struct Unwatched;
+
+#[async_trait]
+impl Progress for Unwatched {
+    async fn step(&self, _: Step) {}
+}
+
 /// The result of a refinement.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Refinement {
@@ -181,6 +189,15 @@ pub enum RefineError {
 }
 
 impl Refinement {
+    /// Marks the refinement as that of a refiner that stood in for another.
+    pub(crate) fn stands_in(self, by: RefinerKind, why: String) -> Self {
+        let degraded = Some(match self.degraded {
+            Some(also) => format!("{why}; {also}"),
+            None => why,
+        });
+        Self { ordered_by: Some(by), degraded, ..self }
+    }
+
     /// Returns why the place of the frame cannot be known, if the refinement says so.
     pub fn why_unknown(&self) -> Option<&'static str> {
         (self.evidence == Some(Evidence::NONE_OF_THESE))

@@ -13,10 +13,9 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use parking_lot::Mutex;
-use uuid::Uuid;
 use whereabouts_core::{
-    Agreement, Calibration, Description, Evidence, ImageId, JobVerdict, Map, Priority, Ranking,
-    RefinerKind, Usage,
+    Agreement, Calibration, Description, Evidence, ImageId, JobVerdict, Map, Ranking, RefinerKind,
+    Usage,
 };
 use whereabouts_store::{HardNegatives, MapStore, Step};
 
@@ -25,8 +24,8 @@ pub use question::CascadeSettings;
 use self::question::{LocalFinding, Question, question};
 use crate::mllm::MllmRefiner;
 use crate::{
-    BuildError, NegativeEvidence, PaidCalls, PaidMeasurement, PaidNegatives, Progress, QueryFrame,
-    RefineError, RefineInput, Refinement, Refiner, RefinerContext, RefinerSettings, RegionMatcher,
+    BuildError, NegativeEvidence, PaidCalls, PaidMeasurement, PaidNegatives, Progress, RefineError,
+    RefineInput, Refinement, Refiner, RefinerContext, RefinerSettings, RegionMatcher, Unwatched,
     local, mllm,
 };
 
@@ -263,19 +262,8 @@ impl PaidNegatives for CascadeRefiner {
         map: &Map,
         negatives: &HardNegatives,
     ) -> Result<Option<Evidence>, RefineError> {
-        let Some(image) = self.maps.image(map, &negatives.image_id).await? else { return Ok(None) };
-        let id = Uuid::now_v7();
-        let input = RefineInput {
-            id,
-            map: map.clone(),
-            refiner: None,
-            frame: QueryFrame { query_id: id, digest: image.digest, descriptor: None },
-            candidates: negatives.others.clone(),
-            priority: Priority::Low,
-            attempts_left: 0,
-            spent: Usage::default(),
-            fresh_since: None,
-        };
+        let input = RefineInput::of_negatives(map, negatives, self.maps.as_ref()).await?;
+        let Some(input) = input else { return Ok(None) };
         let (first, question) = self.first(&input, &Unwatched).await?;
         let agreement = first.agreement.clone();
         let candidates = match question {
@@ -306,14 +294,6 @@ impl Progress for Counted<'_> {
     fn waiting(&self, waits: bool) {
         self.progress.waiting(waits);
     }
-}
-
-/// Nobody watches a measurement.
-struct Unwatched;
-
-#[async_trait]
-impl Progress for Unwatched {
-    async fn step(&self, _: Step) {}
 }
 
 /// Returns one description for each candidate, in coarse order: that of the model where there is one.

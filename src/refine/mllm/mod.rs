@@ -236,16 +236,9 @@ impl MllmRefiner {
     ) -> Result<Refinement, RefineError> {
         run.progress.waiting(false);
         let refinement = fallback.refine(run.input, run.progress).await?;
-        let degraded = format!("refined by `{}` instead of `mllm`: {why}", fallback.kind());
-        Ok(Refinement {
-            usage: run.usage() + refinement.usage,
-            ordered_by: Some(fallback.kind()),
-            degraded: Some(match refinement.degraded {
-                Some(also) => format!("{degraded}; {also}"),
-                None => degraded,
-            }),
-            ..refinement
-        })
+        let why = format!("refined by `{}` instead of `mllm`: {why}", fallback.kind());
+        let usage = run.usage() + refinement.usage;
+        Ok(Refinement { usage, ..refinement.stands_in(fallback.kind(), why) })
     }
 
     /// Refines a job of which no pair was described.

@@ -1,14 +1,11 @@
 //! The model's verdicts on images of other places, from which its certainty is calibrated.
 
 use async_trait::async_trait;
-use uuid::Uuid;
-use whereabouts_core::{Evidence, Map, Priority, Usage};
-use whereabouts_store::{HardNegatives, Step};
+use whereabouts_core::{Evidence, Map};
+use whereabouts_store::HardNegatives;
 
 use super::MllmRefiner;
-use crate::{
-    PaidMeasurement, PaidNegatives, Progress, QueryFrame, RefineError, RefineInput, Refiner,
-};
+use crate::{PaidMeasurement, PaidNegatives, RefineError, RefineInput, Refiner, Unwatched};
 
 /// Estimated tokens of a describe call, for a picture of 640×480: the prompt, two pictures, and the answer.
 const DESCRIBE_TOKENS: (u64, u64) = (1400, 400);
@@ -37,19 +34,8 @@ impl PaidNegatives for MllmRefiner {
         map: &Map,
         negatives: &HardNegatives,
     ) -> Result<Option<Evidence>, RefineError> {
-        let Some(image) = self.maps.image(map, &negatives.image_id).await? else { return Ok(None) };
-        let id = Uuid::now_v7();
-        let input = RefineInput {
-            id,
-            map: map.clone(),
-            refiner: None,
-            frame: QueryFrame { query_id: id, digest: image.digest, descriptor: None },
-            candidates: negatives.others.clone(),
-            priority: Priority::Low,
-            attempts_left: 0,
-            spent: Usage::default(),
-            fresh_since: None,
-        };
+        let input = RefineInput::of_negatives(map, negatives, self.maps.as_ref()).await?;
+        let Some(input) = input else { return Ok(None) };
         let refinement = self.refine(&input, &Unwatched).await?;
         // The order of another refiner, or of a part of the pairs, is no verdict of the model.
         let is_verdict = refinement.ordered_by.is_none() && refinement.degraded.is_none();
@@ -57,12 +43,4 @@ impl PaidNegatives for MllmRefiner {
         // Whichever image it is certain of: the worst that its certainty can do is to be that of the best match.
         Ok(agreement.and_then(|agreement| agreement.strongest_verdict(refinement.certainty)))
     }
-}
-
-/// Nobody watches a measurement.
-struct Unwatched;
-
-#[async_trait]
-impl Progress for Unwatched {
-    async fn step(&self, _: Step) {}
 }
