@@ -99,7 +99,7 @@ impl Draft for EmbeddedDraft {
                 },
                 move |stored| {
                     if let Some(stored) = stored {
-                        publishing.publish(stored);
+                        publishing.publish(stored.into());
                     }
                 },
             )

@@ -7,9 +7,9 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use super::super::{HardNegatives, LocatedImage, StoreError};
 use super::blobs::replace_durably;
 use super::segments::VectorFiles;
-use super::trees::{StoredImage, Trees};
+use super::trees::{LocatedId, SearchedImage, StoredImage, Trees};
 use parking_lot::RwLock;
-use whereabouts_core::{Calibration, CalibrationSettings, Candidate, ImageId, Map, Pose};
+use whereabouts_core::{Calibration, CalibrationSettings, Candidate, Map, Pose};
 use whereabouts_index::{IndexSettings, MapIndex, ScoredSlot, SealedGraph, SearchMode, Vectors};
 
 pub(super) struct LiveMap {
@@ -20,19 +20,14 @@ pub(super) struct LiveMap {
     pub calibration: StoredCalibration,
     /// Where the sealed graph is stored, so that a restart need not rebuild it.
     graph_file: PathBuf,
-    entries: RwLock<Vec<Option<Entry>>>,
+    /// By slot, kept in memory so that a search reads no records.
+    entries: RwLock<Vec<Option<LocatedId>>>,
     /// The slot of the next image. Only the writer thread changes it.
     next_slot: AtomicUsize,
     /// Number of additions, removals and changed poses since the map was loaded.
     changes: AtomicU64,
     /// How often poses were changed since the map was created.
     moved: AtomicU64,
-}
-
-/// The fields of an image that a candidate needs, kept in memory so that a search reads no records.
-struct Entry {
-    id: ImageId,
-    pose: Option<Pose>,
 }
 
 impl LiveMap {
@@ -45,22 +40,36 @@ impl LiveMap {
     ) -> Result<Self, StoreError> {
         let uid = map.uid;
         let live = Self::open(map, descriptors, index)?;
-        live.restore_graph(index);
         live.moved.store(trees.moved(uid)?, Ordering::Relaxed);
-        for stored in trees.images_of(uid) {
-            let stored = stored?;
-            live.next_slot.fetch_max(stored.slot + 1, Ordering::Relaxed);
-            if live.vectors.is_intact(stored.slot) {
-                live.publish(&stored);
+        // Each takes seconds for a million images.
+        std::thread::scope(|scope| {
+            let graph = scope.spawn(|| live.restore_graph(index));
+            let images = live.restore_images(trees);
+            if graph.join().is_err() {
+                tracing::error!(map = %live.map().name, "the graph was not read; rebuilding it");
+            }
+            images
+        })?;
+        Ok(live)
+    }
+
+    /// Makes the stored images visible to searches.
+    fn restore_images(&self, trees: &Trees) -> Result<(), StoreError> {
+        let map = self.map();
+        for searched in trees.searched_images_of(map.uid) {
+            let searched = searched?;
+            self.next_slot.fetch_max(searched.slot + 1, Ordering::Relaxed);
+            if self.vectors.is_intact(searched.slot) {
+                self.publish(searched);
             } else {
                 tracing::error!(
-                    map = %live.map().name, image = %stored.image.id,
+                    map = %map.name, image = %searched.image.id,
                     "its descriptor is damaged, so searches do not find it; delete the image and add it \
                      again"
                 );
             }
         }
-        Ok(live)
+        Ok(())
     }
 
     /// Opens a map's descriptors, without any images yet.
@@ -142,15 +151,15 @@ impl LiveMap {
     }
 
     /// Makes a stored image visible to searches.
-    pub fn publish(&self, stored: &StoredImage) {
+    pub fn publish(&self, SearchedImage { image, slot }: SearchedImage) {
         let mut entries = self.entries.write();
-        if entries.len() <= stored.slot {
-            entries.resize_with(stored.slot + 1, || None);
+        if entries.len() <= slot {
+            entries.resize_with(slot + 1, || None);
         }
-        entries[stored.slot] = Some(Entry { id: stored.image.id.clone(), pose: stored.image.pose });
+        entries[slot] = Some(image);
         drop(entries);
         self.changes.fetch_add(1, Ordering::Relaxed);
-        self.index.add(stored.slot);
+        self.index.add(slot);
     }
 
     /// Makes the changed pose of an image visible to searches.
@@ -193,7 +202,7 @@ impl LiveMap {
     /// Returns the images that have a pose, in insertion order.
     pub fn positions(&self) -> Vec<LocatedImage> {
         let entries = self.entries.read();
-        let located = |(slot, entry): (usize, &Option<Entry>)| {
+        let located = |(slot, entry): (usize, &Option<LocatedId>)| {
             let entry = entry.as_ref()?;
             Some(LocatedImage { slot, id: entry.id.clone(), pose: entry.pose? })
         };

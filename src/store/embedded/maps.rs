@@ -177,7 +177,7 @@ impl MapStore for EmbeddedStore {
                 },
                 move |(stored, new)| {
                     if *new {
-                        publishing.publish(stored);
+                        publishing.publish(stored.into());
                         inner.indexer.notify(&publishing);
                     }
                 },

@@ -5,13 +5,14 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
+use serde::de::DeserializeOwned;
 use uuid::Uuid;
 
 use super::super::changes::queue_rank;
 use super::super::{JobRecord, StoreError};
 pub(super) use super::records::{decode, encode, failed, get, put, transaction_failed};
 use super::webhooks::trees::WebhookTrees;
-use whereabouts_core::{Digest, Image, ImageId, Job, JobState, Map};
+use whereabouts_core::{Digest, Image, ImageId, Job, JobState, Map, Pose};
 
 /// The sled trees. Clones share the same database.
 #[derive(Clone)]
@@ -78,6 +79,27 @@ fn open_when_released(config: &sled::Config) -> sled::Result<sled::Db> {
 pub(super) struct StoredImage {
     pub image: Image,
     pub slot: usize,
+}
+
+/// What searches need of a [`StoredImage`]; its other fields take longer to read.
+#[derive(Debug, serde::Deserialize)]
+pub(super) struct SearchedImage {
+    pub image: LocatedId,
+    pub slot: usize,
+}
+
+/// The id of an image and where it was taken.
+#[derive(Debug, Clone, serde::Deserialize)]
+pub(super) struct LocatedId {
+    pub id: ImageId,
+    pub pose: Option<Pose>,
+}
+
+impl From<&StoredImage> for SearchedImage {
+    fn from(stored: &StoredImage) -> Self {
+        let Image { id, pose, .. } = &stored.image;
+        Self { image: LocatedId { id: id.clone(), pose: *pose }, slot: stored.slot }
+    }
 }
 
 /// The moment before which a job cannot be claimed, because a worker holds it or its retry is delayed.
@@ -160,6 +182,21 @@ impl Trees {
         &self,
         map_uid: Uuid,
     ) -> impl Iterator<Item = Result<StoredImage, StoreError>> + use<> {
+        self.image_records(map_uid)
+    }
+
+    /// Iterates over the images of a map as searches need them, by id.
+    pub fn searched_images_of(
+        &self,
+        map_uid: Uuid,
+    ) -> impl Iterator<Item = Result<SearchedImage, StoreError>> + use<> {
+        self.image_records(map_uid)
+    }
+
+    fn image_records<T: DeserializeOwned>(
+        &self,
+        map_uid: Uuid,
+    ) -> impl Iterator<Item = Result<T, StoreError>> + use<T> {
         self.images
             .scan_prefix(map_uid.as_bytes())
             .values()
