@@ -108,6 +108,7 @@ impl RegionMatcher for LocalRefiner {
     }
 
     async fn agreement(&self, input: &RefineInput) -> Result<Agreement, RefineError> {
+        let _turn = self.turns.acquire().await;
         let Comparison { present, pairs, .. } = self.compare_input(input).await?;
         Ok(agreement_of_all(input.candidates.len(), &present, &pairs))
     }

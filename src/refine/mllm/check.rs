@@ -96,11 +96,15 @@ pub(super) fn in_background(
     reasoner.check_begins();
     tokio::spawn(async move {
         let checking = check_clients(&describer, &reasoner, &settings);
-        // A server that is slow to begin with is found out by the first jobs.
         let checked = tokio::time::timeout(settings.timeout(), checking).await;
+        let checked = checked.unwrap_or_else(|_| {
+            describer.stays_unchecked();
+            reasoner.stays_unchecked();
+            Vec::new()
+        });
         describer.checked();
         reasoner.checked();
-        for CheckedServer { used_for, findings, server } in checked.unwrap_or_default() {
+        for CheckedServer { used_for, findings, server } in checked {
             for Finding { what, detail, .. } in findings.iter().filter(|finding| !finding.ok) {
                 tracing::warn!(
                     server = server.url,
@@ -408,8 +412,9 @@ impl<'a> Check<'a> {
 
     async fn ended(&mut self, what: &'static str, failure: &Failure) -> Result<(), Ended> {
         self.client.note(failure);
-        if failure.kind.stops_all() {
-            self.client.suspend().await;
+        match failure.kind.stops_all() {
+            true => self.client.suspend().await,
+            false => self.client.stays_unchecked(),
         }
         self.found(what, false, failure.why.clone());
         Err(Ended)

@@ -94,6 +94,8 @@ pub struct MllmClient {
     /// Whether so much was left out of a request that the server is to be checked again; once is enough.
     pub(super) wants_check: AtomicBool,
     checked_again: AtomicBool,
+    /// Whether the last check got no answer, so that it is not known what the server can do.
+    is_unchecked: AtomicBool,
     /// Whether calls wait until the server has been checked.
     checking: watch::Sender<bool>,
 }
@@ -152,6 +154,7 @@ impl MllmClient {
             tried_plain: AtomicBool::new(false),
             wants_check: AtomicBool::new(false),
             checked_again: AtomicBool::new(false),
+            is_unchecked: AtomicBool::new(false),
             checking: watch::Sender::new(false),
         })
     }
@@ -203,10 +206,17 @@ impl MllmClient {
         &self.gate
     }
 
-    /// Whether to check the server again, to find out what of all that was left out it does not support.
+    /// Whether to check the server again: to find out what of all that was left out it does not support, or because it
+    /// did not answer the last check. Not while calls are suspended.
     pub(super) fn take_wants_check(&self) -> bool {
-        self.wants_check.swap(false, Ordering::Relaxed)
-            && !self.checked_again.swap(true, Ordering::Relaxed)
+        let left_out = self.wants_check.swap(false, Ordering::Relaxed)
+            && !self.checked_again.swap(true, Ordering::Relaxed);
+        left_out || (!self.is_suspended() && self.is_unchecked.swap(false, Ordering::Relaxed))
+    }
+
+    /// Has the server checked again with the next job, because it did not answer.
+    pub(super) fn stays_unchecked(&self) {
+        self.is_unchecked.store(true, Ordering::Relaxed);
     }
 
     /// Suspends calls, because the server was found to refuse all.

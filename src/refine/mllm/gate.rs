@@ -73,6 +73,9 @@ pub(super) struct GateLevels {
 const LONGEST_PAUSE: Duration = Duration::from_secs(20);
 const MOST_DOUBLINGS: u32 = 8;
 
+/// One call in this many is kept ready beside those in progress: calls that were sent together often end together.
+const AHEAD: usize = 2;
+
 /// A call that takes this many times as long as usual seems to hang.
 const LATE: u32 = 4;
 
@@ -114,7 +117,7 @@ impl CallGate {
         (0..calls).map(|_| WantedCall(Arc::clone(self))).collect()
     }
 
-    /// Whether the calls that are wanted do not keep all permits busy.
+    /// Whether another job is needed to keep all permits busy.
     pub fn has_room(&self) -> bool {
         *self.room.borrow()
     }
@@ -144,7 +147,7 @@ impl CallGate {
         let mut state = self.state();
         let changed = change(&mut state);
         state.admit();
-        let has_room = state.wanted <= (state.limit.get() + state.late).min(state.limit.bound());
+        let has_room = state.has_room();
         self.room.send_if_modified(|room| std::mem::replace(room, has_room) != has_room);
         changed
     }
@@ -181,6 +184,13 @@ impl State {
             // If the waiter has just left, it returns the permit itself.
             let _ = turn.send(());
         }
+    }
+
+    /// Whether the calls that are wanted do not suffice to keep all permits busy while another job is claimed and its
+    /// pictures are prepared.
+    fn has_room(&self) -> bool {
+        let permits = (self.limit.get() + self.late).min(self.limit.bound());
+        self.wanted <= permits + permits / AHEAD
     }
 
     fn is_full(&self) -> bool {

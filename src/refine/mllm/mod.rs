@@ -333,18 +333,16 @@ impl MllmRefiner {
         let pairs = self.pairs(input).await?;
         let pairs = self.describe_all(&run, &pairs).await;
         self.judge_describer(&pairs);
-        let order = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
-            ([], None) => Order::Nothing,
+        let described = match (pairs.described.as_slice(), conclude::most_serious(&pairs.failed)) {
+            ([], None) => return conclude::conclude(&run, &pairs, Order::Nothing, None),
             ([], Some(why)) => return self.without_descriptions(fallback, &run, &why).await,
-            (described, _) => self.order(fallback, &run, described).await?,
+            (described, _) => described,
         };
-        let agreement = match &order {
-            Order::Model(_) => {
-                run.progress.waiting(false);
-                self.agreement(fallback, input).await
-            }
-            _ => None,
-        };
+        // This machine has nothing to do for the job while the model ranks.
+        let agreement = async { Ok(self.agreement(fallback, input).await) };
+        let (order, agreement) =
+            futures_util::try_join!(self.order(fallback, &run, described), agreement)?;
+        let agreement = agreement.filter(|_| matches!(order, Order::Model(_)));
         conclude::conclude(&run, &pairs, order, agreement.as_ref())
     }
 

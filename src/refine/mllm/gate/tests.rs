@@ -264,14 +264,16 @@ async fn after_a_refusal_of_the_only_call_all_wait_as_long_as_the_server_asks() 
 }
 
 #[tokio::test(start_paused = true)]
-async fn there_is_room_for_a_job_while_the_wanted_calls_do_not_keep_all_permits_busy() {
+async fn there_is_room_for_a_job_until_half_as_many_calls_wait_as_are_in_progress() {
     let gate = CallGate::new(3, SECOND);
     assert!(gate.has_room());
     let mut wanted = gate.want(10);
     assert!(!gate.has_room());
     let mut room = std::pin::pin!(gate.room());
     assert!(poll!(&mut room).is_pending());
-    wanted.truncate(3);
+    wanted.truncate(5);
+    assert!(poll!(&mut room).is_pending());
+    wanted.truncate(4);
     room.await;
     gate.adjust(|limit| limit.start_from(1));
     assert!(!gate.has_room());

@@ -1,6 +1,8 @@
 //! What a check finds out about servers that can do less than others.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::Duration;
 
 use serde_json::{Value, json};
 use whereabouts_testkit::mock_mllm::{MockMllm, Purpose, RawCall};
@@ -97,6 +99,40 @@ async fn a_server_that_takes_one_picture_gets_both_side_by_side_in_one() {
     assert_eq!(bench.mock.arrived(Purpose::Describe), 4);
     let [server] = bench.refiner.servers().try_into().unwrap();
     assert_eq!((server.capabilities.two_pictures, server.suspended), (Some(false), false));
+}
+
+/// A gateway whose model is still loading, as it is where both start together.
+#[tokio::test]
+async fn a_server_that_did_not_answer_its_check_is_checked_with_a_later_job() {
+    let is_loading = Arc::new(AtomicBool::new(true));
+    let loading = Arc::clone(&is_loading);
+    let script = Script {
+        intercept: Box::new(move |call| match (call.purpose, pictures(call.body)) {
+            _ if loading.load(Ordering::Relaxed) => Some(refusal(502, "the model is loading")),
+            (_, 2) => Some(refusal(400, "At most 1 image(s) may be provided in one request.")),
+            (Purpose::Describe, 1) => Some(Reply::Said(notes("walls"))),
+            _ => None,
+        }),
+        ..Script::default()
+    };
+    let bench = Bench::with(script, |settings| settings.breaker_open_s = 1).await;
+    bench.refiner.check_in_background();
+    let first = bench.refine(4).await;
+    assert!(first.is_err() || first.is_ok_and(|refinement| refinement.degraded.is_some()));
+    is_loading.store(false, Ordering::Relaxed);
+    let described = async {
+        loop {
+            match bench.refine(4).await {
+                Ok(refinement) if refinement.degraded.is_none() => break refinement.descriptions,
+                // The breaker is open until its time is over.
+                _ => tokio::task::yield_now().await,
+            }
+        }
+    };
+    let described = tokio::time::timeout(Duration::from_secs(20), described).await.unwrap();
+    assert_eq!(described.len(), 4);
+    let [server] = bench.refiner.servers().try_into().unwrap();
+    assert_eq!(server.capabilities.two_pictures, Some(false));
 }
 
 #[tokio::test]
