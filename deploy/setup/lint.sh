@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs the tools of `make lint` into a folder, pinned by version: typos (a wheel from PyPI) and cargo-deny (compiled
-# once, which takes about two minutes on two cores). Does nothing if these versions are there already.
+# once, without optimisation, because it runs for a second). Does nothing if these versions are there already.
 #
 #     lint.sh FOLDER
 set -euo pipefail
@@ -18,5 +18,5 @@ if [ "$("$tools/bin/typos" --version 2> /dev/null)" != "typos-cli $typos" ]; the
     "$tools/bin/pip" install --quiet --disable-pip-version-check --only-binary=:all: "typos==$typos"
 fi
 if [ "$("$tools/bin/cargo-deny" --version 2> /dev/null)" != "cargo-deny $deny" ]; then
-    "${CARGO:-cargo}" install --quiet --locked --root "$tools" --version "$deny" cargo-deny
+    "${CARGO:-cargo}" install --quiet --locked --debug --root "$tools" --version "$deny" cargo-deny
 fi
