@@ -1,5 +1,8 @@
 //! The command line: one module for each command. Client commands talk to a server.
 
+#[macro_use]
+mod output;
+
 mod backup;
 mod client;
 mod config;

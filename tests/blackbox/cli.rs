@@ -221,3 +221,18 @@ async fn the_commands_take_the_key_from_the_environment() {
         assert!(!ok && said.contains("leave --data out"), "{said}");
     }
 }
+
+#[test]
+fn a_reader_that_leaves_ends_a_command_quietly_and_a_full_disk_with_a_message() {
+    for command in [&["openapi"][..], &["model", "list"], &["model", "list", "--json"], &["--help"]]
+    {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let run = Command::new(&*BINARY).args(command).stdout(writer).output().unwrap();
+        assert_eq!((run.status.code(), error(&run).as_str()), (Some(0), ""), "{command:?}");
+    }
+    let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let run = Command::new(&*BINARY).arg("openapi").stdout(full).output().unwrap();
+    assert_eq!(run.status.code(), Some(1));
+    assert!(error(&run).contains("standard output cannot be written"), "{}", error(&run));
+}
