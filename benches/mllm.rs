@@ -14,6 +14,7 @@
     reason = "it uses what the black-box tests use"
 )]
 
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
@@ -66,7 +67,7 @@ async fn throughput() {
     );
 }
 
-/// The time from the start of a server whose queue is full of jobs to the end of the last of them.
+/// The time from the first call of a server whose queue is full of jobs to the end of the last of them.
 async fn queue_seconds(jobs: usize, in_progress: usize) -> f64 {
     let dir = TempDir::new().unwrap();
     let (at_once, in_progress) = (AT_ONCE.to_string(), in_progress.to_string());
@@ -86,17 +87,26 @@ async fn queue_seconds(jobs: usize, in_progress: usize) -> f64 {
         hrefs.push(answer["job"]["href"].as_str().unwrap().to_owned());
     }
     server.terminate();
-    let mock = one_second().await;
-    let began = Timestamp::now();
+    let first_call = Arc::new(OnceLock::new());
+    let noted = Arc::clone(&first_call);
+    let mock = MockMllm::start(Script {
+        latency: Duration::from_secs(1),
+        delay: Box::new(move |_| {
+            noted.get_or_init(Timestamp::now);
+            Duration::ZERO
+        }),
+        ..Script::default()
+    })
+    .await;
     let server = restart(&dir, &mock, &settings);
-    let mut last = began;
+    let mut last = Timestamp::MIN;
     for href in hrefs {
         let job = ended(&server, &href).await;
         assert_eq!(job["state"], "succeeded", "{job}");
         last = last.max(time(&job["finished_at"]));
     }
     assert_eq!(mock.describe_calls(), jobs * CANDIDATES);
-    last.duration_since(began).as_secs_f64()
+    last.duration_since(*first_call.get().unwrap()).as_secs_f64()
 }
 
 /// Twenty jobs, one every fifth of a second; a pair of the first hangs for a minute.

@@ -241,7 +241,7 @@ impl MapIndex {
         let (beyond, waiting) =
             (live.slots.len().saturating_sub(end), live.slots.len().saturating_sub(graphed));
         let has_grown = live.count > self.settings.exact_up_to
-            && (beyond >= end.max(1) || waiting >= live.slots.len() / FASTER_AS_A_WHOLE);
+            && (beyond >= end.max(1) || waiting > live.slots.len() / FASTER_AS_A_WHOLE);
         let dead = points.saturating_sub(live.sealed_count);
         has_grown || dead as f32 > self.settings.max_dead_share * points as f32
     }

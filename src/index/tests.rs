@@ -136,7 +136,7 @@ fn graphs_are_merged_as_a_map_grows_and_every_image_is_found_meanwhile() {
 
 #[test]
 fn an_image_is_found_before_it_is_in_the_graph() {
-    let rows = clustered(300, 16);
+    let rows = clustered(250, 16);
     let index = MapIndex::new(SETTINGS);
     let found = |slot: usize| index.search(&rows, &rows.0[slot], 1, SearchMode::Fast)[0].slot;
     (0..200).for_each(|slot| index.add(slot));
@@ -145,9 +145,9 @@ fn an_image_is_found_before_it_is_in_the_graph() {
     assert_eq!((index.graphed(), found(7), found(199)), (0, 7, 199));
     caught_up(&index, &rows);
     assert_eq!(index.graphed(), 200);
-    (200..300).for_each(|slot| index.add(slot));
-    index.catch_up(&rows, 50, &threads());
-    assert_eq!((index.graphed(), found(7), found(220), found(299)), (250, 7, 220, 299));
+    (200..250).for_each(|slot| index.add(slot));
+    index.catch_up(&rows, 25, &threads());
+    assert_eq!((index.graphed(), found(7), found(220), found(249)), (225, 7, 220, 249));
 }
 
 /// What robots leave that stand still: pictures that hardly differ, of very many places.
@@ -239,12 +239,18 @@ fn lost(index: &MapIndex, rows: &Rows) -> usize {
     (0..rows.0.len()).filter(|slot| live[*slot]).filter(misses).count()
 }
 
-/// An index of all rows: the first `sealed` of them in the sealed graph, the rest in the growing one.
+/// An index of all rows: the first `sealed` of them in the sealed graph, the rest in the growing one, because they
+/// arrive a few at a time.
 fn grown(rows: &Rows, sealed: usize, settings: IndexSettings) -> MapIndex {
     let index = MapIndex::new(settings);
     (0..sealed).for_each(|slot| index.add(slot));
     caught_up(&index, rows);
-    (sealed..rows.0.len()).for_each(|slot| index.add(slot));
+    for slot in sealed..rows.0.len() {
+        index.add(slot);
+        if slot % 32 == 0 {
+            caught_up(&index, rows);
+        }
+    }
     caught_up(&index, rows);
     index
 }
@@ -281,6 +287,22 @@ fn identical_images_that_arrive_in_the_growing_graph_crowd_no_other_image_out() 
     let index = grown(&rows, 1600, DEFAULTS);
     assert!(index.graphs().growing.is_some(), "the rest is in the growing graph");
     assert_eq!(lost(&index, &rows), 0);
+}
+
+#[test]
+fn many_images_that_arrive_at_once_are_built_into_a_new_graph() {
+    let rows = around(1000, 0.6, 2000, 32);
+    for (at_once, is_whole) in [(400, false), (600, true)] {
+        let (sealed, all) = (1400, 1400 + at_once);
+        let index = MapIndex::new(DEFAULTS);
+        (0..sealed).for_each(|slot| index.add(slot));
+        caught_up(&index, &rows);
+        (sealed..all).for_each(|slot| index.add(slot));
+        caught_up(&index, &rows);
+        let graphs = index.graphs().clone();
+        assert_eq!((graphs.sealed_end() == all, graphs.growing.is_none()), (is_whole, is_whole));
+        assert_eq!(graphs.graphed, all);
+    }
 }
 
 #[test]

@@ -76,7 +76,7 @@ struct Trial {
 
 /// Where the limit starts, unless its bound is lower. What a server bears is not known then; a higher bound is reached
 /// in a few rounds.
-const START: usize = 128;
+const START: usize = 64;
 
 /// Calls whose median is compared.
 const ROUND: usize = 16;

@@ -125,7 +125,7 @@ async fn a_server_that_did_not_answer_its_check_is_checked_with_a_later_job() {
             match bench.refine(4).await {
                 Ok(refinement) if refinement.degraded.is_none() => break refinement.descriptions,
                 // The breaker is open until its time is over.
-                _ => tokio::task::yield_now().await,
+                _ => tokio::time::sleep(Duration::from_millis(50)).await,
             }
         }
     };
