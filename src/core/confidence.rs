@@ -23,17 +23,23 @@ use super::{Candidate, ImageId, Pose};
 /// Number of top candidates among which similarities are compared.
 pub const COMPARED: usize = 10;
 
-/// Share of a frame's regions that match a picture of another place by chance. It bounds the evidence of small counts:
-/// 11 of 1,200 regions against none would otherwise weigh as much as 600 against 50.
+/// Share of a frame's regions that match a picture of another place by chance.
 pub const CHANCE_SHARE: f32 = 0.02;
 
+/// Share of a frame's regions that is added to both counts of a comparison. It bounds the evidence of small counts: 60 of
+/// 1,200 regions against 20, as a test card has, would otherwise weigh as much as 600 against 200. Right answers have a
+/// quarter of the regions or more.
+pub const SUPPORT_SHARE: f32 = 0.08;
+
 /// Evidence that a candidate shows the place of the frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
 pub enum Evidence {
     /// Similarity of the candidate minus the median similarity of the other candidates.
     Similarity(f32),
-    /// ln((a + c) / (m + c)), where a regions of the candidate match the frame, m is the median of that count over
-    /// the other candidates, and c is [`CHANCE_SHARE`] of the regions of the frame.
+    /// ln((a + c) / (m + c)), where a regions of the candidate match the frame, m is the mean of the two largest counts
+    /// among the candidates of other places, and c is [`SUPPORT_SHARE`] of the regions of the frame. See
+    /// [`Agreement::evidence`](crate::Agreement::evidence).
     Agreement(f32),
     /// The evidence of a model's verdict, see [`Agreement::verdict`](crate::Agreement::verdict).
     Verdict(f32),
@@ -59,21 +65,16 @@ impl Evidence {
         let median = median(others.map(|candidate| candidate.similarity).collect())?;
         Some(Self::Similarity(one.similarity - median))
     }
-
-    /// Computes the evidence for the candidate at index `of` from the number of matching regions of every
-    /// candidate, of the `regions` that the frame has. Returns `None` if there is no other candidate.
-    pub fn agreement(matches: &[usize], regions: usize, of: usize) -> Option<Self> {
-        let one = *matches.get(of)?;
-        let others = matches.iter().enumerate().filter(|(index, _)| *index != of);
-        let median = median(others.map(|(_, &count)| count as f32).collect())?;
-        let chance = chance(regions);
-        Some(Self::Agreement(((one as f32 + chance) / (median + chance)).ln()))
-    }
 }
 
 /// How many of that many regions of a frame match a picture of another place by chance.
 pub(super) fn chance(regions: usize) -> f32 {
     (CHANCE_SHARE * regions as f32).max(1.0)
+}
+
+/// How many regions are added to the counts of a comparison.
+pub(super) fn support(regions: usize) -> f32 {
+    (SUPPORT_SHARE * regions as f32).max(1.0)
 }
 
 /// The median; `None` if `values` is empty.
@@ -132,7 +133,7 @@ impl NullDistribution {
 }
 
 /// Null distributions of one map.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// Number of images in the map when it was calibrated.
     pub images: usize,
@@ -157,6 +158,23 @@ pub struct Calibration {
     /// Number of images about which the model was asked for that; 0 if it was not.
     #[serde(default)]
     pub model_asked: usize,
+}
+
+impl Default for Calibration {
+    /// Nothing is measured.
+    fn default() -> Self {
+        Self {
+            images: 0,
+            moved: 0,
+            settings: CalibrationSettings::default(),
+            evidence: Self::EVIDENCE,
+            complete: false,
+            similarity: NullDistribution::default(),
+            agreement: NullDistribution::default(),
+            verdict: NullDistribution::default(),
+            model_asked: 0,
+        }
+    }
 }
 
 /// How a map is calibrated.
@@ -198,39 +216,54 @@ impl CalibrationSettings {
         one: (usize, Option<Pose>),
         other: (usize, Option<Pose>),
     ) -> bool {
-        let distance = one.1.zip(other.1).and_then(|(a, b)| a.distance_m(&b));
-        one.0.abs_diff(other.0) > self.place_radius(images)
-            && distance.is_none_or(|distance| distance > self.place_m)
+        one.0.abs_diff(other.0) > self.place_radius(images) && self.are_distant(one.1, other.1)
+    }
+
+    /// Whether two poses are too far apart for one place, as far as both are known.
+    pub(super) fn are_distant(&self, one: Option<Pose>, other: Option<Pose>) -> bool {
+        let distance = one.zip(other).and_then(|(one, other)| one.distance_m(&other));
+        distance.is_none_or(|distance| distance > self.place_m)
     }
 }
 
 impl Calibration {
     /// The present definition of [`Evidence`].
-    pub const EVIDENCE: u32 = 2;
+    pub const EVIDENCE: u32 = 3;
 
-    /// Confidence that the image `of` shows the place of the frame. Uses the evidence of the refiner if
-    /// there is any and its kind is calibrated, and similarity otherwise.
+    /// Confidence that the image `of` shows the place of the frame, in [0, 1). Uses the evidence of the refiner if there
+    /// is any and its kind is calibrated, and similarity otherwise. `None` while it is not measured yet.
     pub fn refined_confidence(
         &self,
         candidates: &[Candidate],
         of: &ImageId,
         refined: Option<Evidence>,
-    ) -> f32 {
-        if refined == Some(Evidence::NONE_OF_THESE) {
-            return 0.0;
+    ) -> Option<f32> {
+        match refined {
+            Some(Evidence::NONE_OF_THESE) => return Some(0.0),
+            Some(evidence) => match self.confidence(evidence) {
+                Some(confidence) => return Some(confidence),
+                // It may be measured after the similarity.
+                None if !self.complete => return None,
+                None => {}
+            },
+            None => {}
         }
-        let refined = refined.and_then(|evidence| self.calibrated(evidence));
-        let similarity = || Evidence::similarity(candidates, of).map(|one| self.confidence(one));
-        refined.or_else(similarity).unwrap_or_default()
+        let measured = |evidence| self.confidence(evidence);
+        // A complete calibration of a map that is too small says nothing, and so does a single candidate.
+        let of_similarity = Evidence::similarity(candidates, of).and_then(measured);
+        of_similarity.or((self.is_current() && self.complete).then_some(0.0))
     }
 
-    /// Confidence of an answer with this evidence, in [0, 1); 0 in a map that is not calibrated.
-    pub fn confidence(&self, evidence: Evidence) -> f32 {
-        self.calibrated(evidence).unwrap_or_default()
+    /// Whether it is by the present definition of the evidence.
+    fn is_current(&self) -> bool {
+        self.evidence == Self::EVIDENCE
     }
 
-    /// The same; `None` if evidence of its kind is not calibrated.
-    fn calibrated(&self, evidence: Evidence) -> Option<f32> {
+    /// Confidence of an answer with this evidence, in [0, 1); `None` if evidence of its kind is not calibrated.
+    pub fn confidence(&self, evidence: Evidence) -> Option<f32> {
+        if !self.is_current() {
+            return None;
+        }
         let of =
             |null: &NullDistribution, value| (!null.is_empty()).then(|| null.confidence(value));
         match evidence {
@@ -242,44 +275,6 @@ impl Calibration {
                 let agreement = of(&self.agreement, agreement);
                 verdict.into_iter().chain(agreement).reduce(f32::max)
             }
-        }
-    }
-}
-
-/// The most likely place of a frame.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct Estimate {
-    /// Image that shows the place.
-    pub image_id: ImageId,
-    /// Pose of that image, if known.
-    pub pose: Option<Pose>,
-    /// Confidence c, 0 to 1: of frames taken outside the map, at most a fraction 1 − c reaches it. It is
-    /// calibrated on the map itself and 0 until calibration has run, shortly after images were added.
-    pub confidence: f32,
-    /// Whether the confidence reaches the configured threshold. Below it, the place may not be in the map.
-    pub known: bool,
-    /// Why the place cannot be known from this frame, whatever it resembles; otherwise null.
-    #[serde(default)]
-    #[schema(nullable)]
-    pub reason: Option<String>,
-}
-
-impl Estimate {
-    /// An estimate that counts as known if its confidence is at least `known_from`.
-    pub fn new(image_id: &ImageId, pose: Option<Pose>, confidence: f32, known_from: f64) -> Self {
-        // In the precision of the confidence: 0.9 as f32 is less than 0.9 as f64.
-        let known = confidence >= known_from as f32;
-        Self { image_id: image_id.clone(), pose, confidence, known, reason: None }
-    }
-
-    /// The estimate for a frame that shows no place, if `reason` says why: what it resembles is chance, so the
-    /// confidence is 0.
-    pub fn unless(self, reason: Option<&str>) -> Self {
-        match reason {
-            Some(reason) => {
-                Self { confidence: 0.0, known: false, reason: Some(reason.to_owned()), ..self }
-            }
-            None => self,
         }
     }
 }
@@ -312,19 +307,6 @@ mod tests {
     }
 
     #[test]
-    fn agreement_evidence_is_the_log_ratio_to_the_median_of_the_others() {
-        let ratio = |matches: &[usize], regions| match Evidence::agreement(matches, regions, 1) {
-            Some(Evidence::Agreement(ratio)) => ratio,
-            other => panic!("{other:?}"),
-        };
-        assert!((ratio(&[3, 39, 1, 1, 5], 20) - (40.0_f32 / 3.0).ln()).abs() < 1e-6);
-        assert_eq!(Evidence::agreement(&[3], 20, 0), None);
-        assert_eq!(Evidence::agreement(&[3, 4], 20, 2), None);
-        // A few regions against none are less than many against some.
-        assert!(ratio(&[0, 11, 0], 1200) < 0.5 && ratio(&[50, 600, 50], 1200) > 2.0);
-    }
-
-    #[test]
     fn confidence_bounds_the_false_positive_rate() {
         let null = NullDistribution::from(vec![0.3, 0.1, 0.2, 0.2]);
         let of = |evidence| null.confidence(evidence);
@@ -340,6 +322,37 @@ mod tests {
         assert_eq!(NullDistribution::default().confidence(1.0), 0.0);
     }
 
+    /// Numbers of a heavy-tailed distribution, as evidence has.
+    fn draws(seed: u64) -> impl FnMut() -> f32 {
+        let mut state = seed.wrapping_mul(6_364_136_223_846_793_005) | 1;
+        move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            let uniform = ((state >> 40) as f32 + 0.5) / (1 << 24) as f32;
+            -uniform.ln() + 0.1 / uniform.sqrt()
+        }
+    }
+
+    #[test]
+    fn of_frames_outside_the_map_at_most_the_promised_share_is_known_in_maps_of_any_size() {
+        for images in [2, 8, 9, 10, 20, 55, 80, 256] {
+            for known_from in [0.5, 0.9, 0.95] {
+                let (maps, frames) = (400, 50);
+                let mut known = 0;
+                for map in 0..maps {
+                    let mut draw = draws(map * 1000 + images as u64);
+                    let null: Vec<f32> = (0..images).map(|_| draw()).collect();
+                    let null = NullDistribution::from(null);
+                    known += (0..frames).filter(|_| null.confidence(draw()) >= known_from).count();
+                }
+                let share = known as f32 / (maps as usize * frames) as f32;
+                // The standard error over maps is at most 0.015.
+                assert!(share <= 1.0 - known_from + 0.03, "{images}, {known_from}: {share}");
+                let reachable = images as f32 / (images + 1) as f32 >= known_from;
+                assert_eq!(share > 0.0, reachable, "{images}, {known_from}: {share}");
+            }
+        }
+    }
+
     #[test]
     fn a_model_that_says_none_of_these_makes_nothing_known() {
         let some = candidates(&[0.9, 0.1, 0.1]);
@@ -348,19 +361,43 @@ mod tests {
         let calibration = Calibration { similarity, verdict: null, ..Calibration::default() };
         let of =
             |refined| calibration.refined_confidence(&some, &"0".parse().unwrap(), Some(refined));
-        assert_eq!(of(Evidence::Verdict(1.0)), 0.99);
-        assert_eq!(of(Evidence::NONE_OF_THESE), 0.0);
-        // What is not calibrated is not used: the similarity decides.
-        assert_eq!(of(Evidence::Agreement(-5.0)), 0.99);
+        assert_eq!(of(Evidence::Verdict(1.0)), Some(0.99));
+        assert_eq!(of(Evidence::NONE_OF_THESE), Some(0.0));
+        // What is never calibrated is not used: the similarity decides. Until then it is open.
+        assert_eq!(of(Evidence::Agreement(-5.0)), None);
+        let complete = Calibration { complete: true, ..calibration.clone() };
+        let refined = Some(Evidence::Agreement(-5.0));
+        let by_similarity = complete.refined_confidence(&some, &"0".parse().unwrap(), refined);
+        assert_eq!(by_similarity, Some(0.99));
         let agreement = NullDistribution::from(vec![5.0; 99]);
         let both = Calibration { agreement, ..calibration.clone() };
         let concurring = |agreement| Evidence::Concurring { verdict: 1.0, agreement };
-        assert_eq!(both.confidence(concurring(0.0)), 0.99);
-        assert_eq!(both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 6.0 }), 0.99);
-        assert_eq!(both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 4.0 }), 0.0);
+        assert_eq!(both.confidence(concurring(0.0)), Some(0.99));
+        assert_eq!(
+            both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 6.0 }),
+            Some(0.99)
+        );
+        assert_eq!(
+            both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 4.0 }),
+            Some(0.0)
+        );
         let stored = serde_json::to_string(&NullDistribution::from(vec![f32::MIN, 1.0])).unwrap();
         let read: NullDistribution = serde_json::from_str(&stored).unwrap();
         assert_eq!(read, NullDistribution::from(vec![f32::MIN, 1.0]));
+    }
+
+    #[test]
+    fn what_is_not_measured_is_none_and_what_was_measured_by_another_definition_too() {
+        let some = candidates(&[0.9, 0.1, 0.1]);
+        let first = "0".parse().unwrap();
+        let of = |calibration: &Calibration| calibration.refined_confidence(&some, &first, None);
+        assert_eq!(of(&Calibration::default()), None);
+        let similarity = NullDistribution::from(vec![0.0; 99]);
+        let measured = Calibration { similarity, ..Calibration::default() };
+        assert_eq!(of(&measured), Some(0.99));
+        assert_eq!(of(&Calibration { evidence: Calibration::EVIDENCE - 1, ..measured }), None);
+        // Nothing can be measured in a map without hard negatives.
+        assert_eq!(of(&Calibration { complete: true, ..Calibration::default() }), Some(0.0));
     }
 
     #[test]

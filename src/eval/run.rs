@@ -198,6 +198,7 @@ impl Evaluator<'_> {
             .await
             .with_context(file)?;
         let coarse = coarse_outcome(query, digest, &retrieved, calibration);
+        let is_uninformative = retrieved.extraction.information.lack().is_some();
         let mut outcomes = Vec::with_capacity(caches.len());
         let input = self.refine_input(map, digest, retrieved);
         // The refiners fetch the frame from the store; the pin protects it from removal until then.
@@ -209,7 +210,13 @@ impl Evaluator<'_> {
                 (None, None) => coarse.clone(),
                 (None, Some(refiner)) => {
                     let refiner = self.refiners[refiner].as_ref();
-                    self.refine(refiner, &input, &coarse, calibration).await.with_context(file)?
+                    let found = self.refine(refiner, &input, &coarse, calibration).await;
+                    let mut found = found.with_context(file)?;
+                    if is_uninformative {
+                        // As a server has it: what such a frame resembles is chance.
+                        found.confidence = Some(0.0);
+                    }
+                    found
                 }
             };
             cache.insert(&outcome)?;
@@ -260,15 +267,13 @@ impl Evaluator<'_> {
         match self.settings.attempts.run(attempt).await {
             Ok((refinement, elapsed)) => {
                 let confidence = |evidence| {
-                    refinement.ranking.first().map_or(0.0, |first| {
-                        let first = &first.image_id;
-                        calibration.refined_confidence(&input.candidates, first, evidence)
-                    })
+                    let first = &refinement.ranking.first()?.image_id;
+                    calibration.refined_confidence(&input.candidates, first, evidence)
                 };
                 let (refined, similarity) = (confidence(refinement.evidence), confidence(None));
                 let asks_a_model = refiner.paid_negatives().is_some();
                 let alternatives = asks_a_model.then(|| AlternativeConfidence {
-                    similarity,
+                    similarity: similarity.unwrap_or_default(),
                     stated: stated(refinement.certainty),
                 });
                 let outcome = refined_outcome(coarse, refinement, refined, elapsed);
@@ -313,9 +318,12 @@ fn coarse_outcome(
         query: query.picture.id.clone(),
         digest,
         predictions: predictions.collect(),
-        confidence: candidates
-            .first()
-            .map_or(0.0, |first| calibration.refined_confidence(candidates, &first.image_id, None)),
+        confidence: match retrieved.extraction.information.lack() {
+            Some(_) => Some(0.0),
+            None => candidates.first().and_then(|first| {
+                calibration.refined_confidence(candidates, &first.image_id, None)
+            }),
+        },
         alternatives: None,
         descriptions: Vec::new(),
         reasoning: None,
@@ -335,7 +343,7 @@ fn coarse_outcome(
 fn refined_outcome(
     coarse: &QueryOutcome,
     refinement: Refinement,
-    confidence: f32,
+    confidence: Option<f32>,
     elapsed: Duration,
 ) -> QueryOutcome {
     if refinement.ordered_by.is_some() {

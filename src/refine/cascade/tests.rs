@@ -29,8 +29,12 @@ impl Refiner for Scripted {
     ) -> Result<Refinement, RefineError> {
         let mut order: Vec<usize> = (0..input.candidates.len()).collect();
         order.sort_by_key(|&index| std::cmp::Reverse(self.0[index]));
-        let agreement =
-            Agreement { regions: 500, matches: self.0.clone(), first: order.first().copied() };
+        let agreement = Agreement {
+            regions: 500,
+            matches: self.0.clone(),
+            first: order.first().copied(),
+            same_place: SamePlace::default(),
+        };
         let description = |candidate: &Candidate| Description {
             image_id: candidate.image_id.clone(),
             text: "of local".into(),
@@ -42,7 +46,7 @@ impl Refiner for Scripted {
         Ok(Refinement {
             descriptions: input.candidates.iter().map(description).collect(),
             ranking: Ranking::new(&input.candidates, &order).unwrap(),
-            evidence: Evidence::agreement(&self.0, 500, order[0]),
+            evidence: agreement.evidence(order[0]),
             certainty: None,
             agreement: Some(agreement),
             verdicts: Vec::new(),
@@ -138,7 +142,7 @@ async fn a_confident_answer_of_local_stands_without_any_call() {
     assert_eq!(ranks(&refinement), [2, 3, 4, 1, 5]);
     assert!(matches!(refinement.evidence, Some(Evidence::Agreement(_))));
     let [verdict] = refinement.verdicts.as_slice() else { panic!("{:?}", refinement.verdicts) };
-    assert!(verdict.confidence > 0.9 && verdict.refiner == RefinerKind::Local);
+    assert!(verdict.confidence > Some(0.9) && verdict.refiner == RefinerKind::Local);
     assert!(verdict.then.as_ref().unwrap().starts_with("its answer stands"), "{verdict:?}");
 }
 
@@ -165,7 +169,12 @@ async fn an_answer_below_the_bound_goes_on_with_the_candidates_in_question_only(
     assert_eq!((second.compared, second.certainty), (3, Some(Certainty::Certain)));
     assert_eq!((refinement.usage.calls, refinement.degraded), (4, None));
     // Measured among all candidates, as the calibration is.
-    let agreement = Agreement { regions: 500, matches: vec![28, 30, 27, 26, 10], first: Some(1) };
+    let agreement = Agreement {
+        regions: 500,
+        matches: vec![28, 30, 27, 26, 10],
+        first: Some(1),
+        same_place: SamePlace::default(),
+    };
     assert_eq!(refinement.evidence, agreement.verdict(0, Some(Certainty::Certain)));
 }
 
@@ -220,7 +229,7 @@ async fn none_of_these_is_the_last_word() {
             .await;
     let refinement = cascade.refine().await.unwrap();
     assert_eq!(refinement.evidence, Some(Evidence::NONE_OF_THESE));
-    assert_eq!(refinement.verdicts[1].confidence, 0.0);
+    assert_eq!(refinement.verdicts[1].confidence, Some(0.0));
 }
 
 #[tokio::test]

@@ -259,6 +259,10 @@ impl MapStore for Shelf {
         unused()
     }
 
+    async fn slots(&self, _: &Map, _: &[ImageId]) -> Result<Vec<Option<usize>>, StoreError> {
+        unused()
+    }
+
     async fn hard_negatives(
         &self,
         _: &Map,
