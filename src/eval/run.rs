@@ -198,7 +198,6 @@ impl Evaluator<'_> {
             .await
             .with_context(file)?;
         let coarse = coarse_outcome(query, digest, &retrieved, calibration);
-        let is_uninformative = retrieved.extraction.information.lack().is_some();
         let mut outcomes = Vec::with_capacity(caches.len());
         let input = self.refine_input(map, digest, retrieved);
         // The refiners fetch the frame from the store; the pin protects it from removal until then.
@@ -210,13 +209,7 @@ impl Evaluator<'_> {
                 (None, None) => coarse.clone(),
                 (None, Some(refiner)) => {
                     let refiner = self.refiners[refiner].as_ref();
-                    let found = self.refine(refiner, &input, &coarse, calibration).await;
-                    let mut found = found.with_context(file)?;
-                    if is_uninformative {
-                        // As a server has it: what such a frame resembles is chance.
-                        found.confidence = Some(0.0);
-                    }
-                    found
+                    self.refine(refiner, &input, &coarse, calibration).await.with_context(file)?
                 }
             };
             cache.insert(&outcome)?;
@@ -241,6 +234,7 @@ impl Evaluator<'_> {
                 query_id: Uuid::now_v7(),
                 digest,
                 descriptor: Some(extraction.descriptor),
+                uninformative: extraction.information.lack().is_some(),
             },
             candidates,
             priority: Priority::Normal,
@@ -268,7 +262,7 @@ impl Evaluator<'_> {
             Ok((refinement, elapsed)) => {
                 let confidence = |evidence| {
                     let first = &refinement.ranking.first()?.image_id;
-                    calibration.refined_confidence(&input.candidates, first, evidence)
+                    input.confidence(calibration, first, evidence)
                 };
                 let (refined, similarity) = (confidence(refinement.evidence), confidence(None));
                 let asks_a_model = refiner.paid_negatives().is_some();

@@ -133,9 +133,9 @@ impl CascadeRefiner {
         };
         let calibration = self.calibration(&input.map).await?;
         let mut verdicts = refinement.verdicts;
-        let confidence = ranking.first().and_then(|first| {
-            calibration.refined_confidence(&input.candidates, &first.image_id, evidence)
-        });
+        let confidence = ranking
+            .first()
+            .and_then(|first| input.confidence(&calibration, &first.image_id, evidence));
         verdicts.extend(ranking.first().map(|first| JobVerdict {
             refiner: RefinerKind::Mllm,
             image_id: first.image_id.clone(),
@@ -183,9 +183,9 @@ impl CascadeRefiner {
             }
         };
         let evidence = refinement.evidence;
-        let confidence = ranked.first().and_then(|first| {
-            calibration.refined_confidence(&input.candidates, &first.image_id, evidence)
-        });
+        let confidence = ranked
+            .first()
+            .and_then(|first| input.confidence(&calibration, &first.image_id, evidence));
         refinement.verdicts.extend(ranked.first().map(|first| JobVerdict {
             refiner: RefinerKind::Local,
             image_id: first.image_id.clone(),

@@ -87,7 +87,10 @@ impl Refiner for LocalRefiner {
         let calibration = self.maps.calibration(&input.map).await.ok().flatten();
         let calibration = calibration.unwrap_or_default();
         conclude(&input.candidates, &comparison, |evidence| Standing {
-            confidence: evidence.and_then(|evidence| calibration.confidence(evidence)),
+            confidence: match input.frame.uninformative {
+                true => Some(0.0),
+                false => evidence.and_then(|evidence| calibration.confidence(evidence)),
+            },
             known_from: self.known_from,
         })
     }

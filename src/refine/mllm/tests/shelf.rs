@@ -156,6 +156,7 @@ impl Shelf {
                 query_id: Uuid::now_v7(),
                 digest: self.digest(self.pictures.len() - 1),
                 descriptor: None,
+                uninformative: false,
             },
             candidates: (0..candidates).map(candidate).collect(),
             priority: Priority::Normal,
