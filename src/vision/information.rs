@@ -37,11 +37,11 @@ const MIN_EDGES: f32 = 0.08;
 const MIN_PERSISTENCE: f32 = 0.45;
 const MAX_PERSISTENCE: f32 = 6.0;
 
-/// Minimum share of the energy that no four products of a column and a row explain. Scenes have 0.13 to 0.64, test
+/// Minimum share of the energy that no four products of a column and a row explain. Scenes have 0.10 to 0.64, test
 /// patterns at most 0.05.
-const MIN_BEYOND_LOW_RANK: f32 = 0.085;
+const MIN_BEYOND_LOW_RANK: f32 = 0.07;
 
-/// Minimum kurtosis of the edges. Scenes have 3.7 to 170, rings and checkerboards with noise about 2.
+/// Minimum kurtosis of the edges. Scenes have 3.6 to 170, rings and checkerboards with noise about 2.
 const MIN_EDGE_KURTOSIS: f32 = 2.6;
 
 /// Maximum share of the picture that has one value all along rows or columns, and the same without the values of a dark
