@@ -33,7 +33,11 @@ impl Refiner for Scripted {
             regions: 500,
             matches: self.0.clone(),
             first: order.first().copied(),
-            same_place: SamePlace::default(),
+            same_place: SamePlace::of(
+                &input.candidates.iter().map(|one| (None, one.pose)).collect::<Vec<_>>(),
+                input.candidates.len(),
+                &calibrated().settings,
+            ),
         };
         let description = |candidate: &Candidate| Description {
             image_id: candidate.image_id.clone(),
@@ -59,13 +63,18 @@ impl Refiner for Scripted {
     }
 }
 
-/// The values of a map whose wrong answers have hardly any evidence.
+/// The values of a map whose wrong answers have little evidence.
 fn calibrated() -> Calibration {
+    calibrated_to(1.0)
+}
+
+/// The values of a map whose wrong answers have at most this evidence.
+fn calibrated_to(highest: f32) -> Calibration {
     let null = |highest: f32| {
         NullDistribution::from((0..40).map(|n| highest * n as f32 / 40.0).collect::<Vec<f32>>())
     };
     let mut calibration =
-        Calibration { agreement: null(1.0), verdict: null(1.0), ..Calibration::default() };
+        Calibration { agreement: null(highest), verdict: null(1.0), ..Calibration::default() };
     calibration.settings.place_m = 25.0;
     calibration
 }
@@ -181,8 +190,10 @@ async fn an_answer_below_the_bound_goes_on_with_the_candidates_in_question_only(
 #[tokio::test]
 async fn a_close_second_of_another_place_goes_on_whatever_the_confidence() {
     let regions = [300, 290, 20, 20, 10];
+    // It is known, and yet another is close.
+    let calibrated = calibrated_to(0.3);
     let cascade =
-        cascade(preferring("number 2.", "certain"), &regions, Some(calibrated()), |_| {}).await;
+        cascade(preferring("number 2.", "certain"), &regions, Some(calibrated), |_| {}).await;
     let refinement = cascade.refine().await.unwrap();
     assert_eq!(cascade.calls(), (3, 1));
     assert_eq!(ranks(&refinement)[0], 2);
@@ -192,8 +203,9 @@ async fn a_close_second_of_another_place_goes_on_whatever_the_confidence() {
 #[tokio::test]
 async fn neighbours_of_the_same_place_are_not_in_each_others_way() {
     let regions = [300, 290, 20, 20, 10];
+    let calibrated = calibrated_to(0.3);
     let mut cascade =
-        cascade(preferring("number 2.", "certain"), &regions, Some(calibrated()), |_| {}).await;
+        cascade(preferring("number 2.", "certain"), &regions, Some(calibrated), |_| {}).await;
     // 10 m apart, or anywhere.
     let near = cascade.input.candidates[0].pose;
     for pose in [near, None] {
