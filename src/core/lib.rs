@@ -18,6 +18,7 @@ mod leftovers;
 mod map;
 mod model_server;
 pub mod moment;
+mod null_distribution;
 mod pose;
 mod secret;
 mod service_time;
