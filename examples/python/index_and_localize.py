@@ -107,14 +107,14 @@ def index(service: Whereabouts, options: argparse.Namespace) -> None:
 
 
 def wait_for_calibration(service: Whereabouts, options: argparse.Namespace) -> None:
-    """Waits for the background calibration of the map; confidence is 0 until then."""
+    """Waits for the background calibration of the map; confidence is not measured until then."""
     end = time.monotonic() + options.wait
     while True:
         state = service.map(options.map)
         if state.calibration and state.calibration.images == state.images:
             return
         if time.monotonic() > end:
-            print("the map is not calibrated yet, so confidence may be 0; run again later", file=sys.stderr)
+            print("the map is not calibrated yet, so confidence may not be measured; run again later", file=sys.stderr)
             return
         time.sleep(0.2)
 
@@ -123,7 +123,8 @@ def row(frame: str, answer: Answer, job: Job | None) -> str:
     coarse = answer.candidates[0].image_id if answer.candidates else "-"
     refined = job.ranking[0].image_id if job and job.ranking else "-"
     estimate = (job.estimate if job else None) or answer.estimate
-    confidence = f"{estimate.confidence:.2f}" if estimate else "-"
+    measured = estimate is not None and estimate.confidence is not None
+    confidence = f"{estimate.confidence:.2f}" if measured else "unmeasured" if estimate else "-"
     if job:
         ended = job.state if not job.error else f"{job.state}: {job.error}"
     else:

@@ -187,7 +187,7 @@ class MapState:
     created_at: datetime
     reindex: Reindex | None = None
     calibration: CalibrationState | None = None
-    """None until the map is calibrated, shortly after images are added; until then every confidence is 0."""
+    """None until the map is calibrated, shortly after images are added; until then every confidence is None."""
     refiner: Refiner | None = None
     """The refiner that the map is set to; None for the server's."""
     description: str | None = None
@@ -210,8 +210,9 @@ class Estimate:
     """The best estimate of where a frame was taken."""
 
     image_id: str
-    confidence: float
-    """Calibrated, 0 to 1: of frames from outside the map, at most a share of 1 - confidence reach it."""
+    confidence: float | None
+    """Calibrated, 0 to 1: of frames from outside the map, at most a share of 1 - confidence reach it.
+    None while it is not measured yet, shortly after images are added."""
     known: bool
     """Whether the confidence reaches the server's threshold; below it, the place may not be in the map."""
     pose: Pose | None = None
@@ -359,7 +360,8 @@ class JobVerdict:
 
     refiner: Refiner
     image_id: str
-    confidence: float
+    confidence: float | None
+    """None while it is not measured yet."""
     compared: int
     """Number of candidates that it compared."""
     certainty: Literal["certain", "likely", "unsure", "none"] | None = None

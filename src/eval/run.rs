@@ -234,6 +234,7 @@ impl Evaluator<'_> {
                 query_id: Uuid::now_v7(),
                 digest,
                 descriptor: Some(extraction.descriptor),
+                uninformative: extraction.information.lack().is_some(),
             },
             candidates,
             priority: Priority::Normal,
@@ -260,15 +261,13 @@ impl Evaluator<'_> {
         match self.settings.attempts.run(attempt).await {
             Ok((refinement, elapsed)) => {
                 let confidence = |evidence| {
-                    refinement.ranking.first().map_or(0.0, |first| {
-                        let first = &first.image_id;
-                        calibration.refined_confidence(&input.candidates, first, evidence)
-                    })
+                    let first = &refinement.ranking.first()?.image_id;
+                    input.confidence(calibration, first, evidence)
                 };
                 let (refined, similarity) = (confidence(refinement.evidence), confidence(None));
                 let asks_a_model = refiner.paid_negatives().is_some();
                 let alternatives = asks_a_model.then(|| AlternativeConfidence {
-                    similarity,
+                    similarity: similarity.unwrap_or_default(),
                     stated: stated(refinement.certainty),
                 });
                 let outcome = refined_outcome(coarse, refinement, refined, elapsed);
@@ -313,9 +312,12 @@ fn coarse_outcome(
         query: query.picture.id.clone(),
         digest,
         predictions: predictions.collect(),
-        confidence: candidates
-            .first()
-            .map_or(0.0, |first| calibration.refined_confidence(candidates, &first.image_id, None)),
+        confidence: match retrieved.extraction.information.lack() {
+            Some(_) => Some(0.0),
+            None => candidates.first().and_then(|first| {
+                calibration.refined_confidence(candidates, &first.image_id, None)
+            }),
+        },
         alternatives: None,
         descriptions: Vec::new(),
         reasoning: None,
@@ -335,7 +337,7 @@ fn coarse_outcome(
 fn refined_outcome(
     coarse: &QueryOutcome,
     refinement: Refinement,
-    confidence: f32,
+    confidence: Option<f32>,
     elapsed: Duration,
 ) -> QueryOutcome {
     if refinement.ordered_by.is_some() {

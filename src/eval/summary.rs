@@ -164,7 +164,7 @@ fn first_correct_ranks(data: &Dataset, method: &MethodOutcomes) -> Vec<FirstCorr
 
 /// Returns the first prediction of each query, of every kind.
 pub(super) fn top_predictions(data: &Dataset, method: &MethodOutcomes) -> Vec<TopPrediction> {
-    scored(data, method, |outcome| outcome.confidence)
+    scored(data, method, |outcome| outcome.confidence.unwrap_or_default())
 }
 
 fn scored(
@@ -217,8 +217,9 @@ fn summarize_method(
         alternatives: outcomes.iter().any(|outcome| outcome.alternatives.is_some()).then(|| {
             let rates = |of: fn(AlternativeConfidence) -> f32| {
                 // A query that the model did not rank has the confidence of its coarse answer.
-                let score =
-                    |outcome: &QueryOutcome| outcome.alternatives.map_or(outcome.confidence, of);
+                let score = |outcome: &QueryOutcome| {
+                    outcome.alternatives.map(of).or(outcome.confidence).unwrap_or_default()
+                };
                 KnownRates::at(&scored(data, method, score), thresholds.service)
             };
             KnownAlternatives {

@@ -126,7 +126,7 @@ async fn outcome(
         query: id(0),
         digest: Digest::of(b""),
         predictions: predictions.collect(),
-        confidence: 0.0,
+        confidence: Some(0.0),
         alternatives: None,
         descriptions: Vec::new(),
         reasoning: None,

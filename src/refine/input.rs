@@ -2,7 +2,10 @@
 
 use jiff::Timestamp;
 use uuid::Uuid;
-use whereabouts_core::{Candidate, Descriptor, Digest, Map, Priority, RefinerKind, Usage};
+use whereabouts_core::{
+    Calibration, Candidate, Descriptor, Digest, Evidence, ImageId, Map, Priority, RefinerKind,
+    Usage,
+};
 use whereabouts_store::{HardNegatives, JobRecord, MapStore};
 
 use super::RefineError;
@@ -39,9 +42,25 @@ pub struct QueryFrame {
     pub digest: Digest,
     /// The frame's descriptor, if it is known and comparable with the map's current descriptors.
     pub descriptor: Option<Descriptor>,
+    /// Whether it shows nothing by which a place can be known.
+    pub uninformative: bool,
 }
 
 impl RefineInput {
+    /// Returns the confidence that an image shows the place of the frame; `None` while it is not measured yet. What a
+    /// frame that shows nothing resembles is chance.
+    pub fn confidence(
+        &self,
+        calibration: &Calibration,
+        of: &ImageId,
+        evidence: Option<Evidence>,
+    ) -> Option<f32> {
+        match self.frame.uninformative {
+            true => Some(0.0),
+            false => calibration.refined_confidence(&self.candidates, of, evidence),
+        }
+    }
+
     /// Returns the input of a job. Fails with [`RefineError::Permanent`] if the job's map was removed.
     pub async fn of_job(record: &JobRecord, maps: &dyn MapStore) -> Result<Self, RefineError> {
         let map = match maps.map(&record.job.map).await? {
@@ -59,6 +78,7 @@ impl RefineInput {
                 query_id: record.query.id,
                 digest: record.query.digest,
                 descriptor,
+                uninformative: record.query.uninformative.is_some(),
             },
             candidates: record.candidates.clone(),
             priority: record.job.priority,
@@ -80,7 +100,12 @@ impl RefineInput {
             id,
             map: map.clone(),
             refiner: None,
-            frame: QueryFrame { query_id: id, digest: image.digest, descriptor: None },
+            frame: QueryFrame {
+                query_id: id,
+                digest: image.digest,
+                descriptor: None,
+                uninformative: false,
+            },
             candidates: negatives.others.clone(),
             priority: Priority::Low,
             attempts_left: 0,

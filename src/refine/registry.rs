@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use futures_util::future::BoxFuture;
 use tokio::sync::OnceCell;
-use whereabouts_core::RefinerKind;
+use whereabouts_core::{CalibrationSettings, RefinerKind};
 use whereabouts_store::{SharedLimits, Store, StoreError};
 use whereabouts_vision::{CpuPool, LoadedModels};
 
@@ -81,6 +81,10 @@ pub struct RefinerSettings {
     pub cascade: CascadeSettings,
     /// The settings of `mllm`.
     pub mllm: MllmSettings,
+    /// The confidence from which a place counts as known.
+    pub known_confidence: f64,
+    /// Which images count as the same place; the other settings of calibration are not used.
+    pub places: CalibrationSettings,
     /// The longest a job may take, in seconds. A refiner's own timeouts must be shorter.
     pub job_timeout_s: u64,
 }

@@ -231,7 +231,8 @@ impl Worker {
             refinement.evidence,
         );
         let known_from = self.known_confidence;
-        let estimate = Estimate::new(&first.image_id, first.pose, confidence, known_from);
+        let estimate = Estimate::new(&first.image_id, first.pose, confidence, known_from)
+            .with_evidence(refinement.evidence);
         let unknown = record.query.uninformative.as_deref().or(refinement.why_unknown());
         Some(estimate.unless(unknown))
     }

@@ -218,10 +218,10 @@ impl Calibrator {
     }
 }
 
-/// Returns a sample of at most about `count` of them, spread evenly.
+/// Returns a sample of at most `count` of them, spread evenly.
 fn sampled(asked: &[HardNegatives], count: usize) -> impl Iterator<Item = HardNegatives> {
-    let step = asked.len().div_ceil(count.max(1)).max(1);
-    asked.iter().step_by(step).cloned()
+    let count = count.min(asked.len());
+    (0..count).map(move |index| asked[index * asked.len() / count].clone())
 }
 
 fn values(evidence: impl Iterator<Item = Evidence>) -> Vec<f32> {

@@ -60,7 +60,7 @@ impl Jobs {
     ) -> Result<impl Stream<Item = JobEvent> + Send + use<>, ServiceError> {
         let mut follower = Follower {
             changes: self.store.changes(),
-            jobs: Arc::clone(&self.store),
+            jobs: self.clone(),
             id,
             status: None,
             reported: HashSet::new(),
@@ -68,7 +68,7 @@ impl Jobs {
             ended: false,
         };
         match self.store.job(id).await? {
-            Some(record) => follower.update(record),
+            Some(record) => follower.update(self.measured(record).await),
             None => return Err(no_job(id)),
         }
         Ok(stream::unfold(follower, |mut follower| async {
@@ -134,7 +134,7 @@ impl AllFollower {
 
 /// Turns notifications of one job into its events, without repeats.
 struct Follower {
-    jobs: Arc<dyn JobStore>,
+    jobs: Jobs,
     changes: Receiver<Uuid>,
     id: Uuid,
     status: Option<JobStatus>,
@@ -158,8 +158,11 @@ impl Follower {
                 Ok(_) | Err(RecvError::Lagged(_)) => {}
                 Err(RecvError::Closed) => return None,
             }
-            match self.jobs.job(self.id).await {
-                Ok(Some(record)) => self.update(record),
+            match self.jobs.store.job(self.id).await {
+                Ok(Some(record)) => {
+                    let record = self.jobs.measured(record).await;
+                    self.update(record);
+                }
                 Ok(None) => return None,
                 Err(error) => {
                     tracing::error!(job = %self.id, %error, "a followed job could not be read");

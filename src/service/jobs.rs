@@ -37,6 +37,8 @@ pub struct Jobs {
     pub searching: Arc<Semaphore>,
     /// The longest time that a caller may wait for the end of a job.
     pub max_wait: Duration,
+    /// Minimum confidence of a known place.
+    pub known_confidence: f64,
 }
 
 impl Jobs {
@@ -68,13 +70,20 @@ impl Jobs {
         let JobList { mut jobs, searched_to } = self.store.jobs(&filter, cursor, limit + 1).await?;
         let more = jobs.len() > limit;
         jobs.truncate(limit);
+        for job in &mut jobs {
+            if job.is_unmeasured()
+                && let Some(record) = self.store.job(job.id).await?
+            {
+                *job = self.measured(record).await.job;
+            }
+        }
         let next_cursor = jobs.last().filter(|_| more).map(|job| job.id).or(searched_to);
         Ok(JobPage { jobs, next_cursor })
     }
 
     /// Cancels a job. A job that has ended stays as it is.
     pub async fn cancel(&self, id: Uuid) -> Result<Job, ServiceError> {
-        Ok(self.store.cancel(id).await?)
+        self.with_confidence(self.store.cancel(id).await?).await
     }
 
     /// Queues a job again that ended without success. With `fresh`, any job that has ended, and its descriptions
@@ -167,8 +176,32 @@ impl Jobs {
 
     async fn find(&self, id: Uuid) -> Result<Job, ServiceError> {
         match self.store.job(id).await? {
-            Some(record) => Ok(record.job),
+            Some(record) => Ok(self.measured(record).await.job),
             None => Err(no_job(id)),
+        }
+    }
+
+    /// Computes the confidences that were not measured when a job ended, if they are now.
+    pub(super) async fn measured(&self, mut record: JobRecord) -> JobRecord {
+        if record.job.is_unmeasured() {
+            let maps = &self.imaging.maps;
+            let calibration = match maps.map(&record.job.map).await {
+                Ok(Some(map)) if map.uid == record.map_uid => maps.calibration(&map).await,
+                _ => Ok(None),
+            };
+            // Without, they stay unmeasured: the job can still be read.
+            if let Ok(Some(calibration)) = calibration {
+                record.job.measure(&calibration, &record.candidates, self.known_confidence);
+            }
+        }
+        record
+    }
+
+    /// The same for a job without its record.
+    async fn with_confidence(&self, job: Job) -> Result<Job, ServiceError> {
+        match job.is_unmeasured() {
+            true => self.find(job.id).await,
+            false => Ok(job),
         }
     }
 }

@@ -185,6 +185,7 @@ impl Service {
             matching: Arc::new(Semaphore::new(1)),
             searching: Arc::new(Semaphore::new(1)),
             max_wait: settings.jobs.max_wait,
+            known_confidence: settings.localize.known_confidence,
         };
         let submitter = Submitter {
             jobs: store.clone(),

@@ -106,7 +106,7 @@ impl ServiceMetrics {
             uninformative_frames: register(
                 registry,
                 "uninformative_frames",
-                "Frames that cannot show a known place, by reason: blank, noise or blurred",
+                "Frames that cannot show a known place, by reason: blank, noise, blurred, pattern or incomplete",
                 Family::default(),
             ),
             damaged_pictures: register(

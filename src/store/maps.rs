@@ -110,6 +110,9 @@ pub trait MapStore: Send + Sync {
     ) -> Result<Vec<Option<Image>>, StoreError> {
         try_join_all(ids.iter().map(|id| self.image(map, id))).await
     }
+    /// Returns the positions of images in the order of addition, with gaps where images were removed: one entry for each
+    /// id, in the order of `ids`, and `None` for an id that the map does not have.
+    async fn slots(&self, map: &Map, ids: &[ImageId]) -> Result<Vec<Option<usize>>, StoreError>;
     /// Returns up to `limit` images whose ids sort after `after`, in order of id.
     async fn images(
         &self,

@@ -6,13 +6,21 @@
 //! and the response properties of cortical cells*, 1987). Noise fades with every averaging, and a blurred picture
 //! has edges only at the largest scale.
 //!
+//! Test patterns and pictures of which a part is missing are recognised by how regular they are
+//! ([`regularity`]).
+//!
 //! Edges are measured as second differences, which a brightness gradient does not have, on the picture that the model
 //! sees, averaged to 64, 32 and 16 columns. The thresholds were measured: see docs/evaluation.md.
 
+mod regularity;
+
 use std::fmt;
 
+use self::regularity::{beyond_low_rank, kurtosis};
 use super::manifest::Input;
 use super::preprocess::Tensor;
+
+pub use self::regularity::Dead;
 
 /// Longest edge of the finest of the three scales.
 const FINE: usize = 64;
@@ -29,6 +37,17 @@ const MIN_EDGES: f32 = 0.08;
 const MIN_PERSISTENCE: f32 = 0.45;
 const MAX_PERSISTENCE: f32 = 6.0;
 
+/// Minimum share of the energy that no four products of a column and a row explain. Scenes have 0.10 to 0.64, test
+/// patterns at most 0.05.
+const MIN_BEYOND_LOW_RANK: f32 = 0.07;
+
+/// Minimum kurtosis of the edges. Scenes have 3.6 to 170, rings and checkerboards with noise about 2.
+const MIN_EDGE_KURTOSIS: f32 = 2.6;
+
+/// Maximum share of the picture that has one value all along rows or columns, and the same without the values of a dark
+/// or over-exposed part. Scenes have none, over-exposed ones up to 0.5 and 0.
+const MAX_DEAD: Dead = Dead { any: 0.45, grey: 0.35 };
+
 /// The structure of a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Information {
@@ -36,6 +55,12 @@ pub struct Information {
     pub edges: f32,
     /// Amplitude of the edges at the coarse scale, relative to the fine scale.
     pub persistence: f32,
+    /// Share of the energy that is in no pattern of stripes and squares, 0 to 1.
+    pub irregular: f32,
+    /// How unequal the edges are: the kurtosis of their amplitudes at the fine scale.
+    pub edge_kurtosis: f32,
+    /// What is missing.
+    pub dead: Dead,
 }
 
 /// Why a frame shows no place.
@@ -47,6 +72,10 @@ pub enum Uninformative {
     Noise,
     /// It is blurred beyond recognition.
     Blurred,
+    /// It is a pattern of stripes, squares or rings, as of a test card.
+    Pattern,
+    /// A large part of it is missing.
+    Incomplete,
 }
 
 impl Information {
@@ -62,6 +91,9 @@ impl Information {
         Self {
             edges: strong as f32 / at_middle.len().max(1) as f32,
             persistence: (mean(&at_coarse) + FLOOR) / (mean(&at_fine) + FLOOR),
+            irregular: beyond_low_rank(&fine),
+            edge_kurtosis: kurtosis(&at_fine),
+            dead: Dead::of(tensor.width, Lumas::of(tensor, input).rows()),
         }
     }
 
@@ -74,6 +106,10 @@ impl Information {
             Some(Uninformative::Blank)
         } else if self.persistence > MAX_PERSISTENCE {
             Some(Uninformative::Blurred)
+        } else if self.irregular < MIN_BEYOND_LOW_RANK || self.edge_kurtosis < MIN_EDGE_KURTOSIS {
+            Some(Uninformative::Pattern)
+        } else if self.dead.any > MAX_DEAD.any || self.dead.grey > MAX_DEAD.grey {
+            Some(Uninformative::Incomplete)
         } else {
             None
         }
@@ -87,6 +123,8 @@ impl Uninformative {
             Self::Blank => "blank",
             Self::Noise => "noise",
             Self::Blurred => "blurred",
+            Self::Pattern => "pattern",
+            Self::Incomplete => "incomplete",
         }
     }
 }
@@ -105,6 +143,63 @@ impl fmt::Display for Uninformative {
             Self::Blurred => {
                 "the frame is blurred beyond recognition, so the place cannot be known from it; check the focus"
             }
+            Self::Pattern => {
+                "the frame is a regular pattern, as of a test card or a camera without a signal, so the place cannot be \
+                 known from it"
+            }
+            Self::Incomplete => {
+                "a large part of the frame has no content, as of a picture that was not transmitted or decoded to the \
+                 end, so the place cannot be known from it"
+            }
+        })
+    }
+}
+
+/// The luma of the pixels of a tensor.
+struct Lumas<'a> {
+    width: usize,
+    height: usize,
+    planes: [&'a [f32]; 3],
+    weights: [f32; 3],
+    offset: f32,
+}
+
+impl<'a> Lumas<'a> {
+    fn of(tensor: &'a Tensor, input: &Input) -> Self {
+        // Luma of Rec. 601, of numbers that are still normalised.
+        const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
+        let (red, rest) = tensor.data.split_at(tensor.width * tensor.height);
+        let (green, blue) = rest.split_at(tensor.width * tensor.height);
+        Self {
+            width: tensor.width,
+            height: tensor.height,
+            planes: [red, green, blue],
+            weights: [0, 1, 2].map(|channel| LUMA[channel] * input.std[channel]),
+            offset: (0..3).map(|channel| LUMA[channel] * input.mean[channel]).sum(),
+        }
+    }
+
+    /// Adds the numbers of a row to `sums`, which [`level`](Self::level) makes grey levels of.
+    fn add_row(&self, y: usize, sums: &mut [f32]) {
+        let row = y * self.width..(y + 1) * self.width;
+        let [red, green, blue] = self.planes.map(|plane| &plane[row.clone()]);
+        for (sum, ((r, g), b)) in sums.iter_mut().zip(red.iter().zip(green).zip(blue)) {
+            *sum += self.weights[0] * r + self.weights[1] * g + self.weights[2] * b;
+        }
+    }
+
+    /// Converts a number of a row to a grey level, 0 to 255.
+    fn level(&self, number: f32) -> f32 {
+        255.0 * (number + self.offset)
+    }
+
+    /// The rows in grey levels.
+    fn rows(&self) -> impl Iterator<Item = Vec<f32>> {
+        (0..self.height).map(|y| {
+            let mut row = vec![0.0; self.width];
+            self.add_row(y, &mut row);
+            row.iter_mut().for_each(|value| *value = self.level(*value));
+            row
         })
     }
 }
@@ -125,33 +220,21 @@ impl Grey {
         let fit = |edge: usize| (edge * FINE.min(longest)).div_ceil(longest).max(1);
         let (width, height) = (fit(from_width), fit(from_height));
         let columns: Vec<usize> = (0..from_width).map(|x| x * width / from_width).collect();
-        let plane = from_width * from_height;
-        let (red, rest) = tensor.data.split_at(plane);
-        let (green, blue) = rest.split_at(plane);
-        // Luma of Rec. 601, of numbers that are still normalised.
-        const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
-        let weights: [f32; 3] = [0, 1, 2].map(|channel| LUMA[channel] * input.std[channel]);
-        let offset: f32 = (0..3).map(|channel| LUMA[channel] * input.mean[channel]).sum();
+        let pixels = Lumas::of(tensor, input);
         let mut values = Vec::with_capacity(width * height);
         for to_row in 0..height {
             let first = |row: usize| (row * from_height).div_ceil(height);
             let rows = first(to_row)..first(to_row + 1);
             // The rows are added first, which the compiler vectorises, and the columns once for all of them.
             let mut lumas = vec![0.0; from_width];
-            for y in rows.clone() {
-                let row = y * from_width..(y + 1) * from_width;
-                let pixels = red[row.clone()].iter().zip(&green[row.clone()]).zip(&blue[row]);
-                for (luma, ((r, g), b)) in lumas.iter_mut().zip(pixels) {
-                    *luma += weights[0] * r + weights[1] * g + weights[2] * b;
-                }
-            }
+            rows.clone().for_each(|y| pixels.add_row(y, &mut lumas));
             let mut sums = vec![(0.0, 0u32); width];
             for (luma, column) in lumas.iter().zip(&columns) {
                 let (sum, count) = &mut sums[*column];
                 (*sum, *count) = (*sum + luma, *count + 1);
             }
             let rows = rows.len() as f32;
-            let value = |(sum, count): (f32, u32)| 255.0 * (sum / (count as f32 * rows) + offset);
+            let value = |(sum, count): (f32, u32)| pixels.level(sum / (count as f32 * rows));
             values.extend(sums.into_iter().map(value));
         }
         Self { width, height, values }

@@ -37,7 +37,7 @@ pub use execution::{Execution, Provider, ProviderPreference};
 pub use extractor::{
     ExtractError, Extraction, Extractor, ExtractorSettings, PendingExtraction, StageTimes,
 };
-pub use information::{Information, Uninformative};
+pub use information::{Dead, Information, Uninformative};
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{DataFile, MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};

@@ -54,17 +54,62 @@ async fn frames_of_mapped_places_are_known_and_others_are_not() {
 }
 
 #[tokio::test]
-async fn confidence_is_0_before_calibration_and_is_calibrated_again_when_a_map_grows() {
+async fn confidence_is_null_before_calibration_and_is_filled_in_for_a_job_that_ended_before() {
     let (server, map) = shared_server();
     server.town(&map, 1).await;
-    let answer =
-        server.post_jpeg(&format!("/localize?map={map}&refine=off"), frame(0, 0)).await.expect(200);
-    assert_eq!(
-        (&answer["estimate"]["confidence"], &answer["estimate"]["known"]),
-        (&0.0.into(), &false.into())
-    );
+    let answer = server.post_jpeg(&format!("/localize?map={map}"), frame(0, 0)).await.expect(200);
+    let path = answer["job"]["href"].as_str().unwrap().to_owned();
+    let job = server.get(&format!("{path}?wait=60")).await.expect(200);
+    for response in [&answer, &job] {
+        let estimate = &response["estimate"];
+        assert_eq!((&estimate["confidence"], &estimate["known"]), (&Value::Null, &false.into()));
+    }
+    assert_eq!(server.get(&format!("/maps/{map}")).await.expect(200)["calibration"], Value::Null);
     server.town_more(&map, 1..12).await;
+    calibrated(server, &map, 12).await;
+    let measured = eventually(async || {
+        let job = server.get(&path).await.expect(200);
+        job["estimate"]["confidence"].is_number().then_some(job)
+    })
+    .await;
+    // It had a single candidate, which was compared with none.
+    assert_eq!(measured["estimate"]["confidence"], 0.0);
+    let page = server.get(&format!("/jobs?map={map}")).await.expect(200);
+    assert_eq!(page["jobs"][0]["estimate"], measured["estimate"]);
+    let events = server.get(&format!("{path}/events")).await.bytes;
+    let events = String::from_utf8(events).unwrap();
+    assert!(!events.contains("\"confidence\":null"), "{events}");
+}
+
+#[tokio::test]
+async fn a_map_is_calibrated_again_when_it_grows() {
+    let (server, map) = shared_server();
+    server.town(&map, 12).await;
     calibrated(server, &map, 12).await;
     server.town_more(&map, 12..24).await;
     calibrated(server, &map, 24).await;
+}
+
+#[tokio::test]
+async fn the_words_of_a_description_follow_from_the_confidence() {
+    let (server, map) = shared_server();
+    server.town(&map, PLACES).await;
+    calibrated(server, &map, PLACES).await;
+    for place in (0..6).chain(500..506) {
+        let path = format!("/localize?map={map}&refine=wait");
+        let answer = server.post_jpeg(&path, frame(place, 0)).await.expect(200);
+        let job = server.get(answer["job"]["href"].as_str().unwrap()).await.expect(200);
+        let estimate = &job["estimate"];
+        let descriptions = job["descriptions"].as_array().unwrap();
+        let is_strong = |description: &&Value| {
+            description["text"].as_str().unwrap().contains("Strong agreement: ")
+        };
+        for description in descriptions.iter().filter(is_strong) {
+            // No other candidate agrees as much as a known one, unless it shows the same place.
+            assert_eq!(description["image_id"], estimate["image_id"], "place {place}: {job}");
+        }
+        let first = descriptions.iter().find(|one| one["image_id"] == estimate["image_id"]);
+        let is_known = estimate["known"].as_bool().unwrap();
+        assert_eq!(is_strong(&first.unwrap()), is_known, "place {place}: {job}");
+    }
 }

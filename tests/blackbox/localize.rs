@@ -26,8 +26,9 @@ async fn a_map_image_finds_itself_and_the_response_is_complete() {
 
     assert_eq!(answer["estimate"]["image_id"], "place-4");
     assert_eq!(answer["estimate"]["pose"], json!({"lat": 45.004, "lon": 7.0, "heading": 90.0}));
-    // See confidence.rs.
-    assert!(answer["estimate"]["confidence"].is_number());
+    // See confidence.rs. It is null until it is measured.
+    let confidence = answer["estimate"].get("confidence");
+    assert!(confidence.is_some_and(|value| value.is_number() || value.is_null()));
     assert!(answer["estimate"]["known"].is_boolean());
     assert_eq!((&answer["map"], &answer["model"]), (&json!(map), &json!("xfeat")));
     let job = &answer["job"];

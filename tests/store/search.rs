@@ -25,6 +25,7 @@ contract!(
     a_query_of_another_dimension_is_rejected,
     long_descriptors_are_searched,
     hard_negatives_are_the_most_similar_images_of_other_places,
+    slots_are_in_the_order_of_addition,
 );
 
 const BOTH: [SearchMode; 2] = [SearchMode::Fast, SearchMode::Exact];
@@ -359,4 +360,20 @@ async fn hard_negatives_are_the_most_similar_images_of_other_places(fixture: &Fi
     let wide = CalibrationSettings { place_m: 38.0, ..settings };
     let found = store.hard_negatives(&map, wide, 50).await.unwrap();
     assert!(found.iter().any(|found| (1..50).contains(&found.others.len())));
+}
+
+async fn slots_are_in_the_order_of_addition(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let (map, _) = store.put_map(map("m", 4)).await.unwrap();
+    let mut random = Random(5);
+    for name in ["z", "a", "m"] {
+        let bytes = Bytes::copy_from_slice(name.as_bytes());
+        let _pin = store.put_blob(Digest::of(&bytes), bytes).await.unwrap();
+        store.add_image(&map, image(name, name.as_bytes()), random.descriptor(4)).await.unwrap();
+    }
+    let ids = ["m", "nobody", "z", "a"].map(|id| id.parse().unwrap());
+    let slots = store.slots(&map, &ids).await.unwrap();
+    let [m, nobody, z, a] = slots.as_slice() else { panic!("{slots:?}") };
+    assert!(nobody.is_none() && z.is_some() && z < a && a < m, "{slots:?}");
+    assert!(store.slots(&map, &[]).await.unwrap().is_empty());
 }

@@ -15,7 +15,7 @@ use async_trait::async_trait;
 use parking_lot::Mutex;
 use whereabouts_core::{
     Agreement, Calibration, Description, Evidence, ImageId, JobVerdict, Map, Ranking, RefinerKind,
-    Usage,
+    SamePlace, Usage,
 };
 use whereabouts_store::{HardNegatives, MapStore, Step};
 
@@ -133,14 +133,14 @@ impl CascadeRefiner {
         };
         let calibration = self.calibration(&input.map).await?;
         let mut verdicts = refinement.verdicts;
+        let confidence = ranking
+            .first()
+            .and_then(|first| input.confidence(&calibration, &first.image_id, evidence));
         verdicts.extend(ranking.first().map(|first| JobVerdict {
             refiner: RefinerKind::Mllm,
             image_id: first.image_id.clone(),
-            confidence: calibration.refined_confidence(
-                &input.candidates,
-                &first.image_id,
-                evidence,
-            ),
+            confidence,
+            evidence: evidence.filter(|_| confidence.is_none()),
             certainty: verdict.certainty,
             compared: asked.len(),
             then: None,
@@ -159,6 +159,7 @@ impl CascadeRefiner {
             regions: 0,
             matches: vec![0; input.candidates.len()],
             first: None,
+            same_place: SamePlace::default(),
         });
         let index_of =
             |image: &ImageId| input.candidates.iter().position(|one| one.image_id == *image);
@@ -181,14 +182,15 @@ impl CascadeRefiner {
                 format!("the model was asked about {}: {why}", images.join(", "))
             }
         };
+        let evidence = refinement.evidence;
+        let confidence = ranked
+            .first()
+            .and_then(|first| input.confidence(&calibration, &first.image_id, evidence));
         refinement.verdicts.extend(ranked.first().map(|first| JobVerdict {
             refiner: RefinerKind::Local,
             image_id: first.image_id.clone(),
-            confidence: calibration.refined_confidence(
-                &input.candidates,
-                &first.image_id,
-                refinement.evidence,
-            ),
+            confidence,
+            evidence: evidence.filter(|_| confidence.is_none()),
             certainty: None,
             compared: order.len(),
             then: Some(then),

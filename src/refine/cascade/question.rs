@@ -78,7 +78,8 @@ pub fn question(
     let bound = settings.stop_confidence as f32;
     let reachable = calibration.agreement.highest_confidence();
     let is_calibrated = reachable >= bound && reachable > 0.0;
-    let confidence = found.evidence.map_or(0.0, |evidence| calibration.confidence(evidence));
+    let confidence = found.evidence.and_then(|evidence| calibration.confidence(evidence));
+    let confidence = confidence.unwrap_or_default();
     if is_calibrated && confidence < bound {
         return open(format!(
             "its confidence of {confidence:.2} is below {bound} (cascade.stop_confidence)"

@@ -29,8 +29,16 @@ impl Refiner for Scripted {
     ) -> Result<Refinement, RefineError> {
         let mut order: Vec<usize> = (0..input.candidates.len()).collect();
         order.sort_by_key(|&index| std::cmp::Reverse(self.0[index]));
-        let agreement =
-            Agreement { regions: 500, matches: self.0.clone(), first: order.first().copied() };
+        let agreement = Agreement {
+            regions: 500,
+            matches: self.0.clone(),
+            first: order.first().copied(),
+            same_place: SamePlace::of(
+                &input.candidates.iter().map(|one| (None, one.pose)).collect::<Vec<_>>(),
+                input.candidates.len(),
+                &calibrated().settings,
+            ),
+        };
         let description = |candidate: &Candidate| Description {
             image_id: candidate.image_id.clone(),
             text: "of local".into(),
@@ -42,7 +50,7 @@ impl Refiner for Scripted {
         Ok(Refinement {
             descriptions: input.candidates.iter().map(description).collect(),
             ranking: Ranking::new(&input.candidates, &order).unwrap(),
-            evidence: Evidence::agreement(&self.0, 500, order[0]),
+            evidence: agreement.evidence(order[0]),
             certainty: None,
             agreement: Some(agreement),
             verdicts: Vec::new(),
@@ -55,13 +63,18 @@ impl Refiner for Scripted {
     }
 }
 
-/// The values of a map whose wrong answers have hardly any evidence.
+/// The values of a map whose wrong answers have little evidence.
 fn calibrated() -> Calibration {
+    calibrated_to(1.0)
+}
+
+/// The values of a map whose wrong answers have at most this evidence.
+fn calibrated_to(highest: f32) -> Calibration {
     let null = |highest: f32| {
         NullDistribution::from((0..40).map(|n| highest * n as f32 / 40.0).collect::<Vec<f32>>())
     };
     let mut calibration =
-        Calibration { agreement: null(1.0), verdict: null(1.0), ..Calibration::default() };
+        Calibration { agreement: null(highest), verdict: null(1.0), ..Calibration::default() };
     calibration.settings.place_m = 25.0;
     calibration
 }
@@ -138,7 +151,7 @@ async fn a_confident_answer_of_local_stands_without_any_call() {
     assert_eq!(ranks(&refinement), [2, 3, 4, 1, 5]);
     assert!(matches!(refinement.evidence, Some(Evidence::Agreement(_))));
     let [verdict] = refinement.verdicts.as_slice() else { panic!("{:?}", refinement.verdicts) };
-    assert!(verdict.confidence > 0.9 && verdict.refiner == RefinerKind::Local);
+    assert!(verdict.confidence > Some(0.9) && verdict.refiner == RefinerKind::Local);
     assert!(verdict.then.as_ref().unwrap().starts_with("its answer stands"), "{verdict:?}");
 }
 
@@ -165,15 +178,22 @@ async fn an_answer_below_the_bound_goes_on_with_the_candidates_in_question_only(
     assert_eq!((second.compared, second.certainty), (3, Some(Certainty::Certain)));
     assert_eq!((refinement.usage.calls, refinement.degraded), (4, None));
     // Measured among all candidates, as the calibration is.
-    let agreement = Agreement { regions: 500, matches: vec![28, 30, 27, 26, 10], first: Some(1) };
+    let agreement = Agreement {
+        regions: 500,
+        matches: vec![28, 30, 27, 26, 10],
+        first: Some(1),
+        same_place: SamePlace::default(),
+    };
     assert_eq!(refinement.evidence, agreement.verdict(0, Some(Certainty::Certain)));
 }
 
 #[tokio::test]
 async fn a_close_second_of_another_place_goes_on_whatever_the_confidence() {
     let regions = [300, 290, 20, 20, 10];
+    // It is known, and yet another is close.
+    let calibrated = calibrated_to(0.3);
     let cascade =
-        cascade(preferring("number 2.", "certain"), &regions, Some(calibrated()), |_| {}).await;
+        cascade(preferring("number 2.", "certain"), &regions, Some(calibrated), |_| {}).await;
     let refinement = cascade.refine().await.unwrap();
     assert_eq!(cascade.calls(), (3, 1));
     assert_eq!(ranks(&refinement)[0], 2);
@@ -183,8 +203,9 @@ async fn a_close_second_of_another_place_goes_on_whatever_the_confidence() {
 #[tokio::test]
 async fn neighbours_of_the_same_place_are_not_in_each_others_way() {
     let regions = [300, 290, 20, 20, 10];
+    let calibrated = calibrated_to(0.3);
     let mut cascade =
-        cascade(preferring("number 2.", "certain"), &regions, Some(calibrated()), |_| {}).await;
+        cascade(preferring("number 2.", "certain"), &regions, Some(calibrated), |_| {}).await;
     // 10 m apart, or anywhere.
     let near = cascade.input.candidates[0].pose;
     for pose in [near, None] {
@@ -220,7 +241,7 @@ async fn none_of_these_is_the_last_word() {
             .await;
     let refinement = cascade.refine().await.unwrap();
     assert_eq!(refinement.evidence, Some(Evidence::NONE_OF_THESE));
-    assert_eq!(refinement.verdicts[1].confidence, 0.0);
+    assert_eq!(refinement.verdicts[1].confidence, Some(0.0));
 }
 
 #[tokio::test]

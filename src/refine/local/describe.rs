@@ -25,17 +25,23 @@ const STRIPS: [([usize; 3], &str); 6] = [
     ([1, 4, 7], "down the middle"),
 ];
 
-/// The score from which agreement is called strong, in units of an even share of the votes. In comparisons
-/// of ten candidates on XFeat features of two buildings and a rendered town, two in three candidates above
-/// it were correct.
-const STRONG: f32 = 0.5;
+/// The share of the pictures of other places of the map, of those that agree most with their frames, from which there is
+/// some agreement.
+const SOME: f32 = 0.5;
 
-/// The score from which there is some agreement, likewise. Nine in ten correct candidates were above it.
-const SOME: f32 = 0.3;
+/// How the agreement of a pair compares with that of wrong answers of the map. The words of the verdict rest on the same
+/// measurement as the confidence of an estimate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Standing {
+    /// The confidence of the pair; `None` while it is not measured how much wrong answers agree.
+    pub confidence: Option<f32>,
+    /// The confidence from which a place is known.
+    pub known_from: f64,
+}
 
 /// Describes one pair in plain English, in three to six sentences. The same pair always gives the same
 /// text. The console reads these texts, so their wording is part of its contract (`words.js`).
-pub fn describe(pair: &PairMatch) -> String {
+pub fn describe(pair: &PairMatch, standing: Standing) -> String {
     if pair.matches.is_empty() {
         return nothing_agrees(pair);
     }
@@ -44,7 +50,7 @@ pub fn describe(pair: &PairMatch) -> String {
     sentences.extend(distinctiveness(pair));
     sentences.push(movement(pair));
     sentences.push(parts.gaps());
-    sentences.push(verdict(pair));
+    sentences.push(verdict(standing));
     sentences.join(" ")
 }
 
@@ -60,7 +66,7 @@ fn nothing_agrees(pair: &PairMatch) -> String {
 
 fn how_much(pair: &PairMatch) -> String {
     format!(
-        "{} of {} of the query ({} %) have a counterpart in the candidate that moved together \
+        "{} of {} of the query ({} % of them) have a counterpart in the candidate that moved together \
          with its surroundings; {} more resembled each other but not in the same arrangement.",
         pair.matches.len(),
         regions(pair.cells),
@@ -94,18 +100,24 @@ fn movement(pair: &PairMatch) -> String {
     )
 }
 
-/// Judges by votes and not by the number of matches: a candidate that shares only the lens rim and the floor
-/// with the query has many matches but few votes.
-fn verdict(pair: &PairMatch) -> String {
-    let even_share = 1.0 / (pair.rivals + 1) as f32;
-    match pair.score / even_share {
-        evidence if evidence >= STRONG => "Strong agreement: probably the same place.",
-        evidence if evidence >= SOME => {
-            "Some agreement: possibly the same place, or one built like it."
-        }
-        _ => "Weak agreement: what matches may be chance or a repeated pattern.",
+/// Judges by how often a wrong answer of the map agrees as much, and not by the number of matches: a candidate that
+/// shares only the lens rim and the floor with the query has many matches.
+fn verdict(standing: Standing) -> String {
+    let Some(confidence) = standing.confidence else {
+        return "Whether that is more than pictures of other places agree was not measured yet in this map.".to_owned();
+    };
+    // Rounded down, as the confidence is shown.
+    let less = format!(
+        "{} % of the best wrong answers in this map agree less",
+        (confidence * 100.0 + 1e-4) as usize
+    );
+    if confidence >= standing.known_from as f32 {
+        format!("Strong agreement: {less}, so this is probably the same place.")
+    } else if confidence >= SOME {
+        format!("Some agreement: {less}, so this is possibly the same place, or one built like it.")
+    } else {
+        format!("Weak agreement: {less}, so what matches may be chance or a repeated pattern.")
     }
-    .to_owned()
 }
 
 fn share(pair: &PairMatch) -> f32 {

@@ -22,7 +22,7 @@ mod votes;
 #[cfg(test)]
 mod tests;
 
-pub use describe::describe;
+pub use describe::{Standing, describe};
 pub use motion::Motion;
 pub use rank::rank;
 pub use refiner::LocalRefiner;

@@ -8,13 +8,14 @@ use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt, stream};
 use tokio::sync::Semaphore;
 use whereabouts_core::{
-    Agreement, Candidate, Certainty, DenseFeatures, Description, DescriptorKind, Digest, Evidence,
-    ImageId, Map, PairRegion, Ranking, RefinerKind, Usage,
+    Agreement, CalibrationSettings, Candidate, Certainty, DenseFeatures, Description,
+    DescriptorKind, Digest, Evidence, ImageId, Map, PairRegion, Pose, Ranking, RefinerKind,
+    SamePlace, Usage,
 };
 use whereabouts_store::{BlobStore, HardNegatives, MapStore};
 use whereabouts_vision::{CpuPool, ExtractError, Extractor, FeatureSet, LoadedModels, ModelError};
 
-use super::{LocalMatcher, LocalSettings, Match, PairMatch, describe, rank};
+use super::{LocalMatcher, LocalSettings, Match, PairMatch, Standing, describe, rank};
 use crate::{
     BuildError, DenseCache, DenseKey, NegativeEvidence, Progress, RefineError, RefineInput,
     Refinement, Refiner, RefinerContext, RefinerSettings, RegionMatcher, milliseconds,
@@ -36,6 +37,10 @@ pub struct LocalRefiner {
     /// pool's queue.
     turns: Semaphore,
     matcher: LocalMatcher,
+    /// The confidence from which a place is known.
+    known_from: f64,
+    /// Which images count as the same place.
+    places: CalibrationSettings,
 }
 
 /// Builds the refiner `local`.
@@ -48,6 +53,8 @@ pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, 
         turns: Semaphore::new(context.pool.threads()),
         pool: context.pool.clone(),
         matcher: LocalMatcher::new(LocalSettings::default()),
+        known_from: context.settings.known_confidence,
+        places: context.settings.places,
     }))
 }
 
@@ -76,7 +83,16 @@ impl Refiner for LocalRefiner {
         // Cannot fail, because the semaphore is never closed.
         let _turn = self.turns.acquire().await;
         let comparison = self.compare_input(input).await?;
-        conclude(&input.candidates, &comparison)
+        // The words of a description follow from the calibration. An answer in other words is better than none.
+        let calibration = self.maps.calibration(&input.map).await.ok().flatten();
+        let calibration = calibration.unwrap_or_default();
+        conclude(&input.candidates, &comparison, |evidence| Standing {
+            confidence: match input.frame.uninformative {
+                true => Some(0.0),
+                false => evidence.and_then(|evidence| calibration.confidence(evidence)),
+            },
+            known_from: self.known_from,
+        })
     }
 
     fn region_matcher(&self) -> Option<&dyn RegionMatcher> {
@@ -109,8 +125,7 @@ impl RegionMatcher for LocalRefiner {
 
     async fn agreement(&self, input: &RefineInput) -> Result<Agreement, RefineError> {
         let _turn = self.turns.acquire().await;
-        let Comparison { present, pairs, .. } = self.compare_input(input).await?;
-        Ok(agreement_of_all(input.candidates.len(), &present, &pairs))
+        Ok(self.compare_input(input).await?.agreement_of_all())
     }
 }
 
@@ -129,25 +144,51 @@ impl NegativeEvidence for LocalRefiner {
             None => None,
         };
         let Some(query) = query else { return Ok(Vec::new()) };
-        let Comparison { pairs, .. } =
-            self.compare(map, extractor, query, &negatives.others).await?;
-        let own = rank(&pairs).first().and_then(|&first| agreement(&pairs, first));
-        let all: Vec<usize> = (0..pairs.len()).collect();
+        let agreement = self.compare(map, extractor, query, &negatives.others).await?.agreement();
+        let own = agreement.first.and_then(|first| agreement.evidence(first));
         // Of a model that was not asked, the worst is assumed.
-        let worst = agreement_of_all(pairs.len(), &all, &pairs);
-        let worst = worst.strongest_verdict(Some(Certainty::Certain));
+        let worst = agreement.strongest_verdict(Some(Certainty::Certain));
         Ok(own.into_iter().chain(worst).collect())
     }
 }
 
 /// The outcome of matching a query with those of its candidates that are still in the map.
 struct Comparison {
-    /// The indices of these candidates.
+    /// The number of candidates.
+    candidates: usize,
+    /// The indices of those that are still in the map.
     present: Vec<usize>,
     /// How each of them agrees with the query.
     pairs: Vec<PairMatch>,
     /// Duration of the matching, without fetching and extraction.
     took: Duration,
+    /// Which of all candidates show the same place.
+    same_place: SamePlace,
+    /// The same of those that are present.
+    present_same_place: SamePlace,
+}
+
+impl Comparison {
+    /// Returns how many regions of the query agree with each candidate that is present.
+    fn agreement(&self) -> Agreement {
+        Agreement {
+            regions: self.pairs.first().map_or(0, |pair| pair.cells),
+            matches: self.pairs.iter().map(|pair| pair.matches.len()).collect(),
+            first: rank(&self.pairs).first().copied(),
+            same_place: self.present_same_place.clone(),
+        }
+    }
+
+    /// Returns the same for all candidates; 0 for one that was removed.
+    fn agreement_of_all(&self) -> Agreement {
+        let of_present = self.agreement();
+        let mut matches = vec![0; self.candidates];
+        for (&index, count) in self.present.iter().zip(of_present.matches) {
+            matches[index] = count;
+        }
+        let first = of_present.first.map(|first| self.present[first]);
+        Agreement { matches, first, same_place: self.same_place.clone(), ..of_present }
+    }
 }
 
 impl LocalRefiner {
@@ -177,13 +218,37 @@ impl LocalRefiner {
                 sources.push(source);
             }
         }
+        let same_place = |places: &[_], images| SamePlace::of(places, images, &self.places);
+        let (places, images) = self.places_of(map, candidates).await?;
+        let present_places: Vec<_> = present.iter().map(|&index| places[index]).collect();
         let (dense, matcher) = (Arc::clone(&self.dense), self.matcher.clone());
         let (pairs, took) = self
             .pool
             .run(move || match_all(&extractor, &dense, &matcher, query, sources))
             .await
             .map_err(|error| RefineError::Transient(error.to_string()))??;
-        Ok(Comparison { present, pairs, took })
+        Ok(Comparison {
+            candidates: candidates.len(),
+            present,
+            pairs,
+            took,
+            same_place: same_place(&places, images),
+            present_same_place: same_place(&present_places, images),
+        })
+    }
+
+    /// Returns where the candidates are in the order of addition and in space, and the number of images of the map.
+    async fn places_of(
+        &self,
+        map: &Map,
+        candidates: &[Candidate],
+    ) -> Result<(Vec<(Option<usize>, Option<Pose>)>, usize), RefineError> {
+        let ids: Vec<ImageId> =
+            candidates.iter().map(|candidate| candidate.image_id.clone()).collect();
+        let images = self.maps.index_state(map).await?.images;
+        let slots = self.maps.slots(map, &ids).await?;
+        let poses = candidates.iter().map(|candidate| candidate.pose);
+        Ok((slots.into_iter().zip(poses).collect(), images))
     }
 
     /// Returns the feature source of each candidate, in order; `None` for one that was removed.
@@ -261,8 +326,13 @@ fn match_all(
 }
 
 /// Ranks the compared candidates, and puts removed ones behind them in coarse order.
-fn conclude(candidates: &[Candidate], comparison: &Comparison) -> Result<Refinement, RefineError> {
-    let Comparison { present, pairs, took } = comparison;
+fn conclude(
+    candidates: &[Candidate],
+    comparison: &Comparison,
+    standing: impl Fn(Option<Evidence>) -> Standing,
+) -> Result<Refinement, RefineError> {
+    let Comparison { present, pairs, took, .. } = comparison;
+    let agreement = comparison.agreement();
     let per_pair = u32::try_from(pairs.len()).ok().and_then(|pairs| took.checked_div(pairs));
     let ranked = rank(pairs);
     let ordered: Vec<usize> = ranked.iter().map(|&pair| present[pair]).collect();
@@ -275,9 +345,10 @@ fn conclude(candidates: &[Candidate], comparison: &Comparison) -> Result<Refinem
         descriptions: present
             .iter()
             .zip(pairs)
-            .map(|(&index, pair)| Description {
+            .enumerate()
+            .map(|(of, (&index, pair))| Description {
                 image_id: candidates[index].image_id.clone(),
-                text: describe(pair),
+                text: describe(pair, standing(agreement.evidence(of))),
                 cached: false,
                 stands_in: None,
                 took_ms: per_pair.map(milliseconds),
@@ -287,35 +358,16 @@ fn conclude(candidates: &[Candidate], comparison: &Comparison) -> Result<Refinem
         reasoning: reasoning(candidates, present, pairs, &ordered),
         reasoning_took_ms: None,
         ordered_by: None,
-        evidence: ranked.first().and_then(|&first| agreement(pairs, first)),
+        evidence: ranked.first().and_then(|&first| agreement.evidence(first)),
         certainty: None,
         verdicts: Vec::new(),
-        agreement: Some(agreement_of_all(candidates.len(), present, pairs)),
+        agreement: Some(comparison.agreement_of_all()),
         ranking,
         usage: Usage::default(),
         degraded: (missing > 0).then(|| {
             format!("{missing} of {} candidates were removed from the map", candidates.len())
         }),
     })
-}
-
-/// Returns the evidence for one of the compared candidates.
-fn agreement(pairs: &[PairMatch], of: usize) -> Option<Evidence> {
-    let agreeing: Vec<usize> = pairs.iter().map(|pair| pair.matches.len()).collect();
-    Evidence::agreement(&agreeing, pairs.get(of)?.cells, of)
-}
-
-/// Returns how many regions of the query agree with each candidate; 0 for one that was removed.
-fn agreement_of_all(candidates: usize, present: &[usize], pairs: &[PairMatch]) -> Agreement {
-    let mut matches = vec![0; candidates];
-    for (&index, pair) in present.iter().zip(pairs) {
-        matches[index] = pair.matches.len();
-    }
-    Agreement {
-        regions: pairs.first().map_or(0, |pair| pair.cells),
-        matches,
-        first: rank(pairs).first().map(|&first| present[first]),
-    }
 }
 
 /// Explains in one sentence why the first candidate is first.
@@ -325,20 +377,21 @@ fn reasoning(
     pairs: &[PairMatch],
     order: &[usize],
 ) -> Option<String> {
-    let score = |index: usize| {
+    let votes = |index: usize| {
         let pair = present.iter().position(|&known| known == index)?;
         pairs.get(pair).map(|pair| pair.score * 100.0)
     };
     let first = *order.first()?;
     let best = format!(
-        "{} shares the most with the frame: {:.1} % of the frame's regions speak for it",
+        "{} gets the most of the frame's votes: each region of the frame votes for the candidates that match it, and \
+         {:.1} % of all votes go to this one",
         candidates[first].image_id,
-        score(first)?
+        votes(first)?
     );
     Some(match order.get(1) {
         Some(&second) => format!(
-            "{best}, against {:.1} % for {}, the next best.",
-            score(second)?,
+            "{best}, {:.1} % to {}, the next best.",
+            votes(second)?,
             candidates[second].image_id
         ),
         None => format!("{best}."),

@@ -214,7 +214,7 @@ fn nonsensical_settings_do_not_panic() {
         };
         let pairs = LocalMatcher::new(settings).compare_all(&query, &[&query, &query]).unwrap();
         assert!(pairs.iter().all(|pair| pair.score.is_finite()));
-        assert!(!describe(&pairs[0]).is_empty());
+        assert!(!told(&pairs[0]).is_empty());
     }
 }
 
@@ -233,7 +233,7 @@ fn the_same_input_gives_the_same_output() {
     let first = LocalMatcher::default().compare_all(&query, &[&candidate, &query]).unwrap();
     let again = LocalMatcher::default().compare_all(&query, &[&candidate, &query]).unwrap();
     assert_eq!(first, again);
-    assert_eq!(describe(&first[0]), describe(&again[0]));
+    assert_eq!(told(&first[0]), told(&again[0]));
 }
 
 #[test]
@@ -254,19 +254,40 @@ fn a_description_states_counts_regions_and_motion() {
     let scene = Scene::new(21);
     let query = scene.picture(24, 32, 1.0, [0.0; 2]);
     let pair = compare(&query, &scene.picture(24, 32, 1.2, [-0.35, 0.0]));
-    let text = describe(&pair);
+    let text = told(&pair);
     assert!(text.contains(&format!("{} of 768 regions", pair.matches.len())), "{text}");
     assert!(text.contains("35 % of the width to the left"), "{text}");
     assert!(text.contains("1.2 times larger"), "{text}");
     assert!(text.contains("taken from closer"), "{text}");
     assert!(text.contains("Hardly anything along the left edge"), "{text}");
-    assert!(text.ends_with("Strong agreement: probably the same place."), "{text}");
+    assert!(text.ends_with("was not measured yet in this map."), "{text}");
+}
+
+#[test]
+fn the_words_of_a_verdict_follow_from_the_confidence_and_the_threshold_of_known() {
+    let scene = Scene::new(21);
+    let query = scene.picture(24, 32, 1.0, [0.0; 2]);
+    let pair = compare(&query, &scene.picture(24, 32, 1.2, [-0.35, 0.0]));
+    let word = |confidence: f32, known_from: f64| {
+        let text = describe(&pair, Standing { confidence: Some(confidence), known_from });
+        let (_, verdict) = text.rsplit_once(". ").unwrap();
+        verdict.to_owned()
+    };
+    assert!(word(0.9, 0.9).starts_with("Strong agreement: 90 % of"), "{}", word(0.9, 0.9));
+    assert!(word(0.899, 0.9).starts_with("Some agreement: 89 % of"), "{}", word(0.899, 0.9));
+    assert!(word(0.899, 0.8).starts_with("Strong agreement: 89 % of"));
+    assert!(word(0.4, 0.9).starts_with("Weak agreement: 40 % of"), "{}", word(0.4, 0.9));
+}
+
+/// The description of a pair in a map that is not calibrated.
+fn told(pair: &PairMatch) -> String {
+    describe(pair, Standing { confidence: None, known_from: 0.9 })
 }
 
 #[test]
 fn a_description_of_unrelated_pictures_says_that_nothing_agrees() {
     let blank = features(4, 4, vec![0.0; 16 * CHANNELS]);
-    let text = describe(&compare(&noise(22, 4, 4), &blank));
+    let text = told(&compare(&noise(22, 4, 4), &blank));
     assert!(text.starts_with("None of the 16 regions"), "{text}");
     assert!(text.contains("no sign that this is the same place"), "{text}");
 }
@@ -278,7 +299,7 @@ fn a_description_states_how_many_regions_have_no_better_counterpart_elsewhere() 
     let pairs = LocalMatcher::default()
         .compare_all(&query, &[&query, &scene.picture(24, 32, 1.4, [0.3, 0.0]), &noise(24, 24, 32)])
         .unwrap();
-    let text = describe(&pairs[0]);
+    let text = told(&pairs[0]);
     assert!(text.contains("in any of the other 2 candidates"), "{text}");
     assert!(text.contains("stayed where they were"), "{text}");
 }

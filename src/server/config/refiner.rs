@@ -79,6 +79,8 @@ impl Config {
     /// Returns the settings of all refiners.
     pub fn refiner_settings(&self) -> RefinerSettings {
         RefinerSettings {
+            known_confidence: self.localize.known_confidence,
+            places: self.confidence.calibration(self.refine.local_candidates),
             local_candidates: self.refine.local_candidates,
             mllm_candidates: self.refine.candidates,
             cascade: self.cascade,

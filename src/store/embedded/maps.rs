@@ -213,6 +213,15 @@ impl MapStore for EmbeddedStore {
         .await
     }
 
+    async fn slots(&self, map: &Map, ids: &[ImageId]) -> Result<Vec<Option<usize>>, StoreError> {
+        let (inner, uid, ids) = (Arc::clone(&self.inner), map.uid, ids.to_vec());
+        blocking(move || {
+            let slot = |id| Ok(inner.trees.image(uid, id)?.map(|stored| stored.slot));
+            ids.iter().map(slot).collect()
+        })
+        .await
+    }
+
     async fn images(
         &self,
         map: &Map,

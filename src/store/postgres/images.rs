@@ -164,6 +164,24 @@ impl Inner {
         Ok(ids.iter().map(|id| found.get(id).cloned()).collect())
     }
 
+    pub(super) async fn slots_of(
+        &self,
+        map_uid: Uuid,
+        ids: &[ImageId],
+    ) -> Result<Vec<Option<usize>>, StoreError> {
+        let keys: Vec<&str> = ids.iter().map(ImageId::as_str).collect();
+        let found: Vec<(String, i64)> =
+            sqlx::query_as("SELECT id, slot FROM images WHERE map_uid = $1 AND id = ANY($2)")
+                .bind(map_uid)
+                .bind(keys)
+                .fetch_all(&self.pool)
+                .await?;
+        let found: HashMap<String, i64> = found.into_iter().collect();
+        let slot =
+            |id: &ImageId| found.get(id.as_str()).and_then(|&slot| usize::try_from(slot).ok());
+        Ok(ids.iter().map(slot).collect())
+    }
+
     pub(super) async fn images(
         &self,
         map: &Map,

@@ -98,6 +98,10 @@ impl MapStore for PostgresStore {
         self.inner.call(self.inner.images_by_id(map.uid, ids)).await
     }
 
+    async fn slots(&self, map: &Map, ids: &[ImageId]) -> Result<Vec<Option<usize>>, StoreError> {
+        self.inner.call(self.inner.slots_of(map.uid, ids)).await
+    }
+
     async fn images(
         &self,
         map: &Map,

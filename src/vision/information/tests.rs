@@ -152,3 +152,77 @@ fn scenes_are_informative_in_good_and_bad_conditions() {
         }
     }
 }
+
+fn shaded(value: impl Fn(u32, u32) -> f32) -> RgbImage {
+    RgbImage::from_fn(640, 480, |x, y| Rgb([value(x, y) as u8; 3]))
+}
+
+/// Colour bars: the first row of bars, and two rows below them if it is a whole card.
+fn colour_bars(card: bool) -> RgbImage {
+    const BARS: [[u8; 3]; 8] = [
+        [255; 3],
+        [255, 255, 0],
+        [0, 255, 255],
+        [0, 255, 0],
+        [255, 0, 255],
+        [255, 0, 0],
+        [0, 0, 255],
+        [0; 3],
+    ];
+    RgbImage::from_fn(640, 480, |x, y| {
+        let bar = (x / 80) as usize;
+        Rgb(match y {
+            320..360 if card => BARS[7 - bar],
+            360.. if card => [[9; 3], [255; 3], [50, 0, 106], [19; 3]][bar / 2],
+            _ => BARS[bar],
+        })
+    })
+}
+
+fn is_odd(number: u32) -> f32 {
+    255.0 * (number % 2) as f32
+}
+
+#[test]
+fn stripes_checkerboards_colour_bars_and_rings_are_uninformative() {
+    let mut patterns =
+        vec![("bars".to_owned(), colour_bars(false)), ("card".into(), colour_bars(true))];
+    for size in [3, 4, 8, 16, 20, 24, 32, 40, 60, 64] {
+        patterns.extend([
+            (format!("columns of {size}"), shaded(|x, _| is_odd(x / size))),
+            (format!("rows of {size}"), shaded(|_, y| is_odd(y / size))),
+            (format!("diagonals of {size}"), shaded(|x, y| is_odd((x + y) / size))),
+            (format!("squares of {size}"), shaded(|x, y| is_odd(x / size + y / size))),
+        ]);
+    }
+    for period in [8.0, 20.0] {
+        let ring = |x: u32, y: u32| (x as f32 - 320.0).hypot(y as f32 - 240.0) / period;
+        patterns.push(("rings".into(), shaded(|x, y| 127.0 + 120.0 * ring(x, y).sin())));
+    }
+    for (name, pattern) in patterns {
+        assert_uninformative(&name, &pattern);
+        assert_uninformative(&format!("{name}, noisy"), &Noise(11).over(&pattern, 4.0));
+    }
+}
+
+#[test]
+fn a_scene_of_which_a_large_part_is_missing_is_uninformative() {
+    for scene in SCENES {
+        let scene = decode(scene, LIMITS, Needed::All).unwrap().pixels;
+        let (width, height) = scene.dimensions();
+        let without = |is_missing: &dyn Fn(u32, u32) -> bool, fill: [u8; 3]| {
+            let mut scene = scene.clone();
+            let missing = scene.enumerate_pixels_mut().filter(|(x, y, _)| is_missing(*x, *y));
+            missing.for_each(|(.., pixel)| *pixel = Rgb(fill));
+            scene
+        };
+        for fill in [[128; 3], [0, 135, 0], [0; 3], [255; 3]] {
+            assert_uninformative("lower half", &without(&|_, y| 2 * y >= height, fill));
+            assert_uninformative("right half", &without(&|x, _| 2 * x >= width, fill));
+        }
+        assert_uninformative("lower 40 %", &without(&|_, y| 10 * y >= 6 * height, [128; 3]));
+        // Bars above and below a picture are no fault.
+        let bars = without(&|_, y| y < height / 8 || y >= height - height / 8, [0; 3]);
+        assert_eq!(measured(&bars).lack(), None);
+    }
+}

@@ -156,6 +156,7 @@ impl Shelf {
                 query_id: Uuid::now_v7(),
                 digest: self.digest(self.pictures.len() - 1),
                 descriptor: None,
+                uninformative: false,
             },
             candidates: (0..candidates).map(candidate).collect(),
             priority: Priority::Normal,
@@ -256,6 +257,10 @@ impl MapStore for Shelf {
         _: usize,
         _: SearchMode,
     ) -> Result<Vec<Candidate>, StoreError> {
+        unused()
+    }
+
+    async fn slots(&self, _: &Map, _: &[ImageId]) -> Result<Vec<Option<usize>>, StoreError> {
         unused()
     }
 

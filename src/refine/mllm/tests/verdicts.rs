@@ -4,7 +4,7 @@ use async_trait::async_trait;
 use parking_lot::Mutex;
 use serde_json::json;
 use whereabouts_core::{
-    Agreement, Candidate, Certainty, Evidence, ImageId, PairRegion, RefinerKind,
+    Agreement, Candidate, Certainty, Evidence, ImageId, PairRegion, RefinerKind, SamePlace,
 };
 use whereabouts_store::HardNegatives;
 
@@ -41,9 +41,12 @@ impl RegionMatcher for Regions {
 
     async fn agreement(&self, input: &RefineInput) -> Result<Agreement, RefineError> {
         match self.0.get(..input.candidates.len()) {
-            Some(matches) => {
-                Ok(Agreement { regions: 500, matches: matches.to_vec(), first: Some(1) })
-            }
+            Some(matches) => Ok(Agreement {
+                regions: 500,
+                matches: matches.to_vec(),
+                first: Some(1),
+                same_place: SamePlace::default(),
+            }),
             None => Err(RefineError::Transient("no features".into())),
         }
     }
@@ -71,7 +74,12 @@ async fn bench(first: &'static str, certainty: &'static str) -> Bench {
 
 #[tokio::test]
 async fn a_verdict_is_worth_what_the_regions_bear_out() {
-    let agreement = Agreement { regions: 500, matches: vec![20, 200, 30, 10, 5], first: Some(1) };
+    let agreement = Agreement {
+        regions: 500,
+        matches: vec![20, 200, 30, 10, 5],
+        first: Some(1),
+        same_place: SamePlace::default(),
+    };
     for (first, of) in [("number 2.", 1), ("number 4.", 3)] {
         for (certainty, says) in [("certain", Certainty::Certain), ("unsure", Certainty::Unsure)] {
             let refinement = bench(first, certainty).await.refine(5).await.unwrap();
@@ -145,7 +153,12 @@ fn negatives(count: usize) -> HardNegatives {
 async fn the_model_is_asked_about_images_of_other_places_at_the_cost_it_says() {
     let bench = bench("number 4.", "likely").await;
     let verdict = bench.refiner.verdict(&bench.shelf.map, &negatives(5)).await.unwrap();
-    let agreement = Agreement { regions: 500, matches: vec![20, 200, 30, 10, 5], first: Some(1) };
+    let agreement = Agreement {
+        regions: 500,
+        matches: vec![20, 200, 30, 10, 5],
+        first: Some(1),
+        same_place: SamePlace::default(),
+    };
     assert_eq!(verdict, agreement.strongest_verdict(Some(Certainty::Likely)));
     let cost = bench.refiner.cost(5);
     let calls = bench.mock.describe_calls() + bench.mock.reason_calls();

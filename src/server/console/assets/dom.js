@@ -1,6 +1,8 @@
 // DOM helpers without markup: everything from the server, including names, tags and model text, enters the page
 // only as text nodes and attributes. Nothing in this folder sets innerHTML.
 
+import { downTo } from "./format.js";
+
 /** Creates an element. `attributes`: `class`, `on…` handlers, booleans or plain attributes; null is skipped. */
 export function h(name, attributes = {}, ...children) {
   const made = document.createElement(name);
@@ -108,4 +110,10 @@ export function confirm({ title, text, action, word }) {
     document.body.append(dialog);
     dialog.showModal();
   });
+}
+
+/** The confidence of an estimate as a large number, or that it is not measured yet. */
+export function confidenceLine(estimate) {
+  return estimate.confidence == null ? h("p", { class: "muted" }, "Confidence not measured yet")
+    : h("p", { class: "big" }, downTo(estimate.confidence), h("span", { class: "muted" }, " confidence"));
 }

@@ -6,6 +6,18 @@ const compact = new Intl.NumberFormat("en", { notation: "compact", maximumFracti
 export const count = (value) => number.format(value);
 export const short = (value) => (value < 10000 ? number.format(value) : compact.format(value).toLowerCase());
 export const percent = (share) => `${Math.round(share * 100)} %`;
+
+/** A confidence in words: null while it is not measured yet how convincing a wrong answer is in this map. */
+export const confidence = (share) => share == null ? "confidence not measured yet" : `${downTo(share)} confidence`;
+
+/** Rounded down, so that what is below a threshold is never shown as if it reached it. */
+export const downTo = (share) => `${Math.floor(share * 100 + 1e-4)} %`;
+
+/** What an estimate says about its place. */
+export const knownOrNot = (estimate) => estimate.known ? "The place is known."
+  : estimate.reason ?? (estimate.confidence == null
+    ? "Whether the place is known is not measured yet: the images of the map were changed lately."
+    : "May not be in the map: the confidence is below the configured threshold.");
 export const plural = (value, one, many = `${one}s`) => `${count(value)} ${value === 1 ? one : many}`;
 
 /** Formats a duration: "216 ms", "3.2 s", "4 min 10 s". */

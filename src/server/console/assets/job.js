@@ -1,8 +1,8 @@
 // One job: its result, the frame next to each candidate, and its cost. An open job is followed live.
 
 import { address, call, contentOf, follow, frameOf, isAbort, picture } from "./api.js";
-import { announce, badge, facts, failure, fill, h, loading } from "./dom.js";
-import { cost, count, duration, moment, percent, plural, pose, shortId, timeAgo } from "./format.js";
+import { announce, badge, confidenceLine, facts, failure, fill, h, loading } from "./dom.js";
+import { confidence, cost, count, duration, knownOrNot, moment, plural, pose, shortId, timeAgo } from "./format.js";
 import { bought, moved, pictures, words } from "./pair.js";
 
 const OPEN = ["queued", "running"];
@@ -61,11 +61,11 @@ export async function show({ root, argument: id, query, signal, setQuery, title 
         h("div", { class: "card answer" },
           picture(frameOf(id, 640), "The frame of this job", { signal, className: "small-picture", gone: "The frame is no longer stored, or this server does not serve frames." }),
           h("div", {}, h("h2", {}, "Estimate"),
-            estimate ? h("p", { class: "big" }, percent(estimate.confidence), h("span", { class: "muted" }, " confidence")) : h("p", { class: "muted" }, ended() ? "None." : "Available when the job has ended."),
-            estimate && h("p", {}, estimate.known ? "The place is known." : estimate.reason ?? "May not be in the map: the confidence is below the configured threshold."),
+            estimate ? confidenceLine(estimate) : h("p", { class: "muted" }, ended() ? "None." : "Available when the job has ended."),
+            estimate && h("p", {}, knownOrNot(estimate)),
             estimate && h("p", {}, h("code", {}, estimate.image_id), h("br"), h("span", { class: "muted" }, pose(estimate.pose))),
             job.verdicts?.length > 0 && h("div", {}, h("h2", {}, "Verdicts"), job.verdicts.map((verdict) => h("p", {},
-              h("strong", {}, verdict.refiner), ": ", h("code", {}, verdict.image_id), ` of ${plural(verdict.compared, "candidate")}, ${percent(verdict.confidence)} confidence`,
+              h("strong", {}, verdict.refiner), ": ", h("code", {}, verdict.image_id), ` of ${plural(verdict.compared, "candidate")}, ${confidence(verdict.confidence)}`,
               verdict.certainty && ` (the model says: ${verdict.certainty})`, verdict.then && h("span", { class: "muted" }, `; ${verdict.then}`)))),
             job.reasoning && h("div", {}, h("h2", {}, "Reasoning"), job.reasoning.split(/\n+/).map((part) => h("p", { class: "told" }, part))))),
         h("div", { class: "card" }, facts(

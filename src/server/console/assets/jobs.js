@@ -3,7 +3,7 @@
 
 import { address, call, follow, isAbort } from "./api.js";
 import { announce, badge, command, empty, failure, fill, h, loading } from "./dom.js";
-import { cost, count, duration, percent, plural, shortId, timeAgo } from "./format.js";
+import { cost, count, downTo, duration, plural, shortId, timeAgo } from "./format.js";
 
 const PAGE = 50;
 const STATES = ["queued", "running", "succeeded", "degraded", "failed", "cancelled"];
@@ -236,7 +236,7 @@ function cells(job) {
     cell("Map", job.map),
     cell("Age", timeAgo(job.created_at)),
     cell("Took", took),
-    cell("Estimate", job.estimate ? [job.estimate.image_id, h("span", { class: job.estimate.known ? "sure" : "muted" }, ` ${percent(job.estimate.confidence)}`)] : "–"),
+    cell("Estimate", job.estimate ? [job.estimate.image_id, h("span", { class: job.estimate.known ? "sure" : "muted" }, job.estimate.confidence == null ? " not measured yet" : ` ${downTo(job.estimate.confidence)}`)] : "–"),
     cell("Refiner", job.refiner),
     cell("Cost", h("span", { class: job.usage.calls || job.usage.cached ? null : "muted" }, cost(job.usage))),
   ];

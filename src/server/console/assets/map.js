@@ -2,7 +2,7 @@
 
 import { address, call, isAbort } from "./api.js";
 import { announce, command, confirm, empty, facts, failure, fill, h, loading } from "./dom.js";
-import { ago, count, metres, moment, percent, plural, pose } from "./format.js";
+import { ago, confidence, count, metres, moment, plural, pose } from "./format.js";
 import { imageCard, uploadCard } from "./images.js";
 import { reindexed, searched } from "./maps.js";
 import { Plan } from "./plan.js";
@@ -162,7 +162,7 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
       plan.setMarkers(ranking.map((candidate) => ({ pose: candidate.pose, label: String(candidate.rank), kind: candidate.image_id === best ? "estimate" : "candidate" })));
       const known = (image) => images.find((one) => one.id === image);
       fill(asked, h("div", { class: "heading" }, h("h2", {}, "Query"), h("a", { class: "heading-end", href: `#/jobs/${encodeURIComponent(id)}` }, "Its job")),
-        job.estimate && h("p", {}, "Estimate ", h("code", {}, best), `, ${percent(job.estimate.confidence)} confidence, ${job.estimate.known ? "known" : "may not be in the map"}. It is ringed on the plan.`),
+        job.estimate && h("p", {}, "Estimate ", h("code", {}, best), `, ${confidence(job.estimate.confidence)}${job.estimate.confidence == null ? "" : job.estimate.known ? ", known" : ", may not be in the map"}. It is ringed on the plan.`),
         ranking.length ? h("ol", { class: "images" }, ranking.map((candidate) => h("li", {}, h("button", { type: "button", onclick: () => { const image = known(candidate.image_id); if (image) choose(image, { focus: true }); } },
           h("span", {}, `${candidate.rank}. ${candidate.image_id}`), h("span", { class: "muted" }, candidate.pose ? "" : "no pose"))))) : h("p", { class: "muted" }, "The job has no ranking, so there are no candidates to show."));
     } catch (problem) {

@@ -1,8 +1,8 @@
 // Localizes a picture: shows the estimate, the similar images, and then the refinement pair by pair.
 
 import { address, call, contentOf, follow, isAbort, picture } from "./api.js";
-import { announce, badge, command, empty, facts, failure, fill, h } from "./dom.js";
-import { count, duration, percent, pose, shortId } from "./format.js";
+import { announce, badge, command, confidenceLine, empty, facts, failure, fill, h } from "./dom.js";
+import { confidence, count, duration, knownOrNot, pose, shortId } from "./format.js";
 import { moved } from "./pair.js";
 import { apart } from "./words.js";
 
@@ -70,7 +70,7 @@ export async function show({ root, query, signal, setQuery, title }) {
     const round = performance.now() - start;
     setQuery({ map: answer.map, job: answer.job?.id });
     estimated(best, told, answer, answer.estimate, { round });
-    announce(answer.estimate ? `Answered: ${answer.estimate.image_id}, ${percent(answer.estimate.confidence)} confidence.` : "Answered: no candidates.");
+    announce(answer.estimate ? `Answered: ${answer.estimate.image_id}, ${confidence(answer.estimate.confidence)}.` : "Answered: no candidates.");
     if (!answer.candidates.length) {
       fill(rest, empty("Nothing to compare with", h("p", {}, "This map has no images yet:"), command(`whereabouts index FOLDER --map ${answer.map}`)));
       return;
@@ -88,8 +88,8 @@ export async function show({ root, query, signal, setQuery, title }) {
         h("figcaption", {}, "Most similar: ", h("code", {}, estimate.image_id))]);
     }
     fill(told, h("h2", {}, job ? "Refined estimate" : "Estimate"),
-      estimate ? h("p", { class: "big" }, percent(estimate.confidence), h("span", { class: "muted" }, " confidence")) : h("p", {}, "None: the map has no images."),
-      estimate && h("p", {}, estimate.known ? "The place is known." : estimate.reason ?? "May not be in the map: the confidence is below the configured threshold."),
+      estimate ? confidenceLine(estimate) : h("p", {}, "None: the map has no images."),
+      estimate && h("p", {}, knownOrNot(estimate)),
       (answer.warnings ?? []).map((warning) => h("div", { class: "notice warn" }, h("strong", {}, "Damaged picture"), h("p", {}, warning))),
       facts(["Pose", estimate && pose(estimate.pose)], ["Answered in", `${duration(timing.total)} (decode ${duration(timing.decode)}, extract ${duration(timing.extract)}, search ${duration(timing.search)})`],
         ["Round trip", duration(round)], ["Model", answer.model]));
