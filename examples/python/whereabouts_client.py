@@ -286,6 +286,8 @@ class TrackEstimate:
     """Up to two other places where the robot may be, the most probable first."""
     is_late: bool = False
     """Whether the frame is older than the last one of the track."""
+    off_map: float = 0.0
+    """The probability that the robot is at no place of the map, 0 to 1."""
 
 
 @dataclass(frozen=True)
