@@ -212,8 +212,9 @@ async fn a_robot_that_drives_on_past_the_end_without_seeing_anything_is_not_know
     let (counts, answers) = counted(&map, &frames).await;
     counts.check("blind past the end");
     for answers in answers {
-        let rising: Vec<f64> = answers[20..].iter().map(off_map).collect();
-        assert!(rising[23] > 0.8, "{rising:?}");
+        // Without seeing anything, it may also have come back.
+        let off: Vec<f64> = answers[20..].iter().map(off_map).collect();
+        assert!(off[2..8].iter().all(|off| *off > 0.7) && off[23] > 0.5, "{off:?}");
     }
 }
 

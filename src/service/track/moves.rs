@@ -261,16 +261,17 @@ impl Way<'_> {
                 let share = (metres - low) / (high - low);
                 let is_off = high - low > GAP * self.spacing
                     && (metres - low).min(high - metres) > self.spacing;
-                let kept = if is_off { BEYOND } else { 1.0 };
-                put(before, mass * kept * (1.0 - share));
-                put(after, mass * kept * share);
-                moved.left += mass * (1.0 - kept);
+                put(before, mass * (1.0 - share));
+                put(after, mass * share);
+                if is_off {
+                    moved.left += mass * (1.0 - BEYOND) / BEYOND;
+                }
             }
         }
     }
 }
 
-/// Weight of staying on the map where a path ends, or in a gap between two images.
+/// Weight of staying on the map where a path ends; in a gap between two images, the probability of being at one of them.
 const BEYOND: f64 = 0.3;
 
 /// Images this many times further apart than usual have a gap between them: who is there is off the map.
