@@ -288,16 +288,16 @@ export class Plan {
     ink.globalAlpha = 1;
   }
 
-  /** Draws a way: solid where the robot's place is sure, with a gap where it is probably off the map. */
+  /** Draws a way: solid where the robot's place is sure, with a gap where it may be anywhere or off the map. */
   drawWay() {
     const { ink, colours, way } = this;
-    const isOff = (place) => place.off_map > 0.5;
-    ink.strokeStyle = ink.fillStyle = colours.accent;
-    ink.lineWidth = 3;
+    const isLost = (place) => place.off_map > 0.5 || place.probability < 0.2;
+    ink.strokeStyle = ink.fillStyle = colours.good;
+    ink.lineWidth = 4;
     ink.lineJoin = ink.lineCap = "round";
     for (let at = 1; at < way.length; at += 1) {
       const [before, here] = [way[at - 1], way[at]];
-      if (isOff(before) || isOff(here)) continue;
+      if (isLost(before) || isLost(here)) continue;
       ink.globalAlpha = before.known && here.known ? 0.9 : 0.35;
       ink.beginPath();
       ink.moveTo(...this.toScreen(...before.at));
@@ -306,9 +306,9 @@ export class Plan {
     }
     ink.globalAlpha = 1;
     const last = way.at(-1);
-    if (!last) return;
+    if (!last || isLost(last)) return;
     ink.beginPath();
-    ink.arc(...this.toScreen(...last.at), 8, 0, 6.2832);
+    ink.arc(...this.toScreen(...last.at), 9, 0, 6.2832);
     // Hollow where the robot may be elsewhere.
     if (last.known) ink.fill(); else ink.stroke();
   }
