@@ -24,10 +24,13 @@ const MAX_PAUSE_S: f64 = 86_400.0;
 const AHEAD_S: f64 = 10.0;
 
 /// A step ahead of more than this many seconds may be that of a clock which was set ...
-const STEP_S: f64 = 10.0;
+const STEP_S: f64 = 45.0;
 
-/// ... if it is also this many times the usual one, and longer than the frame took to arrive by as much.
-const STEP: f64 = 10.0;
+/// ... if it is also this many times the usual one: robots that are recorded wait, and drive where nothing is recorded ...
+const STEP: f64 = 25.0;
+
+/// ... and this many times what the frame took to arrive.
+const STEP_ARRIVED: f64 = 10.0;
 
 /// This many frames in a row that are older than the last, in order and at the usual pace, follow a clock that was set
 /// back.
@@ -281,7 +284,7 @@ fn reset(elapsed: Elapsed) -> Tick {
 /// Whether a clock that went ahead by this much may have been set.
 fn is_step(elapsed: f64, usual: Option<f64>, arrived: f64) -> bool {
     elapsed > STEP_S
-        && elapsed > STEP * arrived
+        && elapsed > STEP_ARRIVED * arrived
         && usual.is_some_and(|usual| elapsed > STEP * usual)
 }
 

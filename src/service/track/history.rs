@@ -125,7 +125,7 @@ struct Transition<'a> {
 }
 
 impl Transition<'_> {
-    fn from_image(&self, from: u32, to: u32) -> f64 {
+    fn between(&self, from: u32, to: u32) -> f64 {
         let count = self.ground.len().max(1) as f64;
         let spacing = self.ground.paths.spacing();
         let Some(Move { metres, error }) = self.moved else { return 1.0 / count };
@@ -150,7 +150,7 @@ impl Transition<'_> {
             let elsewhere = filtered.elsewhere / count;
             let off_map = filtered.off_map * enter / count;
             for ((way, (from, _)), mass) in ways.iter_mut().zip(&one.images).zip(&filtered.images) {
-                *way = mass * self.from_image(*from, *to);
+                *way = mass * self.between(*from, *to);
             }
             let total = ways.iter().sum::<f64>() + elsewhere + off_map;
             let scale = goal / total.max(f64::MIN_POSITIVE);

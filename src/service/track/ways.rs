@@ -92,7 +92,7 @@ impl Tracks {
             .iter()
             .filter(|(key, entry)| is_wanted(key) && !entry.is_idle(&self.settings))
             .collect();
-        found.sort_by(|(_, a), (_, b)| b.last_used.cmp(&a.last_used));
+        found.sort_by_key(|(_, entry)| std::cmp::Reverse(entry.last_used));
         found.into_iter().map(|(key, entry)| (key.clone(), Arc::clone(&entry.track))).collect()
     }
 }
