@@ -28,6 +28,8 @@ pub(super) struct FrameWeights {
     pub weights: Weights,
     /// The share of it that is new.
     pub fresh: f64,
+    /// The share by which it differs from the frame before, both without what they have in common with others.
+    pub unlike: f64,
     /// The confidence of the frame alone; `None` if the map has no calibration.
     pub confidence: Option<f32>,
 }
@@ -55,7 +57,8 @@ impl Posterior {
             false => [1.0; LEVELS],
         };
         let ratios = ratios.map(|ratio| ratio.powf(frame.fresh));
-        let presence = self.presence.updated(&ratios, most_evidence(frame.confidence));
+        let most = most_evidence(frame.confidence);
+        let presence = self.presence.updated(&ratios, most, frame.unlike);
         Self { belief, presence }
     }
 

@@ -16,6 +16,9 @@
 //! alike. The most that one frame may count is what the calibration of the map
 //! allows: of frames off the map, a share of at most 1 − c reaches the confidence c of the frame alone, so that evidence
 //! for the map is worth at most 1 / (1 − c); without a calibration, [`MOST_EVIDENCE`].
+//!
+//! Off the map, frames resemble each other, in light and in kind of place, and so all of them resemble the same image.
+//! Only what sets a frame apart from the one before is therefore evidence of the map.
 
 /// The values of clarity that are told apart.
 pub(super) const CLARITIES: [f64; 4] = [1.5, 2.5, 3.5, 4.5];
@@ -103,13 +106,15 @@ impl Presence {
         (next, (back / next.on_map().max(LEAST)).min(1.0))
     }
 
-    /// The update step, with the likelihood ratios of a frame, which counts at most `most`.
-    pub fn updated(&self, ratios: &Ratios, most: f64) -> Self {
+    /// The update step, with the likelihood ratios of a frame. As evidence of the map it counts at most `most`, and only
+    /// the share `unlike` of it, by which it differs from the frame before.
+    pub fn updated(&self, ratios: &Ratios, most: f64, unlike: f64) -> Self {
         let mut next = *self;
         next.on.iter_mut().zip(ratios).for_each(|(on, ratio)| *on *= ratio);
         let ratio = next.on.iter().sum::<f64>() / self.on.iter().sum::<f64>().max(LEAST);
-        if ratio > most {
-            next.on.iter_mut().for_each(|on| *on *= most / ratio);
+        if ratio > 1.0 {
+            let counted = ratio.min(most).powf(unlike);
+            next.on.iter_mut().for_each(|on| *on *= counted / ratio);
         }
         next.normalised()
     }
@@ -146,7 +151,7 @@ mod tests {
     fn after(presence: Presence, similarities: &[f64]) -> Presence {
         similarities.iter().fold(presence, |presence, z| {
             let ratios = ratios(*z).map(|ratio| OUTLIERS + (1.0 - OUTLIERS) * ratio);
-            presence.predicted(0.005, 0.02).0.updated(&ratios, 50.0)
+            presence.predicted(0.005, 0.02).0.updated(&ratios, 50.0, 1.0)
         })
     }
 
@@ -175,7 +180,7 @@ mod tests {
     #[test]
     fn a_frame_that_says_nothing_changes_nothing_but_what_motion_does() {
         let presence = after(Presence::new(), &[3.0; 4]);
-        let next = presence.updated(&[1.0; LEVELS], 20.0);
+        let next = presence.updated(&[1.0; LEVELS], 20.0, 1.0);
         assert!((next.on_map() - presence.on_map()).abs() < 1e-9);
         let (left, _) = presence.predicted(0.7, 0.0);
         assert!((left.on_map() - 0.3 * presence.on_map()).abs() < 1e-6);
@@ -191,7 +196,7 @@ mod tests {
         assert_eq!(most_evidence(None), MOST_EVIDENCE);
         let odds = |presence: Presence| presence.on_map() / (1.0 - presence.on_map());
         let before = Presence::new();
-        assert!((odds(before.updated(&ratios(30.0), 7.0)) / odds(before) - 7.0).abs() < 1e-3);
+        assert!((odds(before.updated(&ratios(30.0), 7.0, 1.0)) / odds(before) - 7.0).abs() < 1e-3);
         assert!(ratios(-30.0).into_iter().all(|ratio| ratio < 1.0));
     }
 }

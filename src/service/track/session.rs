@@ -49,6 +49,8 @@ pub(super) struct Track {
     /// When the last frame arrived.
     pub last_frame_at: Timestamp,
     seen: Frames,
+    /// The last frame without what it has in common with others; empty before the first.
+    centred: Vec<f32>,
     odometer: Odometer,
     clock: Clock,
     /// What the filter said after the last frames, the oldest first.
@@ -73,6 +75,8 @@ pub(super) struct Prediction {
     fresh: f64,
     /// Whether the frame is older than the last one.
     pub is_late: bool,
+    /// The share by which the frame differs from the one before.
+    unlike: f64,
     /// The frame without what it has in common with others.
     pub frame: Vec<f32>,
     /// What the robot should send instead.
@@ -92,6 +96,7 @@ impl Track {
             ground: None,
             revision: 0,
             frames: 0,
+            centred: Vec::new(),
             last_frame_at: Timestamp::UNIX_EPOCH,
             seen: Frames::default(),
             odometer: Odometer::default(),
@@ -186,8 +191,22 @@ impl Track {
             .or_else(|| self.rate_warning(step, (max_speed, spacing), settings));
         self.frames += 1;
         let frame = self.seen.centred(descriptor, ground.mean());
+        let unlike = unlike(&self.centred, &frame);
+        if is_informative {
+            self.centred.clone_from(&frame);
+        }
         let times = (step.captured_at, arrival.clock);
-        Prediction { posterior, fresh, is_late: false, frame, warning, times, motion, max_speed }
+        Prediction {
+            posterior,
+            fresh,
+            is_late: false,
+            unlike,
+            frame,
+            warning,
+            times,
+            motion,
+            max_speed,
+        }
     }
 
     /// What is believed after a move by odometry.
@@ -237,6 +256,7 @@ impl Track {
             posterior,
             fresh: 1.0,
             is_late: true,
+            unlike: 1.0,
             frame,
             warning,
             times,
@@ -304,6 +324,16 @@ impl Track {
     }
 }
 
+/// The share by which a frame differs from the one before: one minus their cosine.
+fn unlike(before: &[f32], frame: &[f32]) -> f64 {
+    let dot = |a: &[f32], b: &[f32]| f64::from(whereabouts_core::dot(a, b));
+    let lengths = (dot(before, before) * dot(frame, frame)).sqrt();
+    if before.len() != frame.len() || lengths <= 0.0 {
+        return 1.0;
+    }
+    (1.0 - dot(before, frame) / lengths).clamp(0.0, 1.0)
+}
+
 pub(super) fn habits(max_speed: f64, settings: &TrackSettings) -> Habits {
     let TrackSettings { turn, jump, leave, enter, .. } = *settings;
     Habits { max_speed, turn, jump, leave, enter }
@@ -356,6 +386,7 @@ impl Prediction {
         (!sample.is_empty()).then(|| FrameWeights {
             weights: Weights::new(&similar, &sample, ground.len(), strength),
             fresh: self.fresh,
+            unlike: self.unlike,
             confidence,
         })
     }
