@@ -14,7 +14,7 @@ pub fn all(sets: &Sets) -> anyhow::Result<Vec<Drive>> {
         drives.push(town.drive(", past the end", &|place| place < count / 2, count / 4..count));
         let is_street = |place: usize| place / STREET % 4 != 2;
         drives.push(town.drive(", streets not in the map", &is_street, 0..count));
-        let is_half = |place: usize| place / STREET % 2 == 0;
+        let is_half = |place: usize| (place / STREET).is_multiple_of(2);
         drives.push(town.drive(", half of the map", &is_half, 0..count));
         drives.push(kidnapped(town, elsewhere));
         let whole = elsewhere.drive("", &|_| true, 0..elsewhere.map.len());
@@ -24,7 +24,7 @@ pub fn all(sets: &Sets) -> anyhow::Result<Vec<Drive>> {
         let count = set.map.len();
         let order: Vec<usize> = (0..count).collect();
         drives.push(set.drive(", past the end", &|place| place < count / 2, &order));
-        let is_half = |place: usize| place * 10 / count % 2 == 0;
+        let is_half = |place: usize| (place * 10 / count).is_multiple_of(2);
         drives.push(set.drive(", half of the map", &is_half, &order));
         for other in sets.traverses.iter().filter(|other| other.name != set.name) {
             drives.push(swapped(set, other));
