@@ -112,6 +112,8 @@ call 200 -H "$jpeg" -H 'X-Deadline-Ms: 20000' --data-binary "@$first" "$url/loca
 job=$(pick '.*"job":\{"id":"([^"]*)".*')
 call 200 -H "$jpeg" --data-binary "@$second" \
     "$url/localize?map=curl-example&refine=off&track=robot-7&captured_at=2026-03-01T12:00:02Z&moved_m=16.5"
+call 200 "$url/maps/curl-example/tracks"
+call 200 "$url/maps/curl-example/tracks/robot-7"
 call 404 -H "$jpeg" --data-binary "@$first" "$url/localize?map=curl-nowhere"
 
 # Jobs. A succeeded job cannot be retried.

@@ -16,14 +16,17 @@ const LIMITS: ImageLimits = ImageLimits { max_pixels: 10_000_000 };
 /// Speed of the robot in the town, in metres per second.
 const SPEED: f64 = 8.0;
 
-/// A map and the frames of one robot in it.
+/// A map and the frames of one robot, in it or not.
+#[derive(Clone)]
 pub struct Drive {
     pub name: String,
     /// Descriptors and positions in metres, in the order of recording.
     pub map: Vec<(Descriptor, [f64; 2])>,
+    /// The number of the place of each image of the map.
+    pub places: Vec<usize>,
     pub frames: Vec<Frame>,
-    /// An answer is right if its number is at most this much off.
-    tolerance: usize,
+    /// An answer is right if its place is at most this much off.
+    pub tolerance: usize,
 }
 
 /// A frame, with what the robot says of its way.
@@ -32,19 +35,28 @@ pub struct Frame {
     pub descriptor: Descriptor,
     pub seconds: f64,
     pub moved_m: f64,
-    /// The number of the image of the place.
-    truth: usize,
+    /// The number of the place; `None` for a place that has no number.
+    pub truth: Option<usize>,
 }
 
 impl Drive {
+    /// Whether an answer, the number of an image of the map, is right.
     pub fn is_right(&self, frame: usize, answer: Option<usize>) -> bool {
-        answer.is_some_and(|answer| answer.abs_diff(self.frames[frame].truth) <= self.tolerance)
+        let place = answer.map(|image| self.places[image]);
+        let truth = self.frames[frame].truth;
+        place.zip(truth).is_some_and(|(place, truth)| place.abs_diff(truth) <= self.tolerance)
     }
 
-    /// The share of right answers in percent.
+    /// Whether the map has an image of the place of a frame.
+    pub fn is_on_map(&self, frame: usize) -> bool {
+        (0..self.places.len()).any(|image| self.is_right(frame, Some(image)))
+    }
+
+    /// The share of right answers to the frames on the map, in percent.
     pub fn right(&self, answers: impl Iterator<Item = Option<usize>>) -> f64 {
         let right = answers.enumerate().filter(|(frame, answer)| self.is_right(*frame, *answer));
-        100.0 * right.count() as f64 / self.frames.len() as f64
+        let on_map = (0..self.frames.len()).filter(|frame| self.is_on_map(*frame)).count();
+        100.0 * right.count() as f64 / on_map.max(1) as f64
     }
 }
 
@@ -60,58 +72,126 @@ impl Describer {
     }
 }
 
-/// All drives, described by `kind` or the model's default: two towns, and real traverses that are driven forwards, backwards, at twice the speed, and there and back.
-pub fn all(kind: Option<DescriptorKind>) -> anyhow::Result<Vec<Drive>> {
-    let assets = Assets::locate(Some(&Path::new(env!("CARGO_MANIFEST_DIR")).join("assets")));
-    let extractor = Extractor::load(&assets, &ExtractorSettings::plain("xfeat", 1, LIMITS))?;
-    let kind = kind.unwrap_or(extractor.manifest().default_kind());
-    println!("descriptors: {}", kind.as_str());
-    let describer = Describer { extractor, kind };
-    let mut drives = vec![town(&describer, 11, 96)?, town(&describer, 5, 160)?];
-    let data =
-        std::env::var_os("WHEREABOUTS_DATA").map_or_else(|| "../shared/data".into(), PathBuf::from);
-    for (name, map, queries) in [
-        ("corridor", "corridor/ref", "corridor/query"),
-        ("nordland", "nordland/summer", "nordland/winter"),
-    ] {
-        let [map, queries] = [map, queries].map(|folder| data.join(folder));
-        if !map.is_dir() {
-            println!("{name} is left out: there is no {}", map.display());
-            continue;
+/// The recorded and rendered sets that drives are made of.
+pub struct Sets {
+    pub towns: Vec<TownSet>,
+    pub traverses: Vec<Traverse>,
+}
+
+/// A town: what the map sees, and what a robot sees that drives by later.
+pub struct TownSet {
+    pub seed: u64,
+    pub map: Vec<(Descriptor, [f64; 2])>,
+    pub frames: Vec<(Descriptor, [f64; 2])>,
+}
+
+/// A real traverse, recorded twice.
+pub struct Traverse {
+    pub name: &'static str,
+    pub map: Vec<Descriptor>,
+    pub frames: Vec<Descriptor>,
+}
+
+impl Sets {
+    /// Describes all sets by `kind` or the model's default.
+    pub fn new(kind: Option<DescriptorKind>) -> anyhow::Result<Self> {
+        let assets = Assets::locate(Some(&Path::new(env!("CARGO_MANIFEST_DIR")).join("assets")));
+        let extractor = Extractor::load(&assets, &ExtractorSettings::plain("xfeat", 1, LIMITS))?;
+        let kind = kind.unwrap_or(extractor.manifest().default_kind());
+        println!("descriptors: {}", kind.as_str());
+        let describer = Describer { extractor, kind };
+        let towns = [(11, 96), (5, 160), (23, 48)];
+        let towns = towns.into_iter().map(|(seed, places)| town(&describer, seed, places));
+        let data = std::env::var_os("WHEREABOUTS_DATA")
+            .map_or_else(|| "../shared/data".into(), PathBuf::from);
+        let mut traverses = Vec::new();
+        for (name, map, queries) in [
+            ("corridor", "corridor/ref", "corridor/query"),
+            ("nordland", "nordland/summer", "nordland/winter"),
+        ] {
+            let [map, queries] = [map, queries].map(|folder| data.join(folder));
+            if !map.is_dir() {
+                println!("{name} is left out: there is no {}", map.display());
+                continue;
+            }
+            let [map, frames] = [described(&describer, &map)?, described(&describer, &queries)?];
+            traverses.push(Traverse { name, map, frames });
         }
-        let [map, queries] = [described(&describer, &map)?, described(&describer, &queries)?];
-        let count = queries.len();
-        let drive = |kind: &str, order: Vec<usize>| {
-            traverse(&format!("{name}{kind}"), &map, &queries, &order)
-        };
-        drives.push(drive("", (0..count).collect()));
-        drives.push(drive(", backwards", (0..count).rev().collect()));
-        drives.push(drive(", two images a frame", (0..count).step_by(2).collect()));
-        drives
-            .push(drive(", there and back", (0..count / 2).chain((0..count / 2).rev()).collect()));
+        Ok(Self { towns: towns.collect::<anyhow::Result<_>>()?, traverses })
     }
-    Ok(drives)
-}
 
-/// A map with an image every metre, and frames each second.
-fn traverse(name: &str, map: &[Descriptor], queries: &[Descriptor], order: &[usize]) -> Drive {
-    let map = map.iter().cloned().zip(0..).map(|(image, x)| (image, [f64::from(x), 0.0])).collect();
-    let mut before = order[0];
-    let frames = order.iter().enumerate().map(|(number, truth)| {
-        let moved_m = truth.abs_diff(before) as f64;
-        before = *truth;
-        Frame {
-            descriptor: queries[*truth].clone(),
-            seconds: number as f64,
-            moved_m,
-            truth: *truth,
+    /// The drives on the map: two towns, and real traverses that are driven forwards, backwards, at twice the speed, and
+    /// there and back.
+    pub fn all(&self) -> anyhow::Result<Vec<Drive>> {
+        let town = |town: &TownSet| town.drive("", &|_| true, 0..town.map.len());
+        let mut drives: Vec<Drive> = self.towns[..2].iter().map(town).collect();
+        for set in &self.traverses {
+            let count = set.frames.len();
+            let drive = |kind: &str, order: Vec<usize>| set.drive(kind, &|_| true, &order);
+            drives.push(drive("", (0..count).collect()));
+            drives.push(drive(", backwards", (0..count).rev().collect()));
+            drives.push(drive(", two images a frame", (0..count).step_by(2).collect()));
+            let back = (0..count / 2).chain((0..count / 2).rev());
+            drives.push(drive(", there and back", back.collect()));
         }
-    });
-    Drive { name: name.into(), map, frames: frames.collect(), tolerance: 2 }
+        Ok(drives)
+    }
 }
 
-/// The places of a town in four lights, three in ten behind a van, with odometry that is five metres off.
-fn town(describer: &Describer, seed: u64, places: usize) -> anyhow::Result<Drive> {
+impl Traverse {
+    /// A drive past some places, in a map with an image every metre of the places that `is_mapped`, and frames each
+    /// second.
+    pub fn drive(&self, kind: &str, is_mapped: &dyn Fn(usize) -> bool, order: &[usize]) -> Drive {
+        let places: Vec<usize> = (0..self.map.len()).filter(|place| is_mapped(*place)).collect();
+        let map = places.iter().map(|place| (self.map[*place].clone(), [*place as f64, 0.0]));
+        let mut before = order[0];
+        let frames = order.iter().enumerate().map(|(number, truth)| {
+            let moved_m = truth.abs_diff(before) as f64;
+            before = *truth;
+            let descriptor = self.frames[*truth].clone();
+            Frame { descriptor, seconds: number as f64, moved_m, truth: Some(*truth) }
+        });
+        Drive {
+            name: format!("{}{kind}", self.name),
+            map: map.collect(),
+            frames: frames.collect(),
+            places,
+            tolerance: 2,
+        }
+    }
+}
+
+impl TownSet {
+    /// A drive past some places, in a map of those that `is_mapped`, with odometry that is five metres off.
+    pub fn drive(
+        &self,
+        kind: &str,
+        is_mapped: &dyn Fn(usize) -> bool,
+        order: impl Iterator<Item = usize>,
+    ) -> Drive {
+        let places: Vec<usize> = (0..self.map.len()).filter(|place| is_mapped(*place)).collect();
+        let mut before: Option<[f64; 2]> = None;
+        let mut seconds = 0.0;
+        let frames = order.map(|place| {
+            let (descriptor, here) = &self.frames[place];
+            let way = before.map_or(0.0, |[x, y]| (here[0] - x).hypot(here[1] - y));
+            before = Some(*here);
+            seconds += way / SPEED;
+            let descriptor = descriptor.clone();
+            Frame { descriptor, seconds, moved_m: way + 5.0, truth: Some(place) }
+        });
+        Drive {
+            name: format!("town {}{kind}", self.seed),
+            frames: frames.collect(),
+            map: places.iter().map(|place| self.map[*place].clone()).collect(),
+            places,
+            tolerance: 0,
+        }
+    }
+}
+
+/// The places of a town in four lights, three in ten behind a van.
+fn town(describer: &Describer, seed: u64, places: usize) -> anyhow::Result<TownSet> {
     let town = Town::new(TownSpec { seed, places, width: 320, height: 240 });
     let described = |picture: &RgbImage| describer.describe(&encode_jpeg(picture)?);
     let drawn: Vec<_> = (0..places)
@@ -121,20 +201,11 @@ fn town(describer: &Describer, seed: u64, places: usize) -> anyhow::Result<Drive
             let image =
                 if is_blocked(place) { behind_a_van(visit.image, place) } else { visit.image };
             let map = (described(&reference.image)?, [reference.x, reference.y]);
-            Ok((map, described(&image)?, [visit.x, visit.y]))
+            Ok((map, (described(&image)?, [visit.x, visit.y])))
         })
         .collect::<anyhow::Result<_>>()?;
-    let mut before: Option<[f64; 2]> = None;
-    let mut metres = 0.0;
-    let (mut map, mut frames) = (Vec::new(), Vec::new());
-    for (truth, (image, descriptor, here)) in drawn.into_iter().enumerate() {
-        let way = before.map_or(0.0, |[x, y]| (here[0] - x).hypot(here[1] - y));
-        before = Some(here);
-        metres += way;
-        map.push(image);
-        frames.push(Frame { descriptor, seconds: metres / SPEED, moved_m: way + 5.0, truth });
-    }
-    Ok(Drive { name: format!("town {seed}"), map, frames, tolerance: 0 })
+    let (map, frames) = drawn.into_iter().unzip();
+    Ok(TownSet { seed, map, frames })
 }
 
 /// The descriptors of the pictures of a folder, in the order of their names.

@@ -181,6 +181,11 @@ class RealServer(unittest.TestCase):
         assert track
         self.assertEqual(track.image_id, "place-0002.jpg")
         self.assertIsInstance(track.pose, GeographicPose)
+        way = self.service.track("town", "robot-7")
+        # A late frame is none of the way.
+        self.assertEqual((way.id, way.frames, len(way.places)), ("robot-7", 5, 4))
+        self.assertEqual(way.places[-1].image_id, "place-0002.jpg")
+        self.assertEqual(way.places[-1].captured_at, taken + timedelta(seconds=4))
         self.assertIsNone(self.service.localize("town", self.frame(2), refine="off").track)
 
     def test_a_time_without_a_time_zone_is_refused(self) -> None:

@@ -287,6 +287,36 @@ class TrackEstimate:
     """Up to two other places where the robot may be, the most probable first."""
     is_late: bool = False
     """Whether the frame is older than the last one of the track."""
+    off_map: float = 0.0
+    """The probability that the robot is at no place of the map, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class TrackPlace:
+    """Where a robot was at one frame, given the frames before and after it."""
+
+    received_at: datetime
+    probability: float
+    """The probability that the robot was at the image or one next to it, 0 to 1."""
+    known: bool
+    off_map: float
+    """The probability that the robot was at no place of the map, 0 to 1."""
+    captured_at: datetime | None = None
+    image_id: str | None = None
+    pose: Pose | None = None
+
+
+@dataclass(frozen=True)
+class TrackWay:
+    """The last places of a robot, the oldest first."""
+
+    id: str
+    map: str
+    frames: int
+    """Number of frames in the track so far."""
+    places: tuple[TrackPlace, ...]
+    key: str | None = None
+    """Id of the API key whose robot sends the track; None without keys."""
 
 
 @dataclass(frozen=True)
@@ -513,6 +543,10 @@ class Whereabouts:
     def map(self, map: str) -> MapState:
         """Returns one map."""
         return self._call(MapState, "GET", f"/maps/{_segment(map)}")
+
+    def track(self, map: str, id: str) -> TrackWay:
+        """Returns the last places of a track, each estimated from the frames before and after it."""
+        return self._call(TrackWay, "GET", f"/maps/{_segment(map)}/tracks/{_segment(id)}")
 
     def maps(self) -> list[MapState]:
         """Returns all maps, sorted by name."""

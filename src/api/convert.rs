@@ -120,6 +120,7 @@ impl From<TrackEstimate> for proto::TrackEstimate {
             known: track.known,
             others: track.others.into_iter().map(Into::into).collect(),
             is_late: track.is_late,
+            off_map: track.off_map,
         }
     }
 }

@@ -12,6 +12,7 @@ mod jobs;
 mod keys;
 mod localize;
 mod maps;
+mod tracks;
 mod usage;
 mod webhooks;
 
@@ -32,6 +33,7 @@ pub use self::maps::{
     CalibrationState, IndexKind, MapChange, MapRefiner, MapState, Reindex, ReindexRequest,
     ReindexState,
 };
+pub use self::tracks::{TrackList, TrackPlace, TrackSummary, TrackWay};
 pub use self::usage::{Today, Total, UsageReport};
 pub use self::webhooks::{DeliveryPage, MadeWebhook, NewWebhook};
 

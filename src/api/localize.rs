@@ -129,6 +129,10 @@ pub struct TrackEstimate {
     pub probability: f64,
     /// Whether the probability reaches the configured threshold.
     pub known: bool,
+    /// Probability, 0 to 1, that the robot is at no place of the map: `probability` is that of being on the map and at
+    /// that image.
+    #[serde(default)]
+    pub off_map: f64,
     /// Up to two other places where the robot may be, each with a probability of at least 0.1; the most probable first.
     #[serde(default)]
     pub others: Vec<TrackHypothesis>,

@@ -61,7 +61,7 @@ pub use self::reindex::{Reindexer, Reindexes};
 pub use self::rejections::{Rejection, Rejections};
 pub use self::retention::Janitor;
 pub use self::submit::Submitter;
-pub use self::track::{Odometry, TrackSettings, TrackStep, Tracks};
+pub use self::track::{FrameEvidence, Odometry, TrackSettings, TrackStep, Tracks};
 pub use self::transfer::Transfer;
 pub use self::usage::UsageReports;
 pub use self::webhooks::{Dispatcher, WebhookSettings, Webhooks};

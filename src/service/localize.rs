@@ -10,8 +10,8 @@ use uuid::Uuid;
 use super::images::empty_body;
 use super::submit::{JobWish, LocalizedFrame, Submission};
 use super::{
-    AllowedRefiners, Chosen, Jobs, Maps, RecallCheck, SUPERSEDED_RETRIES, ServiceError, Submitter,
-    TrackStep, Tracks,
+    AllowedRefiners, Chosen, FrameEvidence, Jobs, Maps, RecallCheck, SUPERSEDED_RETRIES,
+    ServiceError, Submitter, TrackStep, Tracks,
 };
 use whereabouts_api::{Answer, JobLink, RefineMode, TimingMs};
 use whereabouts_core::confidence::COMPARED;
@@ -146,7 +146,8 @@ impl Localizer {
         let track = match request.track {
             Some(step) => {
                 // A frame that shows nothing moves the belief, but is no evidence.
-                let evidence = lack.is_none().then_some(candidates.as_slice());
+                let evidence =
+                    lack.is_none().then(|| FrameEvidence::new(&candidates, &calibration));
                 let following = self.tracks.follow(&map, step, &extraction.descriptor, evidence);
                 let (track, warning) = following.instrument(traces::stage("track")).await?;
                 warnings.extend(warning);

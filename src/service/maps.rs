@@ -132,7 +132,8 @@ impl Maps {
         }
     }
 
-    pub(crate) async fn find(&self, name: &MapName) -> Result<Map, ServiceError> {
+    /// Returns a map.
+    pub async fn find(&self, name: &MapName) -> Result<Map, ServiceError> {
         self.store.map(name).await?.ok_or_else(|| no_map(name))
     }
 

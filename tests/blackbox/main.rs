@@ -32,6 +32,7 @@ mod localize;
 mod maps;
 mod mllm;
 mod odd_folders;
+mod off_map;
 mod refiner_choice;
 mod reindex;
 mod retention;
@@ -42,6 +43,7 @@ mod smuggling;
 mod tls;
 mod traces;
 mod track;
+mod track_clocks;
 mod webhooks;
 
 use whereabouts_testkit::{

@@ -17,7 +17,7 @@ fn id(place: usize) -> String {
     format!("place-{place}")
 }
 
-async fn metric_map(server: &Server, map: &str, town: &Town) {
+pub(crate) async fn metric_map(server: &Server, map: &str, town: &Town) {
     server
         .put(&format!("/maps/{map}"), json!({"scene": "outdoor", "frame": "metric"}))
         .await

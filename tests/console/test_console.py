@@ -272,6 +272,26 @@ class Maps(Console):
         asked.get_by_role("button").first.click()
         expect(page.locator(".chosen-image h2")).to_have_text(job["ranking"][0]["image_id"])
 
+    def test_the_way_of_a_robot_is_drawn_on_the_plan(self):
+        for number in range(6):
+            at = f"2026-03-01T12:00:{2 * number:02}Z"
+            path = f"/localize?map=town&refine=off&track=robot-7&captured_at={at}"
+            call("POST", path, frame(number).read_bytes(), "image/jpeg")
+        page = self.page("#/maps/town")
+        robots = page.get_by_role("region", name="Robots")
+        expect(robots).to_contain_text("robot-7")
+        self.settled(page, "map")
+        drawn = "document.querySelector('.plan canvas').toDataURL()"
+        before = page.evaluate(drawn)
+        robots.get_by_role("button", name="robot-7").click()
+        expect(robots.get_by_role("status")).to_contain_text("6 places")
+        self.assertIn("track=robot-7", page.url)
+        self.until(page, f"() => {drawn} !== {json.dumps(before)}")
+        page.reload()
+        expect(robots.get_by_role("status")).to_contain_text("6 places")
+        robots.get_by_role("button", name="robot-7").click()
+        expect(robots.get_by_role("status")).to_be_empty()
+
     def test_an_image_can_be_uploaded_and_deleted(self):
         call("PUT", "/maps/yard", {"frame": "metric"})
         page = self.page("#/maps/yard")

@@ -41,6 +41,7 @@ const ASSETS: &[(&str, &str)] = assets![
     "plan.js",
     "points.js",
     "style.css",
+    "tracks.js",
     "try.js",
     "words.js",
 ];

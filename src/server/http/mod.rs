@@ -15,6 +15,7 @@ mod maps;
 mod pixels;
 mod state;
 mod status;
+mod tracks;
 mod transfer;
 mod usage;
 mod webhooks;
@@ -117,6 +118,8 @@ fn described() -> Described {
         robot.map(MapSource::Query).idempotent().waits(waits_for_job).localizes(),
         routes!(localize::localize),
     )
+    .route(operator.map(MapSource::Path), routes!(tracks::list_tracks))
+    .route(robot.map(MapSource::Path), routes!(tracks::get_track))
     .route(operator.map(MapSource::Query), routes!(jobs::list_jobs))
     .route(robot.map(MapSource::Job).waits(Waits::WithQuery("wait")), routes!(jobs::get_job))
     .route(operator.map(MapSource::Job), routes!(jobs::frame))

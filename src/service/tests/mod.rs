@@ -13,6 +13,7 @@ mod submit;
 mod track;
 mod transfer;
 mod usage;
+mod ways;
 mod webhooks;
 
 use std::collections::VecDeque;
@@ -176,9 +177,12 @@ fn settings() -> ServiceSettings {
             outliers: 0.2,
             turn: 0.005,
             jump: 0.005,
+            leave: 0.005,
+            enter: 0.02,
             sharpness: 1.0,
             candidates: 10,
             states: 64,
+            history: 50,
             known_probability: 0.5,
         },
         confidence: ConfidenceSettings {

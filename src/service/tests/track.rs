@@ -3,7 +3,7 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 
 use super::{DIM, Fixture, candidates, image, image_id, map};
-use crate::{Odometry, Principal, TrackStep};
+use crate::{FrameEvidence, Odometry, Principal, TrackStep};
 use whereabouts_api::{ErrorKind, TrackEstimate};
 use whereabouts_core::{ApiKey, Descriptor, KeyLimits, Map, Role};
 use whereabouts_store::{BlobStore, MapStore};
@@ -11,18 +11,21 @@ use whereabouts_store::{BlobStore, MapStore};
 /// Places with views that differ from each other.
 const VIEWS: usize = 64;
 
+/// A frame about which the search says nothing: in these small maps, all images are compared.
+const ALONE: FrameEvidence<'static> = FrameEvidence { candidates: &[], confidence: None };
+
 /// A step that is taken `seconds` after the epoch.
-fn step(caller: &Principal, id: &str, seconds: i64) -> TrackStep {
+pub(super) fn step(caller: &Principal, id: &str, seconds: i64) -> TrackStep {
     let at = Timestamp::UNIX_EPOCH + SignedDuration::from_secs(seconds);
     TrackStep::new(caller, id.into(), Some(at), None).unwrap()
 }
 
-fn robot(seconds: i64) -> TrackStep {
+pub(super) fn robot(seconds: i64) -> TrackStep {
     step(&Principal::Anonymous, "robot", seconds)
 }
 
 /// What a camera sees at a place: all views have something in common, and neighbours a little more.
-fn view(place: usize) -> Descriptor {
+pub(super) fn view(place: usize) -> Descriptor {
     let mut numbers = vec![0.1; VIEWS];
     numbers[place % VIEWS] += 1.0;
     numbers[(place + 1) % VIEWS] += 0.3;
@@ -30,13 +33,13 @@ fn view(place: usize) -> Descriptor {
 }
 
 /// What a camera sees that is halfway between two places in looks.
-fn between(one: usize, other: usize) -> Descriptor {
+pub(super) fn between(one: usize, other: usize) -> Descriptor {
     let sum = view(one).as_slice().iter().zip(view(other).as_slice()).map(|(a, b)| a + b).collect();
     Descriptor::normalised(sum).unwrap()
 }
 
 /// A map of views every ten metres along a road.
-async fn road(fixture: &Fixture, places: usize) -> Map {
+pub(super) async fn road(fixture: &Fixture, places: usize) -> Map {
     let map = Map { dim: VIEWS, ..map("road") };
     let (map, _) = fixture.store.put_map(map).await.unwrap();
     for place in 0..places {
@@ -47,7 +50,12 @@ async fn road(fixture: &Fixture, places: usize) -> Map {
     map
 }
 
-async fn follow(fixture: &Fixture, map: &Map, step: TrackStep, view: &Descriptor) -> TrackEstimate {
+pub(super) async fn follow(
+    fixture: &Fixture,
+    map: &Map,
+    step: TrackStep,
+    view: &Descriptor,
+) -> TrackEstimate {
     follow_with_warning(fixture, map, step, view).await.0
 }
 
@@ -58,7 +66,24 @@ async fn follow_with_warning(
     view: &Descriptor,
 ) -> (TrackEstimate, Option<String>) {
     let tracks = &fixture.service.localizer.tracks;
-    tracks.follow(map, step, view, Some(&[])).await.unwrap()
+    tracks.follow(map, step, view, Some(ALONE)).await.unwrap()
+}
+
+/// A caller with an API key.
+pub(super) fn key(id: &str, role: Role) -> Principal {
+    Principal::ApiKey(
+        ApiKey {
+            id: id.into(),
+            name: id.into(),
+            role,
+            maps: vec![],
+            limits: KeyLimits::default(),
+            created_at: Timestamp::now(),
+            expires_at: None,
+            revoked_at: None,
+        }
+        .into(),
+    )
 }
 
 #[tokio::test]
@@ -67,8 +92,9 @@ async fn a_track_in_a_map_without_poses_is_unprocessable() {
     let map = fixture.map("yard", &[None, None]).await;
     let tracks = &fixture.service.localizer.tracks;
     let found = candidates(&[(0, 0.9), (1, 0.8)]);
+    let found = FrameEvidence { candidates: &found, confidence: None };
     let frame = Descriptor::normalised(vec![1.0; DIM]).unwrap();
-    let refused = tracks.follow(&map, robot(0), &frame, Some(&found)).await.unwrap_err();
+    let refused = tracks.follow(&map, robot(0), &frame, Some(found)).await.unwrap_err();
     assert_eq!(refused.kind, ErrorKind::Unprocessable);
     assert!(refused.detail.contains("poses"), "{refused}");
 }
@@ -163,23 +189,9 @@ async fn a_frame_that_shows_nothing_moves_the_track_on() {
 async fn tracks_of_two_api_keys_are_separate_even_if_their_ids_are_equal() {
     let fixture = Fixture::new().await;
     let map = road(&fixture, 5).await;
-    let key = |id: &str| {
-        Principal::ApiKey(
-            ApiKey {
-                id: id.into(),
-                name: id.into(),
-                role: Role::Robot,
-                maps: vec![],
-                limits: KeyLimits::default(),
-                created_at: Timestamp::now(),
-                expires_at: None,
-                revoked_at: None,
-            }
-            .into(),
-        )
-    };
     for (caller, frames) in [("one", 1), ("one", 2), ("two", 1), ("one", 3)] {
-        let estimate = follow(&fixture, &map, step(&key(caller), "robot", 0), &view(1)).await;
+        let estimate =
+            follow(&fixture, &map, step(&key(caller, Role::Robot), "robot", 0), &view(1)).await;
         assert_eq!(estimate.frames, frames, "{caller}");
     }
 }
@@ -225,5 +237,50 @@ fn a_step_with_an_unusable_id_is_unprocessable() {
     let long = "x".repeat(65);
     for id in ["", "a b", "ö", long.as_str()] {
         assert_eq!(new(id).unwrap_err().kind, ErrorKind::Unprocessable, "{id}");
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_stands_still_for_long_neither_leaves_the_map_nor_comes_back() {
+    let fixture = Fixture::new().await;
+    let map = road(&fixture, 40).await;
+    for place in 5..15 {
+        follow(&fixture, &map, robot(place as i64), &view(place)).await;
+    }
+    let mut last = None;
+    for second in 15..315 {
+        last = Some(follow(&fixture, &map, robot(second), &view(14)).await);
+    }
+    let last = last.unwrap();
+    assert_eq!(last.image_id, Some(image_id(14)));
+    assert!(last.off_map < 0.05 && last.known, "{last:?}");
+}
+
+#[tokio::test]
+async fn a_robot_that_sees_what_no_image_shows_is_off_the_map() {
+    let fixture = Fixture::new().await;
+    let map = road(&fixture, 40).await;
+    for place in 5..15 {
+        follow(&fixture, &map, robot(place as i64), &view(place)).await;
+    }
+    let mut answers = Vec::new();
+    for second in 15..35_i64 {
+        // Views that no place of the map has.
+        let view = view(41 + second as usize % 20);
+        answers.push(follow(&fixture, &map, robot(second), &view).await);
+    }
+    let last = answers.last().unwrap();
+    assert!(last.off_map > 0.8 && !last.known, "{last:?}");
+    assert!(answers[6..].iter().all(|answer| answer.probability < 0.5), "{answers:?}");
+    assert!((last.probability + last.off_map) <= 1.0 + 1e-9);
+}
+
+#[tokio::test]
+async fn in_a_map_of_a_few_images_nothing_says_that_a_robot_is_off_it() {
+    let fixture = Fixture::new().await;
+    let map = road(&fixture, 4).await;
+    for second in 0..10 {
+        let answer = follow(&fixture, &map, robot(second), &view(20)).await;
+        assert!(!answer.known && answer.off_map < 0.5, "{answer:?}");
     }
 }

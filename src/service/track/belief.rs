@@ -27,6 +27,10 @@ pub(super) struct Habits {
     pub turn: f64,
     /// Probability that it was carried anywhere.
     pub jump: f64,
+    /// Probability that it has left the map where no path ends.
+    pub leave: f64,
+    /// Probability that a robot off the map has come back.
+    pub enter: f64,
 }
 
 /// A map as the filter sees it.
@@ -52,6 +56,8 @@ pub(super) struct Belief {
 /// A belief while it is changed, with the place of each image of the map in it.
 pub(super) struct Numbered {
     pub belief: Belief,
+    /// The probability of having left the map.
+    pub left: f64,
     at: Vec<u32>,
 }
 
@@ -64,7 +70,7 @@ impl Numbered {
         for (place, image) in (0..).zip(&belief.images) {
             at[*image as usize] = place;
         }
-        Self { belief, at }
+        Self { belief, left: 0.0, at }
     }
 
     /// Returns the place of an image, which is added if it is new.
@@ -90,8 +96,9 @@ impl Belief {
         &self.images
     }
 
-    /// The prediction step: the belief after the robot has moved.
-    pub fn predicted(&self, motion: Motion, habits: Habits, roads: Roads) -> Self {
+    /// The prediction step: the belief after the robot has moved, if it is still on the map, and the probability that it
+    /// has left it.
+    pub fn predicted(&self, motion: Motion, habits: Habits, roads: Roads) -> (Self, f64) {
         let empty = Self { images: Vec::new(), states: Vec::new(), elsewhere: self.elsewhere };
         let mut moved = Numbered::new(empty, roads.grid.len());
         let mut ways = (Vec::new(), Vec::new());
@@ -103,7 +110,7 @@ impl Belief {
                 move_states(from, speeds, (motion, habits), roads, &mut ways, &mut moved);
             }
         }
-        let mut belief = moved.belief;
+        let Numbered { mut belief, left, .. } = moved;
         for states in &mut belief.states {
             let is_free = matches!(motion, Motion::Elapsed { .. });
             change_speeds(&mut states[..SPEEDS], is_free);
@@ -111,7 +118,30 @@ impl Belief {
             turn_round(states, habits);
         }
         belief.elsewhere += habits.jump * (1.0 - belief.elsewhere);
-        belief.normalised()
+        let left = left / (left + belief.total()).max(f64::MIN_POSITIVE);
+        (belief.normalised(), left)
+    }
+
+    /// The same belief, but with a probability the robot is anywhere.
+    pub fn or_anywhere(mut self, probability: f64) -> Self {
+        for states in self.states.iter_mut().flatten() {
+            *states = (f64::from(*states) * (1.0 - probability)) as f32;
+        }
+        self.elsewhere = self.elsewhere * (1.0 - probability) + probability;
+        self
+    }
+
+    /// Half of this belief and half of another.
+    pub fn mixed(self, other: &Self, count: usize) -> Self {
+        let elsewhere = 0.5 * (self.elsewhere + other.elsewhere);
+        let mut mixed = Numbered::new(self, count);
+        mixed.belief.states.iter_mut().flatten().for_each(|probability| *probability *= 0.5);
+        for (image, states) in other.images.iter().zip(&other.states) {
+            let place = mixed.place(*image);
+            let sums = mixed.belief.states[place].iter_mut().zip(states);
+            sums.for_each(|(sum, probability)| *sum += 0.5 * probability);
+        }
+        Self { elsewhere, ..mixed.belief }
     }
 
     /// The update step: the belief after a frame. At most `max` images are kept.
@@ -203,8 +233,12 @@ impl Belief {
         self
     }
 
+    fn total(&self) -> f64 {
+        self.elsewhere + self.masses().iter().map(|(_, mass)| mass).sum::<f64>()
+    }
+
     fn normalised(mut self) -> Self {
-        let total = self.elsewhere + self.masses().iter().map(|(_, mass)| mass).sum::<f64>();
+        let total = self.total();
         if !total.is_normal() {
             return Self::uniform();
         }

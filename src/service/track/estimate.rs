@@ -1,8 +1,8 @@
 //! The places where a robot probably is, given what the filter believes.
 
 use super::TrackSettings;
-use super::belief::Belief;
 use super::ground::Ground;
+use super::posterior::{MIN_IMAGES, Posterior};
 use whereabouts_api::{TrackEstimate, TrackHypothesis};
 
 /// Images within this many times the usual distance of neighbours show the same place.
@@ -20,16 +20,22 @@ const MIN_HYPOTHESIS: f64 = 0.1;
 /// Maximum number of hypotheses in addition to the estimate.
 const HYPOTHESES: usize = 2;
 
-/// Where a robot is, given its belief.
+/// Radius of a place in metres.
+pub(super) fn place_radius(ground: &Ground, place_m: f64) -> f64 {
+    place_m.min(SAME_PLACE * ground.paths.spacing())
+}
+
+/// Where a robot is.
 pub(super) fn estimate(
     (id, frames): (String, u64),
-    belief: &Belief,
+    Posterior { belief, presence }: &Posterior,
     ground: &Ground,
     place_m: f64,
     settings: &TrackSettings,
 ) -> TrackEstimate {
+    let on_map = presence.on_map();
     let spacing = ground.paths.spacing();
-    let radius = place_m.min(SAME_PLACE * spacing);
+    let radius = place_radius(ground, place_m);
     let share = belief.elsewhere() / ground.len().max(1) as f64;
     let mut masses = vec![0.0_f32; ground.len()];
     for (image, mass) in belief.masses() {
@@ -54,7 +60,7 @@ pub(super) fn estimate(
     let probability = |image: u32| -> f64 {
         let same = near(image).into_iter().filter(|(_, metres)| *metres <= radius);
         let sum: f64 = same.map(|(other, _)| f64::from(masses[other as usize]) + share).sum();
-        sum.min(1.0)
+        sum.min(1.0) * on_map
     };
     let mut places: Vec<TrackHypothesis> = Vec::new();
     let mut taken: Vec<u32> = Vec::new();
@@ -82,14 +88,11 @@ pub(super) fn estimate(
         pose: best.and_then(|best| best.pose),
         probability,
         known: probability >= settings.known_probability && ground.len() >= MIN_IMAGES,
+        off_map: 1.0 - on_map,
         others: places.collect(),
         is_late: false,
     }
 }
-
-/// Fewest located images of a map in which a place can be known: with fewer, nothing says how alike images of different
-/// places are. A single frame needs as many.
-const MIN_IMAGES: usize = 9;
 
 /// Number of images that may be the estimate.
 const RIVALS: usize = 64;

@@ -9,11 +9,15 @@
 //! The weight of image j is ω + (1 − ω) e(j) / ē, with e(j) = exp(β z(j)) and ē its mean over the map. ω is the share
 //! of frames without information because, for example, a bus blocks the camera; it bounds the weight of one frame.
 //!
+//! What a frame says about whether the robot is on the map at all ([`presence`](super::presence)) follows from z, too.
+//!
 //! Frames that differ little from the ones before are no new evidence. How much two frames differ is measured in units
 //! of the difference of two neighbours in the map: the *novelty* of a frame.
 
 use std::collections::VecDeque;
 
+use super::belief::Belief;
+use super::presence::{LEVELS, Ratios, ratios};
 use whereabouts_core::dot;
 
 /// Frames that the mean of the map counts as in the mean of a track.
@@ -31,6 +35,18 @@ const NEW: f64 = 0.5;
 /// Share of its evidence that the first frame without novelty keeps; later ones keep less.
 const REPEATED: f64 = 0.3;
 
+/// A frame that differs from the last one by this many times as much as from an earlier one follows the earlier one.
+const UNLIKE: f64 = 2.0;
+
+/// Weight of a new frame in the share of those that follow an earlier one than the last.
+const ALTERNATION_WEIGHT: f64 = 1.0 / 12.0;
+
+/// The share that shows two cameras in one track. A van in three frames of ten makes it 0.2.
+const ALTERNATION: f64 = 0.45;
+
+/// Number of frames after which that is judged.
+const ALTERNATING: u32 = 8;
+
 /// Smallest standard deviation of similarities.
 const MIN_DEVIATION: f64 = 1e-9;
 
@@ -39,6 +55,12 @@ const MIN_DEVIATION: f64 = 1e-9;
 pub(super) struct Weights {
     known: Vec<(u32, f64)>,
     rest: f64,
+    /// The standardised similarities of the images in `known`.
+    standardised: Vec<f64>,
+    /// Those of the sample.
+    sample: Vec<f64>,
+    /// The share of frames without information.
+    outliers: f64,
 }
 
 impl Weights {
@@ -54,7 +76,8 @@ impl Weights {
         let mean = sample.iter().map(|s| f64::from(*s)).sum::<f64>() / number;
         let square = |s: &f32| (f64::from(*s) - mean).powi(2);
         let deviation = (sample.iter().map(square).sum::<f64>() / number).sqrt();
-        let e = |s: f32| (sharpness * (f64::from(s) - mean) / deviation.max(MIN_DEVIATION)).exp();
+        let z = |s: f32| (f64::from(s) - mean) / deviation.max(MIN_DEVIATION);
+        let e = |s: f32| (sharpness * z(s)).exp();
         let usual = sample.iter().map(|s| e(*s)).sum::<f64>() / number;
         let usual = if sample.is_empty() { 1.0 } else { usual };
         let weight = |s: f32| outliers + (1.0 - outliers) * e(s) / usual;
@@ -62,7 +85,36 @@ impl Weights {
         // All weights together have the mean 1, but a sample knows that only roughly.
         let rest = count as f64 - known.iter().map(|(_, weight)| weight).sum::<f64>();
         let rest = rest / count.saturating_sub(known.len()).max(1) as f64;
-        Self { known, rest: rest.clamp(outliers, 1.0) }
+        Self {
+            known,
+            rest: rest.clamp(outliers, 1.0),
+            standardised: similar.iter().map(|(_, s)| z(*s)).collect(),
+            sample: sample.iter().map(|s| z(*s)).collect(),
+            outliers,
+        }
+    }
+
+    /// How much more likely the frame is on a map of `count` images, where `belief` expects the robot, than off it.
+    pub fn presence(&self, belief: &Belief, count: usize) -> Ratios {
+        let weight = |z: f64| ratios(z).map(|r| self.outliers + (1.0 - self.outliers) * r);
+        let mut sums = [0.0; LEVELS];
+        let mut add = |share: f64, ratios: Ratios| {
+            sums.iter_mut().zip(ratios).for_each(|(sum, ratio)| *sum += share * ratio);
+        };
+        for (image, mass) in belief.masses() {
+            let at = self.known.binary_search_by_key(&image, |(image, _)| *image);
+            add(mass, at.map_or([1.0; LEVELS], |at| weight(self.standardised[at])));
+        }
+        // Of a large map, the sample stands for all images that were not asked for.
+        let all = self.known.len() >= count;
+        let asked = if all { count } else { self.known.len().saturating_sub(self.sample.len()) };
+        let rest = count.saturating_sub(asked) as f64 / self.sample.len().max(1) as f64;
+        let share = belief.elsewhere() / count.max(1) as f64;
+        self.standardised.iter().for_each(|z| add(share, weight(*z)));
+        if !all {
+            self.sample.iter().for_each(|z| add(share * (rest - 1.0), weight(*z)));
+        }
+        sums
     }
 
     /// The weights by image.
@@ -85,6 +137,10 @@ pub(super) struct Frames {
     last: VecDeque<Vec<f32>>,
     /// Frames without novelty in a row.
     repeated: u32,
+    /// How often a frame was unlike the last one, but like one before that.
+    alternation: f64,
+    /// Number of frames.
+    count: u32,
 }
 
 impl Frames {
@@ -95,8 +151,23 @@ impl Frames {
         differences.map(f64::from).min_by(f64::total_cmp).map(|novelty| novelty.max(0.0))
     }
 
-    /// Adds a frame. Returns the share of its evidence that is new.
-    pub fn add(&mut self, frame: &[f32], novelty: Option<f64>) -> f64 {
+    /// Whether the frames are those of two cameras: they look like the one before the last rather than like the last.
+    pub fn alternates(&self) -> bool {
+        self.count >= ALTERNATING && self.alternation > ALTERNATION
+    }
+
+    /// Notes whether a frame follows the last one or another. `usual` is the difference of neighbours in the map.
+    fn compare(&mut self, frame: &[f32], usual: f32) {
+        let differences = || self.last.iter().map(|last| f64::from(1.0 - dot(last, frame)));
+        let Some(last) = differences().next_back() else { return };
+        let least = differences().fold(f64::INFINITY, f64::min);
+        let is_other = last > NEW * f64::from(usual) && last > UNLIKE * least;
+        self.alternation += ALTERNATION_WEIGHT * (f64::from(u8::from(is_other)) - self.alternation);
+        self.count = self.count.saturating_add(1);
+    }
+
+    /// Adds a frame. Returns the share of its evidence that is new. `usual` is the difference of neighbours in the map.
+    pub fn add(&mut self, frame: &[f32], novelty: Option<f64>, usual: f32) -> f64 {
         let fresh = novelty.map_or(1.0, |novelty| {
             self.repeated = if novelty < NEW { self.repeated + 1 } else { 0 };
             let kept = REPEATED / f64::from(self.repeated.max(1)).sqrt();
@@ -105,6 +176,7 @@ impl Frames {
         if self.sum.len() != frame.len() {
             *self = Self { sum: vec![0.0; frame.len()], ..Self::default() };
         }
+        self.compare(frame, usual);
         if self.weight > MEMORY {
             let kept = (MEMORY / self.weight) as f32;
             self.sum.iter_mut().for_each(|number| *number *= kept);

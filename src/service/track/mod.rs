@@ -1,22 +1,27 @@
 //! Tracks: sequences of frames of one robot, whose estimates are filtered over time.
 //!
-//! [`belief`] is the filter over the [`paths`] of a map, [`moves`] and [`speeds`] are its motion model, [`evidence`] is
-//! what a frame says, [`odometry`] how the robot says that it moved, [`session`] one track, [`ground`] what all tracks in
-//! a map share, and [`mod@estimate`] the answer. This file keeps the tracks in memory, bounded in number and age; they do
+//! [`belief`] is the filter over the [`paths`] of a map, [`moves`] and [`speeds`] are its motion model, [`presence`] says
+//! whether the robot is on the map at all, [`posterior`] joins the two, [`evidence`] is what a frame says, [`odometry`] and [`clock`] how the robot says that it moved and when, [`session`] one track, [`ground`] what all tracks in
+//! a map share, [`mod@estimate`] the answer, and [`history`] and [`ways`] the way so far. This file keeps the tracks in memory, bounded in number and age; they do
 //! not survive a restart. The map of tracks is a plain one with strict LRU: moka and quick_cache would evict newcomers
 //! first.
 
 mod belief;
+mod clock;
 mod estimate;
 mod evidence;
 mod grid;
 mod ground;
+mod history;
 mod moves;
 mod odometry;
 mod paths;
+mod posterior;
+mod presence;
 mod session;
 mod settings;
 mod speeds;
+mod ways;
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -31,11 +36,12 @@ use uuid::Uuid;
 use self::estimate::estimate;
 use self::ground::{Ground, Known};
 pub use self::odometry::Odometry;
+use self::posterior::MIN_IMAGES;
 use self::session::{Frame, Prediction, Track};
 pub use self::settings::TrackSettings;
 use super::{Principal, ServiceError};
 use whereabouts_api::{ErrorKind, TrackEstimate};
-use whereabouts_core::{Candidate, Descriptor, Map};
+use whereabouts_core::{Calibration, Candidate, Descriptor, Map};
 use whereabouts_store::{MapStore, StoreError};
 
 /// Minimum age of the cached positions of a map before they are read again, for maps that grow.
@@ -76,11 +82,37 @@ impl TrackStep {
     }
 }
 
+/// What a frame says alone.
+#[derive(Debug, Clone, Copy)]
+pub struct FrameEvidence<'a> {
+    /// The images most similar to it, best first.
+    pub candidates: &'a [Candidate],
+    /// The confidence of the first, calibrated on the map; `None` without a usable calibration.
+    pub confidence: Option<f32>,
+}
+
+impl<'a> FrameEvidence<'a> {
+    /// The evidence of candidates in a map with this calibration.
+    pub fn new(candidates: &'a [Candidate], calibration: &Calibration) -> Self {
+        let is_usable = calibration.similarity.len() >= MIN_IMAGES;
+        let first = candidates.first().filter(|_| is_usable);
+        let confidence =
+            first.map(|first| calibration.refined_confidence(candidates, &first.image_id, None));
+        Self { candidates, confidence }
+    }
+}
+
 /// A track with the time of its last use.
 #[derive(Debug)]
 struct TrackEntry {
     last_used: Instant,
     track: Arc<AsyncMutex<Track>>,
+}
+
+impl TrackEntry {
+    fn is_idle(&self, settings: &TrackSettings) -> bool {
+        self.last_used.elapsed() > Duration::from_secs(settings.idle_s)
+    }
 }
 
 /// What tracks know of one map.
@@ -179,7 +211,7 @@ impl Tracks {
 
 impl Tracks {
     /// Updates a track with a frame and estimates the place; returns also what the robot should send instead.
-    /// `candidates` are the images most similar to the frame, `None` if it shows nothing.
+    /// `evidence` is what the frame alone says, `None` if it shows nothing.
     ///
     /// # Errors
     /// [`ErrorKind::Unprocessable`] in a map whose images have no poses.
@@ -188,8 +220,9 @@ impl Tracks {
         map: &Map,
         step: TrackStep,
         frame: &Descriptor,
-        candidates: Option<&[Candidate]>,
+        evidence: Option<FrameEvidence<'_>>,
     ) -> Result<(TrackEstimate, Option<String>), ServiceError> {
+        let candidates = evidence.map(|evidence| evidence.candidates);
         let ground = self.ground(map).await?;
         if ground.len() == 0 && candidates.is_some_and(|candidates| !candidates.is_empty()) {
             return Err(ServiceError::unprocessable(format!(
@@ -220,22 +253,24 @@ impl Tracks {
         };
         let (on, settings) = (Arc::clone(&ground), Arc::clone(&self.settings));
         let (warning, is_late) = (prediction.warning.clone(), prediction.is_late);
-        let (next, belief) = on_blocking_thread(move || {
+        let confidence = evidence.and_then(|evidence| evidence.confidence);
+        let (next, posterior) = on_blocking_thread(move || {
             let Similar { images, similarities } = similar;
-            let weights = prediction.weights((&images, &similarities), &on, &settings);
-            let belief = next.update(prediction, weights.as_ref(), &on, &settings);
-            (next, belief)
+            let similar = (images.as_slice(), similarities.as_slice());
+            let weights = prediction.weights(similar, confidence, &on, &settings);
+            let posterior = next.update(prediction, weights.as_ref(), &on, &settings);
+            (next, posterior)
         })
         .await?;
         let frames = next.frames;
         *track = next;
         drop(track);
-        let mut belief = belief;
+        let mut posterior = posterior;
         loop {
             let place = (id.clone(), frames);
             let (on, settings, place_m) =
                 (Arc::clone(&ground), Arc::clone(&self.settings), self.place_m);
-            let whole = Arc::clone(&belief);
+            let whole = Arc::clone(&posterior);
             let estimate =
                 on_blocking_thread(move || estimate(place, &whole, &on, place_m, &settings))
                     .await?;
@@ -246,7 +281,7 @@ impl Tracks {
                 return Ok((TrackEstimate { is_late, ..estimate }, warning));
             }
             // Deleted since the positions were read.
-            belief = Arc::new(belief.renumbered(&|other| (other != image).then_some(other)));
+            posterior = Arc::new(posterior.renumbered(&|other| (other != image).then_some(other)));
         }
     }
 

@@ -1,7 +1,8 @@
 //! Where the states of an image move to: along its path and through links, in metres or in images.
 
-use super::belief::{Belief, Habits, Numbered, Roads};
+use super::belief::{Habits, Numbered, Roads};
 use super::paths::Stop;
+use super::presence::OFF_AT_FIRST;
 use super::speeds::{METRIC, nearest_speed, speed_of, state};
 
 /// The position after a move is off by this share of the usual distance of neighbours: no path is as straight as its
@@ -80,10 +81,12 @@ pub(super) fn move_states(
             }
         }
     }
-    // Who may have passed that many images is anywhere.
+    // Who may have passed that many images is anywhere, on the map or not.
     let (moves, gone): (Vec<_>, Vec<_>) =
         moves[..count].iter().copied().partition(|(_, metres, ..)| *metres <= lost);
-    moved.belief.elsewhere += gone.iter().map(|(mass, ..)| f64::from(*mass)).sum::<f64>();
+    let gone: f64 = gone.iter().map(|(mass, ..)| f64::from(*mass)).sum();
+    moved.belief.elsewhere += (1.0 - OFF_AT_FIRST) * gone;
+    moved.left += OFF_AT_FIRST * gone;
     let reach = moves.iter().map(|(_, metres, error, _)| metres + FAR * error).fold(0.0, f64::max);
     let kept = 1.0 - habits.jump;
     for (number, mass) in (METRIC..).zip(steps).filter(|(_, mass)| **mass > NEGLIGIBLE) {
@@ -97,11 +100,13 @@ pub(super) fn move_states(
     let spot = roads.paths.same_spot();
     for (share, way) in ways {
         let places = Landing::all(way, spot, moved);
+        let is_end = way.last().is_some_and(|last| roads.paths.is_end(*last));
+        let way = Way { stops: way, places: &places, is_end, spacing };
         for (mass, metres, error, speed) in &moves {
             let mass = f64::from(*mass) * share * kept;
             for (at, weight) in [(-FAR, OFF), (0.0, 1.0 - 2.0 * OFF), (FAR, OFF)] {
                 let metres = (metres + at * error).max(0.0);
-                deposit((way, &places), metres, (mass * weight, *speed), &mut moved.belief);
+                way.deposit(metres, (mass * weight, *speed), moved);
             }
         }
     }
@@ -126,7 +131,9 @@ fn step_on(
         return;
     }
     let steps = number - METRIC + 1;
-    let mut at = start;
+    let spacing = roads.paths.spacing();
+    let mut at = Some(start);
+    let mut metres = start.metres;
     for passed in 0..=steps + 1 {
         let weight = if passed == steps {
             1.0 - 2.0 * STEP_ERROR
@@ -136,20 +143,25 @@ fn step_on(
             0.0
         };
         // Odometry may contradict.
-        let spacing = roads.paths.spacing();
-        let fit = measured.map_or(1.0, |metres| {
-            let off = (at.metres - metres) / (STEP_SLACK * (metres + spacing));
+        let fit = measured.map_or(1.0, |measured| {
+            let off = (metres - measured) / (STEP_SLACK * (measured + spacing));
             (-0.5 * off * off).exp()
         });
-        if weight > 0.0 {
-            let place = moved.place(at.image);
-            let mass = mass * weight * fit;
-            moved.belief.states[place][state(at.ahead, number)] += mass as f32;
+        let mass = mass * weight * fit;
+        match at {
+            Some(at) if mass > 0.0 => {
+                let place = moved.place(at.image);
+                moved.belief.states[place][state(at.ahead, number)] += mass as f32;
+            }
+            Some(_) => {}
+            // The path has ended.
+            None => moved.left += mass,
         }
-        match roads.paths.next(roads.grid, at) {
-            Some(next) => at = next,
-            // The path ends here.
-            None => return,
+        let Some(before) = at else { continue };
+        at = roads.paths.next(roads.grid, before);
+        metres = at.map_or(metres + spacing, |at| at.metres);
+        if at.is_none() && !roads.paths.is_end(before) {
+            return;
         }
     }
 }
@@ -212,33 +224,55 @@ impl Landing {
     }
 }
 
-/// Puts a probability on the images before and after a distance on a way, the nearer one the more.
-fn deposit(
-    (way, places): (&[Stop], &[Landing]),
-    metres: f64,
-    (mass, speed): (f64, usize),
-    moved: &mut Belief,
-) {
-    let after = way.partition_point(|stop| stop.metres < metres);
-    let mut put = |at: usize, mass: f64| {
-        let Landing { first, end, .. } = places[at];
-        let share = (mass / (end - first) as f64) as f32;
-        for at in first..end {
-            moved.states[places[at].place][state(way[at].ahead, speed)] += share;
-        }
-    };
-    match after.checked_sub(1) {
-        None => put(0, mass),
-        // The path ends here. A robot that stays on the map has stopped, or is not so fast.
-        Some(last) if after == way.len() => put(last, mass * BEYOND),
-        Some(before) => {
-            let [low, high] = [way[before].metres, way[after].metres];
-            let share = (metres - low) / (high - low);
-            put(before, mass * (1.0 - share));
-            put(after, mass * share);
+/// A way from an image, and where a move on it ends.
+struct Way<'a> {
+    stops: &'a [Stop],
+    places: &'a [Landing],
+    /// Whether the map ends with the way.
+    is_end: bool,
+    /// The usual distance of neighbours in metres.
+    spacing: f64,
+}
+
+impl Way<'_> {
+    /// Puts a probability on the images before and after a distance, the nearer one the more.
+    fn deposit(&self, metres: f64, (mass, speed): (f64, usize), moved: &mut Numbered) {
+        let after = self.stops.partition_point(|stop| stop.metres < metres);
+        let mut put = |at: usize, mass: f64| {
+            let Landing { first, end, .. } = self.places[at];
+            let share = (mass / (end - first) as f64) as f32;
+            for at in first..end {
+                let place = self.places[at].place;
+                moved.belief.states[place][state(self.stops[at].ahead, speed)] += share;
+            }
+        };
+        match after.checked_sub(1) {
+            None => put(0, mass),
+            // The way ends here. A robot that stays on the map has stopped, or is not so fast.
+            Some(last) if after == self.stops.len() => {
+                put(last, mass * BEYOND);
+                if self.is_end {
+                    let beyond = (metres - self.stops[last].metres) / self.spacing;
+                    moved.left += mass * (1.0 - BEYOND) * beyond.min(1.0);
+                }
+            }
+            Some(before) => {
+                let [low, high] = [self.stops[before].metres, self.stops[after].metres];
+                let share = (metres - low) / (high - low);
+                let is_off = high - low > GAP * self.spacing
+                    && (metres - low).min(high - metres) > self.spacing;
+                put(before, mass * (1.0 - share));
+                put(after, mass * share);
+                if is_off {
+                    moved.left += mass * (1.0 - BEYOND) / BEYOND;
+                }
+            }
         }
     }
 }
 
-/// Weight of moving beyond the end of a path.
+/// Weight of staying on the map where a path ends; in a gap between two images, the probability of being at one of them.
 const BEYOND: f64 = 0.3;
+
+/// Images this many times further apart than usual have a gap between them: who is there is off the map.
+const GAP: f64 = 5.0;

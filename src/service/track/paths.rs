@@ -212,6 +212,12 @@ impl Paths {
         SAME_SPOT * self.spacing
     }
 
+    /// Whether the map ends at a stop: no image comes after it, on its path or on another.
+    pub fn is_end(&self, at: Stop) -> bool {
+        self.neighbours[at.image as usize][usize::from(at.ahead)] == NONE
+            && self.links(at.image).is_empty()
+    }
+
     /// The next stop on a path.
     pub fn next(&self, grid: &Grid, at: Stop) -> Option<Stop> {
         let next = self.neighbours[at.image as usize][usize::from(at.ahead)];

@@ -6,31 +6,22 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use tokio::time::Instant;
 
-use super::belief::{Belief, Habits, Roads};
+use super::belief::{Habits, Roads};
+use super::clock::{Arrival, Clock, Elapsed, Tick};
 use super::evidence::{Frames, Weights};
 use super::ground::Ground;
+use super::history::Passed;
 use super::moves::Motion;
 use super::odometry::{Odometer, Odometry};
+use super::posterior::{FrameWeights, Posterior};
 use super::{TrackSettings, TrackStep};
 
 /// Number of beliefs kept for frames that arrive late.
 const KEPT: usize = 8;
 
-/// Longest time between two frames that limits how far a robot may have moved.
-const MAX_PAUSE_S: f64 = 86_400.0;
-
 /// A robot whose frames have no times moves at most this far from one to the next, in units of the usual distance of
 /// neighbours in the map.
 const MAX_RATE: f64 = 8.0;
-
-/// A pause of this many times the usual interval of frames without times is a pause, and not jitter.
-const PAUSE: f64 = 3.0;
-
-/// Weight of a new interval in the usual one.
-const INTERVAL_WEIGHT: f64 = 0.2;
-
-/// Shortest interval of frames in seconds.
-const MIN_INTERVAL_S: f64 = 1e-4;
 
 /// Number of frames after which the rate of frames without times is judged.
 const JUDGED: u64 = 5;
@@ -42,22 +33,30 @@ const SURE: f64 = 0.9;
 /// path.
 const TURNED: f64 = 0.8;
 
+/// What to tell robots that share a track.
+const SHARED: &str = "the frames of this track alternate between two views, as if two robots or cameras shared its id; \
+                      each was localized alone. Give each camera a track id of its own";
+
 /// The state of a track between two frames.
 #[derive(Debug, Clone)]
 pub(super) struct Track {
-    belief: Arc<Belief>,
-    /// The map that the belief refers to.
+    posterior: Arc<Posterior>,
+    /// The map that it refers to.
     ground: Option<Arc<Ground>>,
     /// The revision of that map: descriptors of another one cannot be compared.
     revision: u32,
     pub frames: u64,
+    /// When the last frame arrived.
+    pub last_frame_at: Timestamp,
     seen: Frames,
+    /// The last frame without what it has in common with others; empty before the first.
+    centred: Vec<f32>,
     odometer: Odometer,
-    last: Option<Last>,
-    /// The usual time between two arrivals in seconds.
-    interval: Option<f64>,
-    /// The latest beliefs, with the times that their robot stated.
-    kept: VecDeque<(Timestamp, Arc<Belief>)>,
+    clock: Clock,
+    /// What the filter said after the last frames, the oldest first.
+    pub passed: VecDeque<Passed>,
+    /// The latest posteriors, with the times that their robot stated.
+    kept: VecDeque<(Timestamp, Arc<Posterior>)>,
 }
 
 /// A frame, as the filter takes it.
@@ -68,39 +67,41 @@ pub(super) struct Frame<'a> {
     pub is_informative: bool,
 }
 
-/// The frame before.
-#[derive(Debug, Clone, Copy)]
-struct Last {
-    captured_at: Option<Timestamp>,
-    arrived: Instant,
-}
-
-/// The belief before a frame is taken into account.
+/// What is believed before a frame is taken into account.
 #[derive(Debug, Clone)]
 pub(super) struct Prediction {
-    belief: Belief,
+    posterior: Posterior,
     /// Share of the evidence of the frame that is new.
     fresh: f64,
     /// Whether the frame is older than the last one.
     pub is_late: bool,
+    /// The share by which the frame differs from the one before.
+    unlike: f64,
     /// The frame without what it has in common with others.
     pub frame: Vec<f32>,
     /// What the robot should send instead.
     pub warning: Option<String>,
+    /// When the frame was taken and when it arrived.
+    times: (Option<Timestamp>, Timestamp),
+    motion: Option<Motion>,
+    /// The highest speed that is possible, in metres per unit of time.
+    max_speed: f64,
 }
 
 impl Track {
     /// A track without frames.
     pub fn new() -> Self {
         Self {
-            belief: Arc::new(Belief::uniform()),
+            posterior: Arc::new(Posterior::new()),
             ground: None,
             revision: 0,
             frames: 0,
+            centred: Vec::new(),
+            last_frame_at: Timestamp::UNIX_EPOCH,
             seen: Frames::default(),
             odometer: Odometer::default(),
-            last: None,
-            interval: None,
+            clock: Clock::default(),
+            passed: VecDeque::new(),
             kept: VecDeque::new(),
         }
     }
@@ -114,15 +115,16 @@ impl Track {
             && !Arc::ptr_eq(before, ground)
         {
             let number = |image: u32| ground.number(before.id(image));
-            self.belief = Arc::new(self.belief.renumbered(&number));
-            for (_, belief) in &mut self.kept {
-                *belief = Arc::new(belief.renumbered(&number));
+            self.posterior = Arc::new(self.posterior.renumbered(&number));
+            for (_, posterior) in &mut self.kept {
+                *posterior = Arc::new(posterior.renumbered(&number));
             }
+            self.passed.iter_mut().for_each(|passed| passed.renumber(&number));
         }
         self.ground = Some(Arc::clone(ground));
     }
 
-    /// The prediction step: the belief when a frame is taken. `frame` is its descriptor.
+    /// The prediction step: what is believed when a frame is taken. `frame` is its descriptor.
     pub fn predict(
         &mut self,
         step: &TrackStep,
@@ -130,78 +132,102 @@ impl Track {
         ground: &Ground,
         settings: &TrackSettings,
     ) -> Prediction {
-        let now = Instant::now();
-        let last = self.last;
-        let before = last.and_then(|last| last.captured_at);
-        let late = step.captured_at.zip(before).filter(|(at, before)| at < before);
-        if let Some((at, _)) = late {
-            return self.predict_late(at, frame.descriptor, ground, settings);
-        }
-        let arrived = last.map(|last| now.duration_since(last.arrived).as_secs_f64());
+        let usual = self.clock.usual_arrival();
+        let arrival = Arrival { at: Instant::now(), clock: Timestamp::now() };
+        self.last_frame_at = arrival.clock;
+        let (tick, clock_warning) = self.clock.read(step.captured_at, arrival);
+        let spans = match tick {
+            Tick::Late(at) => return self.predict_late(at, frame.descriptor, ground, settings),
+            Tick::First => None,
+            Tick::Next { elapsed, or_else, is_reset } => {
+                if is_reset {
+                    self.kept.clear();
+                }
+                Some((elapsed, or_else))
+            }
+        };
         let spacing = ground.paths.spacing();
         // The frames' own rate is more than the clock can tell.
-        let usual = self.interval;
-        let elapsed = match (step.captured_at.zip(before), arrived) {
-            (Some((at, before)), _) => at.duration_since(before).as_secs_f64().min(MAX_PAUSE_S),
-            (None, Some(arrived)) => {
-                let pause = arrived / usual.unwrap_or(arrived).max(MIN_INTERVAL_S);
-                if pause > PAUSE { pause } else { 1.0 }
-            }
-            (None, None) => 0.0,
-        };
         let by_rate = MAX_RATE * spacing;
-        let max_speed = match step.captured_at.is_some() && before.is_some() {
-            true => settings.max_speed_m_s,
-            false => by_rate.max(
+        let max_speed = match spans {
+            Some((Elapsed::Seconds(_), _)) => settings.max_speed_m_s,
+            _ => by_rate.max(
                 usual.map_or(0.0, |usual| (settings.max_speed_m_s * usual).min(MAX_RATE * by_rate)),
             ),
         };
-        let mut habits = Habits { max_speed, turn: settings.turn, jump: settings.jump };
+        let habits = habits(max_speed, settings);
         let Frame { descriptor, is_informative } = frame;
         let novelty = self.seen.novelty(descriptor, ground.difference()).filter(|_| is_informative);
-        let fresh = if is_informative { self.seen.add(descriptor, novelty) } else { 0.0 };
-        let belief = match (last, step.odometry) {
-            (None, _) => Belief::clone(&self.belief),
-            (Some(_), Some(odometry)) => {
-                self.moved(odometry, elapsed, &mut habits, ground, settings)
+        let fresh = if is_informative {
+            self.seen.add(descriptor, novelty, ground.difference())
+        } else {
+            0.0
+        };
+        let (posterior, motion) = match (spans, step.odometry) {
+            // What one of two robots sees says nothing of the other.
+            _ if self.seen.alternates() => (Posterior::new(), None),
+            (None, _) => (Posterior::clone(&self.posterior), None),
+            (Some((elapsed, or_else)), Some(odometry)) => {
+                let elapsed = or_else.unwrap_or(elapsed).number();
+                let (posterior, motion) = self.moved(odometry, elapsed, habits, ground, settings);
+                (posterior, Some(motion))
             }
-            (Some(_), None) => {
-                let motion = Motion::Elapsed { time: elapsed, novelty };
-                let changes = Changes(ground.changes(self.belief.images()));
-                self.belief.predicted(motion, habits, changes.roads(ground))
+            (Some((elapsed, or_else)), None) => {
+                let changes = Changes(ground.changes(self.posterior.belief.images()));
+                let motion = |elapsed: Elapsed| Motion::Elapsed { time: elapsed.number(), novelty };
+                let after = |elapsed: Elapsed| {
+                    self.posterior.predicted(motion(elapsed), habits, changes.roads(ground))
+                };
+                match or_else {
+                    // The frames that follow decide.
+                    Some(other) => (after(elapsed).mixed(&after(other), ground.len()), None),
+                    None => (after(elapsed), Some(motion(elapsed))),
+                }
             }
         };
-        let warning = self.rate_warning(step, (max_speed, spacing), settings);
-        if let Some(arrived) = arrived {
-            let usual = usual.unwrap_or(arrived);
-            let next = usual + INTERVAL_WEIGHT * (arrived.min(PAUSE * usual) - usual);
-            self.interval = Some(next.max(MIN_INTERVAL_S));
-        }
-        self.last = Some(Last { captured_at: step.captured_at.or(before), arrived: now });
+        let shared = self.seen.alternates().then(|| SHARED.to_owned());
+        let warning = shared
+            .or(clock_warning)
+            .or_else(|| self.rate_warning(step, (max_speed, spacing), settings));
         self.frames += 1;
         let frame = self.seen.centred(descriptor, ground.mean());
-        Prediction { belief, fresh, is_late: false, frame, warning }
+        let unlike = unlike(&self.centred, &frame);
+        if is_informative {
+            self.centred.clone_from(&frame);
+        }
+        let times = (step.captured_at, arrival.clock);
+        Prediction {
+            posterior,
+            fresh,
+            is_late: false,
+            unlike,
+            frame,
+            warning,
+            times,
+            motion,
+            max_speed,
+        }
     }
 
-    /// The belief after a move by odometry.
+    /// What is believed after a move by odometry.
     fn moved(
         &mut self,
         odometry: Odometry,
         elapsed: f64,
-        habits: &mut Habits,
+        mut habits: Habits,
         ground: &Ground,
         settings: &TrackSettings,
-    ) -> Belief {
+    ) -> (Posterior, Motion) {
         let moved = self.odometer.add(odometry, settings.odometry_error, ground.paths.spacing());
         if moved.turned {
             habits.turn = TURNED;
         }
         let speed = if elapsed > 0.0 { moved.metres / elapsed } else { 0.0 };
         let motion = Motion::Measured { metres: moved.metres, error: moved.error, speed };
-        self.belief.predicted(motion, *habits, Changes::none().roads(ground))
+        (self.posterior.predicted(motion, habits, Changes::none().roads(ground)), motion)
     }
 
-    /// The belief when a frame was taken that is older than the last one.
+    /// What is believed when a frame was taken that is older than the last one.
     fn predict_late(
         &mut self,
         at: Timestamp,
@@ -210,22 +236,33 @@ impl Track {
         settings: &TrackSettings,
     ) -> Prediction {
         self.frames += 1;
-        let max_speed = settings.max_speed_m_s;
-        let habits = Habits { max_speed, turn: settings.turn, jump: settings.jump };
+        let habits = habits(settings.max_speed_m_s, settings);
         let before = self.kept.iter().rev().find(|(time, _)| *time <= at);
-        let belief = before.map_or_else(Belief::uniform, |(time, belief)| {
+        let posterior = before.map_or_else(Posterior::new, |(time, posterior)| {
             let time = at.duration_since(*time).as_secs_f64();
             let motion = Motion::Elapsed { time, novelty: None };
-            belief.predicted(motion, habits, Changes::none().roads(ground))
+            posterior.predicted(motion, habits, Changes::none().roads(ground))
         });
         let frame = self.seen.centred(frame, ground.mean());
         // A recording that is replayed again would be late for ever.
         let warning = before.is_none().then(|| {
-            "the frame is older than the last frames of its track, so it was localized alone; if the clock was set back \
-             or a recording starts again, use a new track id"
+            "the frame is older than the last frames of its track, so it was localized alone; if a recording starts \
+             again, use a new track id, and give each robot a track id of its own"
                 .to_owned()
         });
-        Prediction { belief, fresh: 1.0, is_late: true, frame, warning }
+        let (times, motion) = ((Some(at), Timestamp::now()), None);
+        let max_speed = settings.max_speed_m_s;
+        Prediction {
+            posterior,
+            fresh: 1.0,
+            is_late: true,
+            unlike: 1.0,
+            frame,
+            warning,
+            times,
+            motion,
+            max_speed,
+        }
     }
 
     /// What to tell a robot whose frames have no times and arrive faster than it can have moved.
@@ -235,14 +272,15 @@ impl Track {
         (max_speed, spacing): (f64, f64),
         settings: &TrackSettings,
     ) -> Option<String> {
-        let interval = self.interval.filter(|_| self.frames >= JUDGED)?;
+        let interval = self.clock.usual_arrival().filter(|_| self.frames >= JUDGED)?;
         if step.captured_at.is_some() || step.odometry.is_some() {
             return None;
         }
         let possible = settings.max_speed_m_s * interval / max_speed;
         let image = spacing / max_speed;
-        (self.belief.faster_than(possible, image) > SURE).then(|| {
-            let speed = self.belief.speed(image) * max_speed / interval;
+        let belief = &self.posterior.belief;
+        (belief.faster_than(possible, image) > SURE).then(|| {
+            let speed = belief.speed(image) * max_speed / interval;
             format!(
                 "the frames of this track arrive as if the robot moved at {speed:.0} m/s, faster than \
                  track.max_speed_m_s = {}; their order was used and not the times of arrival. Send captured_at with \
@@ -252,29 +290,53 @@ impl Track {
         })
     }
 
-    /// The update step: keeps and returns the belief after a frame. Without `weights`, the frame showed nothing.
+    /// The update step: keeps and returns what is believed after a frame. Without `weights`, the frame showed nothing.
     pub fn update(
         &mut self,
         prediction: Prediction,
-        weights: Option<&Weights>,
+        weights: Option<&FrameWeights>,
         ground: &Ground,
         settings: &TrackSettings,
-    ) -> Arc<Belief> {
-        let belief = Arc::new(match weights {
-            Some(weights) => prediction.belief.updated(weights, ground.len(), settings.states),
-            None => prediction.belief,
+    ) -> Arc<Posterior> {
+        let (times, motion, max_speed) =
+            (prediction.times, prediction.motion, prediction.max_speed);
+        let posterior = Arc::new(match weights {
+            Some(weights) => prediction.posterior.updated(weights, ground.len(), settings.states),
+            None => prediction.posterior,
         });
         if !prediction.is_late {
-            self.belief = Arc::clone(&belief);
-            if let Some(at) = self.last.and_then(|last| last.captured_at) {
+            self.posterior = Arc::clone(&posterior);
+            let moved = motion.map(|motion| posterior.moved(motion, max_speed, ground));
+            if self.passed.len() >= settings.history {
+                self.passed.pop_front();
+            }
+            if settings.history > 0 {
+                self.passed.push_back(Passed::new(times, &posterior, moved));
+            }
+            if let Some(at) = self.clock.last_capture() {
                 if self.kept.len() == KEPT {
                     self.kept.pop_front();
                 }
-                self.kept.push_back((at, Arc::clone(&belief)));
+                self.kept.push_back((at, Arc::clone(&posterior)));
             }
         }
-        belief
+        posterior
     }
+}
+
+/// The share by which a frame differs from the one before: one minus their cosine.
+fn unlike(before: &[f32], frame: &[f32]) -> f64 {
+    let dot = |a: &[f32], b: &[f32]| f64::from(whereabouts_core::dot(a, b));
+    let lengths = (dot(before, before) * dot(frame, frame)).sqrt();
+    if before.len() != frame.len() || lengths <= 0.0 {
+        return 1.0;
+    }
+    (1.0 - dot(before, frame) / lengths).clamp(0.0, 1.0)
+}
+
+pub(super) fn habits(max_speed: f64, settings: &TrackSettings) -> Habits {
+    let TrackSettings { turn, jump, leave, enter, .. } = *settings;
+    Habits { max_speed, turn, jump, leave, enter }
 }
 
 /// How much the images of a belief differ from their neighbours.
@@ -295,7 +357,7 @@ impl Prediction {
     /// The images whose similarity to the frame is needed: those of the belief, the candidates of the search, and the
     /// sample of the map.
     pub fn images(&self, candidates: &[u32], ground: &Ground) -> Vec<u32> {
-        let mut images = [self.belief.images(), candidates, ground.sample()].concat();
+        let mut images = [self.posterior.belief.images(), candidates, ground.sample()].concat();
         images.sort_unstable();
         images.dedup();
         images
@@ -305,9 +367,10 @@ impl Prediction {
     pub fn weights(
         &self,
         (images, similarities): (&[u32], &[Option<f32>]),
+        confidence: Option<f32>,
         ground: &Ground,
         settings: &TrackSettings,
-    ) -> Option<Weights> {
+    ) -> Option<FrameWeights> {
         let shift = whereabouts_core::dot(&self.frame, ground.mean());
         let lengths = ground.lengths(images);
         let known = images.iter().zip(similarities).zip(lengths);
@@ -320,6 +383,11 @@ impl Prediction {
         let sample: Vec<f32> =
             similar.iter().filter(|(image, _)| is_sample(image)).map(|(_, s)| *s).collect();
         let strength = (settings.sharpness * self.fresh, settings.outliers);
-        (!sample.is_empty()).then(|| Weights::new(&similar, &sample, ground.len(), strength))
+        (!sample.is_empty()).then(|| FrameWeights {
+            weights: Weights::new(&similar, &sample, ground.len(), strength),
+            fresh: self.fresh,
+            unlike: self.unlike,
+            confidence,
+        })
     }
 }

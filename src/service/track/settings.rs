@@ -8,6 +8,9 @@ const MAX_SPEED_M_S: f64 = 1000.0;
 /// Odometry that errs by more than this many times the distance moved says nothing.
 const MAX_ODOMETRY_ERROR: f64 = 1000.0;
 
+/// Maximum number of places of a track that can be configured: smoothing takes time for each.
+const MAX_HISTORY: usize = 1000;
+
 /// Limits of the exponent. Beyond them, single precision makes every image equally likely, or one certain.
 const SHARPNESS: [f64; 2] = [1e-6, 1e6];
 
@@ -29,12 +32,18 @@ pub struct TrackSettings {
     pub turn: f64,
     /// Probability that a robot was carried anywhere since its last frame: ε of the filter.
     pub jump: f64,
+    /// Probability that a robot has left the map since its last frame, where no path ends.
+    pub leave: f64,
+    /// Probability that a robot off the map has come back since its last frame.
+    pub enter: f64,
     /// Weight of similarity: β of the filter.
     pub sharpness: f64,
     /// Most similar images of a frame that are always considered, however unlikely they were before it.
     pub candidates: usize,
     /// Maximum number of likely images that are kept between frames.
     pub states: usize,
+    /// Number of last places of each track that are kept, and smoothed when they are asked for.
+    pub history: usize,
     /// Minimum probability of a known place.
     pub known_probability: f64,
 }
@@ -53,12 +62,17 @@ impl TrackSettings {
         if self.max_speed_m_s > MAX_SPEED_M_S {
             return Some(format!("track.max_speed_m_s must be at most {MAX_SPEED_M_S}"));
         }
+        if self.history > MAX_HISTORY {
+            return Some(format!("track.history must be at most {MAX_HISTORY}"));
+        }
         let counts = [("max", self.max), ("candidates", self.candidates), ("states", self.states)];
         let zero = counts.into_iter().find(|(_, count)| *count == 0);
         zero.map(|(name, _)| format!("track.{name} must be at least 1"))
             .or_else(|| share("outliers", self.outliers))
             .or_else(|| share("turn", self.turn))
             .or_else(|| share("jump", self.jump))
+            .or_else(|| share("leave", self.leave))
+            .or_else(|| share("enter", self.enter))
             .or_else(|| above_zero("max_speed_m_s", self.max_speed_m_s))
             .or_else(|| above_zero("odometry_error", self.odometry_error))
             .or_else(|| {

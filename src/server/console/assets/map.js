@@ -7,6 +7,7 @@ import { imageCard, uploadCard } from "./images.js";
 import { reindexed, searched } from "./maps.js";
 import { Plan } from "./plan.js";
 import { AGES } from "./points.js";
+import { tracksCard } from "./tracks.js";
 
 const PAGE = 1000;
 const MOST = 100_000; // maximum number of images loaded automatically
@@ -52,6 +53,7 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
         settings())));
 
   const plan = new Plan(canvas, { signal, picked: choose, moved: listSoon, tiles: tiles?.url ?? null });
+  single.after(tracksCard(name, { plan, signal, query, setQuery }));
 
   function settings() {
     return h("section", { class: "card" }, h("h2", {}, "This map"), facts(

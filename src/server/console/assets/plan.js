@@ -15,6 +15,7 @@ export class Plan {
     this.points = new Points([], plane(null));
     this.plane = null;
     this.markers = [];
+    this.way = [];
     this.chosen = null;
     this.coverage = false;
     this.centre = [0, 0];
@@ -42,6 +43,13 @@ export class Plan {
     this.around(markers.find((marker) => marker.pose)?.pose);
     this.markers = markers.filter((marker) => marker.pose).map((marker) => ({ ...marker, at: this.plane.project(marker.pose) }));
     if (this.fitted) this.fit();
+    this.touch();
+  }
+
+  /** Sets the way of a robot: places with `pose`, `known` and `off_map`, the oldest first. */
+  setWay(places) {
+    this.around(places.find((place) => place.pose)?.pose);
+    this.way = places.filter((place) => place.pose).map((place) => ({ ...place, at: this.plane.project(place.pose) }));
     this.touch();
   }
 
@@ -206,6 +214,7 @@ export class Plan {
     else this.drawLines();
     if (this.coverage) this.drawDiscs();
     this.drawPoints();
+    this.drawWay();
     this.drawMarkers();
     this.drawScale(colours);
   }
@@ -277,6 +286,31 @@ export class Plan {
     }
     ink.fill(); // one path, so that overlapping discs do not accumulate opacity
     ink.globalAlpha = 1;
+  }
+
+  /** Draws a way: solid where the robot's place is sure, with a gap where it may be anywhere or off the map. */
+  drawWay() {
+    const { ink, colours, way } = this;
+    const isLost = (place) => place.off_map > 0.5 || place.probability < 0.2;
+    ink.strokeStyle = ink.fillStyle = colours.good;
+    ink.lineWidth = 4;
+    ink.lineJoin = ink.lineCap = "round";
+    for (let at = 1; at < way.length; at += 1) {
+      const [before, here] = [way[at - 1], way[at]];
+      if (isLost(before) || isLost(here)) continue;
+      ink.globalAlpha = before.known && here.known ? 0.9 : 0.35;
+      ink.beginPath();
+      ink.moveTo(...this.toScreen(...before.at));
+      ink.lineTo(...this.toScreen(...here.at));
+      ink.stroke();
+    }
+    ink.globalAlpha = 1;
+    const last = way.at(-1);
+    if (!last || isLost(last)) return;
+    ink.beginPath();
+    ink.arc(...this.toScreen(...last.at), 9, 0, 6.2832);
+    // Hollow where the robot may be elsewhere.
+    if (last.known) ink.fill(); else ink.stroke();
   }
 
   drawMarkers() {

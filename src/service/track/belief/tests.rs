@@ -2,7 +2,8 @@ use super::super::moves::fit;
 use super::*;
 use proptest::prelude::*;
 
-const HABITS: Habits = Habits { max_speed: 10.0, turn: 0.005, jump: 0.01 };
+const HABITS: Habits =
+    Habits { max_speed: 10.0, turn: 0.005, jump: 0.01, leave: 0.005, enter: 0.02 };
 
 /// A map with an image every ten metres along a road.
 #[derive(Debug)]
@@ -44,7 +45,7 @@ impl Road {
         let mut belief = Belief::uniform();
         for (number, image) in images.into_iter().enumerate() {
             if number > 0 {
-                belief = belief.predicted(second(), HABITS, self.roads());
+                belief = belief.predicted(second(), HABITS, self.roads()).0;
             }
             belief = self.updated(&belief, &[image]);
         }
@@ -78,7 +79,7 @@ fn a_robot_is_expected_ahead_of_where_it_drove_and_not_behind() {
     for (way, next, behind) in
         [((10..20).collect::<Vec<_>>(), 20, 18), ((10..20).rev().collect(), 9, 11)]
     {
-        let belief = road.driven(way).predicted(second(), HABITS, road.roads());
+        let belief = road.driven(way).predicted(second(), HABITS, road.roads()).0;
         assert_eq!(best(&belief), next);
         assert!(mass(&belief, next) > 10.0 * mass(&belief, behind), "{behind}");
     }
@@ -87,7 +88,7 @@ fn a_robot_is_expected_ahead_of_where_it_drove_and_not_behind() {
 #[test]
 fn the_direction_decides_between_places_that_look_alike() {
     let road = Road::new(60);
-    let belief = road.driven(10..20).predicted(second(), HABITS, road.roads());
+    let belief = road.driven(10..20).predicted(second(), HABITS, road.roads()).0;
     assert_eq!(best(&road.updated(&belief, &[18, 20, 50])), 20);
 }
 
@@ -96,7 +97,7 @@ fn odometry_decides_between_places_that_look_alike() {
     let road = Road::new(60);
     let start = road.updated(&Belief::uniform(), &[10]);
     let moved =
-        road.updated(&start.predicted(measured(200.0), HABITS, road.roads()), &[18, 30, 42]);
+        road.updated(&start.predicted(measured(200.0), HABITS, road.roads()).0, &[18, 30, 42]);
     assert_eq!(best(&moved), 30);
 }
 
@@ -105,19 +106,19 @@ fn a_turn_is_expected_when_odometry_has_seen_one() {
     let road = Road::new(60);
     let habits = Habits { turn: 0.8, ..HABITS };
     let mut belief = road.driven(10..20);
-    belief = belief.predicted(measured(0.0), habits, road.roads());
-    belief = belief.predicted(measured(10.0), HABITS, road.roads());
+    belief = belief.predicted(measured(0.0), habits, road.roads()).0;
+    belief = belief.predicted(measured(10.0), HABITS, road.roads()).0;
     assert_eq!(best(&belief), 18);
 }
 
 #[test]
 fn one_misleading_frame_does_not_outvote_the_track_but_a_few_relocate_it() {
     let road = Road::new(100);
-    let mut belief = road.driven(10..20).predicted(second(), HABITS, road.roads());
+    let mut belief = road.driven(10..20).predicted(second(), HABITS, road.roads()).0;
     belief = road.updated(&belief, &[80]);
     assert_eq!(best(&belief), 20);
     for image in 81..86 {
-        belief = road.updated(&belief.predicted(second(), HABITS, road.roads()), &[image]);
+        belief = road.updated(&belief.predicted(second(), HABITS, road.roads()).0, &[image]);
     }
     assert_eq!(best(&belief), 85);
 }
@@ -127,7 +128,7 @@ fn a_pause_in_which_the_robot_may_have_passed_the_whole_map_spreads_the_belief()
     let road = Road::new(400);
     let driven = road.driven(10..20);
     let paused = Motion::Elapsed { time: 7200.0, novelty: None };
-    let later = driven.predicted(paused, HABITS, road.roads());
+    let later = driven.predicted(paused, HABITS, road.roads()).0;
     assert!(later.elsewhere > 0.5, "{}", later.elsewhere);
     assert!((total(&later) - 1.0).abs() < 1e-5);
 }
@@ -148,7 +149,7 @@ fn a_robot_may_take_either_way_where_a_road_branches() {
     positions.extend((1..=10).map(|n| [200.0, -10.0 * f64::from(n)]));
     let road = Road::at(positions);
     for (look, name) in [(25, "north"), (35, "south")] {
-        let belief = road.driven(10..=20).predicted(measured(50.0), HABITS, road.roads());
+        let belief = road.driven(10..=20).predicted(measured(50.0), HABITS, road.roads()).0;
         let belief = road.updated(&belief, &[look]);
         assert_eq!(best(&belief), look, "{name}");
         assert!(mass(&belief, look) > 0.5, "{name}: {}", mass(&belief, look));
@@ -162,7 +163,7 @@ fn a_loop_is_driven_round_and_round() {
     let road =
         Road::at((0..count).map(|n| [57.3 * angle(n).cos(), 57.3 * angle(n).sin()]).collect());
     let belief = road.driven((20..60).map(|n| n % count as u32));
-    let belief = belief.predicted(second(), HABITS, road.roads());
+    let belief = belief.predicted(second(), HABITS, road.roads()).0;
     assert_eq!(best(&belief), 60 % count as u32);
 }
 
@@ -172,7 +173,7 @@ fn images_in_no_order_are_driven_past_by_their_positions() {
     let place = |n: u32| n * 23 % count;
     let number = |wanted: u32| (0..count).find(|n| place(*n) == wanted).unwrap();
     let road = Road::at((0..count).map(|n| [10.0 * f64::from(place(n)), 0.0]).collect());
-    let belief = road.driven((10..20).map(number)).predicted(second(), HABITS, road.roads());
+    let belief = road.driven((10..20).map(number)).predicted(second(), HABITS, road.roads()).0;
     assert_eq!(best(&belief), number(20));
 }
 
@@ -233,7 +234,7 @@ proptest! {
         let count = road.grid.len();
         let mut belief = Belief::uniform();
         for (motion, images) in frames {
-            belief = belief.predicted(motion, habits, road.roads());
+            belief = belief.predicted(motion, habits, road.roads()).0;
             prop_assert!((total(&belief) - 1.0).abs() < 1e-4, "{}", total(&belief));
             let images: Vec<u32> = images.into_iter().filter(|i| (*i as usize) < count).collect();
             belief = belief.updated(&road.looks_like(&images), count, most);
