@@ -224,6 +224,8 @@ async fn map_of(images: usize) {
         dim: DIM,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: Timestamp::now(),
     };

@@ -107,6 +107,8 @@ async fn new_map(store: &EmbeddedStore) -> anyhow::Result<Map> {
         dim: DIM,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: Timestamp::now(),
     };

@@ -241,6 +241,8 @@ fn map(dim: usize) -> anyhow::Result<Map> {
         dim,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: Timestamp::now(),
     })

@@ -60,6 +60,8 @@ impl Robots {
             dim: images.first().context("no images")?.0.as_slice().len(),
             revision: 0,
             refiner: None,
+            vocabulary: None,
+            keeps_shipped: false,
             description: None,
             created_at: Timestamp::now(),
         };

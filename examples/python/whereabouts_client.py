@@ -170,6 +170,20 @@ class Reindex:
 
 
 @dataclass(frozen=True)
+class VocabularyState:
+    """The vocabulary of a map whose descriptors have one."""
+
+    source: Literal["shipped", "own"]
+    """`shipped` with the model, or fitted on the images of the map."""
+    digest: str | None = None
+    fitted_at: datetime | None = None
+    images: int | None = None
+    """Number of images that an own vocabulary was fitted on."""
+    reason: str | None = None
+    """Why the map has the vocabulary of the model; None if it has its own, or if one may be fitted."""
+
+
+@dataclass(frozen=True)
 class MapState:
     """A map: a named set of reference images."""
 
@@ -185,6 +199,8 @@ class MapState:
     images: int
     index: Literal["exact", "building", "hnsw"]
     created_at: datetime
+    vocabulary: VocabularyState | None = None
+    """The vocabulary of the descriptors; None if this kind has none."""
     reindex: Reindex | None = None
     calibration: CalibrationState | None = None
     """None until the map is calibrated, shortly after images are added; until then every confidence is None."""

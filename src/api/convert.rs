@@ -8,7 +8,7 @@ use whereabouts_core::{
 
 use crate::{
     Answer, IndexKind, MapState, NoJob, NoJobReason, TimingMs, TrackEstimate, TrackHypothesis,
-    proto,
+    VocabularyChoice, VocabularyState, proto,
 };
 
 /// Converts a job state to its gRPC message.
@@ -292,6 +292,17 @@ impl From<MapState> for proto::Map {
             description: map.description.unwrap_or_default(),
             created_at: Some(moment_to(map.created_at)),
             refiner: map.refiner.map_or(proto::Refiner::Unspecified, refiner_to).into(),
+            vocabulary: map.vocabulary.map(vocabulary_to),
         }
+    }
+}
+
+fn vocabulary_to(vocabulary: VocabularyState) -> proto::MapVocabulary {
+    proto::MapVocabulary {
+        own: vocabulary.source == VocabularyChoice::Own,
+        digest: vocabulary.digest.map_or_else(String::new, |digest| digest.to_string()),
+        fitted_at: vocabulary.fitted_at.map(moment_to),
+        images: vocabulary.images.unwrap_or_default() as u64,
+        reason: vocabulary.reason.unwrap_or_default(),
     }
 }

@@ -1,5 +1,8 @@
 //! Reference images: metadata and pages.
 
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use bytes::Bytes;
 use jiff::Timestamp;
 use serde::{Deserialize, Deserializer, Serialize};
 use utoipa::ToSchema;
@@ -89,6 +92,43 @@ pub struct ExportPage {
     pub images: Vec<ExportedImage>,
     /// `cursor=` of the request for the next page; null on the last page.
     pub next_cursor: Option<String>,
+}
+
+/// A map to be imported.
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
+pub struct ImportedMap {
+    /// The map that was exported, as returned by `export`.
+    #[serde(flatten)]
+    pub map: Map,
+    /// The bytes of `GET /maps/{map}/vocabulary` in base64, if `map` has a vocabulary of its own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<String>)]
+    pub vocabulary_data: Option<VocabularyData>,
+}
+
+/// The bytes of a vocabulary, serialized in base64.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct VocabularyData(pub Bytes);
+
+impl From<Bytes> for VocabularyData {
+    fn from(bytes: Bytes) -> Self {
+        Self(bytes)
+    }
+}
+
+impl From<VocabularyData> for String {
+    fn from(data: VocabularyData) -> Self {
+        STANDARD.encode(data.0)
+    }
+}
+
+impl TryFrom<String> for VocabularyData {
+    type Error = base64::DecodeError;
+
+    fn try_from(text: String) -> Result<Self, Self::Error> {
+        STANDARD.decode(text).map(|bytes| Self(bytes.into()))
+    }
 }
 
 /// An image to be imported; its bytes are sent as a separate part.

@@ -23,7 +23,10 @@ pub use self::client::{Client, MAX_ATTEMPTS, MAX_PAUSE, explained, segment};
 pub use self::convert::{job_state_to, moment_to};
 pub use self::descriptions::{DescriptionPage, KeyedDescription, PurgedDescriptions};
 pub use self::error::ErrorKind;
-pub use self::images::{ExportPage, ImageAnswer, ImageMeta, ImagePage, ImagePatch, ImportedImage};
+pub use self::images::{
+    ExportPage, ImageAnswer, ImageMeta, ImagePage, ImagePatch, ImportedImage, ImportedMap,
+    VocabularyData,
+};
 pub use self::jobs::{JobChange, JobPage, JobStatus, Missed, PairDescribed, PairRegions};
 pub use self::keys::{MadeKey, NewKey};
 pub use self::localize::{
@@ -31,7 +34,7 @@ pub use self::localize::{
 };
 pub use self::maps::{
     CalibrationState, IndexKind, MapChange, MapRefiner, MapState, Reindex, ReindexRequest,
-    ReindexState,
+    ReindexState, VocabularyChoice, VocabularyState,
 };
 pub use self::tracks::{TrackList, TrackPlace, TrackSummary, TrackWay};
 pub use self::usage::{Today, Total, UsageReport};

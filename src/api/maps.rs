@@ -80,6 +80,10 @@ pub struct MapState {
     pub precision: Precision,
     /// Dimension of the descriptors.
     pub dim: usize,
+    /// The vocabulary of the descriptors; null if this kind has none.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub vocabulary: Option<VocabularyState>,
     /// Number of images in the map.
     pub images: usize,
     /// How the map is searched: `exact`, `building` (a graph covers part of the map, the rest is searched
@@ -126,6 +130,37 @@ pub struct ReindexRequest {
     /// does not have that kind.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub descriptor: Option<DescriptorKind>,
+    /// The vocabulary of a descriptor like `vlad`. `own` fits one on the images of the map, whatever is measured;
+    /// `shipped` takes that of the model, and the map keeps it. By default that of the model, until the server finds one
+    /// of the map's own to be better (`vocabulary.own`).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vocabulary: Option<VocabularyChoice>,
+}
+
+/// Which vocabulary a descriptor uses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum VocabularyChoice {
+    /// That of the model.
+    Shipped,
+    /// One that was fitted on the images of the map.
+    Own,
+}
+
+/// The vocabulary of a map whose descriptors have one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct VocabularyState {
+    /// `shipped` with the model, or the map's `own`.
+    pub source: VocabularyChoice,
+    /// SHA-256 of the vocabulary.
+    #[schema(value_type = Option<String>)]
+    pub digest: Option<Digest>,
+    /// When an own vocabulary was fitted.
+    pub fitted_at: Option<Timestamp>,
+    /// Number of images that an own vocabulary was fitted on.
+    pub images: Option<usize>,
+    /// Why the map has the vocabulary of the model; null if it has its own, or if one may be fitted.
+    pub reason: Option<String>,
 }
 
 /// The progress of the last reindex of a map. It is lost when the server restarts. The map keeps its old descriptors

@@ -4,6 +4,7 @@
 //! ```text
 //! manifest.json             format, version, and the list of maps
 //! maps/NAME/map.json        the map, with the digest of the model that computed its descriptors
+//! maps/NAME/vocabulary.bin  the vocabulary of the map's own, if map.json names one
 //! maps/NAME/SHA256.json     an image record with its descriptor, named by the SHA-256 of this entry
 //! maps/NAME/SHA256.jpg      the picture of that image, named by its SHA-256
 //! maps/NAME/left-out.json   instead of an image that could not be saved: its id and the reason
@@ -28,8 +29,10 @@ use whereabouts_core::{Digest, ImageId, MapName, MediaType};
 
 /// Name of the format in `manifest.json`.
 pub const FORMAT: &str = "whereabouts-backup";
-/// Version of the format that is written and read.
-pub const VERSION: u32 = 1;
+/// Version of the format that is written.
+pub const VERSION: u32 = 2;
+/// Oldest version of the format that is read; it has no vocabularies.
+pub const OLDEST_VERSION: u32 = 1;
 
 const MANIFEST: &str = "manifest.json";
 const END: &str = "end.json";
@@ -135,6 +138,10 @@ fn bytes_name(map: &MapName, digest: &Digest, media_type: MediaType) -> String {
 
 fn left_out_name(map: &MapName) -> String {
     format!("maps/{map}/left-out.json")
+}
+
+fn vocabulary_name(map: &MapName) -> String {
+    format!("maps/{map}/vocabulary.bin")
 }
 
 fn map_name(map: &MapName) -> String {

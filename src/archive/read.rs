@@ -11,8 +11,8 @@ use tar::{EntryType, Header};
 
 use super::checkpoint::{Checkpoint, disk};
 use super::{
-    ArchiveError, ArchivedMap, BLOCK, END, End, FORMAT, LeftOut, MANIFEST, Manifest, VERSION,
-    bytes_name, left_out_name, map_name, record_name,
+    ArchiveError, ArchivedMap, BLOCK, END, End, FORMAT, LeftOut, MANIFEST, Manifest,
+    OLDEST_VERSION, VERSION, bytes_name, left_out_name, map_name, record_name, vocabulary_name,
 };
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, ImageId, Map, MapName};
@@ -50,8 +50,8 @@ enum State {
 pub enum Item {
     /// The first item.
     Manifest(Manifest),
-    /// A map; its images follow.
-    Map(Map),
+    /// A map, with the vocabulary that it has of its own; its images follow.
+    Map(Map, Option<Bytes>),
     /// An image and the bytes of its picture.
     Image(ExportedImage, Bytes),
     /// An image of the map that could not be saved.
@@ -127,9 +127,9 @@ impl<R: Read> Reader<R> {
         if manifest.format != FORMAT {
             return refuse("its manifest names another format");
         }
-        if manifest.version != VERSION {
+        if !(OLDEST_VERSION..=VERSION).contains(&manifest.version) {
             return refuse(&format!(
-                "it has version {}, but this program reads version {VERSION}; restore it with \
+                "it has version {}, but this program reads versions {OLDEST_VERSION} to {VERSION}; restore it with \
                  the version of whereabouts that made it ({}), or a later one",
                 manifest.version, manifest.made_by
             ));
@@ -172,9 +172,24 @@ impl<R: Read> Reader<R> {
         if map.name != name {
             return Err(self.damaged("a map is stored under the name of another"));
         }
+        let vocabulary = self.vocabulary(&map)?;
         self.found.push(ArchivedMap { name, images: 0, left_out: Vec::new() });
         self.current = Some((map.clone(), None));
-        Ok(Item::Map(map))
+        Ok(Item::Map(map, vocabulary))
+    }
+
+    fn vocabulary(&mut self, map: &Map) -> Result<Option<Bytes>, ArchiveError> {
+        let Some(own) = &map.vocabulary else { return Ok(None) };
+        match self.entry()? {
+            None => Err(ArchiveError::Truncated(self.bytes)),
+            Some(entry) if entry.name != vocabulary_name(&map.name) => {
+                Err(self.misplaced(&entry.name))
+            }
+            Some(entry) if Digest::of(&entry.bytes) != own.digest => {
+                Err(self.damaged("a vocabulary does not match its digest"))
+            }
+            Some(entry) => Ok(Some(entry.bytes.into())),
+        }
     }
 
     fn left_out(

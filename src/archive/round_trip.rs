@@ -77,7 +77,7 @@ fn write(path: &Path, maps: &Maps, restart_every: Option<usize>) {
     let mut writer = Writer::begin(path, &Manifest::new(names.clone())).unwrap();
     let mut written = 0;
     for (name, images) in maps {
-        writer.map(&map(name)).unwrap();
+        writer.map(&map(name), None).unwrap();
         for (id, saved) in images {
             written += 1;
             if restart_every.is_some_and(|every| written % every == 0) {
@@ -101,7 +101,7 @@ proptest! {
         let mut items = read(&path).unwrap().into_iter();
         prop_assert!(matches!(items.next(), Some(Item::Manifest(_))));
         for (name, images) in &maps {
-            let Some(Item::Map(read)) = items.next() else { panic!("a map was expected") };
+            let Some(Item::Map(read, None)) = items.next() else { panic!("a map was expected") };
             prop_assert_eq!(read, map(name));
             for (id, saved) in images {
                 match (items.next(), saved) {

@@ -24,6 +24,8 @@ pub(super) fn map(name: &str) -> Map {
         dim: 2,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: Timestamp::UNIX_EPOCH,
     }
@@ -69,11 +71,11 @@ fn add(writer: &mut Writer, map: &str, id: &str) {
 fn write(dir: &TempDir) -> PathBuf {
     let path = dir.path().join("backup.tar");
     let mut writer = Writer::begin(&path, &Manifest::new(names(&["a", "b"]))).unwrap();
-    writer.map(&map("a")).unwrap();
+    writer.map(&map("a"), None).unwrap();
     add(&mut writer, "a", "1");
     writer.left_out(&"a".parse().unwrap(), &left_out()).unwrap();
     add(&mut writer, "a", "2");
-    writer.map(&map("b")).unwrap();
+    writer.map(&map("b"), None).unwrap();
     add(&mut writer, "b", "1");
     writer.finish(vec![archived("a", 2), archived("b", 1)]).unwrap();
     path
@@ -136,7 +138,7 @@ fn a_truncated_archive_is_rejected_and_can_be_resumed() {
         let last = resumed.last.as_ref().map(ImageId::as_str);
         let started: Vec<_> = resumed.maps.iter().map(|map| map.name.as_str()).collect();
         if started.is_empty() {
-            writer.map(&map("a")).unwrap();
+            writer.map(&map("a"), None).unwrap();
         }
         if started.len() < 2 {
             let rest = ["1", "1-damaged", "2"].into_iter();
@@ -146,7 +148,7 @@ fn a_truncated_archive_is_rejected_and_can_be_resumed() {
                     id => add(&mut writer, "a", id),
                 }
             }
-            writer.map(&map("b")).unwrap();
+            writer.map(&map("b"), None).unwrap();
         }
         if started.len() < 2 || last.is_none() {
             add(&mut writer, "b", "1");
@@ -169,11 +171,11 @@ fn rewinding_discards_a_map() {
     let dir = TempDir::new().unwrap();
     let path = dir.path().join("backup.tar");
     let mut writer = Writer::begin(&path, &Manifest::new(names(&["a", "b"]))).unwrap();
-    writer.map(&map("a")).unwrap();
+    writer.map(&map("a"), None).unwrap();
     add(&mut writer, "a", "1");
     writer.left_out(&"a".parse().unwrap(), &left_out()).unwrap();
     let checkpoint = writer.checkpoint();
-    writer.map(&map("b")).unwrap();
+    writer.map(&map("b"), None).unwrap();
     add(&mut writer, "b", "1");
     writer.rewind(&checkpoint).unwrap();
     writer.finish(vec![archived("a", 1)]).unwrap();

@@ -12,7 +12,7 @@ use super::checkpoint::{Checkpoint, disk};
 use super::read::{Item, Reader};
 use super::{
     ArchiveError, ArchivedMap, BLOCK, END, End, LeftOut, MANIFEST, Manifest, bytes_name,
-    left_out_name, map_name, record_name,
+    left_out_name, map_name, record_name, vocabulary_name,
 };
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, ImageId, Map, MapName};
@@ -76,7 +76,7 @@ impl Writer {
         // Everything before the first damaged or incomplete item is kept.
         while let Ok(Some(item)) = reader.next_item() {
             match item {
-                Item::Map(map) => {
+                Item::Map(map, _) => {
                     (resumed.map, resumed.last) = (Some(map), None);
                     resumed.map_start = Some(checkpoint);
                 }
@@ -113,8 +113,13 @@ impl Writer {
     }
 
     /// Starts a map.
-    pub fn map(&mut self, map: &Map) -> Result<(), ArchiveError> {
-        self.json(&map_name(&map.name), map)
+    /// `vocabulary` is its own, if its record names one.
+    pub fn map(&mut self, map: &Map, vocabulary: Option<&[u8]>) -> Result<(), ArchiveError> {
+        self.json(&map_name(&map.name), map)?;
+        match vocabulary {
+            Some(bytes) => self.entry(&vocabulary_name(&map.name), bytes),
+            None => Ok(()),
+        }
     }
 
     /// Adds an image to a map.

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use super::client::{Client, ServerArg, explained, segment};
 use super::progress::ProgressMeter;
-use whereabouts_api::ImportedImage;
+use whereabouts_api::{ImportedImage, ImportedMap};
 use whereabouts_archive::{ArchivedMap, End, Item, LeftOut, Reader};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Digest, Image, ImageId, Map, MapName};
@@ -171,12 +171,14 @@ impl Restore {
         let mut in_flight = FuturesUnordered::new();
         while let Some(item) = reader.next_item()? {
             match item {
-                Item::Map(map) => {
+                Item::Map(map, vocabulary) => {
                     while let Some(outcome) = in_flight.next().await {
                         self.count(outcome)?;
                     }
                     target = match maps.iter().find(|selected| selected.name == map.name) {
-                        Some(archived) => Some(Arc::new(self.open(args, map, archived).await?)),
+                        Some(archived) => {
+                            Some(Arc::new(self.open(args, map, vocabulary, archived).await?))
+                        }
                         None => None,
                     };
                 }
@@ -204,11 +206,14 @@ impl Restore {
         &mut self,
         args: &Args,
         map: Map,
+        vocabulary: Option<Bytes>,
         archived: &ArchivedMap,
     ) -> anyhow::Result<Target> {
         let name = args.name.clone().unwrap_or_else(|| map.name.clone());
         let path = format!("/maps/{}", segment(name.as_str()));
-        self.client.send(self.client.put(&format!("{path}/import")).json(&map)).await?;
+        let import = ImportedMap { map, vocabulary_data: vocabulary.map(Into::into) };
+        self.client.send(self.client.put(&format!("{path}/import")).json(&import)).await?;
+        let map = import.map;
         self.maps.push(RestoredMap {
             name,
             model: map.model.clone(),

@@ -45,7 +45,7 @@ pub use job::{
 };
 pub use key::{ApiKey, KeyLimits, Role, StoredKey, Token};
 pub use leftovers::Leftover;
-pub use map::{CoordinateFrame, Map, MapName, Precision, Scene};
+pub use map::{CoordinateFrame, Map, MapName, MapVocabulary, Precision, Scene};
 pub use model_server::{ModelCapabilities, ModelServer, ModelTrouble};
 pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, PoseInput, PosePatch};
 pub use secret::Secret;

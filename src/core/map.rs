@@ -158,11 +158,33 @@ pub struct Map {
     /// The refiner of its jobs; the server's if it names none. Requests may choose one that costs no more.
     #[serde(default)]
     pub refiner: Option<RefinerKind>,
+    /// The vocabulary that was fitted on the map's own images, if it has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub vocabulary: Option<MapVocabulary>,
+    /// Whether the map stays with the vocabulary of the model.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub keeps_shipped: bool,
     /// Free text for people.
     #[serde(default)]
     pub description: Option<String>,
     /// When the map was created.
     pub created_at: Timestamp,
+}
+
+/// A vocabulary that was fitted on the images of one map. Its bytes are a blob of the store.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct MapVocabulary {
+    /// SHA-256 of the vocabulary.
+    #[schema(value_type = String)]
+    pub digest: Digest,
+    /// When it was fitted.
+    pub fitted_at: Timestamp,
+    /// Number of images that it was fitted on.
+    pub images: usize,
+    /// Number of images that the map had then.
+    pub of: usize,
+    /// Whether it was asked for. Otherwise the map returns to the model's vocabulary where that is better.
+    pub requested: bool,
 }
 
 impl Map {

@@ -23,12 +23,15 @@ pub(super) struct CacheKey<'a> {
     pub refinement: Option<(Scene, &'a str)>,
     /// The settings of the calibration.
     pub calibration: CalibrationSettings,
+    /// The map's own vocabulary.
+    pub vocabulary: Option<Digest>,
 }
 
 impl CacheKey<'_> {
     /// Returns the text to hash.
     pub fn text(&self) -> String {
-        let Self { version, map, references, search, k, refinement, calibration } = self;
+        let Self { version, map, references, search, k, refinement, calibration, vocabulary } =
+            self;
         let search = match search {
             SearchMode::Fast => "Fast",
             SearchMode::Exact => "Exact",
@@ -47,13 +50,15 @@ impl CacheKey<'_> {
             calibration;
         let model_calls =
             if *model_calls > 0 { format!("\nmodel_calls: {model_calls}") } else { String::new() };
+        let vocabulary =
+            vocabulary.map_or_else(String::new, |digest| format!("\nvocabulary: {digest}"));
         let place_m = float(*place_m);
         // A cached confidence is of the evidence that was measured then.
         let evidence = Calibration::EVIDENCE;
         format!(
             "{version}\n{map}\n{references}\n{search}\n{k}\n{refinement}\nCalibrationSettings {{ \
              images: {images}, refined: {refined}, candidates: {candidates}, place_images: \
-             {place_images}, place_m: {place_m} }}{model_calls}\nevidence: {evidence}"
+             {place_images}, place_m: {place_m} }}{model_calls}{vocabulary}\nevidence: {evidence}"
         )
     }
 }
@@ -93,6 +98,7 @@ mod tests {
                 k: 10,
                 refinement,
                 calibration,
+                vocabulary: None,
             }
             .text()
         };

@@ -39,7 +39,12 @@ impl Evaluator<'_> {
             let kinds = extractor.manifest().kinds();
             format!("the model has no descriptor {descriptor:?}; it has {kinds:?}")
         })?;
-        let identity = format!("{digest}\n{}", extractor.execution());
+        let settings = service.maps.vocabulary;
+        let own = match settings.own && extractor.manifest().may_have_own(descriptor) {
+            true => format!("\n{} to {}", settings.min_images, settings.max_images),
+            false => String::new(),
+        };
+        let identity = format!("{digest}\n{}{own}", extractor.execution());
         let name = format!("{descriptor}-{}", &Digest::of(identity.as_bytes()).hex()[..12]);
         let name: MapName = name.parse()?;
         let change = MapChange {
@@ -73,13 +78,32 @@ impl Evaluator<'_> {
         }
         wait_for_index(service, &name).await?;
         self.observer.finish();
+        let listed = Digest::of(listing.as_bytes());
+        if !own.is_empty() {
+            self.fit_vocabulary(&name, listed).await?;
+        }
         let map = service
             .maps
             .store
             .map(&name)
             .await?
             .context("the map of the references was deleted; run the same command again")?;
-        Ok(ReferenceMap { map, digest: Digest::of(listing.as_bytes()) })
+        Ok(ReferenceMap { map, digest: listed })
+    }
+
+    /// Gives the map the vocabulary that a server would, unless an earlier run has done so for these references.
+    async fn fit_vocabulary(&self, map: &MapName, references: Digest) -> anyhow::Result<()> {
+        let mark = self.settings.work_dir.join(format!("vocabulary-{map}"));
+        let listed = references.to_string();
+        if std::fs::read_to_string(&mark).is_ok_and(|fitted| fitted == listed) {
+            return Ok(());
+        }
+        self.observer.begin("vocabulary", 1);
+        self.service.fitter.fit_again(map).await?;
+        wait_for_index(&self.service, map).await?;
+        self.observer.step();
+        self.observer.finish();
+        std::fs::write(&mark, listed).with_context(|| format!("cannot write {}", mark.display()))
     }
 
     async fn add(

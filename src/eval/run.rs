@@ -141,6 +141,7 @@ impl Evaluator<'_> {
             k: *k,
             refinement: method.refiner.map(|_| (*scene, refiner_settings.as_str())),
             calibration: self.service.calibrator.settings,
+            vocabulary: references.map.vocabulary.map(|own| own.digest),
         }
         .text();
         let folder = work_dir.join("outcomes");

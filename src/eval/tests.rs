@@ -72,6 +72,8 @@ async fn map_of(store: &EmbeddedStore, descriptors: &[Descriptor]) -> Map {
         dim: DIM,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: now,
     };

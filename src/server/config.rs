@@ -27,7 +27,7 @@ use whereabouts_refine::cascade::CascadeSettings;
 use whereabouts_refine::mllm::MllmSettings;
 use whereabouts_service::{
     BulkSettings, ConfidenceSettings, IdempotencySettings, LocalizeSettings, TrackSettings,
-    WebhookSettings,
+    VocabularySettings, WebhookSettings,
 };
 use whereabouts_telemetry::{LogSettings, TraceSettings};
 use whereabouts_vision::ImageSettings;
@@ -59,6 +59,8 @@ pub struct Config {
     pub localize: LocalizeSettings,
     /// How maps are measured.
     pub confidence: ConfidenceSettings,
+    /// Vocabularies of maps' own.
+    pub vocabulary: VocabularySettings,
     /// The frames of one robot, one after another.
     pub track: TrackSettings,
     /// Many images in one request.
@@ -208,6 +210,9 @@ impl Config {
             return Some(why);
         }
         if let Some(why) = self.confidence.validate(self.refine.candidates) {
+            return Some(why);
+        }
+        if let Some(why) = self.vocabulary.validate() {
             return Some(why);
         }
         if self.bulk.memory_bytes < self.server.body_limit_bytes {

@@ -78,18 +78,18 @@ impl Images {
             }
         }
         loop {
-            let (map, extractor) = match usable.take() {
+            let (map, extractor, spec) = match usable.take() {
                 Some(usable) => usable,
                 None => self.maps.usable(name).await?,
             };
             let stated_pose = stated.pose(&map)?;
             let bytes = new.bytes.clone();
-            let (kind, features) = (map.descriptor, FeatureSet::DescriptorOnly);
+            let features = FeatureSet::DescriptorOnly;
             let extraction = match permit.take() {
                 Some(permit) => {
-                    imaging.extract_with(permit, &extractor, bytes, kind, features).await?
+                    imaging.extract_with(permit, &extractor, bytes, spec, features).await?
                 }
-                None => imaging.extract(&extractor, bytes, kind, features, new.demand).await?,
+                None => imaging.extract(&extractor, bytes, spec, features, new.demand).await?,
             };
             imaging.metrics.observe_extraction(&extraction);
             let (pose, advice) = match (stated_pose, map.frame) {

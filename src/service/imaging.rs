@@ -6,16 +6,17 @@ use std::sync::Arc;
 use bytes::Bytes;
 use tokio_util::sync::CancellationToken;
 use whereabouts_api::ErrorKind;
-use whereabouts_core::{DescriptorKind, Digest, MediaType};
+use whereabouts_core::{Digest, MediaType};
 use whereabouts_store::MapStore;
 use whereabouts_vision::exif::{GpsReading, gps};
 use whereabouts_vision::{
-    Admission, AdmissionRequest, CpuPool, ExtractError, Extraction, Extractor, FeatureSet,
-    LoadedModels, Manifest, Permit, PoolError, RawPixels, Rejected, WorkClass, decode, preprocess,
+    Admission, AdmissionRequest, CpuPool, DescriptorSpec, ExtractError, Extraction, Extractor,
+    FeatureSet, LoadedModels, Manifest, Permit, PoolError, RawPixels, Rejected, WorkClass, decode,
+    preprocess,
 };
 
 use super::models::unusable;
-use super::{ServiceError, ServiceMetrics};
+use super::{ServiceError, ServiceMetrics, Vocabularies};
 
 /// Decodes images and runs models on them, at most as many at a time as there are permits. Clones share the
 /// permits, the threads and the models.
@@ -25,6 +26,8 @@ pub struct Imaging {
     pub maps: Arc<dyn MapStore>,
     /// The loaded models.
     pub models: LoadedModels,
+    /// The loaded vocabularies of maps.
+    pub vocabularies: Arc<Vocabularies>,
     /// Permits to decode an image and run a model on it.
     pub admission: Arc<Admission>,
     /// The threads for decoding.
@@ -64,12 +67,12 @@ impl Imaging {
         &self,
         extractor: &Arc<Extractor>,
         bytes: Bytes,
-        kind: DescriptorKind,
+        spec: DescriptorSpec,
         features: FeatureSet,
         request: AdmissionRequest,
     ) -> Result<Extraction, ServiceError> {
         let permit = Arc::new(self.admit(request).await?);
-        self.extract_with(permit, extractor, bytes, kind, features).await
+        self.extract_with(permit, extractor, bytes, spec, features).await
     }
 
     /// Like [`Imaging::extract`], with a permit that the caller has.
@@ -78,7 +81,7 @@ impl Imaging {
         permit: Arc<Permit>,
         extractor: &Arc<Extractor>,
         bytes: Bytes,
-        kind: DescriptorKind,
+        spec: DescriptorSpec,
         features: FeatureSet,
     ) -> Result<Extraction, ServiceError> {
         let cancelled = CancellationToken::new();
@@ -87,7 +90,7 @@ impl Imaging {
         let decode = move || {
             // Held until the thread is free, even if the caller has gone.
             let _permit = decoding_permit;
-            decoder.begin(&bytes, kind, features, || !cancelled.is_cancelled())
+            decoder.begin(&bytes, spec, features, || !cancelled.is_cancelled())
         };
         let extraction = self.on_pool(decode).await?.result().await?;
         permit.complete();

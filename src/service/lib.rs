@@ -9,6 +9,8 @@ mod corrections;
 mod descriptions;
 mod error;
 mod events;
+mod fitter;
+mod fitting;
 mod idempotency;
 mod images;
 mod imaging;
@@ -31,6 +33,7 @@ mod tests;
 mod track;
 mod transfer;
 mod usage;
+mod vocabularies;
 mod webhooks;
 
 use std::sync::Arc;
@@ -45,6 +48,7 @@ pub use self::cancellation::Deadline;
 pub use self::descriptions::Descriptions;
 pub use self::error::ServiceError;
 pub use self::events::{AnyJobEvent, JobEvent};
+pub use self::fitter::VocabularyFitter;
 pub use self::idempotency::{Idempotency, IdempotencyOutcome, IdempotencySettings};
 pub use self::images::{Images, NewImage};
 pub use self::imaging::Imaging;
@@ -64,6 +68,7 @@ pub use self::submit::Submitter;
 pub use self::track::{FrameEvidence, Odometry, TrackSettings, TrackStep, Tracks};
 pub use self::transfer::Transfer;
 pub use self::usage::UsageReports;
+pub use self::vocabularies::{Vocabularies, VocabularySettings};
 pub use self::webhooks::{Dispatcher, WebhookSettings, Webhooks};
 use whereabouts_refine::{DenseCache, JobServiceTime, JobSettings, Refiner};
 use whereabouts_store::{Retention, Store};
@@ -85,6 +90,8 @@ pub struct Service {
     pub jobs: Jobs,
     /// Reindexing of maps.
     pub reindexer: Reindexer,
+    /// Vocabularies of maps' own.
+    pub fitter: VocabularyFitter,
     /// Calibration of confidence.
     pub calibrator: Calibrator,
     /// Export and import of maps.
@@ -140,6 +147,8 @@ pub struct ServiceSettings {
     pub track: TrackSettings,
     /// Calibration of confidence.
     pub confidence: ConfidenceSettings,
+    /// Vocabularies of maps' own.
+    pub vocabulary: VocabularySettings,
     /// Refinement jobs.
     pub jobs: JobSettings,
     /// The refiners that maps and requests may choose.
@@ -167,6 +176,7 @@ impl Service {
         let imaging = Imaging {
             maps: store.clone(),
             models,
+            vocabularies: Arc::new(Vocabularies::new(store.clone(), settings.vocabulary.loaded)),
             admission: Arc::clone(&admission),
             pool,
             metrics: Arc::clone(&metrics),
@@ -175,6 +185,7 @@ impl Service {
             store: store.clone(),
             imaging: imaging.clone(),
             reindexes: Arc::default(),
+            vocabulary: settings.vocabulary,
             refiners: settings.refiners.clone(),
         };
         let jobs = Jobs {
@@ -197,6 +208,12 @@ impl Service {
             metrics: Arc::clone(&metrics),
             settings: settings.jobs,
         };
+        let reindexer = Reindexer {
+            maps: maps.clone(),
+            drafts: store.clone(),
+            blobs: store.clone(),
+            settings: settings.vocabulary,
+        };
         let place_m = settings.confidence.place_m;
         Self {
             images: Images {
@@ -215,11 +232,8 @@ impl Service {
                 refiners: settings.refiners.clone(),
             },
             jobs,
-            reindexer: Reindexer {
-                maps: maps.clone(),
-                drafts: store.clone(),
-                blobs: store.clone(),
-            },
+            fitter: VocabularyFitter { reindexer: reindexer.clone() },
+            reindexer,
             calibrator: Calibrator {
                 store: store.clone(),
                 refiner: refiner.clone(),

@@ -237,10 +237,10 @@ impl Localizer {
     ) -> Result<Retrieved, ServiceError> {
         let mut retries = SUPERSEDED_RETRIES;
         loop {
-            let (map, extractor) = self.maps.usable(map).await?;
-            let (frame, kind) = (frame.clone(), map.descriptor);
+            let (map, extractor, spec) = self.maps.usable(map).await?;
+            let frame = frame.clone();
             let extracting =
-                self.maps.imaging.extract(&extractor, frame, kind, features, admission);
+                self.maps.imaging.extract(&extractor, frame, spec, features, admission);
             let extraction = extracting.instrument(traces::stage("extract")).await?;
             self.maps.imaging.metrics.observe_extraction(&extraction);
             let searching = Instant::now();

@@ -5,10 +5,16 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use uuid::Uuid;
 
+use super::fitting::obstacle;
 use super::models::{descriptor_of, kind_of};
-use super::{AllowedRefiners, Imaging, Reindexes, SUPERSEDED_RETRIES, ServiceError};
-use whereabouts_api::{CalibrationState, ErrorKind, IndexKind, MapChange, MapRefiner, MapState};
-use whereabouts_core::{Map, MapName};
+use super::{
+    AllowedRefiners, Imaging, Reindexes, SUPERSEDED_RETRIES, ServiceError, VocabularySettings,
+};
+use whereabouts_api::{
+    CalibrationState, ErrorKind, IndexKind, MapChange, MapRefiner, MapState, VocabularyChoice,
+    VocabularyState,
+};
+use whereabouts_core::{DescriptorKind, Map, MapName};
 use whereabouts_store::{IndexState, MapStore, StoreError};
 
 /// Maps: create, change, list and delete. Clones share the store.
@@ -20,6 +26,8 @@ pub struct Maps {
     pub imaging: Imaging,
     /// The state of the last reindex of each map.
     pub reindexes: Arc<Reindexes>,
+    /// When maps get a vocabulary of their own.
+    pub vocabulary: VocabularySettings,
     /// The refiners to which a map may be set.
     pub refiners: AllowedRefiners,
 }
@@ -65,9 +73,11 @@ impl Maps {
         let unchanged = known.filter(|map| {
             map.model == model && change.descriptor.is_none_or(|kind| kind == map.descriptor)
         });
+        let mut vocabulary = None;
         let (descriptor, model_digest, precision, dim) = match unchanged {
             // The images keep the model that made their descriptors, whatever is installed now.
             Some(map) if self.store.index_state(map).await?.images > 0 => {
+                vocabulary = map.vocabulary;
                 (map.descriptor, map.model_digest, map.precision, map.dim)
             }
             _ => {
@@ -93,6 +103,8 @@ impl Maps {
                 Some(refiner) => refiner.kind(),
                 None => known.and_then(|map| map.refiner),
             },
+            vocabulary,
+            keeps_shipped: known.is_some_and(|map| map.keeps_shipped),
             description: change
                 .description
                 .clone()
@@ -143,6 +155,7 @@ impl Maps {
         let map = self.find(name).await?;
         let IndexState { images, graph, behind, .. } = self.store.index_state(&map).await?;
         let calibration = self.store.calibration(&map).await?;
+        let vocabulary = self.vocabulary_of(&map, images).await;
         let index = match (graph, behind) {
             (false, _) => IndexKind::Exact,
             (true, true) => IndexKind::Building,
@@ -157,6 +170,7 @@ impl Maps {
             model_digest: map.model_digest,
             precision: map.precision,
             dim: map.dim,
+            vocabulary,
             images,
             index,
             calibration: calibration.as_deref().map(CalibrationState::from),
@@ -165,6 +179,33 @@ impl Maps {
             reindex,
             created_at: map.created_at,
         })
+    }
+}
+
+impl Maps {
+    /// Describes the vocabulary of a map; `None` if its descriptors have none.
+    async fn vocabulary_of(&self, map: &Map, images: usize) -> Option<VocabularyState> {
+        if let Some(own) = map.vocabulary {
+            return Some(VocabularyState {
+                source: VocabularyChoice::Own,
+                digest: Some(own.digest),
+                fitted_at: Some(own.fitted_at),
+                images: Some(own.images),
+                reason: None,
+            });
+        }
+        if [DescriptorKind::GEM, DescriptorKind::CLS].contains(&map.descriptor) {
+            return None;
+        }
+        let manifest = self.imaging.manifest(&map.model).await.ok()?;
+        let digest = manifest.vocabulary(map.descriptor)?;
+        let declined = || self.reindexes.declined(map).map(|declined| declined.why);
+        let reason = match manifest.may_have_own(map.descriptor) {
+            true => obstacle(map, images, &self.vocabulary).or_else(declined),
+            false => Some("the model's descriptor has no projection that could be fitted".into()),
+        };
+        let source = VocabularyChoice::Shipped;
+        Some(VocabularyState { source, digest, fitted_at: None, images: None, reason })
     }
 }
 

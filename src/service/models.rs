@@ -4,17 +4,31 @@ use std::sync::Arc;
 
 use whereabouts_api::ErrorKind;
 use whereabouts_core::{DescriptorKind, Digest, Map, MapName};
-use whereabouts_vision::{Extractor, Manifest, ModelError};
+use whereabouts_vision::{DescriptorSpec, Extractor, Manifest, ModelError};
 
 use super::{Maps, ServiceError};
 
 impl Maps {
-    /// Returns a map with the model that made its descriptors; a conflict if that model is not installed, or
-    /// only another version or precision of it.
+    /// Returns a map with the model that made its descriptors, and how it made them; a conflict if that model is not
+    /// installed, or only another version or precision of it.
     pub(crate) async fn usable(
         &self,
         name: &MapName,
-    ) -> Result<(Map, Arc<Extractor>), ServiceError> {
+    ) -> Result<(Map, Arc<Extractor>, DescriptorSpec), ServiceError> {
+        loop {
+            let (map, extractor) = self.with_model(name).await?;
+            match self.imaging.vocabularies.spec_of(&map, &extractor).await {
+                Ok(spec) => return Ok((map, extractor, spec)),
+                // Perhaps it was replaced since the map was read.
+                Err(error) if self.find(name).await?.model_digest == map.model_digest => {
+                    return Err(error);
+                }
+                Err(_) => {}
+            }
+        }
+    }
+
+    async fn with_model(&self, name: &MapName) -> Result<(Map, Arc<Extractor>), ServiceError> {
         let map = self.find(name).await?;
         let extractor = self.imaging.models.of(&map).await.map_err(|error| match error {
             ModelError::NotInstalled(_) => ServiceError::new(
@@ -90,7 +104,7 @@ fn mismatch(map: &Map, extractor: &Extractor) -> Option<String> {
     }
     let (name, model, reindex) = (&map.name, &map.model, how_to_reindex(&map.name, &map.model));
     let precision = extractor.execution().precision;
-    let Some(digest) = extractor.digest(map.descriptor) else {
+    let Some(digest) = extractor.digest_of(map) else {
         return Some(format!(
             "the map {name} was indexed with the descriptor {:?}, which the model {model:?} that is installed does \
              not have; install the former again, or reindex the map with one of {}: {reindex} --descriptor KIND",

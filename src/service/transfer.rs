@@ -8,8 +8,12 @@ use uuid::Uuid;
 
 use super::images::{check_tags, page_size};
 use super::{Maps, SUPERSEDED_RETRIES, ServiceError};
-use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
-use whereabouts_core::{Digest, ExportedImage, Image, ImageId, Map, MapName, MediaType};
+use whereabouts_api::{
+    ErrorKind, ExportPage, ImportedImage, ImportedMap, MapState, VocabularyData,
+};
+use whereabouts_core::{
+    Digest, ExportedImage, Image, ImageId, Map, MapName, MapVocabulary, MediaType,
+};
 use whereabouts_store::{Added, BlobStore, ExportStore, StoreError};
 use whereabouts_vision::{AdmissionRequest, FeatureSet};
 
@@ -57,9 +61,11 @@ impl Transfer {
     pub async fn import_map(
         &self,
         name: &MapName,
-        from: Map,
+        imported: ImportedMap,
     ) -> Result<(MapState, bool), ServiceError> {
+        let ImportedMap { map: from, vocabulary_data } = imported;
         check_map(&from)?;
+        let mut pin = None;
         let mut retries = SUPERSEDED_RETRIES;
         loop {
             let known = self.maps.store.map(name).await?;
@@ -73,6 +79,12 @@ impl Transfer {
                 Some(known) => known.revision,
                 None => 0,
             };
+            if let Some(own) = from.vocabulary
+                && pin.is_none()
+            {
+                let bytes = vocabulary_bytes(&own, vocabulary_data.as_ref())?;
+                pin = Some(self.blobs.put_blob(own.digest, bytes).await?);
+            }
             let new_map = Map { uid: Uuid::now_v7(), name: name.clone(), revision, ..from.clone() };
             match self.maps.store.put_map(new_map).await {
                 Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
@@ -82,6 +94,18 @@ impl Transfer {
                 }
             }
         }
+    }
+
+    /// Returns the bytes of the vocabulary that a map has of its own.
+    pub async fn vocabulary(&self, name: &MapName) -> Result<Bytes, ServiceError> {
+        let map = self.maps.find(name).await?;
+        let missing = || {
+            ServiceError::not_found(format!(
+                "the map {name} has no vocabulary of its own; `vocabulary` of GET /maps/{name} says which it has"
+            ))
+        };
+        let own = map.vocabulary.ok_or_else(missing)?;
+        self.blobs.blob(&own.digest).await?.ok_or_else(missing)
     }
 
     /// Stores an image with the descriptor that it has in another store.
@@ -110,19 +134,32 @@ impl Transfer {
                 )));
             }
             None => {
-                let (_, extractor) = self.maps.usable(name).await?;
+                let (_, extractor, spec) = self.maps.usable(name).await?;
                 let (bytes, features) = (bytes.clone(), FeatureSet::DescriptorOnly);
                 let imaging = &self.maps.imaging;
-                imaging
-                    .extract(&extractor, bytes, map.descriptor, features, admission)
-                    .await?
-                    .descriptor
+                imaging.extract(&extractor, bytes, spec, features, admission).await?.descriptor
             }
         };
         let _pin = self.blobs.put_blob(image.digest, bytes).await?;
         // Not retried if the map was reindexed meanwhile: its descriptors are now of another model than this one.
         Ok(self.maps.store.add_image(&map, image, descriptor).await?)
     }
+}
+
+/// The bytes of an imported vocabulary, if they are those that the record names.
+fn vocabulary_bytes(
+    own: &MapVocabulary,
+    data: Option<&VocabularyData>,
+) -> Result<Bytes, ServiceError> {
+    let detail = match data {
+        Some(data) if Digest::of(&data.0) == own.digest => return Ok(data.0.clone()),
+        Some(_) => "vocabulary_data does not match the digest of the map's vocabulary",
+        None => {
+            "the map has a vocabulary of its own; send its bytes (GET /maps/{map}/vocabulary of the other server) \
+             as vocabulary_data in base64"
+        }
+    };
+    Err(ServiceError::unprocessable(detail))
 }
 
 fn is_compatible(map: &Map, from: &Map) -> bool {

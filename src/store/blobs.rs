@@ -10,7 +10,7 @@ use whereabouts_core::Digest;
 #[async_trait]
 pub trait BlobStore: Send + Sync {
     /// Stores bytes. They are kept at least until the returned pin is dropped, and after that for as
-    /// long as an image or a query refers to them.
+    /// long as an image, a query or the vocabulary of a map refers to them.
     async fn put_blob(&self, digest: Digest, bytes: Bytes) -> Result<BlobPin, StoreError>;
     /// Returns the bytes of this digest.
     async fn blob(&self, digest: &Digest) -> Result<Option<Bytes>, StoreError>;

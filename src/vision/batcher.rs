@@ -8,10 +8,10 @@ use std::thread::{self, JoinHandle};
 
 use serde::{Deserialize, Serialize};
 use tokio::sync::oneshot;
-use whereabouts_core::{DenseFeatures, Descriptor, DescriptorKind};
+use whereabouts_core::{DenseFeatures, Descriptor};
 
 use super::execution::Execution;
-use super::pooling::{FeatureSet, Kinds};
+use super::pooling::{DescriptorSpec, FeatureSet, Kinds};
 use super::preprocess::Tensor;
 use super::session::{InferenceError, Model, Runner};
 use super::sync::{Condvar, Mutex, MutexGuard};
@@ -137,7 +137,7 @@ impl Batcher {
     pub fn submit(
         &self,
         tensor: Tensor,
-        kind: DescriptorKind,
+        spec: DescriptorSpec,
         features: FeatureSet,
     ) -> Result<PendingInference, InferenceError> {
         let (reply, result) = oneshot::channel();
@@ -148,7 +148,7 @@ impl Batcher {
         if state.closed {
             return Err(InferenceError::Stopped);
         }
-        state.push(Request { tensor, kind, features, reply });
+        state.push(Request { tensor, spec, features, reply });
         drop(state);
         self.queue.work_available.notify_all();
         Ok(PendingInference(result))
@@ -180,7 +180,7 @@ enum SessionKind {
 #[derive(Debug)]
 struct Request {
     tensor: Tensor,
-    kind: DescriptorKind,
+    spec: DescriptorSpec,
     features: FeatureSet,
     reply: Reply,
 }

@@ -148,8 +148,9 @@ impl Bench {
         batcher.wait_until_complete();
         let mut pictures = self.sample.iter().cycle();
         let mut next = || pictures.next().cloned().unwrap_or_else(|| Tensor::grey(1, 1));
-        let submit =
-            |picture| batcher.submit(picture, DescriptorKind::GEM, FeatureSet::DescriptorOnly);
+        let submit = |picture| {
+            batcher.submit(picture, DescriptorKind::GEM.into(), FeatureSet::DescriptorOnly)
+        };
         let mut times = Vec::new();
         let start = Instant::now();
         while times.len() < 3 || start.elapsed() < duration {

@@ -9,8 +9,10 @@ use super::batcher::{Batcher, Layout, PendingInference, Pooled};
 use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jpeg};
 use super::execution::{Execution, Provider, ProviderPreference};
 use super::information::Information;
-use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest};
-use super::pooling::{FeatureSet, Kinds, PoolingError, VocabularyError};
+use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest, own_digest};
+use super::pooling::{
+    DescriptorSpec, FeatureSet, Kinds, OwnVocabulary, PoolingError, Vocabulary, VocabularyError,
+};
 use super::preprocess::{self, PreprocessError, Tensor, preprocess};
 use super::provider;
 use super::runtime::{Assets, RuntimeError};
@@ -57,6 +59,9 @@ impl ExtractorSettings {
 #[derive(Debug)]
 pub struct Extractor {
     manifest: Arc<Manifest>,
+    kinds: Arc<Kinds>,
+    /// For each kind that a map's own vocabulary can be fitted for, what the digest of its descriptors depends on besides.
+    own_bases: BTreeMap<DescriptorKind, Digest>,
     /// The digest of each kind of descriptor.
     digests: BTreeMap<DescriptorKind, Digest>,
     batcher: Batcher,
@@ -197,12 +202,14 @@ impl Extractor {
     /// Loads a model and validates it by running one picture through it. Throughput sessions are loaded in
     /// the background.
     pub fn load(assets: &Assets, settings: &ExtractorSettings) -> Result<Self, ExtractError> {
-        let VerifiedModel { model, digests } =
+        let VerifiedModel { model, own_bases, digests } =
             VerifiedModel::open(assets, &settings.model, settings.preference.provider)?;
         let execution = choose_execution(&model, &digests, settings)?;
         let batcher = Batcher::start(&model, execution, settings.layout)?;
         let mut extractor = Self {
             manifest: Arc::clone(&model.manifest),
+            kinds: Arc::clone(&model.kinds),
+            own_bases,
             digests,
             batcher,
             execution,
@@ -225,6 +232,27 @@ impl Extractor {
         self.digests.get(&kind).copied()
     }
 
+    /// Prepares to fit a map's own vocabulary for a kind of descriptor; `None` if the kind has none, or one that cannot
+    /// be fitted.
+    pub fn own_vocabulary(&self, kind: DescriptorKind) -> Option<OwnVocabulary> {
+        OwnVocabulary::new(self.kinds.vocabulary(kind)?)
+    }
+
+    /// Reads a map's own vocabulary. The error says what is wrong with it.
+    pub fn read_vocabulary(
+        &self,
+        kind: DescriptorKind,
+        bytes: &[u8],
+    ) -> Result<Vocabulary, String> {
+        let own = self.own_vocabulary(kind);
+        own.ok_or("the model's descriptor has no vocabulary")?.read(bytes)
+    }
+
+    /// Like [`digest`](Self::digest), with a map's own vocabulary in place of the model's, of which this is the digest.
+    pub fn own_digest(&self, kind: DescriptorKind, vocabulary: Digest) -> Option<Digest> {
+        self.own_bases.get(&kind).map(|base| own_digest(*base, vocabulary))
+    }
+
     /// The execution provider and precision in use.
     pub fn execution(&self) -> Execution {
         self.execution
@@ -239,10 +267,10 @@ impl Extractor {
     pub fn extract(
         &self,
         bytes: &[u8],
-        kind: DescriptorKind,
+        spec: impl Into<DescriptorSpec>,
         features: FeatureSet,
     ) -> Result<Extraction, ExtractError> {
-        self.begin(bytes, kind, features, || true)?.wait()
+        self.begin(bytes, spec, features, || true)?.wait()
     }
 
     /// Decodes a picture and queues it for inference. Blocks while decoding and while the queue is full; call
@@ -251,7 +279,7 @@ impl Extractor {
     pub fn begin(
         &self,
         bytes: &[u8],
-        kind: DescriptorKind,
+        spec: impl Into<DescriptorSpec>,
         features: FeatureSet,
         is_wanted: impl Fn() -> bool,
     ) -> Result<PendingExtraction, ExtractError> {
@@ -267,7 +295,7 @@ impl Extractor {
             return Err(ExtractError::Abandoned);
         }
         let submitted = Instant::now();
-        let inference = self.batcher.submit(tensor, kind, features)?;
+        let inference = self.batcher.submit(tensor, spec.into(), features)?;
         // Hashed after submitting, so that it overlaps with inference.
         let digest = Digest::of(bytes);
         let decode = submitted - start;
@@ -300,6 +328,8 @@ impl Extractor {
 #[derive(Debug)]
 pub(super) struct VerifiedModel {
     pub model: Model,
+    /// For each kind that can have an own vocabulary, what the digest of its descriptors depends on besides.
+    pub own_bases: BTreeMap<DescriptorKind, Digest>,
     /// The digest of each kind of descriptor.
     pub digests: BTreeMap<DescriptorKind, Digest>,
 }
@@ -316,10 +346,13 @@ impl VerifiedModel {
         let file = folder.join(&manifest.file);
         let files = verified_digests(&folder, &manifest)?;
         let kinds = Arc::new(Kinds::load(&manifest, &folder)?);
+        let own_bases = manifest.kinds().into_iter();
+        let own_bases =
+            own_bases.filter_map(|kind| Some((kind, manifest.own_base(&files, kind)?))).collect();
         let digests =
             manifest.kinds().into_iter().map(|kind| (kind, manifest.digest(&files, kind)));
         let digests = digests.collect();
-        Ok(Self { model: Model { environment, file, manifest, kinds }, digests })
+        Ok(Self { model: Model { environment, file, manifest, kinds }, own_bases, digests })
     }
 }
 

@@ -41,7 +41,7 @@ pub use information::{Dead, Information, Uninformative};
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{DataFile, MANIFEST, Manifest, ManifestError, file_digest};
 pub use pool::{CpuPool, Overloaded, PoolError};
-pub use pooling::FeatureSet;
+pub use pooling::{DescriptorSpec, FeatureSet, OwnVocabulary, Vocabulary};
 pub use provider::{MIN_SIMILARITY, Measurement, Trial};
 pub use raw_pixels::{PixelEncoding, RawPixels, RawPixelsError};
 pub use runtime::{AUTO, Assets, BUILT_IN_MODEL, CHOSEN, PREFERRED_MODELS, RuntimeError, WhyModel};

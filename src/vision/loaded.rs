@@ -215,8 +215,16 @@ impl Extractor {
     /// Whether descriptors of this model are comparable to those of the map.
     pub fn is_of(&self, map: &Map) -> bool {
         self.manifest().name == map.model
-            && self.digest(map.descriptor) == Some(map.model_digest)
+            && self.digest_of(map) == Some(map.model_digest)
             && self.execution().precision == map.precision
+    }
+
+    /// The digest that a map's descriptors would have if they were made now.
+    pub fn digest_of(&self, map: &Map) -> Option<Digest> {
+        match &map.vocabulary {
+            Some(own) => self.own_digest(map.descriptor, own.digest),
+            None => self.digest(map.descriptor),
+        }
     }
 
     /// Identifies the model and precision, so that dense features of different models are not mixed.

@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Deserializer, Serialize};
 use sha2::{Digest as _, Sha256};
 
+pub(crate) use self::kinds::own_digest;
 pub use self::kinds::{Method, Vlad, Weighting};
 use whereabouts_core::{DescriptorKind, Digest};
 

@@ -1,9 +1,14 @@
 //! Pooling of local features to a global descriptor: the `[CLS]` token, the generalised mean or VLAD.
 
 mod kinds;
+mod own;
+mod spectrum;
 mod vlad;
 
-pub use self::kinds::{Kinds, VocabularyError};
+pub use self::kinds::{DescriptorSpec, Kinds, VocabularyError};
+pub(crate) use self::own::OWN_BLOCK;
+pub use self::own::OwnVocabulary;
+pub use self::vlad::Vocabulary;
 use super::manifest::{Layout, Output, Pooling};
 use whereabouts_core::dense::DenseFeaturesError;
 use whereabouts_core::{DenseFeatures, Descriptor, DescriptorError, DescriptorKind};
@@ -91,14 +96,14 @@ impl LocalFeatures {
         Ok(Self { height, width, channels, cells, cls, reliability })
     }
 
-    /// Computes the global descriptor of the given kind, and the dense features if requested.
+    /// Computes the global descriptor, and the dense features if requested.
     pub fn pool(
         self,
-        kind: DescriptorKind,
+        spec: &DescriptorSpec,
         features: FeatureSet,
         kinds: &Kinds,
     ) -> Result<(Descriptor, Option<DenseFeatures>), PoolingError> {
-        let descriptor = kinds.descriptor(kind, &self)?;
+        let descriptor = kinds.descriptor(spec, &self)?;
         let dense = match features {
             FeatureSet::DescriptorOnly => None,
             FeatureSet::DescriptorAndDense => Some(self.into_dense()?),
@@ -244,7 +249,8 @@ mod tests {
     fn a_kind_that_is_not_declared_is_refused_with_those_that_are() {
         let features =
             LocalFeatures::from_output(&map_output(64), (1, 1), &[1.0; 64], None).unwrap();
-        let error = kinds().descriptor(DescriptorKind::CLS, &features).unwrap_err().to_string();
+        let error =
+            kinds().descriptor(&DescriptorKind::CLS.into(), &features).unwrap_err().to_string();
         assert!(error.starts_with("this model has no descriptor \"cls\"; it has gem"), "{error}");
     }
 
@@ -252,7 +258,7 @@ mod tests {
     fn dense_features_are_made_only_on_request_and_do_not_change_the_descriptor() {
         let cells: Vec<f32> = (1..=64 * 9).map(|i| i as f32).collect();
         let features = LocalFeatures::from_output(&map_output(64), (3, 3), &cells, None).unwrap();
-        let pool = |set| features.clone().pool(DescriptorKind::GEM, set, &kinds());
+        let pool = |set| features.clone().pool(&DescriptorKind::GEM.into(), set, &kinds());
         let (descriptor, none) = pool(FeatureSet::DescriptorOnly).unwrap();
         let (same, dense) = pool(FeatureSet::DescriptorAndDense).unwrap();
         assert_eq!((descriptor, none), (same, None));

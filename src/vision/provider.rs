@@ -127,7 +127,7 @@ fn run_all(
             .first()
             .ok_or_else(|| InferenceError::Run("the model returned no output".into()))?;
         for kind in model.kinds.names() {
-            descriptors.push(model.kinds.descriptor(kind, local)?);
+            descriptors.push(model.kinds.descriptor(&kind.into(), local)?);
         }
     }
     Ok(descriptors)

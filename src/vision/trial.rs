@@ -165,7 +165,7 @@ pub fn try_model(assets: &Assets, folder: &Path) -> Result<Vec<String>, ModelFau
         outputs.extend(run(&mut runner, &[picture], &manifest)?);
     }
     for kind in kinds.names() {
-        let descriptors = outputs.iter().map(|output| kinds.descriptor(kind, output));
+        let descriptors = outputs.iter().map(|output| kinds.descriptor(&kind.into(), output));
         let descriptors: Vec<Descriptor> = descriptors
             .collect::<Result<_, _>>()
             .map_err(|reason| ModelFault::Pooling { kind, reason })?;

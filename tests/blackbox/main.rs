@@ -44,6 +44,7 @@ mod tls;
 mod traces;
 mod track;
 mod track_clocks;
+mod vocabulary;
 mod webhooks;
 
 use whereabouts_testkit::{

@@ -129,6 +129,8 @@ pub fn archives() -> Vec<Vec<u8>> {
         dim: 2,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: Timestamp::UNIX_EPOCH,
     };
@@ -147,7 +149,7 @@ pub fn archives() -> Vec<Vec<u8>> {
     let descriptor = Some(Descriptor::normalised(vec![1.0, 2.0]).unwrap());
     let left_out = LeftOut { id: "2".parse().unwrap(), why: "damaged".into() };
     let mut writer = Writer::begin(&path, &Manifest::new(vec![map.name.clone()])).unwrap();
-    writer.map(&map).unwrap();
+    writer.map(&map, None).unwrap();
     writer.image(&map.name, &ExportedImage { image, descriptor }, &bytes).unwrap();
     writer.left_out(&map.name, &left_out).unwrap();
     let archived = ArchivedMap { name: map.name, images: 1, left_out: vec![left_out] };

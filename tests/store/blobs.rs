@@ -6,15 +6,18 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures_util::future::join_all;
 use jiff::Timestamp;
-use whereabouts_core::{Digest, Job, JobState};
+use whereabouts_core::{Digest, Job, JobState, Map, MapVocabulary, Scene};
 use whereabouts_store::{Added, JobRetention, StoreError};
 
-use crate::support::{Fixture, Tuning, add, claim, descriptor, image, is_kept, map, submit};
+use crate::support::{
+    Fixture, Tuning, add, claim, descriptor, fill, image, is_kept, map, next, submit,
+};
 
 contract!(
     bytes_are_returned_unchanged,
     bytes_are_removed_with_the_last_image_that_needs_them,
     bytes_of_a_frame_are_removed_with_its_job,
+    bytes_of_a_vocabulary_are_removed_with_the_last_map_that_has_it,
     pinned_bytes_stay,
     bytes_put_during_their_removal_are_kept,
 );
@@ -22,6 +25,7 @@ contract_over_s3!(
     bytes_are_returned_unchanged,
     bytes_are_removed_with_the_last_image_that_needs_them,
     bytes_of_a_frame_are_removed_with_its_job,
+    bytes_of_a_vocabulary_are_removed_with_the_last_map_that_has_it,
     pinned_bytes_stay,
     bytes_put_during_their_removal_are_kept,
 );
@@ -75,6 +79,43 @@ async fn bytes_of_a_frame_are_removed_with_its_job(fixture: &Fixture) {
     assert!(!is_kept(&*store, b"frame").await && is_kept(&*store, b"image").await);
     assert!(store.delete_image(&map, &image.id).await.unwrap());
     assert!(!is_kept(&*store, b"image").await);
+}
+
+async fn bytes_of_a_vocabulary_are_removed_with_the_last_map_that_has_it(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let own = |bytes: &[u8]| {
+        let (digest, fitted_at) = (Digest::of(bytes), Timestamp::now());
+        Some(MapVocabulary { digest, fitted_at, images: 2, of: 3, requested: false })
+    };
+    let put = async |bytes: &'static [u8]| {
+        store.put_blob(Digest::of(bytes), Bytes::from_static(bytes)).await.unwrap()
+    };
+    let pin = put(b"words").await;
+    let with_words = |name| Map { vocabulary: own(b"words"), ..map(name, 3) };
+    let (one, _) = store.put_map(with_words("one")).await.unwrap();
+    let (two, _) = store.put_map(with_words("two")).await.unwrap();
+    drop(pin);
+    assert_eq!(store.map(&one.name).await.unwrap().unwrap().vocabulary, one.vocabulary);
+    // A change of the map leaves it.
+    store.put_map(Map { scene: Scene::Indoor, ..one.clone() }).await.unwrap();
+    assert!(is_kept(&*store, b"words").await);
+
+    // A reindex replaces it, and another drops it.
+    let _image = add(&*store, &one, "a", b"image").await;
+    let pin = put(b"other words").await;
+    let next_one = Map { vocabulary: own(b"other words"), ..next(&one, 3) };
+    let mut draft = store.draft(next_one.clone()).await.unwrap();
+    assert_eq!(fill(draft.as_mut(), 3).await, 1);
+    assert!(draft.replace().await.unwrap());
+    drop(pin);
+    assert!(is_kept(&*store, b"words").await && is_kept(&*store, b"other words").await);
+    let mut draft = store.draft(Map { vocabulary: None, ..next(&next_one, 3) }).await.unwrap();
+    assert_eq!(fill(draft.as_mut(), 3).await, 1);
+    assert!(draft.replace().await.unwrap());
+    assert!(!is_kept(&*store, b"other words").await && is_kept(&*store, b"words").await);
+
+    assert!(store.delete_map(&two.name).await.unwrap());
+    assert!(!is_kept(&*store, b"words").await);
 }
 
 async fn pinned_bytes_stay(fixture: &Fixture) {

@@ -279,6 +279,8 @@ pub fn map(name: &str, dim: usize) -> Map {
         dim,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: Timestamp::now(),
     }

@@ -105,7 +105,20 @@ impl Backup {
                 response.json().await.context("the server's export is not valid")?;
             match &progress.map {
                 None => {
-                    self.writer.map(&page.map)?;
+                    let vocabulary = match self.vocabulary(name, &page.map).await? {
+                        Some(Vocabulary::Is(bytes)) => Some(bytes),
+                        // The map was changed since the page was read.
+                        Some(Vocabulary::Changed) if attempt < MAX_ATTEMPTS => {
+                            attempt += 1;
+                            continue;
+                        }
+                        Some(Vocabulary::Changed) => bail!(
+                            "the vocabulary of the map {name} cannot be read; reindex the map, or try again when it \
+                             no longer changes"
+                        ),
+                        None => None,
+                    };
+                    self.writer.map(&page.map, vocabulary.as_deref())?;
                     progress.map = Some(page.map);
                 }
                 Some(map) if (map.uid, map.revision) == (page.map.uid, page.map.revision) => {}
@@ -130,6 +143,24 @@ impl Backup {
                 return Ok(MapOutcome::Saved(map));
             }
         }
+    }
+
+    /// Fetches the vocabulary of a map, if the map has one of its own.
+    async fn vocabulary(&self, name: &MapName, map: &Map) -> anyhow::Result<Option<Vocabulary>> {
+        let Some(own) = &map.vocabulary else { return Ok(None) };
+        let path = format!("{}/vocabulary", map_path(name));
+        let response = self.client.response_with_retries(|| Ok(self.client.get(&path))).await?;
+        if response.status() == StatusCode::NOT_FOUND {
+            return Ok(Some(Vocabulary::Changed));
+        }
+        if !response.status().is_success() {
+            return Err(explained(response).await);
+        }
+        let bytes = response.bytes().await.context("the connection closed in a vocabulary")?;
+        Ok(Some(match Digest::of(&bytes) == own.digest {
+            true => Vocabulary::Is(bytes),
+            false => Vocabulary::Changed,
+        }))
     }
 
     async fn save_images(
@@ -163,6 +194,13 @@ impl Backup {
         }
         Ok(())
     }
+}
+
+/// The vocabulary of a map on the server.
+enum Vocabulary {
+    Is(Bytes),
+    /// It is not the one that the record of the map names.
+    Changed,
 }
 
 /// The content of an image on the server.

@@ -108,6 +108,7 @@ async fn index_town(
         scene: Some(Scene::Outdoor),
         model: None,
         descriptor: None,
+        vocabulary: None,
         frame: None,
         concurrency: 2,
         json: false,

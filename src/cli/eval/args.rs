@@ -57,7 +57,7 @@ pub struct Args {
     /// Refiners to evaluate: local, mllm, cascade, both (local and mllm), all, or off
     #[arg(long, value_delimiter = ',', default_value = "local", value_parser = refiners)]
     refine: Vec<Refiners>,
-    /// Number of candidates to refine [default: as configured, which is 10 with mllm, otherwise 20]
+    /// Number of candidates to refine [default: as configured, which is 10 with mllm, otherwise 50]
     #[arg(short, value_parser = clap::value_parser!(u8).range(1..=100))]
     k: Option<u8>,
     /// Evaluate a random sample of N queries

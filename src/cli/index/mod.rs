@@ -11,6 +11,7 @@ use std::path::PathBuf;
 pub use self::account::IndexReport;
 pub use self::upload::add_folder;
 use super::client::ServerArg;
+use whereabouts_api::VocabularyChoice;
 use whereabouts_core::{CoordinateFrame, DescriptorKind, MapName, Scene};
 
 /// Add a folder of images to a map on a server
@@ -49,6 +50,9 @@ pub struct Args {
     /// the descriptor to compute
     #[arg(long, value_name = "KIND")]
     pub descriptor: Option<DescriptorKind>,
+    /// Vocabulary to compute the descriptors with: own fits one on the images of the map, shipped is that of the model
+    #[arg(long, value_name = "own|shipped", requires = "reindex", value_parser = vocabulary)]
+    pub vocabulary: Option<VocabularyChoice>,
     /// Coordinate frame of a new map [default: the frame of the poses]
     #[arg(long)]
     pub frame: Option<CoordinateFrame>,
@@ -61,6 +65,14 @@ pub struct Args {
     pub json: bool,
     #[command(flatten)]
     pub server: ServerArg,
+}
+
+fn vocabulary(text: &str) -> Result<VocabularyChoice, String> {
+    match text {
+        "own" => Ok(VocabularyChoice::Own),
+        "shipped" => Ok(VocabularyChoice::Shipped),
+        _ => Err("expected own or shipped".to_owned()),
+    }
 }
 
 pub async fn run(args: Args) -> anyhow::Result<()> {

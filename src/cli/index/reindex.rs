@@ -14,7 +14,11 @@ const POLL_INTERVAL: Duration = Duration::from_millis(300);
 
 pub async fn run(client: &Client, args: &Args) -> anyhow::Result<()> {
     let path = format!("/maps/{}", segment(args.map.as_str()));
-    let request = ReindexRequest { model: args.model.clone(), descriptor: args.descriptor };
+    let request = ReindexRequest {
+        model: args.model.clone(),
+        descriptor: args.descriptor,
+        vocabulary: args.vocabulary,
+    };
     let request = client.post(&format!("{path}/reindex")).json(&request);
     let started: MapState = client.json(request).await?;
     let progress = ProgressMeter::new("images", started.images);

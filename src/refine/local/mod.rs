@@ -12,6 +12,7 @@
 
 mod agreement;
 mod describe;
+mod matching;
 mod motion;
 mod mutual;
 mod nearest;
@@ -33,6 +34,7 @@ use serde::Serialize;
 use mutual::Mutual;
 use nearest::Nearest;
 use votes::Votes;
+use whereabouts_core::confidence::CHANCE_SHARE;
 use whereabouts_core::dense::DenseFeatures;
 
 /// Thresholds of the matcher. The defaults were measured for XFeat. All lengths are fractions of the picture
@@ -56,6 +58,11 @@ pub struct LocalSettings {
     pub vote_temperature: f32,
     /// Rounds of re-weighting in the fit of the motion.
     pub motion_rounds: usize,
+    /// Candidates that are compared at first. The others are compared only if none of these clearly agrees.
+    pub first: usize,
+    /// The evidence from which a candidate clearly agrees: the logarithm of how many times as many of its regions agree
+    /// as of the median of the others.
+    pub clear_evidence: f32,
 }
 
 impl Default for LocalSettings {
@@ -68,6 +75,8 @@ impl Default for LocalSettings {
             min_support: 0.06,
             vote_temperature: 2.0,
             motion_rounds: 6,
+            first: 20,
+            clear_evidence: 0.5,
         }
     }
 }
@@ -116,6 +125,14 @@ pub struct LocalError {
     pub candidate: usize,
 }
 
+/// The candidates that a query was compared with so far.
+#[derive(Debug, Default)]
+struct Compared {
+    /// In the order of the candidates.
+    mutuals: Vec<Mutual>,
+    nearest: Nearest,
+}
+
 /// Matches the dense features of a query with those of its candidates.
 ///
 /// Deterministic: the same input gives the same output, on any thread.
@@ -155,19 +172,54 @@ impl LocalMatcher {
         query: &DenseFeatures,
         candidates: &[&DenseFeatures],
     ) -> Result<Vec<PairMatch>, LocalError> {
-        let mut nearest = Nearest::default();
-        let min_similarity = self.settings.min_similarity;
-        let mutuals: Vec<Mutual> = candidates
-            .iter()
-            .map(|candidate| mutual::find(query, candidate, min_similarity, &mut nearest))
-            .collect::<Result<_, _>>()?;
-        let votes = Votes::count(&mutuals, self.settings.vote_temperature);
+        let mut compared = Compared::default();
+        self.compare_more(query, candidates, &mut compared)?;
+        Ok(self.judge_all(query, candidates, &compared))
+    }
+
+    /// Compares a query with those of its candidates that `compared` does not have yet.
+    fn compare_more(
+        &self,
+        query: &DenseFeatures,
+        candidates: &[&DenseFeatures],
+        compared: &mut Compared,
+    ) -> Result<(), LocalError> {
+        let (min_similarity, known) = (self.settings.min_similarity, compared.mutuals.len());
+        for candidate in candidates.get(known..).unwrap_or_default() {
+            let found = mutual::find(query, candidate, min_similarity, &mut compared.nearest)?;
+            compared.mutuals.push(found);
+        }
+        Ok(())
+    }
+
+    fn judge_all(
+        &self,
+        query: &DenseFeatures,
+        candidates: &[&DenseFeatures],
+        compared: &Compared,
+    ) -> Vec<PairMatch> {
+        let mutuals = &compared.mutuals;
+        let votes = Votes::count(mutuals, self.settings.vote_temperature);
         let rivals = candidates.len().saturating_sub(1);
-        Ok(candidates
+        candidates
             .iter()
-            .zip(&mutuals)
+            .zip(mutuals)
             .map(|(candidate, mutual)| self.judge(query, candidate, mutual, &votes, rivals))
-            .collect())
+            .collect()
+    }
+
+    /// Whether the candidate that would be ranked first agrees so clearly that others need not be compared: whether
+    /// ln((a + c) / (m + c)) reaches `clear_evidence`, where a of its regions match, m is the median of that count over
+    /// the others, and c is [`CHANCE_SHARE`] of the regions of the query.
+    fn is_clear(&self, pairs: &[PairMatch]) -> bool {
+        let Some(&first) = rank(pairs).first() else { return false };
+        let others = pairs.iter().enumerate().filter(|(index, _)| *index != first);
+        let mut others: Vec<usize> = others.map(|(_, pair)| pair.matches.len()).collect();
+        others.sort_unstable();
+        let Some(&median) = others.get(others.len() / 2) else { return false };
+        let chance = (CHANCE_SHARE * pairs[first].cells as f32).max(1.0);
+        let one = pairs[first].matches.len();
+        ((one as f32 + chance) / (median as f32 + chance)).ln() >= self.settings.clear_evidence
     }
 
     fn judge(

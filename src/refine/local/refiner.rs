@@ -1,20 +1,19 @@
 //! The refiner `local`: fetches dense features, has them matched, and turns the matches into a ranking.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use async_trait::async_trait;
-use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt, stream};
 use tokio::sync::Semaphore;
 use whereabouts_core::{
-    Agreement, CalibrationSettings, Candidate, Certainty, DenseFeatures, Description,
-    DescriptorKind, Digest, Evidence, ImageId, Map, PairRegion, Pose, Ranking, RefinerKind,
-    SamePlace, Usage,
+    Agreement, CalibrationSettings, Candidate, Certainty, Description, Digest, Evidence, ImageId,
+    Map, PairRegion, Pose, Ranking, RefinerKind, SamePlace, Usage,
 };
 use whereabouts_store::{BlobStore, HardNegatives, MapStore};
-use whereabouts_vision::{CpuPool, ExtractError, Extractor, FeatureSet, LoadedModels, ModelError};
+use whereabouts_vision::{CpuPool, Extractor, LoadedModels, ModelError};
 
+use super::matching::{FeatureSource, Matching, joined};
 use super::{LocalMatcher, LocalSettings, Match, PairMatch, Standing, describe, rank};
 use crate::{
     BuildError, DenseCache, DenseKey, NegativeEvidence, Progress, RefineError, RefineInput,
@@ -61,12 +60,6 @@ pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, 
 /// Returns a text that changes with everything that decides what the refiner finds.
 pub(crate) fn fingerprint(_: &RefinerSettings) -> Result<String, BuildError> {
     Ok(serde_json::to_string(&LocalSettings::default())?)
-}
-
-/// A picture's dense features, or the bytes to extract them from.
-enum FeatureSource {
-    Cached(Arc<DenseFeatures>),
-    Picture(DenseKey, Bytes),
 }
 
 #[async_trait]
@@ -156,10 +149,14 @@ impl NegativeEvidence for LocalRefiner {
 struct Comparison {
     /// The number of candidates.
     candidates: usize,
+    /// The number of candidates that were looked up; the others were not needed.
+    considered: usize,
     /// The indices of those that are still in the map.
     present: Vec<usize>,
     /// How each of them agrees with the query.
     pairs: Vec<PairMatch>,
+    /// Indices of the pairs, best first.
+    order: Vec<usize>,
     /// Duration of the matching, without fetching and extraction.
     took: Duration,
     /// Which of all candidates show the same place.
@@ -174,7 +171,7 @@ impl Comparison {
         Agreement {
             regions: self.pairs.first().map_or(0, |pair| pair.cells),
             matches: self.pairs.iter().map(|pair| pair.matches.len()).collect(),
-            first: rank(&self.pairs).first().copied(),
+            first: self.order.first().copied(),
             same_place: self.present_same_place.clone(),
         }
     }
@@ -209,27 +206,41 @@ impl LocalRefiner {
         query: FeatureSource,
         candidates: &[Candidate],
     ) -> Result<Comparison, RefineError> {
-        let found = self.candidate_sources(map, extractor.identity(), candidates).await?;
-        let mut present = Vec::new();
-        let mut sources = Vec::new();
-        for (index, source) in found.into_iter().enumerate() {
-            if let Some(source) = source {
-                present.push(index);
-                sources.push(source);
+        let (mut matching, mut present, mut considered) = (Matching::of(query), Vec::new(), 0);
+        let mut early = Vec::new();
+        let first = self.matcher.settings.first.min(candidates.len());
+        for end in [first, candidates.len()] {
+            let group = &candidates[considered..end];
+            let found = self.candidate_sources(map, extractor.identity(), group).await?;
+            let mut sources = Vec::new();
+            for (index, source) in found.into_iter().enumerate() {
+                if let Some(source) = source {
+                    present.push(considered + index);
+                    sources.push(source);
+                }
             }
+            considered = end;
+            let (dense, matcher) = (Arc::clone(&self.dense), self.matcher.clone());
+            let extractor = Arc::clone(&extractor);
+            matching = self
+                .pool
+                .run(move || matching.extended(&extractor, &dense, &matcher, sources))
+                .await
+                .map_err(|error| RefineError::Transient(error.to_string()))??;
+            if considered == candidates.len() || self.matcher.is_clear(&matching.pairs) {
+                break;
+            }
+            early = rank(&matching.pairs);
         }
+        let Matching { pairs, took, .. } = matching;
         let same_place = |places: &[_], images| SamePlace::of(places, images, &self.places);
         let (places, images) = self.places_of(map, candidates).await?;
         let present_places: Vec<_> = present.iter().map(|&index| places[index]).collect();
-        let (dense, matcher) = (Arc::clone(&self.dense), self.matcher.clone());
-        let (pairs, took) = self
-            .pool
-            .run(move || match_all(&extractor, &dense, &matcher, query, sources))
-            .await
-            .map_err(|error| RefineError::Transient(error.to_string()))??;
         Ok(Comparison {
             candidates: candidates.len(),
+            considered,
             present,
+            order: joined(early, rank(&pairs)),
             pairs,
             took,
             same_place: same_place(&places, images),
@@ -293,54 +304,22 @@ fn no_model(error: ModelError) -> RefineError {
     }
 }
 
-/// Extracts missing features, matches, and returns the duration of the matching. Blocks.
-fn match_all(
-    extractor: &Extractor,
-    dense: &DenseCache,
-    matcher: &LocalMatcher,
-    query: FeatureSource,
-    candidates: Vec<FeatureSource>,
-) -> Result<(Vec<PairMatch>, Duration), RefineError> {
-    let features = |source: FeatureSource| match source {
-        FeatureSource::Cached(features) => Ok(features),
-        FeatureSource::Picture(key, bytes) => {
-            let extraction = extractor
-                .extract(&bytes, DescriptorKind::GEM, FeatureSet::DescriptorAndDense)
-                .map_err(|error: ExtractError| RefineError::Transient(error.to_string()))?;
-            let features = extraction.dense.map(Arc::new).ok_or_else(|| {
-                RefineError::Permanent("the model computed no dense features".into())
-            })?;
-            dense.insert(key, Arc::clone(&features));
-            Ok(features)
-        }
-    };
-    let query = features(query)?;
-    let candidates =
-        candidates.into_iter().map(features).collect::<Result<Vec<_>, RefineError>>()?;
-    let candidates: Vec<&DenseFeatures> = candidates.iter().map(AsRef::as_ref).collect();
-    let began = Instant::now();
-    let pairs = matcher
-        .compare_all(&query, &candidates)
-        .map_err(|error| RefineError::Permanent(error.to_string()))?;
-    Ok((pairs, began.elapsed()))
-}
-
 /// Ranks the compared candidates, and puts removed ones behind them in coarse order.
 fn conclude(
     candidates: &[Candidate],
     comparison: &Comparison,
     standing: impl Fn(Option<Evidence>) -> Standing,
 ) -> Result<Refinement, RefineError> {
-    let Comparison { present, pairs, took, .. } = comparison;
+    let Comparison { considered, present, pairs, order, took, .. } = comparison;
     let agreement = comparison.agreement();
     let per_pair = u32::try_from(pairs.len()).ok().and_then(|pairs| took.checked_div(pairs));
-    let ranked = rank(pairs);
-    let ordered: Vec<usize> = ranked.iter().map(|&pair| present[pair]).collect();
+    let ordered: Vec<usize> = order.iter().map(|&pair| present[pair]).collect();
+    let first = order.first().copied();
     let gone = (0..candidates.len()).filter(|index| !present.contains(index));
     let order: Vec<usize> = ordered.iter().copied().chain(gone).collect();
     let ranking = Ranking::new(candidates, &order)
         .map_err(|error| RefineError::Permanent(error.to_string()))?;
-    let missing = candidates.len() - present.len();
+    let missing = considered - present.len();
     Ok(Refinement {
         descriptions: present
             .iter()
@@ -358,7 +337,7 @@ fn conclude(
         reasoning: reasoning(candidates, present, pairs, &ordered),
         reasoning_took_ms: None,
         ordered_by: None,
-        evidence: ranked.first().and_then(|&first| agreement.evidence(first)),
+        evidence: first.and_then(|first| agreement.evidence(first)),
         certainty: None,
         verdicts: Vec::new(),
         agreement: Some(comparison.agreement_of_all()),

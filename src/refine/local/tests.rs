@@ -211,6 +211,8 @@ fn nonsensical_settings_do_not_panic() {
             min_support: bad,
             vote_temperature: bad,
             motion_rounds: 2,
+            first: 1,
+            clear_evidence: bad,
         };
         let pairs = LocalMatcher::new(settings).compare_all(&query, &[&query, &query]).unwrap();
         assert!(pairs.iter().all(|pair| pair.score.is_finite()));
@@ -302,4 +304,22 @@ fn a_description_states_how_many_regions_have_no_better_counterpart_elsewhere() 
     let text = told(&pairs[0]);
     assert!(text.contains("in any of the other 2 candidates"), "{text}");
     assert!(text.contains("stayed where they were"), "{text}");
+}
+
+#[test]
+fn candidates_that_are_compared_later_count_as_if_all_had_been_compared_together() {
+    let scene = Scene::new(23);
+    let query = scene.picture(24, 32, 1.0, [0.0; 2]);
+    let (same, other, another) =
+        (scene.picture(24, 32, 1.1, [0.05, 0.02]), noise(24, 24, 32), noise(25, 24, 32));
+    let candidates = [&other, &another, &same];
+    let (matcher, mut compared) = (LocalMatcher::default(), Compared::default());
+    matcher.compare_more(&query, &candidates[..2], &mut compared).unwrap();
+    assert!(!matcher.is_clear(&matcher.judge_all(&query, &candidates[..2], &compared)));
+    matcher.compare_more(&query, &candidates, &mut compared).unwrap();
+    let pairs = matcher.judge_all(&query, &candidates, &compared);
+    assert_eq!(pairs, matcher.compare_all(&query, &candidates).unwrap());
+    assert!(matcher.is_clear(&pairs));
+    // One candidate alone, or none, has nothing to be compared with.
+    assert!(!matcher.is_clear(&pairs[..1]) && !matcher.is_clear(&[]));
 }

@@ -203,6 +203,8 @@ fn map() -> Map {
         dim: 4,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: Timestamp::now(),
     }

@@ -74,7 +74,8 @@ pub(super) async fn put_map(
 /// Recompute all descriptors of a map, with another model
 ///
 /// Answers at once. The old descriptors are used until all new ones are ready; then the map switches to them
-/// atomically. The field `reindex` of the map shows the progress.
+/// atomically. The field `reindex` of the map shows the progress. `vocabulary` asks for a vocabulary that is fitted on the
+/// images of the map, or for that of the model.
 #[utoipa::path(post, path = "/maps/{map}/reindex", tag = "maps", params(("map" = String, Path)),
     request_body(content = ReindexRequest, description = "Which descriptors; omitted fields keep their values"),
     responses(

@@ -105,6 +105,7 @@ fn described() -> Described {
     .route(admin.map(MapSource::Path).changes(), routes!(maps::delete_map))
     .route(admin.map(MapSource::Path).changes().idempotent(), routes!(maps::reindex))
     .route(admin.map(MapSource::Path), routes!(transfer::export))
+    .route(admin.map(MapSource::Path), routes!(transfer::vocabulary))
     .route(admin.map(MapSource::Path).changes(), routes!(transfer::import_map))
     .route(admin.map(MapSource::Path).changes().idempotent(), routes!(transfer::import_image))
     .route(operator.map(MapSource::Path), routes!(images::list_images))

@@ -2,7 +2,9 @@
 
 use axum::Json;
 use axum::extract::{Request, State};
-use axum::http::StatusCode;
+use axum::http::header::CONTENT_TYPE;
+use axum::http::{HeaderName, StatusCode};
+use bytes::Bytes;
 use utoipa::ToSchema;
 
 use super::body::{JsonBody, Params, PictureBody, Segments};
@@ -11,8 +13,8 @@ use super::maps::map_name;
 use super::state::AppState;
 use crate::gate::Problem;
 use crate::gate::Ready;
-use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, MapState};
-use whereabouts_core::{Image, Map};
+use whereabouts_api::{ErrorKind, ExportPage, ImportedImage, ImportedMap, MapState};
+use whereabouts_core::Image;
 use whereabouts_store::Added;
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
@@ -35,11 +37,26 @@ pub(super) async fn export(
     Ok(Json(service.transfer.export(&map_name(&map)?, cursor.as_ref(), page.limit).await?))
 }
 
+/// The vocabulary that a map has of its own
+///
+/// Its SHA-256 is `vocabulary.digest` of the map. `whereabouts backup` saves it.
+#[utoipa::path(get, path = "/maps/{map}/vocabulary", tag = "maps", params(("map" = String, Path)), responses(
+    (status = 200, body = String, description = "16-bit floats", content_type = "application/octet-stream"),
+    (status = 404, body = Problem, description = "No such map, or it has the vocabulary of its model", content_type = "application/problem+json"),
+))]
+pub(super) async fn vocabulary(
+    Ready(service): Ready,
+    Segments(map): Segments<String>,
+) -> Result<([(HeaderName, &'static str); 1], Bytes), Problem> {
+    let bytes = service.transfer.vocabulary(&map_name(&map)?).await?;
+    Ok(([(CONTENT_TYPE, "application/octet-stream")], bytes))
+}
+
 /// Create a map like one that was exported
 ///
 /// An existing map with the same kind of descriptors is left unchanged. The model need not be installed yet.
 #[utoipa::path(put, path = "/maps/{map}/import", tag = "maps", params(("map" = String, Path)),
-    request_body(content = Map, description = "`map` of an export"),
+    request_body(content = ImportedMap, description = "`map` of an export"),
     responses(
         (status = 200, body = MapState, description = "The map exists"),
         (status = 201, body = MapState, description = "Created"),
@@ -50,7 +67,7 @@ pub(super) async fn export(
 pub(super) async fn import_map(
     Ready(service): Ready,
     Segments(map): Segments<String>,
-    JsonBody(from): JsonBody<Map>,
+    JsonBody(from): JsonBody<ImportedMap>,
 ) -> Result<(StatusCode, Json<MapState>), Problem> {
     let (state, new) = service.transfer.import_map(&map_name(&map)?, from).await?;
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, Json(state)))

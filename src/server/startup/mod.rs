@@ -90,7 +90,10 @@ pub async fn run(
         running.spawn(async move { janitor.run(until).await });
         running.spawn(dispatcher.run(shutdown.clone()));
         let until = shutdown.clone();
+        let fitting = Arc::clone(&service);
         running.spawn(async move { service.calibrator.run(until).await });
+        let until = shutdown.clone();
+        running.spawn(async move { fitting.fitter.run(until).await });
     }
     if let Some(worker) = worker {
         running.spawn(worker.run(shutdown.clone()));
@@ -146,6 +149,7 @@ fn service_settings(config: &Config) -> ServiceSettings {
         localize: config.localize,
         track: config.track.clone(),
         confidence: config.confidence,
+        vocabulary: config.vocabulary,
         jobs: config.jobs,
         refiners: allowed_refiners(config),
         compared: config.compared_candidates(),

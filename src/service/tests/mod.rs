@@ -192,6 +192,7 @@ fn settings() -> ServiceSettings {
             place_m: 5.0,
             model_calls: 0,
         },
+        vocabulary: VocabularySettings { own: true, min_images: 10, max_images: 20, loaded: 2 },
         jobs: job_settings(),
         refiners: AllowedRefiners {
             default: Some(RefinerKind::Local),
@@ -225,13 +226,15 @@ pub(crate) fn map(name: &str) -> Map {
         dim: DIM,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: Timestamp::now(),
     }
 }
 
 /// An image that begins like a JPEG file, `x` metres along a road if it has a pose.
-fn image(number: usize, x: Option<f64>) -> (Vec<u8>, Image) {
+pub(crate) fn image(number: usize, x: Option<f64>) -> (Vec<u8>, Image) {
     let bytes = [&[0xFF, 0xD8, 0xFF][..], &number.to_le_bytes()].concat();
     let image = Image {
         id: image_id(number),
@@ -256,7 +259,7 @@ fn metric(x: f64) -> Pose {
 }
 
 /// A descriptor that is the less like that of number 0 the higher its number.
-fn descriptor(number: usize) -> Descriptor {
+pub(crate) fn descriptor(number: usize) -> Descriptor {
     Descriptor::normalised(vec![1.0, number as f32 / 10.0, 0.0, 0.0]).unwrap()
 }
 

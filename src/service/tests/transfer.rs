@@ -1,6 +1,6 @@
 use super::{DIM, Fixture, descriptor, image, map, metric};
 use crate::{ServiceError, Transfer};
-use whereabouts_api::{ErrorKind, ImportedImage};
+use whereabouts_api::{ErrorKind, ImportedImage, ImportedMap};
 use whereabouts_core::{
     CoordinateFrame, Descriptor, ExportedImage, GeographicPose, Map, MapName, MediaType, Pose,
 };
@@ -29,9 +29,10 @@ async fn import(
 async fn a_map_is_imported_once_and_never_over_images_of_another_model() {
     let fixture = Fixture::new().await;
     let transfer = &fixture.service.transfer;
-    let (state, new) = transfer.import_map(&yard(), map("other")).await.unwrap();
+    let (state, new) =
+        transfer.import_map(&yard(), without_vocabulary(map("other"))).await.unwrap();
     assert_eq!((state.name, state.dim, new), (yard(), DIM, true));
-    assert!(!transfer.import_map(&yard(), map("other")).await.unwrap().1);
+    assert!(!transfer.import_map(&yard(), without_vocabulary(map("other"))).await.unwrap().1);
     assert!(matches!(import(transfer, exported()).await.unwrap(), Added::Created(_)));
     assert!(matches!(import(transfer, exported()).await.unwrap(), Added::Present(_)));
     for different in [
@@ -39,7 +40,8 @@ async fn a_map_is_imported_once_and_never_over_images_of_another_model() {
         Map { frame: CoordinateFrame::Wgs84, ..map("other") },
         Map { dim: DIM + 1, ..map("other") },
     ] {
-        let refused = transfer.import_map(&yard(), different.clone()).await.unwrap_err();
+        let refused =
+            transfer.import_map(&yard(), without_vocabulary(different.clone())).await.unwrap_err();
         assert_eq!(refused.kind, ErrorKind::Conflict, "{different:?}");
         let (bytes, from) = exported();
         let refused = import(transfer, (bytes, ImportedImage { map: different, ..from })).await;
@@ -58,7 +60,8 @@ async fn a_map_that_no_server_can_have_made_is_not_imported() {
         Map { dim: (1 << 16) + 1, ..map("other") },
         Map { description: Some("x".repeat(2001)), ..map("other") },
     ] {
-        let refused = fixture.service.transfer.import_map(&yard(), from.clone()).await;
+        let refused =
+            fixture.service.transfer.import_map(&yard(), without_vocabulary(from.clone())).await;
         assert_eq!(refused.unwrap_err().kind, ErrorKind::Unprocessable, "{from:?}");
     }
     assert!(fixture.service.maps.list().await.unwrap().is_empty());
@@ -68,7 +71,7 @@ async fn a_map_that_no_server_can_have_made_is_not_imported() {
 async fn an_image_that_contradicts_its_bytes_or_its_map_is_not_imported() {
     let fixture = Fixture::new().await;
     let transfer = &fixture.service.transfer;
-    transfer.import_map(&yard(), map("other")).await.unwrap();
+    transfer.import_map(&yard(), without_vocabulary(map("other"))).await.unwrap();
     let on_the_globe =
         Pose::Geographic(GeographicPose { lat: 1.0, lon: 2.0, alt: None, heading: None });
     let short = Descriptor::normalised(vec![1.0; DIM - 1]).unwrap();
@@ -107,7 +110,7 @@ async fn an_exported_map_is_the_map_that_was_imported() {
     let mut count = 0;
     loop {
         let page = transfer.export(&source, cursor.as_ref(), Some(2)).await.unwrap();
-        transfer.import_map(&yard(), page.map.clone()).await.unwrap();
+        transfer.import_map(&yard(), without_vocabulary(page.map.clone())).await.unwrap();
         for image in page.images {
             let bytes = super::image(count, None).0;
             import(transfer, (bytes, ImportedImage { map: page.map.clone(), image }))
@@ -125,4 +128,8 @@ async fn an_exported_map_is_the_map_that_was_imported() {
         assert_eq!(copy.descriptor, original.descriptor);
         assert_eq!((&copy.image.id, copy.image.pose), (&original.image.id, original.image.pose));
     }
+}
+
+fn without_vocabulary(map: Map) -> ImportedMap {
+    ImportedMap { map, vocabulary_data: None }
 }

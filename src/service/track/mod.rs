@@ -96,8 +96,8 @@ impl<'a> FrameEvidence<'a> {
     pub fn new(candidates: &'a [Candidate], calibration: &Calibration) -> Self {
         let is_usable = calibration.similarity.len() >= MIN_IMAGES;
         let first = candidates.first().filter(|_| is_usable);
-        let confidence =
-            first.map(|first| calibration.refined_confidence(candidates, &first.image_id, None));
+        let confidence = first
+            .and_then(|first| calibration.refined_confidence(candidates, &first.image_id, None));
         Self { candidates, confidence }
     }
 }

@@ -16,7 +16,7 @@ use async_trait::async_trait;
 use super::super::changes::being_reindexed;
 use super::super::{Draft, DraftStore, StoreError};
 use super::live_map::{LiveMap, folder_of};
-use super::maps::check_revision;
+use super::maps::{check_revision, refer_to_vocabulary};
 use super::orphans::remove_folder;
 use super::trees::{StoredImage, put};
 use super::{EmbeddedStore, Inner, blocking};
@@ -24,8 +24,10 @@ use whereabouts_core::{Descriptor, Image, ImageId, Map};
 
 struct EmbeddedDraft {
     inner: Arc<Inner>,
-    /// The map as it is.
+    /// The map as it is, with the record of the next.
     old: Map,
+    /// The map as it is.
+    stored: Map,
     current: Arc<LiveMap>,
     /// The map as it will be.
     next: Arc<LiveMap>,
@@ -53,7 +55,8 @@ impl DraftStore for EmbeddedStore {
             let next = Arc::new(LiveMap::open(next, &inner.descriptors, inner.index)?);
             drafts.insert(old.uid, Arc::clone(&next));
             drop(drafts);
-            Ok(EmbeddedDraft { inner, old, current, next, done: 0, end: 0, cursor: None })
+            let stored = current.map();
+            Ok(EmbeddedDraft { inner, old, stored, current, next, done: 0, end: 0, cursor: None })
         });
         Ok(Box::new(draft.await?))
     }
@@ -116,7 +119,7 @@ impl Draft for EmbeddedDraft {
             sync_folder(&inner)
         })
         .await?;
-        let (old, done) = (self.old.clone(), self.done);
+        let (old, before, done) = (self.stored.clone(), self.stored.clone(), self.done);
         let (reading, current) = (Arc::clone(&self.current), Arc::clone(&self.current));
         let (inner, next, new_map) =
             (Arc::clone(&self.inner), Arc::clone(&self.next), self.next.map());
@@ -130,9 +133,10 @@ impl Draft for EmbeddedDraft {
                         return Ok(None);
                     }
                     // Scene, coordinate frame and description may have changed meanwhile.
-                    let Map { scene, frame, description, .. } = stored;
-                    let map = Map { scene, frame, description, ..new_map };
+                    let Map { scene, frame, refiner, description, .. } = stored;
+                    let map = Map { scene, frame, refiner, description, ..new_map };
                     put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
+                    refer_to_vocabulary(trees, Some(&old), Some(&map))?;
                     // The descriptors of described frames belong to the old revision.
                     trees.forget_frames(map.uid)?;
                     Ok(Some(map))
@@ -146,6 +150,7 @@ impl Draft for EmbeddedDraft {
                     maps.insert(map.name.clone(), next);
                     drop(maps);
                     inner.forget_draft(map);
+                    inner.forget_vocabulary(Some(&before));
                 },
             )
             .await?

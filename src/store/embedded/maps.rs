@@ -56,9 +56,14 @@ impl Inner {
         }
     }
 
-    /// Stores the map's record. Call it on the writer thread.
-    fn apply_put(&self, trees: &Trees, requested: Map) -> Result<(Map, bool), StoreError> {
+    /// Stores the map's record. Returns it, whether it is new, and the record before it. Call it on the writer thread.
+    fn apply_put(
+        &self,
+        trees: &Trees,
+        requested: Map,
+    ) -> Result<(Map, bool, Option<Map>), StoreError> {
         let stored: Option<Map> = get(&trees.maps, requested.name.as_str().as_bytes())?;
+        let before = stored.clone();
         let (map, new) = match stored {
             None => (requested, true),
             Some(stored) => {
@@ -67,7 +72,15 @@ impl Inner {
             }
         };
         put(&trees.maps, map.name.as_str().as_bytes(), &map)?;
-        Ok((map, new))
+        refer_to_vocabulary(trees, before.as_ref(), Some(&map))?;
+        Ok((map, new, before))
+    }
+
+    /// Removes the vocabulary that a map had, unless something still refers to it. Call it on the writer thread.
+    pub(super) fn forget_vocabulary(&self, before: Option<&Map>) {
+        if let Some(own) = before.and_then(|map| map.vocabulary) {
+            self.blobs.remove_unreferenced(&own.digest, &self.trees);
+        }
     }
 
     fn publish_map(&self, map: &Map) {
@@ -88,13 +101,18 @@ impl Inner {
 impl MapStore for EmbeddedStore {
     async fn put_map(&self, map: Map) -> Result<(Map, bool), StoreError> {
         let (apply, publish) = (Arc::clone(&self.inner), Arc::clone(&self.inner));
-        self.inner
+        let (map, new, _) = self
+            .inner
             .writer
             .commit(
                 move |trees, _| apply.apply_put(trees, map),
-                move |(map, _)| publish.publish_map(map),
+                move |(map, _, before)| {
+                    publish.publish_map(map);
+                    publish.forget_vocabulary(before.as_ref());
+                },
             )
-            .await
+            .await?;
+        Ok((map, new))
     }
 
     async fn map(&self, name: &MapName) -> Result<Option<Map>, StoreError> {
@@ -115,12 +133,16 @@ impl MapStore for EmbeddedStore {
             .commit(
                 move |trees, _| {
                     let record = trees.maps.remove(name.as_str()).map_err(failed)?;
-                    record.map(|record| decode(&record)).transpose()
+                    let map = record.map(|record| decode(&record)).transpose()?;
+                    refer_to_vocabulary(trees, map.as_ref(), None)?;
+                    Ok(map)
                 },
                 move |removed: &Option<Map>| {
                     if let Some(map) = removed {
                         let mut maps = inner.maps.write();
                         maps.remove(&map.name);
+                        drop(maps);
+                        inner.forget_vocabulary(removed.as_ref());
                     }
                 },
             )
@@ -337,6 +359,28 @@ impl BlobStore for EmbeddedStore {
         let (inner, digest) = (Arc::clone(&self.inner), *digest);
         blocking(move || inner.blobs.get(&digest)).await
     }
+}
+
+/// Replaces the reference of a map to its vocabulary.
+pub(super) fn refer_to_vocabulary(
+    trees: &Trees,
+    before: Option<&Map>,
+    after: Option<&Map>,
+) -> Result<(), StoreError> {
+    let reference = |map: &Map| {
+        let owner = BlobOwner::Vocabulary(map.uid);
+        map.vocabulary.map(|own| blob_ref_key(&own.digest, &owner))
+    };
+    let (before, after) = (before.and_then(reference), after.and_then(reference));
+    if before != after {
+        if let Some(key) = after {
+            trees.blob_refs.insert(key, &[]).map_err(failed)?;
+        }
+        if let Some(key) = before {
+            trees.blob_refs.remove(key).map_err(failed)?;
+        }
+    }
+    Ok(())
 }
 
 /// Returns the stored map, whatever its revision.

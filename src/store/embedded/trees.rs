@@ -108,8 +108,13 @@ pub(super) type Lease = Option<Timestamp>;
 
 /// A record that refers to the bytes of a blob.
 pub(super) enum BlobOwner<'a> {
-    Image { map_uid: Uuid, id: &'a ImageId },
+    Image {
+        map_uid: Uuid,
+        id: &'a ImageId,
+    },
     Query(Uuid),
+    /// The vocabulary of a map.
+    Vocabulary(Uuid),
 }
 
 impl Trees {
@@ -305,6 +310,10 @@ pub(super) fn blob_ref_key(digest: &Digest, owner: &BlobOwner<'_>) -> Vec<u8> {
         BlobOwner::Query(id) => {
             key.push(b'q');
             key.extend(id.as_bytes());
+        }
+        BlobOwner::Vocabulary(map_uid) => {
+            key.push(b'v');
+            key.extend(map_uid.as_bytes());
         }
     }
     key

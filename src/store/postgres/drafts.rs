@@ -7,6 +7,7 @@ use sqlx::{AssertSqlSafe, PgConnection};
 use super::super::changes::{being_reindexed, removed};
 use super::super::{Draft, DraftStore, StoreError};
 use super::descriptors::{MAX_INDEXED_DIM, create_table, drop_table, table};
+use super::maps::vocabulary;
 use super::{Inner, PostgresStore, count, record};
 use whereabouts_core::{Descriptor, Image, Map};
 
@@ -195,10 +196,10 @@ impl PostgresDraft {
         );
         sqlx::query(AssertSqlSafe(removed)).bind(uid).execute(&mut *tx).await?;
         // Scene, coordinate frame and description may have changed meanwhile.
-        let Map { scene, frame, description, .. } = stored;
-        let map = Map { scene, frame, description, ..self.next.clone() };
+        let Map { scene, frame, refiner, description, .. } = stored;
+        let map = Map { scene, frame, refiner, description, ..self.next.clone() };
         sqlx::query(
-            "UPDATE maps SET revision = $2, record = $3::json, graph = $4,
+            "UPDATE maps SET revision = $2, record = $3::json, graph = $4, vocabulary = $5,
                  indexed_revision = CASE WHEN $4 THEN $2 END, calibration = NULL, measured_by = NULL
              WHERE uid = $1",
         )
@@ -206,6 +207,7 @@ impl PostgresDraft {
         .bind(i64::from(map.revision))
         .bind(record(&map)?)
         .bind(self.indexed)
+        .bind(vocabulary(&map))
         .execute(&mut *tx)
         .await?;
         // The descriptors of described frames belong to the old revision.

@@ -207,13 +207,14 @@ impl Inner {
         let (map, new) = match stored {
             None => {
                 let inserted = sqlx::query(
-                    "INSERT INTO maps (uid, name, revision, record) VALUES ($1, $2, $3, $4::json)
-                     ON CONFLICT (name) DO NOTHING",
+                    "INSERT INTO maps (uid, name, revision, record, vocabulary)
+                     VALUES ($1, $2, $3, $4::json, $5) ON CONFLICT (name) DO NOTHING",
                 )
                 .bind(requested.uid)
                 .bind(requested.name.as_str())
                 .bind(i64::from(requested.revision))
                 .bind(record(&requested)?)
+                .bind(vocabulary(&requested))
                 .execute(&mut *tx)
                 .await?;
                 if inserted.rows_affected() == 0 {
@@ -233,13 +234,19 @@ impl Inner {
                     create_table(&mut tx, &map).await?;
                 }
                 let changed = sqlx::query(
-                    "UPDATE maps SET uid = $2, record = $3::json,
+                    "UPDATE maps SET uid = $2, record = $3::json, vocabulary = $4,
                          graph = graph AND uid = $2,
                          indexed_revision = CASE WHEN uid = $2 THEN indexed_revision END,
                          calibration = CASE WHEN uid = $2 THEN calibration END
                      WHERE uid = $1",
                 );
-                changed.bind(before).bind(map.uid).bind(record(&map)?).execute(&mut *tx).await?;
+                changed
+                    .bind(before)
+                    .bind(map.uid)
+                    .bind(record(&map)?)
+                    .bind(vocabulary(&map))
+                    .execute(&mut *tx)
+                    .await?;
                 (map, false)
             }
         };
@@ -330,6 +337,11 @@ impl Inner {
         }
         Ok(())
     }
+}
+
+/// The digest of the map's own vocabulary, if it has one.
+pub(super) fn vocabulary(map: &Map) -> Option<Vec<u8>> {
+    map.vocabulary.map(|own| own.digest.as_bytes().to_vec())
 }
 
 /// Adds the tombstone of a deleted map, so that its remaining rows are removed.

@@ -34,6 +34,7 @@ fn migrations() -> Vec<Migration> {
         migration(1, "first", include_str!("../../../migrations/0001_first.sql")),
         migration(2, "moved", include_str!("../../../migrations/0002_moved.sql")),
         migration(3, "twins", include_str!("../../../migrations/0003_twins.sql")),
+        migration(4, "vocabularies", include_str!("../../../migrations/0004_vocabularies.sql")),
     ]
 }
 

@@ -14,9 +14,9 @@ pub(super) fn run(runner: &mut Runner, kinds: &Kinds, batch: Vec<Request>) -> Re
         match runner.run(&tensors) {
             Ok(outputs) => {
                 for (request, local) in group.into_iter().zip(outputs) {
-                    let Request { kind, features, reply, .. } = request;
+                    let Request { spec, features, reply, .. } = request;
                     let pooled = local
-                        .pool(kind, features, kinds)
+                        .pool(&spec, features, kinds)
                         .map(|(descriptor, dense)| Pooled { descriptor, dense, batch });
                     replies.push((reply, pooled.map_err(InferenceError::from)));
                 }

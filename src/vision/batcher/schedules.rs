@@ -1,5 +1,7 @@
 //! The queue under many thread schedules. No model is run.
 
+use whereabouts_core::DescriptorKind;
+
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use whereabouts_schedules::{JoinHandle, block_on, check, spawn, yield_now};
@@ -47,7 +49,7 @@ fn session(batcher: &Arc<Batcher>, runs: &Arc<Runs>, kind: SessionKind) -> JoinH
 fn submit(batcher: &Batcher, width: usize) -> Result<PendingInference, InferenceError> {
     let waiting = || batcher.queue.lock().waiting.len();
     let tensor = Tensor::grey(width, 1);
-    let pending = batcher.submit(tensor, DescriptorKind::GEM, FeatureSet::DescriptorOnly);
+    let pending = batcher.submit(tensor, DescriptorKind::GEM.into(), FeatureSet::DescriptorOnly);
     assert!(waiting() <= batcher.queue.layout.capacity());
     pending
 }

@@ -1,5 +1,7 @@
 //! Which session takes which pictures. No model is run.
 
+use whereabouts_core::DescriptorKind;
+
 use super::*;
 
 fn kinds() -> Arc<Kinds> {
@@ -24,8 +26,8 @@ pub(super) fn queue(throughput_sessions: usize, max_batch: usize) -> Queue {
 fn submit(queue: &Queue) -> PendingInference {
     let (reply, result) = oneshot::channel();
     let mut state = queue.lock();
-    let (kind, features) = (DescriptorKind::GEM, FeatureSet::DescriptorOnly);
-    state.push(Request { tensor: Tensor::grey(1, 1), kind, features, reply });
+    let (spec, features) = (DescriptorKind::GEM.into(), FeatureSet::DescriptorOnly);
+    state.push(Request { tensor: Tensor::grey(1, 1), spec, features, reply });
     PendingInference(result)
 }
 
@@ -102,8 +104,11 @@ fn abandoned_pictures_make_room_in_the_queue() {
     let abandoned: Vec<_> = (0..queue.layout.capacity()).map(|_| submit(&queue)).collect();
     let batcher = Batcher { queue: Arc::clone(&queue), threads: Vec::new() };
     let waiting = thread::spawn(move || {
-        let pending =
-            batcher.submit(Tensor::grey(2, 2), DescriptorKind::GEM, FeatureSet::DescriptorOnly);
+        let pending = batcher.submit(
+            Tensor::grey(2, 2),
+            DescriptorKind::GEM.into(),
+            FeatureSet::DescriptorOnly,
+        );
         (batcher, pending)
     });
     drop(abandoned);
@@ -130,7 +135,7 @@ fn waiting_callers_fail_when_the_batcher_is_dropped() {
     let queue = Arc::new(queue(0, 1));
     let batcher = Batcher { queue: Arc::clone(&queue), threads: Vec::new() };
     let waiting = batcher
-        .submit(Tensor::grey(1, 1), DescriptorKind::GEM, FeatureSet::DescriptorOnly)
+        .submit(Tensor::grey(1, 1), DescriptorKind::GEM.into(), FeatureSet::DescriptorOnly)
         .unwrap();
     drop(batcher);
     assert!(queue.take(SessionKind::Latency).is_none());

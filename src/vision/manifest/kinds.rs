@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::{Input, Manifest, Output, Pooling};
+use crate::pooling::OWN_BLOCK;
 use whereabouts_core::{DescriptorKind, Digest};
 
 /// How local features are aggregated to a kind of descriptor that the manifest declares by name.
@@ -22,7 +23,7 @@ pub enum Method {
 /// Each cell is L2-normalised. A centre's sum is that of (cell − centre), weighted by the cell's weight and by the
 /// share of the cell that is assigned to the centre. Each sum is L2-normalised, shortened by a matrix of its own if
 /// `block` is set, and all of them together are projected if `dimension` is smaller.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vlad {
     /// File of the vocabulary, next to the manifest: 16-bit floats in little-endian order; first the centres
@@ -70,6 +71,14 @@ impl Vlad {
     /// Numbers before the projection.
     pub(crate) fn expanded(&self, channels: usize) -> usize {
         self.rows * self.centres * self.block.unwrap_or(channels)
+    }
+
+    /// The settings of a map's own vocabulary: the model's, with residual sums shortened to `block` numbers. `None` if
+    /// these would be fewer than the descriptor has.
+    pub(crate) fn own(&self, block: usize, channels: usize) -> Option<Self> {
+        let block = Some(block.min(channels));
+        let own = Self { file: PathBuf::new(), sha256: None, block, ..self.clone() };
+        (own.expanded(channels) > own.dimension).then_some(own)
     }
 
     fn fault(&self, name: &str, output: &Output) -> Option<String> {
@@ -154,6 +163,11 @@ impl Method {
     }
 }
 
+/// Digest of everything that determines a descriptor with a map's own vocabulary, of which `vocabulary` is the digest.
+pub(crate) fn own_digest(base: Digest, vocabulary: Digest) -> Digest {
+    Digest::of(format!("own vocabulary\n{base}\n{vocabulary}").as_bytes())
+}
+
 /// The parts of a manifest that determine the descriptors `gem` and `cls`.
 #[derive(Serialize)]
 struct PooledInputs<'a> {
@@ -213,6 +227,31 @@ impl Manifest {
         };
         let files = weights.chain(vocabulary).map(Digest::to_string).collect::<Vec<_>>().join("\n");
         Digest::of(format!("{files}\n{}", text.unwrap_or_default()).as_bytes())
+    }
+
+    /// The pinned digest of the vocabulary of a kind, if it is pinned; `None` if the kind has no vocabulary.
+    pub fn vocabulary(&self, kind: DescriptorKind) -> Option<Option<Digest>> {
+        self.descriptors.get(&kind)?.file().map(|(_, pinned)| pinned)
+    }
+
+    /// Whether a map can have a vocabulary of its own for this kind of descriptor.
+    pub fn may_have_own(&self, kind: DescriptorKind) -> bool {
+        match self.descriptors.get(&kind) {
+            Some(Method::Vlad(vlad)) => vlad.own(OWN_BLOCK, self.output.channels).is_some(),
+            _ => false,
+        }
+    }
+
+    /// What [`own_digest`] needs of a model: the digest of the weights, the input, the output, and how a map's own
+    /// vocabulary is used. `None` if the kind cannot have one.
+    pub(crate) fn own_base(&self, files: &[Digest], kind: DescriptorKind) -> Option<Digest> {
+        let Self { input, output, .. } = self;
+        let Some(Method::Vlad(vlad)) = self.descriptors.get(&kind) else { return None };
+        let descriptor = &Method::Vlad(vlad.own(OWN_BLOCK, output.channels)?);
+        let text = toml::to_string(&DeclaredInputs { input, output, descriptor }).ok()?;
+        let weights = files.iter().take(1 + self.data.len());
+        let files = weights.map(Digest::to_string).collect::<Vec<_>>().join("\n");
+        Some(Digest::of(format!("{files}\n{text}").as_bytes()))
     }
 
     /// Which kinds contradict the rest, and how.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 use whereabouts_core::{Descriptor, DescriptorKind};
 
@@ -15,6 +16,21 @@ pub struct Kinds {
     aggregations: BTreeMap<DescriptorKind, Aggregation>,
 }
 
+/// Which descriptor to compute.
+#[derive(Debug, Clone)]
+pub struct DescriptorSpec {
+    /// Its kind.
+    pub kind: DescriptorKind,
+    /// A map's own vocabulary, in place of the model's.
+    pub vocabulary: Option<Arc<Vocabulary>>,
+}
+
+impl From<DescriptorKind> for DescriptorSpec {
+    fn from(kind: DescriptorKind) -> Self {
+        Self { kind, vocabulary: None }
+    }
+}
+
 /// How local features become one kind of descriptor.
 #[derive(Debug)]
 enum Aggregation {
@@ -23,7 +39,7 @@ enum Aggregation {
     /// Signed generalised mean over each part of a grid.
     Gem(Pooling),
     /// Sums of residuals to the centres of a vocabulary.
-    Vlad(Vocabulary),
+    Vlad(Arc<Vocabulary>),
 }
 
 /// A file that a kind of descriptor needs cannot be used.
@@ -45,7 +61,8 @@ impl Kinds {
                     let path = folder.join(&vlad.file);
                     let read = Vocabulary::read(&path, vlad, manifest.output.channels);
                     let path = path.display().to_string();
-                    Aggregation::Vlad(read.map_err(|reason| VocabularyError { path, reason })?)
+                    let read = read.map_err(|reason| VocabularyError { path, reason })?;
+                    Aggregation::Vlad(Arc::new(read))
                 }
                 None if kind == DescriptorKind::CLS => Aggregation::Cls,
                 None => Aggregation::Gem(manifest.pooling.clone()),
@@ -60,12 +77,24 @@ impl Kinds {
         self.aggregations.keys().copied()
     }
 
-    /// Computes the descriptor of the given kind.
+    /// The vocabulary of a kind, if it has one.
+    pub fn vocabulary(&self, kind: DescriptorKind) -> Option<&Arc<Vocabulary>> {
+        match self.aggregations.get(&kind) {
+            Some(Aggregation::Vlad(vocabulary)) => Some(vocabulary),
+            _ => None,
+        }
+    }
+
+    /// Computes the descriptor that is asked for.
     pub fn descriptor(
         &self,
-        kind: DescriptorKind,
+        spec: &DescriptorSpec,
         features: &LocalFeatures,
     ) -> Result<Descriptor, PoolingError> {
+        let kind = spec.kind;
+        if let Some(own) = &spec.vocabulary {
+            return Ok(Descriptor::normalised(own.aggregate(features))?);
+        }
         let numbers = match self.aggregations.get(&kind) {
             Some(Aggregation::Cls) => features.cls.clone(),
             Some(Aggregation::Gem(pooling)) => Some(features.gem(pooling)),

@@ -23,31 +23,40 @@ const TOGETHER: usize = 4;
 /// The numbers that the compiler keeps in vector registers.
 const LANES: usize = 16;
 
-/// A vocabulary in memory.
-#[derive(Debug)]
-pub(super) struct Vocabulary {
-    settings: Vlad,
-    channels: usize,
+/// A vocabulary in memory: that of a model, or one that was [fitted](Self::fitted) on the images of a map.
+#[derive(Debug, PartialEq)]
+pub struct Vocabulary {
+    pub(super) settings: Vlad,
+    pub(super) channels: usize,
     /// `centres × channels`.
-    centres: Vec<f32>,
+    pub(super) centres: Vec<f32>,
     /// The centres at unit norm, transposed to `channels × padded`.
     directions: Vec<f32>,
     /// `centres`, rounded up to a multiple of [`LANES`].
     padded: usize,
     /// For each band and centre, `block × channels`; empty if residual sums are kept whole.
-    blocks: Vec<f32>,
+    pub(super) blocks: Vec<f32>,
     /// `expanded × dimension`; empty if there is none.
-    projection: Vec<f32>,
+    pub(super) projection: Vec<f32>,
 }
 
 impl Vocabulary {
+    /// Reads the vocabulary of a model; see [`from_bytes`](Self::from_bytes).
+    pub(super) fn read(path: &Path, settings: &Vlad, channels: usize) -> Result<Self, String> {
+        let bytes = std::fs::read(path).map_err(|error| error.to_string())?;
+        Self::from_bytes(&bytes, settings, channels)
+    }
+
     /// Reads a vocabulary: 16-bit floats in little-endian order, first the centres (`centres × channels`), then for
     /// each band and centre the matrix that shortens its residual sum (`channels × block`), then the projection
     /// (`rows · centres · block × dimension`). Those that the manifest does not declare are left out. The error says
     /// what is wrong with the file.
-    pub fn read(path: &Path, settings: &Vlad, channels: usize) -> Result<Self, String> {
+    pub(super) fn from_bytes(
+        bytes: &[u8],
+        settings: &Vlad,
+        channels: usize,
+    ) -> Result<Self, String> {
         let Vlad { centres: count, rows, block, dimension, .. } = *settings;
-        let bytes = std::fs::read(path).map_err(|error| error.to_string())?;
         let expanded = settings.expanded(channels);
         let lengths = [
             count * channels,
@@ -70,18 +79,36 @@ impl Vocabulary {
             return Err("it contains a number that is not finite".to_owned());
         }
         let blocks = transposed(&blocks, channels, block.unwrap_or(1));
-        let padded = count.next_multiple_of(LANES);
+        Ok(Self::new(settings.clone(), channels, centres, blocks, projection))
+    }
+
+    /// Prepares a vocabulary of which `blocks` are stored as `block × channels`.
+    pub(super) fn new(
+        settings: Vlad,
+        channels: usize,
+        centres: Vec<f32>,
+        blocks: Vec<f32>,
+        projection: Vec<f32>,
+    ) -> Self {
+        let padded = settings.centres.next_multiple_of(LANES);
         let mut directions = vec![0.0; channels * padded];
         for (k, centre) in centres.chunks_exact(channels).enumerate() {
             let scale = 1.0 / norm(centre).max(1e-12);
             centre.iter().enumerate().for_each(|(c, x)| directions[c * padded + k] = x * scale);
         }
-        let settings = settings.clone();
-        Ok(Self { settings, channels, centres, directions, padded, blocks, projection })
+        Self { settings, channels, centres, directions, padded, blocks, projection }
+    }
+
+    /// Writes the vocabulary as [`from_bytes`](Self::from_bytes) reads it.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let block = self.settings.block.unwrap_or(1);
+        let blocks = transposed(&self.blocks, block, self.channels);
+        let numbers = self.centres.iter().chain(&blocks).chain(&self.projection);
+        numbers.flat_map(|&number| f16::from_f32(number).to_le_bytes()).collect()
     }
 
     /// Aggregates the local features of a picture.
-    pub fn aggregate(&self, features: &LocalFeatures) -> Vec<f32> {
+    pub(super) fn aggregate(&self, features: &LocalFeatures) -> Vec<f32> {
         let (rows, count, channels) = (self.settings.rows, self.settings.centres, self.channels);
         let (cells, weights) = self.cells(features);
         let mut sums = vec![0.0; rows * count * channels];
@@ -174,9 +201,14 @@ impl Vocabulary {
     }
 
     fn project(&self, expanded: Vec<f32>) -> Vec<f32> {
-        if self.projection.is_empty() {
-            return expanded;
+        match self.projection.is_empty() {
+            true => expanded,
+            false => self.projected(&expanded),
         }
+    }
+
+    /// Multiplies with the projection.
+    pub(super) fn projected(&self, expanded: &[f32]) -> Vec<f32> {
         let mut out = vec![0.0; self.settings.dimension];
         let rows = self.projection.chunks_exact(self.settings.dimension);
         // A centre without features has a sum of zeros.
@@ -187,7 +219,7 @@ impl Vocabulary {
     }
 }
 
-fn norm(numbers: &[f32]) -> f32 {
+pub(super) fn norm(numbers: &[f32]) -> f32 {
     dot(numbers, numbers).sqrt()
 }
 
@@ -204,7 +236,7 @@ fn transposed(matrices: &[f32], rows: usize, columns: usize) -> Vec<f32> {
 
 /// Adds `factor · from` to `to`.
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn add(to: &mut [f32], from: &[f32], factor: f32) {
+pub(super) fn add(to: &mut [f32], from: &[f32], factor: f32) {
     for (to, from) in to.iter_mut().zip(from) {
         *to += factor * from;
     }

@@ -129,6 +129,8 @@ impl Shelf {
             dim: 1,
             revision: 0,
             refiner: None,
+            vocabulary: None,
+            keeps_shipped: false,
             description: None,
             created_at: Timestamp::UNIX_EPOCH,
         };

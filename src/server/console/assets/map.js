@@ -55,9 +55,15 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
   const plan = new Plan(canvas, { signal, picked: choose, moved: listSoon, tiles: tiles?.url ?? null });
   single.after(tracksCard(name, { plan, signal, query, setQuery }));
 
+  function vocabulary(of) {
+    if (of.source === "own") return `the map's own, fitted on ${plural(of.images, "image")}`;
+    return of.reason ? `the model's: ${of.reason}` : "the model's";
+  }
+
   function settings() {
     return h("section", { class: "card" }, h("h2", {}, "This map"), facts(
       ["Scene", map.scene], ["Poses", map.frame], ["Model", `${map.model}, ${map.precision} precision`], ["Descriptor", `${map.descriptor}, ${count(map.dim)} dimensions`],
+      ...(map.vocabulary ? [["Vocabulary", vocabulary(map.vocabulary)]] : []),
       ["Search", searched(map)], ["Reindex", reindexed(map)],
       ["Confidence", map.calibration ? `calibrated on ${plural(map.calibration.asked, "image")}` : "not calibrated yet"], ["Created", moment(map.created_at)]),
       h("details", {}, h("summary", {}, "Delete this map"), h("p", {}, "Needs the role admin. Deletes all images of the map."),

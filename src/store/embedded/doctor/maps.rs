@@ -97,6 +97,11 @@ impl Doctor<'_> {
             }
             None => None,
         };
+        if let Some(own) = map.vocabulary {
+            let owner = BlobOwner::Vocabulary(map.uid);
+            self.required.references.insert(blob_ref_key(&own.digest, &owner));
+            self.required.vocabularies.insert(own.digest, name.to_string());
+        }
         let (mut images, mut end, mut picture_bytes) = (0, 0, 0);
         let (mut damaged, mut sharing) = (Vec::new(), Vec::new());
         let mut slots: HashMap<usize, ImageId> = HashMap::new();

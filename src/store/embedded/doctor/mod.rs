@@ -94,6 +94,8 @@ struct Required {
     images: HashMap<Digest, (String, ImageId)>,
     /// Blobs of frames, each with the id of one such job.
     frames: HashMap<Digest, Uuid>,
+    /// Blobs of maps' own vocabularies, each with its map.
+    vocabularies: HashMap<Digest, String>,
     /// Keys in `blob_refs`.
     references: HashSet<Vec<u8>>,
 }

@@ -33,6 +33,20 @@ impl Doctor<'_> {
                  server, delete them, and `whereabouts restore` a backup or add them again",
             );
         }
+        let lost: Vec<&String> = self
+            .required
+            .vocabularies
+            .iter()
+            .filter(|(digest, _)| !self.picture(digest).is_file())
+            .map(|(_, map)| map)
+            .collect();
+        if !lost.is_empty() {
+            let maps = list(&lost);
+            self.report.problem(
+                format!("the vocabularies of {} maps are lost: {maps}", lost.len()),
+                "frames cannot be localized there: start the server, and reindex these maps",
+            );
+        }
         let (mut orphans, mut damaged) = (Vec::new(), Vec::new());
         let images = self.dir.join("images");
         for entry in WalkDir::new(&images).into_iter().filter_map(Result::ok) {
@@ -60,14 +74,19 @@ impl Doctor<'_> {
     }
 
     fn is_required(&self, digest: &Digest) -> bool {
-        self.required.images.contains_key(digest) || self.required.frames.contains_key(digest)
+        self.required.images.contains_key(digest)
+            || self.required.frames.contains_key(digest)
+            || self.required.vocabularies.contains_key(digest)
     }
 
     fn owner(&self, digest: &Digest) -> String {
         match (self.required.images.get(digest), self.required.frames.get(digest)) {
             (Some((map, id)), _) => format!("{map}/{id}"),
             (None, Some(job)) => format!("the frame of the job {job}"),
-            (None, None) => digest.to_string(),
+            (None, None) => match self.required.vocabularies.get(digest) {
+                Some(map) => format!("the vocabulary of the map {map}"),
+                None => digest.to_string(),
+            },
         }
     }
 

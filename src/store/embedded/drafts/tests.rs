@@ -48,6 +48,8 @@ fn map() -> Map {
         dim: 3,
         revision: 0,
         refiner: None,
+        vocabulary: None,
+        keeps_shipped: false,
         description: None,
         created_at: Timestamp::now(),
     }
