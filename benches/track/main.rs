@@ -3,7 +3,7 @@
 //! `WHEREABOUTS_DATA`. Then how long a step takes in a map of 100,000 images.
 //!
 //! The arguments name the drives to run, by default all, and `kind=gem` the kind of descriptor, by default the model's.
-//! `tests/support/drives.rs` describes the other methods.
+//! `TRACK_TRACE=1` prints each answer. `tests/support/drives.rs` describes the other methods.
 
 mod off;
 mod robots;
