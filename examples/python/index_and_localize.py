@@ -114,7 +114,7 @@ def wait_for_calibration(service: Whereabouts, options: argparse.Namespace) -> N
         if state.calibration and state.calibration.images == state.images:
             return
         if time.monotonic() > end:
-            print("the map is not calibrated yet, so confidence may not be measured; run again later", file=sys.stderr)
+            print("no confidence is measured yet; run this again later", file=sys.stderr)
             return
         time.sleep(0.2)
 
@@ -123,8 +123,10 @@ def row(frame: str, answer: Answer, job: Job | None) -> str:
     coarse = answer.candidates[0].image_id if answer.candidates else "-"
     refined = job.ranking[0].image_id if job and job.ranking else "-"
     estimate = (job.estimate if job else None) or answer.estimate
-    measured = estimate is not None and estimate.confidence is not None
-    confidence = f"{estimate.confidence:.2f}" if measured else "unmeasured" if estimate else "-"
+    if estimate is None:
+        confidence = "-"
+    else:
+        confidence = "unmeasured" if estimate.confidence is None else f"{estimate.confidence:.2f}"
     if job:
         ended = job.state if not job.error else f"{job.state}: {job.error}"
     else:

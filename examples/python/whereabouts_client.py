@@ -203,7 +203,7 @@ class MapState:
     """The vocabulary of the descriptors; None if this kind has none."""
     reindex: Reindex | None = None
     calibration: CalibrationState | None = None
-    """None until the map is calibrated, shortly after images are added; until then every confidence is None."""
+    """None until the map is calibrated, soon after images are added. Every confidence is None until then."""
     refiner: Refiner | None = None
     """The refiner that the map is set to; None for the server's."""
     description: str | None = None
@@ -234,6 +234,8 @@ class Estimate:
     pose: Pose | None = None
     reason: str | None = None
     """Why the place cannot be known from this frame, whatever it resembles."""
+    evidence: dict[str, Any] | None = None
+    """What the confidence will be computed from, while it is None."""
 
 
 @dataclass(frozen=True)

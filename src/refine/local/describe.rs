@@ -33,13 +33,14 @@ const SOME: f32 = 0.5;
 /// measurement as the confidence of an estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Standing {
-    /// The confidence of the pair; `None` while it is not measured how much wrong answers agree.
+    /// The confidence of the pair; `None` while it is not measured how much wrong answers agree, and for a frame that
+    /// shows nothing. There is no verdict then: the estimate says why.
     pub confidence: Option<f32>,
     /// The confidence from which a place is known.
     pub known_from: f64,
 }
 
-/// Describes one pair in plain English, in three to six sentences. The same pair always gives the same
+/// Describes one pair in plain English, in two to six sentences. The same pair always gives the same
 /// text. The console reads these texts, so their wording is part of its contract (`words.js`).
 pub fn describe(pair: &PairMatch, standing: Standing) -> String {
     if pair.matches.is_empty() {
@@ -50,7 +51,7 @@ pub fn describe(pair: &PairMatch, standing: Standing) -> String {
     sentences.extend(distinctiveness(pair));
     sentences.push(movement(pair));
     sentences.push(parts.gaps());
-    sentences.push(verdict(standing));
+    sentences.extend(verdict(standing));
     sentences.join(" ")
 }
 
@@ -102,22 +103,20 @@ fn movement(pair: &PairMatch) -> String {
 
 /// Judges by how often a wrong answer of the map agrees as much, and not by the number of matches: a candidate that
 /// shares only the lens rim and the floor with the query has many matches.
-fn verdict(standing: Standing) -> String {
-    let Some(confidence) = standing.confidence else {
-        return "Whether that is more than pictures of other places agree was not measured yet in this map.".to_owned();
-    };
+fn verdict(standing: Standing) -> Option<String> {
+    let confidence = standing.confidence?;
     // Rounded down, as the confidence is shown.
     let less = format!(
         "{} % of the best wrong answers in this map agree less",
         (confidence * 100.0 + 1e-4) as usize
     );
-    if confidence >= standing.known_from as f32 {
+    Some(if confidence >= standing.known_from as f32 {
         format!("Strong agreement: {less}, so this is probably the same place.")
     } else if confidence >= SOME {
         format!("Some agreement: {less}, so this is possibly the same place, or one built like it.")
     } else {
         format!("Weak agreement: {less}, so what matches may be chance or a repeated pattern.")
-    }
+    })
 }
 
 fn share(pair: &PairMatch) -> f32 {

@@ -81,7 +81,7 @@ impl Refiner for LocalRefiner {
         let calibration = calibration.unwrap_or_default();
         conclude(&input.candidates, &comparison, |evidence| Standing {
             confidence: match input.frame.uninformative {
-                true => Some(0.0),
+                true => None,
                 false => evidence.and_then(|evidence| calibration.confidence(evidence)),
             },
             known_from: self.known_from,

@@ -196,6 +196,24 @@ pub(super) fn smoothed(
     places
 }
 
+/// The place of a frame that the filter named at the time, if it was known from `known_from`, and the smoothed place
+/// otherwise; and whether it is known. What was known stays: a smoother that goes as the crow flies is no better than a
+/// filter that follows paths. Where the two differ, nothing is known.
+pub(super) fn settled(
+    one: &Passed,
+    smoothed: Smoothed,
+    (ground, radius): (&Ground, f64),
+    known_from: f64,
+) -> (Smoothed, bool) {
+    let filtered = place(one, &one.state(), ground, radius);
+    if filtered.probability >= known_from {
+        return (filtered, true);
+    }
+    let agree = filtered.image.zip(smoothed.image);
+    let agree = agree.is_some_and(|(one, other)| ground.grid.distance(one, other) <= radius);
+    (smoothed, agree && smoothed.probability >= known_from)
+}
+
 /// The most likely place of a frame.
 fn place(one: &Passed, state: &State, ground: &Ground, radius: f64) -> Smoothed {
     let spacing = ground.paths.spacing();

@@ -72,10 +72,12 @@ impl TrackStep {
         odometry: Option<Odometry>,
     ) -> Result<Self, ServiceError> {
         let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.:".contains(&byte);
-        if !(1..=64).contains(&id.len()) || !id.bytes().all(plain) {
+        // Clients resolve the paths `.` and `..`.
+        let is_named = id.bytes().any(|byte| byte.is_ascii_alphanumeric());
+        if !(1..=64).contains(&id.len()) || !id.bytes().all(plain) || !is_named {
             let shown: String = id.chars().take(80).collect();
             return Err(ServiceError::unprocessable(format!(
-                "track {shown:?} must have 1 to 64 letters, digits, '-', '_', '.' and ':'"
+                "track {shown:?} must have 1 to 64 letters, digits, '-', '_', '.' and ':', and a letter or digit among them"
             )));
         }
         Ok(Self { id, owner: caller.scope().to_owned(), captured_at, odometry })

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::super::{Principal, ServiceError};
 use super::estimate::place_radius;
-use super::history::{Smoothed, smoothed};
+use super::history::{Smoothed, settled, smoothed};
 use super::posterior::MIN_IMAGES;
 use super::session::{Track, habits};
 use super::{Key, Tracks, on_blocking_thread};
@@ -68,6 +68,8 @@ impl Tracks {
             let habits = habits(settings.max_speed_m_s, &settings);
             let all = smoothed(&track.passed, &ground, radius, habits);
             let place = |(passed, smoothed): (&super::history::Passed, Smoothed)| {
+                let known_from = settings.known_probability;
+                let (smoothed, known) = settled(passed, smoothed, (&ground, radius), known_from);
                 let Smoothed { image, probability, off_map } = smoothed;
                 TrackPlace {
                     captured_at: passed.captured_at,
@@ -75,7 +77,7 @@ impl Tracks {
                     image_id: image.map(|image| ground.id(image).clone()),
                     pose: image.map(|image| ground.pose(image)),
                     probability,
-                    known: probability >= settings.known_probability && ground.len() >= MIN_IMAGES,
+                    known: known && ground.len() >= MIN_IMAGES,
                     off_map,
                 }
             };

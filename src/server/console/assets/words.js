@@ -20,7 +20,7 @@ function ofLocal(text) {
       if (differ && !/^0 /.test(differ)) found.differ.push(differ.replace("more resembled each other but", "regions resembled each other, but"));
     } else if (/^0 of them/.test(sentence) || /^Hardly anything/.test(sentence)) found.differ.push(sentence);
     else if (/^Seen from/.test(sentence)) found.view = sentence;
-    else if (/agreement: |no sign that this|not measured yet/.test(sentence)) found.verdict = sentence;
+    else if (/agreement: |no sign that this/.test(sentence)) found.verdict = sentence;
     else found.agree.push(sentence);
   }
   return found;

@@ -119,3 +119,20 @@ fn only_the_likeliest_images_of_a_frame_are_kept() {
     assert_eq!(passed.images.len(), 10);
     assert!((total(&passed) - 1.0).abs() < 1e-5);
 }
+
+#[test]
+fn what_was_known_stays_and_nothing_is_known_where_later_frames_contradict() {
+    // The believed speed contradicts a gap in the map that the robot has crossed.
+    let frames = vec![
+        passed(&[(10, 0.97), (30, 0.03)], 0.0, 0.0),
+        passed(&[(11, 0.6), (31, 0.4)], 0.0, 10.0),
+        passed(&[(32, 0.97)], 0.0, 10.0),
+    ];
+    let (ground, settled_from) = (road(60), 0.9);
+    let all = way(frames.clone());
+    let settled = |at: usize| settled(&frames[at], all[at], (&ground, 25.0), settled_from);
+    assert_eq!(all[0].image, Some(30), "smoothed");
+    assert_eq!((settled(0).0.image, settled(0).1), (Some(10), true));
+    assert_eq!((settled(1).0.image, settled(1).1), (Some(31), false));
+    assert_eq!((settled(2).0.image, settled(2).1), (Some(32), true));
+}
