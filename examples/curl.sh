@@ -135,9 +135,9 @@ id=$(pick '.*"image":\{"id":"([^"]*)".*')
 echo "$map" > "$scratch/map.json"
 echo "{\"map\":$map,\"image\":$image}" > "$scratch/meta.json"
 call 200 "$url/maps/curl-example/images/$id/content"
+cp "$body" "$scratch/picture"
 # Only a map with a vocabulary of its own has one to export.
 call 404 "$url/maps/curl-example/vocabulary"
-cp "$body" "$scratch/picture"
 call 201 -X PUT "$url/maps/curl-copy/import" -H "$json" -d "@$scratch/map.json"
 call 201 -F "image=@$scratch/picture" -F "meta=<$scratch/meta.json" "$url/maps/curl-copy/import"
 

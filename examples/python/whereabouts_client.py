@@ -416,6 +416,8 @@ class JobVerdict:
     """How certain a model says it is."""
     then: str | None = None
     """Whether the answer stands or goes on to the model, and why."""
+    evidence: dict[str, Any] | None = None
+    """What the confidence will be computed from, while it is None."""
 
 
 @dataclass(frozen=True)
