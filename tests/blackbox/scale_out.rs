@@ -72,10 +72,10 @@ async fn two_workers_that_need_the_same_pair_pay_for_it_once() {
 #[tokio::test]
 #[ignore = "needs the scale-out deployment"]
 async fn a_worker_claims_no_more_jobs_than_keep_its_calls_busy() {
-    const JOBS: usize = 10;
+    const JOBS: usize = 14;
     const PAIRS: usize = 5;
-    // Enough to keep all calls busy, and one for each of the two turns.
-    const MOST: usize = CONCURRENCY / PAIRS + 2;
+    // Enough to keep all calls busy and half as many ready, the one that exceeds them, and one for each of the two turns.
+    const MOST: usize = (CONCURRENCY + CONCURRENCY / 2) / PAIRS + 3;
     let dir = TempDir::new().unwrap();
     let script = Script { describe: Box::new(|_| Reply::Hang), ..Script::default() };
     let mock = MockMllm::start(script).await;
