@@ -23,7 +23,7 @@ const TOGETHER: usize = 4;
 /// The numbers that the compiler keeps in vector registers.
 const LANES: usize = 16;
 
-/// A vocabulary in memory: that of a model, or one that was [fitted](Self::fitted) on the images of a map.
+/// A vocabulary in memory: that of a model, or one that was [fitted](super::OwnVocabulary::fit) on the images of a map.
 #[derive(Debug, PartialEq)]
 pub struct Vocabulary {
     pub(super) settings: Vlad,
@@ -99,7 +99,7 @@ impl Vocabulary {
         Self { settings, channels, centres, directions, padded, blocks, projection }
     }
 
-    /// Writes the vocabulary as [`from_bytes`](Self::from_bytes) reads it.
+    /// Writes the vocabulary as `from_bytes` reads it.
     pub fn to_bytes(&self) -> Vec<u8> {
         let block = self.settings.block.unwrap_or(1);
         let blocks = transposed(&self.blocks, block, self.channels);
