@@ -39,8 +39,8 @@ pub struct TrackWay {
     pub key: Option<String>,
     /// Number of frames so far.
     pub frames: u64,
-    /// Its places at the last `track.history` frames, the oldest first. Each is estimated from the frames before and
-    /// after it, so that it may differ from what was answered at the time, which knew only the frames before.
+    /// Its places at the last `track.history` frames, the oldest first. A place that was known at the time stays as it
+    /// was answered; the others are estimated from the frames before and after them.
     pub places: Vec<TrackPlace>,
 }
 
@@ -61,7 +61,8 @@ pub struct TrackPlace {
     pub pose: Option<Pose>,
     /// Probability, 0 to 1, that the robot was at that image or one next to it.
     pub probability: f64,
-    /// Whether the probability reaches the configured threshold.
+    /// Whether it was known at the time, or the probability reaches the configured threshold at the place that was
+    /// answered then.
     pub known: bool,
     /// Probability, 0 to 1, that the robot was at no place of the map.
     pub off_map: f64,
