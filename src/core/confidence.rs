@@ -69,7 +69,7 @@ impl Evidence {
 }
 
 /// How many of that many regions of a frame match a picture of another place by chance.
-pub(super) fn chance(regions: usize) -> f32 {
+pub fn chance(regions: usize) -> f32 {
     (CHANCE_SHARE * regions as f32).max(1.0)
 }
 

@@ -63,6 +63,13 @@ impl FromStr for DescriptorKind {
     }
 }
 
+impl DescriptorKind {
+    /// Whether a model may have a vocabulary for descriptors of this kind; its manifest says whether it has.
+    pub fn may_have_vocabulary(self) -> bool {
+        ![Self::GEM, Self::CLS].contains(&self)
+    }
+}
+
 impl TryFrom<String> for DescriptorKind {
     type Error = InvalidName;
 

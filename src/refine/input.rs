@@ -63,10 +63,8 @@ impl RefineInput {
 
     /// Returns the input of a job. Fails with [`RefineError::Permanent`] if the job's map was removed.
     pub async fn of_job(record: &JobRecord, maps: &dyn MapStore) -> Result<Self, RefineError> {
-        let map = match maps.map(&record.job.map).await? {
-            Some(map) if map.uid == record.map_uid => map,
-            _ => return Err(RefineError::Permanent("the map was removed".into())),
-        };
+        let map = record.map(maps).await?;
+        let map = map.ok_or_else(|| RefineError::Permanent("the map was removed".into()))?;
         // A reindexed map has other descriptors, which this one cannot be compared with.
         let descriptor = record.query.descriptor.clone();
         let descriptor = descriptor.filter(|_| record.revision == map.revision);

@@ -220,10 +220,7 @@ impl Worker {
     /// Returns the first of the refined ranking with its confidence.
     async fn estimate(&self, record: &JobRecord, refinement: &Refinement) -> Option<Estimate> {
         let first = refinement.ranking.first()?;
-        let calibration = match self.maps.map(&record.job.map).await {
-            Ok(Some(map)) if map.uid == record.map_uid => self.maps.calibration(&map).await,
-            _ => Ok(None),
-        };
+        let calibration = record.calibration(self.maps.as_ref()).await;
         let calibration = calibration.ok().flatten().unwrap_or_default();
         let confidence = calibration.refined_confidence(
             &record.candidates,

@@ -10,7 +10,7 @@ use super::fitting::obstacle;
 use super::reindex::{Declined, FitPlan};
 use super::{Reindexer, ServiceError};
 use whereabouts_api::ErrorKind;
-use whereabouts_core::{DescriptorKind, Map, MapName};
+use whereabouts_core::{Map, MapName};
 use whereabouts_store::IndexState;
 
 /// Pause between two scans for maps that have changed. A map whose images did not change in between is settled.
@@ -92,11 +92,7 @@ impl VocabularyFitter {
         let Reindexer { maps, settings, .. } = &self.reindexer;
         let has_obstacle = obstacle(map, images, settings).is_some();
         match &map.vocabulary {
-            _ if !settings.own
-                || [DescriptorKind::GEM, DescriptorKind::CLS].contains(&map.descriptor) =>
-            {
-                None
-            }
+            _ if !settings.own || !map.descriptor.may_have_vocabulary() => None,
             Some(own) if own.requested => Some((Some(own.of), FitPlan::Renew)),
             // The map has outgrown its own vocabulary.
             Some(own) if images > settings.max_images => Some((Some(own.of), FitPlan::Drop)),

@@ -184,11 +184,7 @@ impl Jobs {
     /// Computes the confidences that were not measured when a job ended, if they are now.
     pub(super) async fn measured(&self, mut record: JobRecord) -> JobRecord {
         if record.job.is_unmeasured() {
-            let maps = &self.imaging.maps;
-            let calibration = match maps.map(&record.job.map).await {
-                Ok(Some(map)) if map.uid == record.map_uid => maps.calibration(&map).await,
-                _ => Ok(None),
-            };
+            let calibration = record.calibration(self.imaging.maps.as_ref()).await;
             // Without, they stay unmeasured: the job can still be read.
             if let Ok(Some(calibration)) = calibration {
                 record.job.measure(&calibration, &record.candidates, self.known_confidence);

@@ -14,7 +14,7 @@ use whereabouts_api::{
     CalibrationState, ErrorKind, IndexKind, MapChange, MapRefiner, MapState, VocabularyChoice,
     VocabularyState,
 };
-use whereabouts_core::{DescriptorKind, Map, MapName};
+use whereabouts_core::{Map, MapName};
 use whereabouts_store::{IndexState, MapStore, StoreError};
 
 /// Maps: create, change, list and delete. Clones share the store.
@@ -194,7 +194,7 @@ impl Maps {
                 reason: None,
             });
         }
-        if [DescriptorKind::GEM, DescriptorKind::CLS].contains(&map.descriptor) {
+        if !map.descriptor.may_have_vocabulary() {
             return None;
         }
         let manifest = self.imaging.manifest(&map.model).await.ok()?;

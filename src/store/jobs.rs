@@ -1,14 +1,16 @@
 //! Jobs and their queue.
 
+use std::sync::Arc;
+
 use async_trait::async_trait;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
 use uuid::Uuid;
 
-use super::{JobFilter, JobList, StoreError};
+use super::{JobFilter, JobList, MapStore, StoreError};
 use whereabouts_core::{
-    Candidate, Description, Descriptor, Digest, Job, JobState, MediaType, Usage,
+    Calibration, Candidate, Description, Descriptor, Digest, Job, JobState, Map, MediaType, Usage,
 };
 
 /// A frame that a robot posted, kept because a job needs it.
@@ -71,6 +73,23 @@ impl JobRecord {
     /// Whether this claim still holds.
     pub fn is_held_by(&self, claim: Claim) -> bool {
         self.job.state == JobState::Running && self.claim() == claim
+    }
+
+    /// Returns the map that the job is about; `None` if it was removed, even if another has its name now.
+    pub async fn map(&self, maps: &dyn MapStore) -> Result<Option<Map>, StoreError> {
+        let map = maps.map(&self.job.map).await?;
+        Ok(map.filter(|map| map.uid == self.map_uid))
+    }
+
+    /// Returns the calibration of that map, if there is one.
+    pub async fn calibration(
+        &self,
+        maps: &dyn MapStore,
+    ) -> Result<Option<Arc<Calibration>>, StoreError> {
+        match self.map(maps).await? {
+            Some(map) => maps.calibration(&map).await,
+            None => Ok(None),
+        }
     }
 }
 

@@ -34,7 +34,7 @@ use serde::Serialize;
 use mutual::Mutual;
 use nearest::Nearest;
 use votes::Votes;
-use whereabouts_core::confidence::CHANCE_SHARE;
+use whereabouts_core::confidence::chance;
 use whereabouts_core::dense::DenseFeatures;
 
 /// Thresholds of the matcher. The defaults were measured for XFeat. All lengths are fractions of the picture
@@ -210,14 +210,14 @@ impl LocalMatcher {
 
     /// Whether the candidate that would be ranked first agrees so clearly that others need not be compared: whether
     /// ln((a + c) / (m + c)) reaches `clear_evidence`, where a of its regions match, m is the median of that count over
-    /// the others, and c is [`CHANCE_SHARE`] of the regions of the query.
+    /// the others, and c is that of [`chance`] for the regions of the query.
     fn is_clear(&self, pairs: &[PairMatch]) -> bool {
         let Some(&first) = rank(pairs).first() else { return false };
         let others = pairs.iter().enumerate().filter(|(index, _)| *index != first);
         let mut others: Vec<usize> = others.map(|(_, pair)| pair.matches.len()).collect();
         others.sort_unstable();
         let Some(&median) = others.get(others.len() / 2) else { return false };
-        let chance = (CHANCE_SHARE * pairs[first].cells as f32).max(1.0);
+        let chance = chance(pairs[first].cells);
         let one = pairs[first].matches.len();
         ((one as f32 + chance) / (median as f32 + chance)).ln() >= self.settings.clear_evidence
     }
