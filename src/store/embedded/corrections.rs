@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use sled::Transactional;
 use uuid::Uuid;
 
 use super::super::StoreError;
 use super::super::changes::{MapContent, check_frame};
 use super::Inner;
+use super::images::StoredImage;
 use super::maps::stored_map;
-use super::trees::{StoredImage, Trees, encode, image_key, transaction_failed};
+use super::trees::Trees;
 use whereabouts_core::{Image, Map};
 
 impl Inner {
@@ -34,7 +34,7 @@ impl Inner {
                     }
                     let moved = current.pose != next.pose;
                     let stored = StoredImage { image: next, slot: stored.slot };
-                    replace_record(trees, uid, &stored, moved)?;
+                    trees.replace_image(uid, &stored, moved)?;
                     Ok(Some((stored, moved)))
                 },
                 move |replaced| {
@@ -59,27 +59,6 @@ impl Inner {
             draft.move_image(stored);
         }
     }
-}
-
-/// Replaces the record of an image, whose bytes stay the same, and counts a changed pose.
-fn replace_record(
-    trees: &Trees,
-    uid: Uuid,
-    stored: &StoredImage,
-    moved: bool,
-) -> Result<(), StoreError> {
-    let key = image_key(uid, &stored.image.id);
-    let value = encode(stored)?;
-    let count = encode(&(trees.moved(uid)? + u64::from(moved)))?;
-    (&trees.images, &trees.moves)
-        .transaction(|(images, moves)| {
-            images.insert(key.as_slice(), value.as_slice())?;
-            if moved {
-                moves.insert(uid.as_bytes().as_slice(), count.as_slice())?;
-            }
-            Ok(())
-        })
-        .map_err(transaction_failed)
 }
 
 /// Returns what a map contains.

@@ -5,7 +5,7 @@
 //! the writer thread, and only if no image has a slot at or above `done`.
 
 #[cfg(test)]
-pub(super) mod tests;
+mod tests;
 
 use std::fs::File;
 use std::path::PathBuf;
@@ -15,10 +15,11 @@ use async_trait::async_trait;
 
 use super::super::changes::being_reindexed;
 use super::super::{Draft, DraftStore, StoreError};
+use super::images::StoredImage;
 use super::live_map::{LiveMap, folder_of};
 use super::maps::{check_revision, refer_to_vocabulary};
 use super::orphans::remove_folder;
-use super::trees::{StoredImage, put};
+use super::trees::put;
 use super::{EmbeddedStore, Inner, blocking};
 use whereabouts_core::{Descriptor, Image, ImageId, Map};
 
@@ -102,7 +103,7 @@ impl Draft for EmbeddedDraft {
                 },
                 move |stored| {
                     if let Some(stored) = stored {
-                        publishing.publish(stored.into());
+                        publishing.publish(stored);
                     }
                 },
             )

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 
 use super::super::{ExportStore, StoreError};
-use super::trees::StoredImage;
+use super::images::StoredImage;
 use super::{EmbeddedStore, blocking};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{ImageId, Map};

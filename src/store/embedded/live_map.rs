@@ -1,16 +1,22 @@
 //! A loaded map: which image is in which slot, and the index over them.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use super::super::{HardNegatives, LocatedImage, StoreError};
 use super::blobs::replace_durably;
+use super::images::{LocatedId, StoredImage};
 use super::segments::VectorFiles;
-use super::trees::{LocatedId, SearchedImage, StoredImage, Trees};
+use super::trees::Trees;
 use parking_lot::RwLock;
+use rayon::prelude::*;
 use whereabouts_core::{Calibration, CalibrationSettings, Candidate, Map, Pose};
 use whereabouts_index::{IndexSettings, MapIndex, ScoredSlot, SealedGraph, SearchMode, Vectors};
+
+/// Slots whose records one thread reads at a time when a map is opened.
+const READ_TOGETHER: usize = 16_384;
 
 pub(super) struct LiveMap {
     /// The map as stored; scene and description may change.
@@ -41,35 +47,53 @@ impl LiveMap {
         let uid = map.uid;
         let live = Self::open(map, descriptors, index)?;
         live.moved.store(trees.moved(uid)?, Ordering::Relaxed);
-        // Each takes seconds for a million images.
-        std::thread::scope(|scope| {
-            let graph = scope.spawn(|| live.restore_graph(index));
-            let images = live.restore_images(trees);
-            if graph.join().is_err() {
-                tracing::error!(map = %live.map().name, "the graph was not read; rebuilding it");
-            }
-            images
-        })?;
+        // Each takes about a second for a million images.
+        let (images, ()) = rayon::join(|| live.restore_images(trees), || live.restore_graph(index));
+        images?;
         Ok(live)
     }
 
     /// Makes the stored images visible to searches.
     fn restore_images(&self, trees: &Trees) -> Result<(), StoreError> {
         let map = self.map();
-        for searched in trees.searched_images_of(map.uid) {
-            let searched = searched?;
-            self.next_slot.fetch_max(searched.slot + 1, Ordering::Relaxed);
-            if self.vectors.is_intact(searched.slot) {
-                self.publish(searched);
+        let end = trees.slot_end(map.uid)?;
+        let starts = (0..end).into_par_iter().step_by(READ_TOGETHER);
+        let intact =
+            starts.map(|start| self.intact_images(trees, &map, start..start + READ_TOGETHER));
+        let intact: Vec<Vec<(usize, LocatedId)>> = intact.collect::<Result<_, _>>()?;
+        self.next_slot.fetch_max(end, Ordering::Relaxed);
+        self.index.add_all(intact.iter().flatten().map(|(slot, _)| *slot));
+        self.changes
+            .fetch_add(intact.iter().map(Vec::len).sum::<usize>() as u64, Ordering::Relaxed);
+        let mut entries = self.entries.write();
+        entries.resize_with(end, || None);
+        for (slot, image) in intact.into_iter().flatten() {
+            entries[slot] = Some(image);
+        }
+        Ok(())
+    }
+
+    /// Returns the images in a range of slots whose descriptors are intact.
+    fn intact_images(
+        &self,
+        trees: &Trees,
+        map: &Map,
+        slots: Range<usize>,
+    ) -> Result<Vec<(usize, LocatedId)>, StoreError> {
+        let mut intact = Vec::new();
+        for located in trees.located_in(map.uid, slots) {
+            let (slot, image) = located?;
+            if self.vectors.is_intact(slot) {
+                intact.push((slot, image));
             } else {
                 tracing::error!(
-                    map = %map.name, image = %searched.image.id,
+                    map = %map.name, image = %image.id,
                     "its descriptor is damaged, so searches do not find it; delete the image and add it \
                      again"
                 );
             }
         }
-        Ok(())
+        Ok(intact)
     }
 
     /// Opens a map's descriptors, without any images yet.
@@ -151,12 +175,13 @@ impl LiveMap {
     }
 
     /// Makes a stored image visible to searches.
-    pub fn publish(&self, SearchedImage { image, slot }: SearchedImage) {
+    pub fn publish(&self, StoredImage { image, slot }: &StoredImage) {
+        let slot = *slot;
         let mut entries = self.entries.write();
         if entries.len() <= slot {
             entries.resize_with(slot + 1, || None);
         }
-        entries[slot] = Some(image);
+        entries[slot] = Some(image.into());
         drop(entries);
         self.changes.fetch_add(1, Ordering::Relaxed);
         self.index.add(slot);

@@ -4,20 +4,16 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use sled::Transactional;
-use uuid::Uuid;
 
 use super::super::changes::{changed_map, check_dim, check_frame, removed, same_bytes};
 use super::super::{
     Added, BlobPin, BlobStore, HardNegatives, IndexState, LocatedImage, MapStore, StoreError,
 };
 use super::corrections::content;
+use super::images::StoredImage;
 use super::live_map::{LiveMap, folder_of};
 use super::orphans::{remove_folder, sweep};
-use super::trees::{
-    BlobOwner, StoredImage, Trees, blob_ref_key, decode, encode, failed, get, image_key, put,
-    transaction_failed,
-};
+use super::trees::{BlobOwner, Trees, blob_ref_key, decode, failed, get, put};
 use super::{EmbeddedStore, Inner, blocking};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Digest, Image, ImageId, Map, MapName,
@@ -194,12 +190,12 @@ impl MapStore for EmbeddedStore {
                     writing.vectors.write(slot, descriptor.as_slice())?;
                     touched.vectors.push(Arc::clone(&writing.vectors));
                     let stored = StoredImage { image, slot };
-                    insert_image(trees, uid, &stored)?;
+                    trees.insert_image(uid, &stored)?;
                     Ok((stored, true))
                 },
                 move |(stored, new)| {
                     if *new {
-                        publishing.publish(stored.into());
+                        publishing.publish(stored);
                         inner.indexer.notify(&publishing);
                     }
                 },
@@ -273,7 +269,7 @@ impl MapStore for EmbeddedStore {
                 move |trees, _| {
                     let stored = trees.image(uid, &id)?;
                     if let Some(stored) = &stored {
-                        remove_images(trees, uid, std::slice::from_ref(stored))?;
+                        trees.remove_images(uid, std::slice::from_ref(stored))?;
                     }
                     Ok(stored)
                 },
@@ -396,35 +392,4 @@ pub(super) fn check_revision(trees: &Trees, map: &Map) -> Result<Map, StoreError
         true => Ok(stored),
         false => Err(StoreError::Superseded(stored.name)),
     }
-}
-
-fn insert_image(trees: &Trees, uid: Uuid, stored: &StoredImage) -> Result<(), StoreError> {
-    let key = image_key(uid, &stored.image.id);
-    let owner = BlobOwner::Image { map_uid: uid, id: &stored.image.id };
-    let reference = blob_ref_key(&stored.image.digest, &owner);
-    let value = encode(stored)?;
-    (&trees.images, &trees.blob_refs)
-        .transaction(|(images, refs)| {
-            images.insert(key.as_slice(), value.as_slice())?;
-            refs.insert(reference.as_slice(), &[] as &[u8])?;
-            Ok(())
-        })
-        .map_err(transaction_failed)
-}
-
-pub(super) fn remove_images(
-    trees: &Trees,
-    uid: Uuid,
-    stored: &[StoredImage],
-) -> Result<(), StoreError> {
-    (&trees.images, &trees.blob_refs)
-        .transaction(|(images, refs)| {
-            for StoredImage { image, .. } in stored {
-                images.remove(image_key(uid, &image.id))?;
-                let owner = BlobOwner::Image { map_uid: uid, id: &image.id };
-                refs.remove(blob_ref_key(&image.digest, &owner))?;
-            }
-            Ok(())
-        })
-        .map_err(transaction_failed)
 }

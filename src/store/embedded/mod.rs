@@ -21,6 +21,7 @@ mod doctor;
 mod drafts;
 mod export;
 mod idempotency;
+mod images;
 mod indexer;
 mod jobs;
 mod keys;
@@ -31,6 +32,8 @@ mod records;
 mod retention;
 mod schema;
 mod segments;
+#[cfg(test)]
+mod test_records;
 mod trees;
 mod usage;
 mod watermark;

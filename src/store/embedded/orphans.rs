@@ -6,9 +6,9 @@ use uuid::Uuid;
 
 use super::super::StoreError;
 use super::blobs::Blobs;
+use super::images::StoredImage;
 use super::live_map::folder_of;
-use super::maps::remove_images;
-use super::trees::{StoredImage, Trees, failed};
+use super::trees::{Trees, failed};
 
 /// Images removed in one transaction when a map is deleted.
 const SWEEP_BATCH: usize = 256;
@@ -55,7 +55,7 @@ pub(super) fn sweep(uid: Uuid, trees: &Trees, blobs: &Blobs) -> Result<(), Store
         if batch.is_empty() {
             break;
         }
-        remove_images(trees, uid, &batch)?;
+        trees.remove_images(uid, &batch)?;
         trees.flush()?;
         for stored in &batch {
             blobs.remove_unreferenced(&stored.image.digest, trees);

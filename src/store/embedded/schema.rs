@@ -8,6 +8,7 @@
 //! |---|---|
 //! | 1 | |
 //! | 2 | queue keys begin with the job's priority; ended jobs are listed by end time |
+//! | 3 | what searches need of an image is also listed by slot |
 
 use std::fs::{self, File};
 use std::io;
@@ -25,8 +26,13 @@ use crate::JobRecord;
 const FILE: &str = "version";
 
 /// The migrations in order, the first from version 1 to version 2.
-const MIGRATIONS: &[Migration] =
-    &[Migration { changes: &["db"], apply: add_priorities_and_end_times }];
+const MIGRATIONS: &[Migration] = &[
+    Migration { changes: &["db"], apply: add_priorities_and_end_times },
+    Migration { changes: &["db"], apply: list_images_by_slot },
+];
+
+/// Size of sled's page cache during a migration, in bytes.
+const CACHE_BYTES: u64 = 64 << 20;
 
 /// A migration from one version to the next.
 struct Migration {
@@ -161,7 +167,6 @@ fn cannot(action: &str, path: &Path, error: &io::Error) -> StoreError {
 
 /// The migration to version 2.
 fn add_priorities_and_end_times(dir: &Path) -> Result<(), StoreError> {
-    const CACHE_BYTES: u64 = 64 << 20;
     let trees = Trees::open(&dir.join("db"), CACHE_BYTES)?;
     for entry in trees.jobs.iter() {
         let (key, value) = entry.map_err(failed)?;
@@ -182,13 +187,28 @@ fn add_priorities_and_end_times(dir: &Path) -> Result<(), StoreError> {
     trees.flush()
 }
 
+/// The migration to version 3.
+fn list_images_by_slot(dir: &Path) -> Result<(), StoreError> {
+    let trees = Trees::open(&dir.join("db"), CACHE_BYTES)?;
+    for map in trees.maps()? {
+        for stored in trees.images_of(map.uid) {
+            trees.put_located(map.uid, &stored?)?;
+        }
+    }
+    trees.flush()
+}
+
 #[cfg(test)]
 mod tests {
     use jiff::Timestamp;
 
+    use super::super::images::{LocatedId, StoredImage};
+    use super::super::test_records;
     use super::*;
     use crate::Query;
-    use whereabouts_core::{Digest, Job, JobState, MediaType, RefinerKind};
+    use whereabouts_core::{
+        Digest, GeographicPose, Image, Job, JobState, MediaType, Pose, RefinerKind,
+    };
 
     fn first(dir: &Path) -> Result<(), StoreError> {
         fs::write(dir.join("db/records"), "two").map_err(|error| cannot("write", dir, &error))
@@ -300,5 +320,28 @@ mod tests {
         let at = ended.job.finished_at.unwrap();
         assert_eq!(keys(&trees.ended), [ended_key(at, ended.job.id)]);
         assert!(copy_before(dir.path(), 2).join("db").is_dir());
+    }
+
+    #[test]
+    fn images_of_an_older_folder_are_listed_by_slot() {
+        let dir = tempfile::tempdir().unwrap();
+        let map = test_records::map();
+        let image = |id: &str, pose| Image { pose, ..test_records::image(id, id.as_bytes()) };
+        let pose = GeographicPose { lat: 1.0, lon: 2.0, alt: None, heading: Some(90.0) };
+        let images = [image("a", Some(Pose::Geographic(pose))), image("b", None)];
+        let trees = Trees::open(&dir.path().join("db"), CACHE_BYTES).unwrap();
+        put(&trees.maps, b"m", &map).unwrap();
+        for (slot, image) in images.clone().into_iter().enumerate() {
+            trees.insert_image(map.uid, &StoredImage { image, slot }).unwrap();
+            // Version 2 did not list it.
+            trees.forget_slot(map.uid, slot).unwrap();
+        }
+        trees.flush().unwrap();
+        drop(trees);
+        fs::write(dir.path().join(FILE), "2\n").unwrap();
+        bring_up_to_date(dir.path()).unwrap();
+        let trees = Trees::open(&dir.path().join("db"), CACHE_BYTES).unwrap();
+        let listed = trees.located_in(map.uid, 0..2).collect::<Result<Vec<_>, _>>().unwrap();
+        assert_eq!(listed, [0, 1].map(|slot| (slot, LocatedId::from(&images[slot]))));
     }
 }

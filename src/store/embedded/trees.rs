@@ -5,14 +5,13 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
-use serde::de::DeserializeOwned;
 use uuid::Uuid;
 
 use super::super::changes::queue_rank;
 use super::super::{JobRecord, StoreError};
 pub(super) use super::records::{decode, encode, failed, get, put, transaction_failed};
 use super::webhooks::trees::WebhookTrees;
-use whereabouts_core::{Digest, Image, ImageId, Job, JobState, Map, Pose};
+use whereabouts_core::{Digest, ImageId, Job, JobState, Map};
 
 /// The sled trees. Clones share the same database.
 #[derive(Clone)]
@@ -20,8 +19,10 @@ pub(super) struct Trees {
     db: sled::Db,
     /// Map name → [`Map`].
     pub maps: sled::Tree,
-    /// Map uid, image id → [`StoredImage`].
+    /// Map uid, image id → [`StoredImage`](super::images::StoredImage).
     pub images: sled::Tree,
+    /// Map uid, slot → [`LocatedId`](super::images::LocatedId).
+    pub slots: sled::Tree,
     /// Map uid → how often poses of its images were changed.
     pub moves: sled::Tree,
     /// Digest, owner → nothing: the references to image bytes.
@@ -74,34 +75,6 @@ fn open_when_released(config: &sled::Config) -> sled::Result<sled::Db> {
     }
 }
 
-/// An image and the slot of its descriptor.
-#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
-pub(super) struct StoredImage {
-    pub image: Image,
-    pub slot: usize,
-}
-
-/// What searches need of a [`StoredImage`]; its other fields take longer to read.
-#[derive(Debug, serde::Deserialize)]
-pub(super) struct SearchedImage {
-    pub image: LocatedId,
-    pub slot: usize,
-}
-
-/// The id of an image and where it was taken.
-#[derive(Debug, Clone, serde::Deserialize)]
-pub(super) struct LocatedId {
-    pub id: ImageId,
-    pub pose: Option<Pose>,
-}
-
-impl From<&StoredImage> for SearchedImage {
-    fn from(stored: &StoredImage) -> Self {
-        let Image { id, pose, .. } = &stored.image;
-        Self { image: LocatedId { id: id.clone(), pose: *pose }, slot: stored.slot }
-    }
-}
-
 /// The moment before which a job cannot be claimed, because a worker holds it or its retry is delayed.
 /// `None` while it waits.
 pub(super) type Lease = Option<Timestamp>;
@@ -129,6 +102,7 @@ impl Trees {
         Ok(Self {
             maps: tree("maps")?,
             images: tree("images")?,
+            slots: tree("slots")?,
             moves: tree("moves")?,
             blob_refs: tree("blob_refs")?,
             jobs: tree("jobs")?,
@@ -173,39 +147,9 @@ impl Trees {
         self.maps.iter().values().map(|value| decode(&value.map_err(failed)?)).collect()
     }
 
-    pub fn image(&self, map_uid: Uuid, id: &ImageId) -> Result<Option<StoredImage>, StoreError> {
-        get(&self.images, &image_key(map_uid, id))
-    }
-
     /// Returns how often poses of a map's images were changed.
     pub fn moved(&self, map_uid: Uuid) -> Result<u64, StoreError> {
         Ok(get(&self.moves, map_uid.as_bytes())?.unwrap_or(0))
-    }
-
-    /// Iterates over the images of a map, by id.
-    pub fn images_of(
-        &self,
-        map_uid: Uuid,
-    ) -> impl Iterator<Item = Result<StoredImage, StoreError>> + use<> {
-        self.image_records(map_uid)
-    }
-
-    /// Iterates over the images of a map as searches need them, by id.
-    pub fn searched_images_of(
-        &self,
-        map_uid: Uuid,
-    ) -> impl Iterator<Item = Result<SearchedImage, StoreError>> + use<> {
-        self.image_records(map_uid)
-    }
-
-    fn image_records<T: DeserializeOwned>(
-        &self,
-        map_uid: Uuid,
-    ) -> impl Iterator<Item = Result<T, StoreError>> + use<T> {
-        self.images
-            .scan_prefix(map_uid.as_bytes())
-            .values()
-            .map(|value| decode(&value.map_err(failed)?))
     }
 
     /// Deletes the described frames of a map.
@@ -214,25 +158,6 @@ impl Trees {
             self.frames.remove(key.map_err(failed)?).map_err(failed)?;
         }
         Ok(())
-    }
-
-    /// Iterates over the images of a map whose ids sort after `after`, by id.
-    pub fn images_after(
-        &self,
-        map_uid: Uuid,
-        after: Option<&ImageId>,
-    ) -> impl Iterator<Item = Result<StoredImage, StoreError>> + use<> {
-        let start = match after {
-            // The smallest key after the cursor's.
-            Some(id) => [image_key(map_uid, id), vec![0]].concat(),
-            None => map_uid.as_bytes().to_vec(),
-        };
-        self.images
-            .range(start..)
-            .take_while(move |entry| {
-                entry.as_ref().map_or(true, |(key, _)| key.starts_with(map_uid.as_bytes()))
-            })
-            .map(|entry| decode(&entry.map_err(failed)?.1))
     }
 
     pub fn job(&self, id: Uuid) -> Result<Option<JobRecord>, StoreError> {

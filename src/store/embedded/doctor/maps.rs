@@ -7,10 +7,11 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use super::super::images::{LocatedId, StoredImage};
 use super::super::live_map::folder_of;
 use super::super::orphans::remove_folder;
 use super::super::segments::VectorFiles;
-use super::super::trees::{BlobOwner, StoredImage, blob_ref_key, decode, failed};
+use super::super::trees::{BlobOwner, blob_ref_key, decode, failed};
 use super::{Doctor, list};
 use crate::StoreError;
 use whereabouts_core::{ImageId, Map, Precision};
@@ -102,11 +103,11 @@ impl Doctor<'_> {
             self.required.references.insert(blob_ref_key(&own.digest, &owner));
             self.required.vocabularies.insert(own.digest, name.to_string());
         }
-        let (mut images, mut end, mut picture_bytes) = (0, 0, 0);
-        let (mut damaged, mut sharing) = (Vec::new(), Vec::new());
+        let (mut images, mut picture_bytes) = (0, 0);
+        let (mut damaged, mut sharing, mut unlisted) = (Vec::new(), Vec::new(), Vec::new());
         let mut slots: HashMap<usize, ImageId> = HashMap::new();
         for stored in self.trees.images_of(map.uid) {
-            let StoredImage { image, slot } = match stored {
+            let stored = match stored {
                 Ok(stored) => stored,
                 Err(error) => {
                     self.report.problem(
@@ -116,8 +117,15 @@ impl Doctor<'_> {
                     continue;
                 }
             };
+            let listed = self.trees.located(map.uid, stored.slot).ok().flatten();
+            if listed != Some(LocatedId::from(&stored.image)) {
+                unlisted.push(stored.image.id.clone());
+                if self.options.repair {
+                    self.trees.put_located(map.uid, &stored)?;
+                }
+            }
+            let StoredImage { image, slot } = stored;
             images += 1;
-            end = end.max(slot + 1);
             if let Some(other) = slots.insert(slot, image.id.clone()) {
                 sharing.push(other);
             }
@@ -144,12 +152,25 @@ impl Doctor<'_> {
                 ),
             );
         }
+        if !unlisted.is_empty() {
+            self.report.found(
+                true,
+                format!(
+                    "{} images of {name} are not listed by slot, so searches do not find them: {}",
+                    unlisted.len(),
+                    list(&unlisted)
+                ),
+                "--repair lists them",
+                self.options.repair,
+            );
+        }
         if !sharing.is_empty() {
             self.report.problem(
                 format!("images of {name} share a descriptor with others: {}", list(&sharing)),
                 format!("start the server and run `whereabouts index --reindex --map {name}`"),
             );
         }
+        self.stale_slots(map, &slots)?;
         self.graph(map, folder);
         let bytes = |suffix: &str| {
             let files = fs::read_dir(folder).into_iter().flatten().flatten();
@@ -169,6 +190,35 @@ impl Doctor<'_> {
         Ok(())
     }
 
+    /// Finds images that are listed by slot only.
+    fn stale_slots(
+        &mut self,
+        map: &Map,
+        images: &HashMap<usize, ImageId>,
+    ) -> Result<(), StoreError> {
+        let listed = self.trees.slots_of(map.uid).collect::<Result<Vec<_>, _>>()?;
+        let stale = listed.into_iter().filter(|slot| !images.contains_key(slot));
+        let stale: Vec<usize> = stale.collect();
+        if stale.is_empty() {
+            return Ok(());
+        }
+        if self.options.repair {
+            stale.iter().try_for_each(|&slot| self.trees.forget_slot(map.uid, slot))?;
+        }
+        self.report.found(
+            true,
+            format!(
+                "{} slots of {} list images that are not there, so searches find them: {}",
+                stale.len(),
+                map.name,
+                list(&stale)
+            ),
+            "--repair removes them",
+            self.options.repair,
+        );
+        Ok(())
+    }
+
     fn graph(&mut self, map: &Map, folder: &Path) {
         let file = folder.join("graph");
         let Ok(bytes) = fs::read(&file) else { return };
@@ -183,5 +233,58 @@ impl Doctor<'_> {
             "the server rebuilds it and searches exactly until then; --repair removes it",
             repaired,
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::test_records::{image, map, settings};
+    use super::super::super::trees::Trees;
+    use crate::embedded::{EmbeddedStore, Examination, examine};
+    use crate::{MapStore, StoreError};
+    use whereabouts_core::{Descriptor, GeographicPose, Image, Pose};
+
+    #[tokio::test]
+    async fn a_wrong_list_of_slots_is_a_problem_that_repair_solves() -> Result<(), StoreError> {
+        let dir = tempfile::tempdir().unwrap();
+        let pose = GeographicPose { lat: 1.0, lon: 2.0, alt: None, heading: None };
+        let store = EmbeddedStore::open(&settings(dir.path()))?;
+        let (map, _) = store.put_map(map()).await?;
+        for (slot, id) in ["a", "b", "c"].into_iter().enumerate() {
+            let image = Image { pose: Some(Pose::Geographic(pose)), ..image(id, id.as_bytes()) };
+            let mut numbers = vec![0.0; 3];
+            numbers[slot] = 1.0;
+            store.add_image(&map, image, Descriptor::normalised(numbers).unwrap()).await?;
+        }
+        drop(store);
+        let trees = Trees::open(&dir.path().join("db"), 1 << 20)?;
+        // a is not listed, b is listed with another pose, and slot 9 lists an image that is not there.
+        trees.forget_slot(map.uid, 0)?;
+        let mut moved = trees.image(map.uid, &"b".parse().unwrap())?.unwrap();
+        moved.image.pose = None;
+        trees.put_located(map.uid, &moved)?;
+        moved.slot = 9;
+        trees.put_located(map.uid, &moved)?;
+        trees.flush()?;
+        drop(trees);
+
+        let problems = |repair| {
+            let report = examine(dir.path(), Examination { deep: false, repair }).unwrap();
+            let problems = report.findings.into_iter().filter(|finding| finding.is_problem);
+            problems.map(|finding| finding.what).collect::<Vec<_>>()
+        };
+        let found = [
+            "2 images of m are not listed by slot, so searches do not find them: a, b",
+            "1 slots of m list images that are not there, so searches find them: 9",
+        ];
+        assert_eq!(problems(false).iter().filter(|what| what.contains("slot")).count(), 2);
+        for expected in found {
+            assert!(problems(false).iter().any(|what| what == expected), "{:?}", problems(false));
+        }
+        problems(true);
+        assert!(problems(false).iter().all(|what| !what.contains("slot")), "{:?}", problems(false));
+        let store = EmbeddedStore::open(&settings(dir.path()))?;
+        assert_eq!(store.positions(&map).await?.len(), 3);
+        Ok(())
     }
 }

@@ -1,59 +1,10 @@
 //! The files that drafts leave in the data folder. `tests/store/drafts.rs` tests their behaviour, for
 //! every store.
 
-use std::path::Path;
-use std::time::Duration;
-
-use jiff::Timestamp;
-use uuid::Uuid;
-
-use super::super::{DescriptionBounds, EmbeddedSettings, EmbeddedStore};
+use super::super::EmbeddedStore;
+use super::super::test_records::{image, map, settings};
 use crate::{Draft, DraftStore, MapStore};
-use whereabouts_core::{
-    CoordinateFrame, Descriptor, DescriptorKind, Digest, Image, Map, MediaType, Precision, Scene,
-};
-use whereabouts_index::IndexSettings;
-
-pub fn settings(dir: &Path) -> EmbeddedSettings {
-    EmbeddedSettings {
-        dir: dir.to_owned(),
-        index: IndexSettings {
-            exact_up_to: 4,
-            m: 8,
-            ef_construction: 50,
-            ef_search: 50,
-            threads: 0,
-            max_dead_share: 0.5,
-            check_s: 0,
-        },
-        index_threads: 1,
-        min_free_bytes: 0,
-        db_cache_bytes: 1 << 20,
-        commit_batch: 8,
-        descriptions: DescriptionBounds { max_bytes: 1 << 20, max_age: Duration::from_secs(60) },
-    }
-}
-
-/// A map whose model gives three dimensions.
-fn map() -> Map {
-    Map {
-        uid: Uuid::now_v7(),
-        name: "m".parse().unwrap(),
-        scene: Scene::Outdoor,
-        descriptor: DescriptorKind::GEM,
-        frame: CoordinateFrame::Wgs84,
-        model: "old".into(),
-        model_digest: Digest::of(b"old"),
-        precision: Precision::Full,
-        dim: 3,
-        revision: 0,
-        refiner: None,
-        vocabulary: None,
-        keeps_shipped: false,
-        description: None,
-        created_at: Timestamp::now(),
-    }
-}
+use whereabouts_core::{Descriptor, Digest, Image, Map};
 
 /// The same map reindexed with a model that gives five dimensions.
 fn next(map: &Map) -> Map {
@@ -63,20 +14,6 @@ fn next(map: &Map) -> Map {
         dim: 5,
         revision: map.revision + 1,
         ..map.clone()
-    }
-}
-
-fn image(id: &str, bytes: &[u8]) -> Image {
-    Image {
-        id: id.parse().unwrap(),
-        digest: Digest::of(bytes),
-        pose: None,
-        captured_at: None,
-        tags: Vec::new(),
-        media_type: MediaType::Jpeg,
-        width: 1,
-        height: 1,
-        created_at: Timestamp::now(),
     }
 }
 

@@ -1,6 +1,6 @@
 //! Searches and leases in the queue of the embedded store.
 
-use super::super::drafts::tests::settings;
+use super::super::test_records::settings;
 use super::*;
 use crate::Query;
 use whereabouts_core::{Digest, MapName, MediaType, RefinerKind};

@@ -4,7 +4,7 @@
 use jiff::Timestamp;
 use uuid::Uuid;
 
-use super::super::drafts::tests::settings;
+use super::super::test_records::settings;
 use super::*;
 use whereabouts_core::{Disposition, Webhook, WebhookEvent, WebhookSecret};
 
