@@ -142,7 +142,13 @@ impl MapIndex {
 
     /// Adds the image in `slot` to all later results.
     pub fn add(&self, slot: usize) {
-        self.live_mut().set(slot, true);
+        self.add_all([slot]);
+    }
+
+    /// Adds the images in these slots to all later results.
+    pub fn add_all(&self, slots: impl IntoIterator<Item = usize>) {
+        let mut live = self.live_mut();
+        slots.into_iter().for_each(|slot| live.set(slot, true));
     }
 
     /// Removes the image in `slot` from all later results.
@@ -351,5 +357,7 @@ fn exactly(
 
 #[cfg(test)]
 mod property_tests;
+#[cfg(test)]
+mod test_rows;
 #[cfg(test)]
 mod tests;

@@ -4,22 +4,8 @@ use std::collections::BTreeSet;
 
 use proptest::prelude::*;
 
+use super::test_rows::Rows;
 use super::*;
-
-/// Descriptors of 8 dimensions, one for each slot.
-struct Rows(Vec<Vec<f32>>);
-
-impl Vectors for Rows {
-    fn dim(&self) -> usize {
-        8
-    }
-
-    fn scan(&self, slots: Range<usize>, visit: &mut dyn FnMut(usize, &[f32])) {
-        for slot in slots.start..slots.end.min(self.0.len()) {
-            visit(slot, &self.0[slot]);
-        }
-    }
-}
 
 /// A step in the life of an index. Numbers are taken modulo what exists.
 #[derive(Debug, Clone)]

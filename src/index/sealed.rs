@@ -25,6 +25,10 @@ pub(super) const DESCENT: usize = 8;
 /// codes.
 pub(super) const WIDENINGS: usize = 3;
 
+/// Up to this many points, comparing every code with that of the query takes no longer than a walk through the graph,
+/// and misses nothing. Tests walk through every graph.
+const SCANNED: usize = if cfg!(test) { 0 } else { 12_000 };
+
 /// A finished graph over the slots below [`SealedGraph::end`].
 #[derive(Debug, PartialEq)]
 pub struct SealedGraph {
@@ -138,8 +142,21 @@ impl SealedGraph {
         if self.is_empty() || query.len() != self.dim() {
             return Vec::new();
         }
-        let mut coded = Codes::new(self.dim(), 1);
-        coded.push(query);
+        match self.slots.points() <= SCANNED {
+            true => self.scan(vectors, query, (k, ef), keep),
+            false => self.walk(vectors, query, (k, ef), keep),
+        }
+    }
+
+    /// Searches with a beam from the entry point.
+    fn walk(
+        &self,
+        vectors: &dyn Vectors,
+        query: &[f32],
+        (k, ef): (usize, usize),
+        keep: impl Fn(usize) -> bool,
+    ) -> Vec<ScoredSlot> {
+        let coded = self.coded(query);
         let query_code = coded.of(0);
         let entries = descend(&self.layers, &self.codes, query_code);
         let kept = |point: u32| self.slots.of(point).iter().any(|&slot| keep(slot as usize));
@@ -159,6 +176,44 @@ impl SealedGraph {
             ef *= 2;
             beam = beam.widen(ef);
         }
+    }
+
+    /// Searches all points.
+    pub(super) fn scan(
+        &self,
+        vectors: &dyn Vectors,
+        query: &[f32],
+        (k, ef): (usize, usize),
+        keep: impl Fn(usize) -> bool,
+    ) -> Vec<ScoredSlot> {
+        let coded = self.coded(query);
+        let query_code = coded.of(0);
+        let kept = |point: &u32| self.slots.of(*point).iter().any(|&slot| keep(slot as usize));
+        let points = (0..self.slots.points() as u32).filter(kept);
+        let mut all: Vec<Ranked> =
+            points.map(|point| self.codes.ranked(query_code, point)).collect();
+        let mut wanted = ef;
+        loop {
+            let count = all.len();
+            let is_last = wanted >= count;
+            if !is_last {
+                all.select_nth_unstable_by(wanted, |a, b| b.cmp(a));
+            }
+            let near = &mut all[..wanted.min(count)];
+            near.sort_unstable_by(|a, b| b.cmp(a));
+            let (best, is_complete) = self.rescored(vectors, query, query_code, near, k, &keep);
+            if is_last || is_complete {
+                return best;
+            }
+            wanted *= 2;
+        }
+    }
+
+    /// The code of a query, as the only point.
+    fn coded(&self, query: &[f32]) -> Codes {
+        let mut coded = Codes::new(self.dim(), 1);
+        coded.push(query);
+        coded
     }
 
     /// Scores candidates with the stored descriptors. Among images that hardly differ the coded similarity says

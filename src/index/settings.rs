@@ -47,7 +47,7 @@ impl IndexSettings {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::SETTINGS;
+    use super::super::test_rows::SETTINGS;
     use super::*;
 
     #[test]

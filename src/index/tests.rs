@@ -2,64 +2,8 @@
 
 use proptest::prelude::*;
 
+use super::test_rows::*;
 use super::*;
-
-struct Rows(Vec<Vec<f32>>);
-
-impl Vectors for Rows {
-    fn dim(&self) -> usize {
-        self.0[0].len()
-    }
-
-    fn scan(&self, slots: Range<usize>, visit: &mut dyn FnMut(usize, &[f32])) {
-        for slot in slots.start..slots.end.min(self.0.len()) {
-            visit(slot, &self.0[slot]);
-        }
-    }
-}
-
-pub(super) const SETTINGS: IndexSettings = IndexSettings {
-    exact_up_to: 100,
-    m: 16,
-    ef_construction: 100,
-    ef_search: 64,
-    threads: 1,
-    max_dead_share: 0.3,
-    check_s: 0,
-};
-
-fn threads() -> ThreadPool {
-    rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap()
-}
-
-/// Unit vectors clustered around a few dozen centres, like the descriptors of one building.
-fn clustered(count: usize, dim: usize) -> Rows {
-    around(32, 0.6, count, dim)
-}
-
-/// Unit vectors around common centres.
-fn around(centres: usize, width: f32, count: usize, dim: usize) -> Rows {
-    let mut state = 1_u64;
-    let mut random = move || {
-        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
-        (state >> 40) as f32 / (1_u64 << 24) as f32 - 0.5
-    };
-    let centres: Vec<Vec<f32>> =
-        (0..centres).map(|_| (0..dim).map(|_| random()).collect()).collect();
-    let rows = (0..count).map(|i| {
-        let row: Vec<f32> =
-            centres[i % centres.len()].iter().map(|x| x + width * random()).collect();
-        let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
-        row.iter().map(|x| x / norm).collect()
-    });
-    Rows(rows.collect())
-}
-
-fn filled(rows: &Rows) -> MapIndex {
-    let index = MapIndex::new(SETTINGS);
-    (0..rows.0.len()).for_each(|slot| index.add(slot));
-    index
-}
 
 #[test]
 fn the_graph_finds_what_exact_search_finds() {
@@ -81,6 +25,29 @@ fn the_graph_finds_what_exact_search_finds() {
         all += exact.len();
     }
     assert!(same * 100 >= all * 99, "recall@10 is {same}/{all}");
+}
+
+#[test]
+fn a_scan_of_all_points_finds_what_exact_search_finds() {
+    // A fifth of the images are equal to others, and a third of all are removed.
+    let mut rows = clustered(1500, 48);
+    for slot in (0..1500).step_by(5) {
+        rows.0[slot] = rows.0[slot * 7 % 1500].clone();
+    }
+    let index = filled(&rows);
+    let mut sealed = None;
+    while index.has_work() {
+        sealed = index.catch_up(&rows, 200, &threads()).or(sealed);
+    }
+    let sealed = sealed.unwrap();
+    let keep = |slot: usize| slot % 3 != 0;
+    (0..1500).filter(|slot| !keep(*slot)).for_each(|slot| index.remove(slot));
+    for (k, ef) in [(1, 1), (10, 64), (10, 4), (2000, 64)] {
+        for query in rows.0.iter().step_by(31) {
+            let exact = index.search(&rows, query, k, SearchMode::Exact);
+            assert_eq!(sealed.scan(&rows, query, (k, ef), keep), exact, "k {k}, ef {ef}");
+        }
+    }
 }
 
 #[test]
