@@ -1,18 +1,17 @@
 //! The graph that takes new images until the next sealing: HNSW (Malkov and Yashunin, 2018) of `hnsw_rs`, which is
 //! searched while it grows.
 //!
-//! Images with equal descriptors are one point with several slots, as in the sealed graph: the neighbours of each of
-//! many twins would be its twins, and the rest of the map could not be reached from them.
+//! Images with equal or nearly equal descriptors ([`ALIKE`]) are one point with several slots: the neighbours of each of
+//! many would be one another, and the rest of the map could not be reached from them.
 //!
-//! `hnsw_rs` does not promise that a point is found: among many near duplicates some are not. Points are therefore
-//! searched for after they were inserted, and again at least once while the graph doubles; those that are missed are
-//! *stray* and are compared with every query.
+//! `hnsw_rs` does not promise that a point is found. Points are therefore searched for after they were inserted, and
+//! again at least once while the graph doubles; those that are missed are *stray* and are compared with every query.
 
 use std::collections::{BTreeSet, HashMap};
 use std::hash::{BuildHasher, RandomState};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use hnsw_rs::prelude::{Distance, Hnsw};
+use hnsw_rs::prelude::{Distance, Hnsw, Neighbour};
 use parking_lot::RwLock;
 use rayon::ThreadPool;
 use rayon::prelude::*;
@@ -36,6 +35,13 @@ impl Distance<f32> for CosineDistance {
 /// A distance that is zero but for rounding.
 const SAME: f32 = 1e-6;
 
+/// Images that are nearer than this to a point are slots of it. Frames of a robot that stands still are 0.0002 to 0.004
+/// from one another (`benches/scale`, the set `standing`).
+const ALIKE: f32 = 0.01;
+
+/// Points examined to find one that is alike.
+const EF_ALIKE: usize = 32;
+
 pub(super) struct Graph {
     hnsw: Hnsw<'static, f32, CosineDistance>,
     points: RwLock<Points>,
@@ -52,7 +58,7 @@ pub(super) struct Graph {
 /// The points of a graph and their slots.
 #[derive(Default)]
 struct Points {
-    /// Point → slots.
+    /// Point → slots. The descriptor of the first is that of the point.
     slots: Vec<Vec<usize>>,
     /// Hash of a descriptor → point. The hash has 64 bits and a random key, so that two descriptors of one map
     /// hardly ever share it.
@@ -80,10 +86,13 @@ impl Graph {
     pub fn insert(&self, slot: usize, vector: &[f32]) {
         let bytes: &[u8] = bytemuck::cast_slice(vector);
         let hash = self.hasher.hash_one(bytes);
+        let alike = self.hnsw.search(vector, 1, EF_ALIKE);
+        let alike = alike.first().filter(|nearest| nearest.distance < ALIKE);
         let point = {
             let mut points = self.points.write();
-            if let Some(&twin) = points.by_hash.get(&hash) {
-                points.slots[twin].push(slot);
+            let known = points.by_hash.get(&hash).copied();
+            if let Some(point) = known.or(alike.map(|nearest| nearest.d_id)) {
+                points.slots[point].push(slot);
                 return;
             }
             let point = points.slots.len();
@@ -105,12 +114,13 @@ impl Graph {
         self.again.store(to, Ordering::Relaxed);
         let is_missed = |point: &usize| {
             let mut missed = false;
-            // A slot whose row is gone cannot be searched for; a twin of it can.
+            // A slot whose row is gone cannot be searched for; one that is alike can.
             for &slot in points.slots[*point].iter() {
                 let mut stored = false;
                 vectors.scan(slot..slot + 1, &mut |_, vector| {
                     let found = self.hnsw.search(vector, 1, self.ef);
-                    missed = found.first().is_none_or(|first| first.distance > SAME);
+                    let is_it = |first: &Neighbour| first.d_id == *point || first.distance <= SAME;
+                    missed = !found.first().is_some_and(is_it);
                     stored = true;
                 });
                 if stored {
@@ -125,24 +135,24 @@ impl Graph {
         self.stray.write().extend(missed);
     }
 
-    /// Slots of stray points that `keep` accepts, at most `k` of each point, to be compared one by one.
-    pub fn stray_slots(&self, k: usize, keep: &dyn Fn(usize) -> bool) -> Vec<usize> {
+    /// Slots of stray points that `keep` accepts, to be compared one by one.
+    pub fn stray_slots(&self, keep: &dyn Fn(usize) -> bool) -> Vec<usize> {
         let points = self.points.read();
         let stray = self.stray.read();
-        let of = |point: &usize| points.slots[*point].iter().copied().filter(|&s| keep(s)).take(k);
+        let of = |point: &usize| points.slots[*point].iter().copied().filter(|&slot| keep(slot));
         stray.iter().flat_map(of).collect()
     }
 
-    /// The nearest of the slots that `keep` accepts, at most `k` of each point. There may be fewer than `k` although
-    /// more are accepted, if most of the nearest are not.
+    /// The slots of the nearest points that `keep` accepts. There may be fewer than `k` although more are accepted, if
+    /// most of the nearest are not.
     ///
     /// The filter is applied to the results: `hnsw_rs` itself does not stop early when it is given one, and takes
     /// about ten times as long.
     pub fn search(
         &self,
+        vectors: &dyn Vectors,
         query: &[f32],
-        k: usize,
-        ef: usize,
+        (k, ef): (usize, usize),
         keep: &dyn Fn(usize) -> bool,
     ) -> Vec<ScoredSlot> {
         let points = self.points.read();
@@ -158,11 +168,14 @@ impl Graph {
             }
             ef *= 2;
         };
-        let found = near.into_iter().flat_map(|neighbour| {
-            let kept = points.slots[neighbour.d_id].iter().copied().filter(|&slot| keep(slot));
-            let similarity = 1.0 - neighbour.distance;
-            kept.take(k).map(move |slot| ScoredSlot { slot, similarity })
-        });
-        found.collect()
+        let mut found = Vec::with_capacity(near.len());
+        for neighbour in near {
+            for &slot in points.slots[neighbour.d_id].iter().filter(|&&slot| keep(slot)) {
+                vectors.scan(slot..slot + 1, &mut |slot, vector| {
+                    found.push(ScoredSlot { slot, similarity: dot(query, vector) });
+                });
+            }
+        }
+        found
     }
 }

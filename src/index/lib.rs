@@ -209,9 +209,9 @@ impl MapIndex {
         if let Some(growing) = &graphs.growing {
             // It may already hold slots beyond `graphed`.
             let kept = |slot: usize| slot < graphed && is_live(slot);
-            let mut found = growing.search(query, k, ef, &kept);
+            let mut found = growing.search(vectors, query, (k, ef), &kept);
             let known: HashSet<usize> = found.iter().map(|found| found.slot).collect();
-            let stray = growing.stray_slots(k, &kept);
+            let stray = growing.stray_slots(&kept);
             for slot in stray.into_iter().filter(|slot| !known.contains(slot)) {
                 vectors.scan(slot..slot + 1, &mut |slot, vector| {
                     found.push(ScoredSlot { slot, similarity: dot(query, vector) });
