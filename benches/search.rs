@@ -4,14 +4,15 @@
 //! 76,000 vectors, as many as Tokyo 24/7 has images, or as many as the first argument says:
 //! `PYTHON=$(benches/peers/setup.sh) cargo bench --bench search -- 20000`.
 //!
-//! The peers run in Python, called with all queries at once, so that Python itself costs nothing. A
+//! The peers run in Python, called with all queries at once, so that Python itself costs nothing. All libraries take
+//! turns with each beam, so that a disturbance of the machine meets all of them, and the median of the turns counts. A
 //! peer that is not installed is skipped with a message.
 
 mod vectors;
 
-use std::io::Write;
+use std::io::{BufRead, BufReader, Lines, Write};
 use std::path::Path;
-use std::process::Command;
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Instant;
 
 use anyhow::Context;
@@ -26,6 +27,7 @@ const K: usize = 10;
 const M: usize = 16;
 const EF_CONSTRUCTION: usize = 200;
 const EFS: [usize; 6] = [16, 24, 32, 48, 96, 192];
+const TURNS: usize = 5;
 const PEERS: [&str; 3] = ["hnswlib", "faiss", "usearch"];
 
 fn settings(ef_search: usize) -> IndexSettings {
@@ -77,33 +79,63 @@ fn main() -> anyhow::Result<()> {
     let again = SealedGraph::from_bytes(&bytes)?;
     println!("read in {:.1} ms", start.elapsed().as_secs_f64() * 1e3);
     drop(again);
+    let folder = tempfile::tempdir()?;
+    write(&folder.path().join("vectors"), bytemuck::cast_slice(&rows.numbers))?;
+    write(&folder.path().join("queries"), bytemuck::cast_slice(&queries.numbers))?;
+    let nearest: Vec<u32> = truth.iter().flatten().map(|&slot| slot as u32).collect();
+    write(&folder.path().join("truth"), bytemuck::cast_slice(&nearest))?;
+    let mut peers = Vec::new();
+    for name in PEERS {
+        match Peer::start(name, folder.path()) {
+            Ok(peer) => peers.push(peer),
+            Err(error) => println!("{name} was not run: {error:#}"),
+        }
+    }
     let mut ours = Vec::new();
     for ef in EFS {
         let index = filled(ef);
         index.restore(SealedGraph::from_bytes(&bytes)?);
-        let start = Instant::now();
-        let found: Vec<_> = (0..QUERIES)
-            .map(|query| slots(&index, &rows, queries.row(query), SearchMode::Fast))
-            .collect();
-        let per_second = QUERIES as f64 / start.elapsed().as_secs_f64();
-        let recall = recall(&found, &truth);
+        let mut turns = Vec::new();
+        for _ in 0..TURNS {
+            let start = Instant::now();
+            let found: Vec<_> = (0..QUERIES)
+                .map(|query| slots(&index, &rows, queries.row(query), SearchMode::Fast))
+                .collect();
+            let per_second = QUERIES as f64 / start.elapsed().as_secs_f64();
+            turns.push((recall(&found, &truth), per_second));
+            peers.iter_mut().try_for_each(|peer| peer.take_turn(ef))?;
+        }
+        let (recall, per_second) = median(turns);
         println!("sealed graph, ef {ef:3}: recall@10 {recall:.4}, {per_second:.0} queries/s");
         ours.push((recall, per_second));
-    }
-    for peer in PEERS {
-        match run_peer(peer, &rows, &queries, &truth) {
-            Ok(theirs) => compare(peer, (built, &ours), &theirs),
-            Err(error) => println!("{peer} was not run: {error:#}"),
+        for peer in &mut peers {
+            let (recall, per_second) = median(std::mem::take(&mut peer.turns));
+            println!("{}, ef {ef:3}: recall@10 {recall:.4}, {per_second:.0} queries/s", peer.name);
+            peer.points.push((recall, per_second));
         }
+    }
+    for peer in peers {
+        compare(peer.name, (built, &ours), (peer.built, &peer.points));
+        peer.end()?;
     }
     Ok(())
 }
 
+/// The turn of the median speed.
+fn median(mut turns: Vec<(f64, f64)>) -> (f64, f64) {
+    turns.sort_by(|a, b| a.1.total_cmp(&b.1));
+    turns[turns.len() / 2]
+}
+
 /// Prints our speed over a peer's at the recalls that the peer reached. Between two of our points the
 /// speed is taken from the line through them.
-fn compare(peer: &str, (built, ours): (f64, &[(f64, f64)]), theirs: &Measured) {
-    println!("{peer}: our graph takes {:.2} × its time to build", built / theirs.built);
-    for &(recall, per_second) in &theirs.points {
+fn compare(
+    peer: &str,
+    (built, ours): (f64, &[(f64, f64)]),
+    (theirs_built, theirs): (f64, &[(f64, f64)]),
+) {
+    println!("{peer}: our graph takes {:.2} × its time to build", built / theirs_built);
+    for &(recall, per_second) in theirs {
         let above = ours.iter().position(|point| point.0 >= recall);
         let Some(above) = above else {
             println!("{peer}: at recall@10 {recall:.4} there is nothing of ours to compare");
@@ -126,49 +158,53 @@ fn slots(index: &MapIndex, rows: &Rows, query: &[f32], mode: SearchMode) -> Vec<
     index.search(rows, query, K, mode).iter().map(|found| found.slot).collect()
 }
 
-/// The result of a peer.
-struct Measured {
+/// A library that has built its graph in a process of its own and waits for its turn.
+struct Peer {
+    name: &'static str,
+    process: Child,
+    efs: ChildStdin,
+    said: Lines<BufReader<ChildStdout>>,
     /// Seconds to build its graph.
     built: f64,
-    /// Recall and queries a second for each of [`EFS`].
+    /// Recall and queries a second of each turn with the present beam.
+    turns: Vec<(f64, f64)>,
+    /// The medians for each of [`EFS`].
     points: Vec<(f64, f64)>,
 }
 
-fn run_peer(
-    peer: &str,
-    rows: &Rows,
-    queries: &Rows,
-    truth: &[Vec<usize>],
-) -> anyhow::Result<Measured> {
-    let dir = tempfile::tempdir()?;
-    write(&dir.path().join("vectors"), bytemuck::cast_slice(&rows.numbers))?;
-    write(&dir.path().join("queries"), bytemuck::cast_slice(&queries.numbers))?;
-    let truth: Vec<u32> = truth.iter().flatten().map(|&slot| slot as u32).collect();
-    write(&dir.path().join("truth"), bytemuck::cast_slice(&truth))?;
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers/search.py");
-    let efs: Vec<String> = EFS.iter().map(usize::to_string).collect();
-    let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".into());
-    let output = Command::new(python)
-        .arg(script)
-        .arg(peer)
-        .arg(dir.path())
-        .args([DIM, K, M, EF_CONSTRUCTION].map(|number| number.to_string()))
-        .args(efs)
-        .output()
-        .context("cannot start Python")?;
-    let said = String::from_utf8_lossy(&output.stderr);
-    anyhow::ensure!(output.status.success(), "{}", said.lines().last().unwrap_or_default());
-    let text = String::from_utf8(output.stdout)?;
-    let mut lines = text.lines();
-    let built = lines.next().context("it said nothing")?.parse()?;
-    let mut points = Vec::new();
-    for (ef, line) in EFS.iter().zip(lines) {
-        let (recall, per_second) = line.split_once(' ').context("it said half a line")?;
-        let (recall, per_second): (f64, f64) = (recall.parse()?, per_second.parse()?);
-        println!("{peer}, ef {ef:3}: recall@10 {recall:.4}, {per_second:.0} queries/s");
-        points.push((recall, per_second));
+impl Peer {
+    fn start(name: &'static str, folder: &Path) -> anyhow::Result<Self> {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers/search.py");
+        let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".into());
+        let mut process = Command::new(python)
+            .arg(script)
+            .arg(name)
+            .arg(folder)
+            .args([DIM, K, M, EF_CONSTRUCTION].map(|number| number.to_string()))
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .context("cannot start Python")?;
+        let efs = process.stdin.take().context("it has no input")?;
+        let mut said = BufReader::new(process.stdout.take().context("it has no output")?).lines();
+        let built = said.next().context("it ended; its message is above")??.parse()?;
+        let (turns, points) = (Vec::new(), Vec::new());
+        Ok(Self { name, process, efs, said, built, turns, points })
     }
-    Ok(Measured { built, points })
+
+    fn take_turn(&mut self, ef: usize) -> anyhow::Result<()> {
+        writeln!(self.efs, "{ef}")?;
+        let line = self.said.next().context("it ended; its message is above")??;
+        let (recall, per_second) = line.split_once(' ').context("it said half a line")?;
+        self.turns.push((recall.parse()?, per_second.parse()?));
+        Ok(())
+    }
+
+    fn end(mut self) -> anyhow::Result<()> {
+        drop(self.efs);
+        anyhow::ensure!(self.process.wait()?.success(), "{} failed at its end", self.name);
+        Ok(())
+    }
 }
 
 fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {

@@ -1,8 +1,9 @@
 """Benchmarks one peer on the vectors written by benches/search.rs, on one thread.
 
-usage: search.py PEER FOLDER DIM K M EF_CONSTRUCTION EF...
+usage: search.py PEER FOLDER DIM K M EF_CONSTRUCTION
        PEER is hnswlib, faiss or usearch (with 16-bit floats; its default is 32-bit)
-prints: the build time in seconds; then for each EF, `RECALL QUERIES_PER_SECOND`
+prints: the build time in seconds; then for each EF that is read from the standard input, one a line,
+        `RECALL QUERIES_PER_SECOND`
 """
 
 import sys
@@ -69,13 +70,13 @@ def main():
     build = {"hnswlib": by_hnswlib, "faiss": by_faiss, "usearch": by_usearch}[peer]
     start = time.perf_counter()
     search = build(vectors, m, ef_construction)
-    print(f"{time.perf_counter() - start:.3f}")
-    for ef in map(int, sys.argv[7:]):
+    print(f"{time.perf_counter() - start:.3f}", flush=True)
+    for ef in map(int, sys.stdin):
         start = time.perf_counter()
         found = search(queries, k, ef)
         took = time.perf_counter() - start
         hits = sum(len(np.intersect1d(f, t)) for f, t in zip(found, truth))
-        print(f"{hits / truth.size:.6f} {len(queries) / took:.3f}")
+        print(f"{hits / truth.size:.6f} {len(queries) / took:.3f}", flush=True)
 
 
 main()
