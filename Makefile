@@ -27,8 +27,9 @@ openvino: ## Also download ONNX Runtime with OpenVINO, faster on many x86-64 pro
 chromium:
 	@deploy/setup/chromium.sh
 
+# Most tests wait for a server: two at a time would leave a two-core machine half idle.
 test: assets nasm chromium ## Set up, build and run every test
-	tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked --workspace
+	RUST_TEST_THREADS=4 tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked --workspace
 	tests/scale_out.sh $(CARGO) target/postgres-venv
 	tests/optional.sh $(CARGO)
 	tests/api/conformance.sh $(BINARY) target/api-venv
