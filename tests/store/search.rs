@@ -18,6 +18,7 @@ contract!(
     exact_search_equals_brute_force,
     a_graph_has_high_recall_and_finds_no_removed_image,
     identical_images_crowd_no_other_image_out,
+    a_robot_that_stands_still_hides_no_place,
     a_search_for_more_images_than_there_are_returns_all,
     equal_images_are_ranked_in_the_order_of_addition,
     the_similarity_is_the_cosine_from_one_to_minus_one,
@@ -191,6 +192,29 @@ async fn identical_images_crowd_no_other_image_out(fixture: &Fixture) {
         }
     }
     assert_eq!(lost(vec![TWINS - 1]).await, 0);
+}
+
+/// What a robot sees that stands still at each of several places: frames that are nearly equal. A search in PostgreSQL may
+/// find others of the same place than the nearest.
+async fn a_robot_that_stands_still_hides_no_place(fixture: &Fixture) {
+    const PLACES: usize = 25;
+    const FRAMES: usize = 120;
+    let store = fixture.open_with(Tuning { exact_up_to: 100, ..Tuning::default() }).await;
+    let (map, _) = store.put_map(map("m", 48)).await.unwrap();
+    let mut random = Random(11);
+    let mut descriptors = Vec::new();
+    for _ in 0..PLACES {
+        let place = random.descriptor(48);
+        descriptors.extend((0..FRAMES).map(|_| random.near(place.as_slice(), 0.02)));
+    }
+    add_all(&store, &map, &descriptors).await;
+    graph_is_ready(&*store, &map).await;
+    for (number, descriptor) in descriptors.iter().enumerate() {
+        let found = store.search(&map, descriptor.clone(), 10, SearchMode::Fast).await.unwrap();
+        assert!(found[0].similarity > 0.995, "{number}: {found:?}");
+        let here = |found: &usize| found / FRAMES == number / FRAMES;
+        assert!(numbers(&found).iter().all(here), "{number}: {found:?}");
+    }
 }
 
 async fn a_search_for_more_images_than_there_are_returns_all(fixture: &Fixture) {

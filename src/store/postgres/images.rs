@@ -12,7 +12,8 @@ use uuid::Uuid;
 
 use super::super::changes::{check_frame, removed, same_bytes};
 use super::super::{Added, ExportStore, LocatedImage, StoreError};
-use super::descriptors::{descriptor_of, image_id, table};
+use super::descriptors::{descriptor_of, table};
+use super::search::image_id;
 use super::{Inner, PostgresStore, blobs, count, is_missing_table, record};
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{Descriptor, Image, ImageId, Map, Pose};

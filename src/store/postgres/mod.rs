@@ -25,6 +25,7 @@ mod maps;
 mod processes;
 mod retention;
 mod schema;
+mod search;
 mod statements;
 mod usage;
 mod webhooks;
