@@ -28,6 +28,8 @@ const MIN_DIFFERENCE: f32 = 1e-6;
 pub(super) struct Ground {
     images: Vec<LocatedImage>,
     numbers: HashMap<ImageId, u32>,
+    /// The images by their slots.
+    by_slot: Vec<(usize, u32)>,
     pub grid: Grid,
     pub paths: Paths,
     /// Images spread evenly over the map; all of a small one.
@@ -59,13 +61,17 @@ impl Ground {
     pub fn new(images: Vec<LocatedImage>) -> Self {
         let images = in_order(images);
         let numbers = images.iter().map(|image| image.id.clone()).zip(0..).collect();
+        let slots = images.iter().map(|image| image.slot);
+        let mut by_slot: Vec<(usize, u32)> = slots.zip(0..).collect();
+        by_slot.sort_unstable();
         let grid = Grid::new(in_a_plane(images.iter().map(|image| &image.pose)));
         let paths = Paths::new(&grid, MIN_SPACING_M);
         let step = images.len().div_ceil(SAMPLE).max(1);
         let sample = (0..images.len() as u32).step_by(step).collect();
         let unknown = vec![f32::NAN; images.len()];
         let traits = Mutex::new(Traits { changes: unknown.clone(), lengths: unknown });
-        Self { images, numbers, grid, paths, sample, common: Common::default(), traits }
+        let common = Common::default();
+        Self { images, numbers, by_slot, grid, paths, sample, common, traits }
     }
 
     /// The number of images.
@@ -83,6 +89,17 @@ impl Ground {
 
     pub fn number(&self, id: &ImageId) -> Option<u32> {
         self.numbers.get(id).copied()
+    }
+
+    /// The slot of an image.
+    pub fn slot(&self, number: u32) -> usize {
+        self.images[number as usize].slot
+    }
+
+    /// The image in a slot.
+    pub fn in_slot(&self, slot: usize) -> Option<u32> {
+        let at = self.by_slot.binary_search_by_key(&slot, |(slot, _)| *slot).ok()?;
+        Some(self.by_slot[at].1)
     }
 
     /// The slots of some images.

@@ -4,13 +4,23 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
+use super::super::changes::in_order;
 use super::super::{HardNegatives, LocatedImage, StoreError};
 use super::blobs::replace_durably;
 use super::segments::VectorFiles;
-use super::trees::{LocatedId, SearchedImage, StoredImage, Trees};
+use super::trees::{SearchedImage, StoredImage, Trees};
 use parking_lot::RwLock;
-use whereabouts_core::{Calibration, CalibrationSettings, Candidate, Map, Pose};
+use whereabouts_core::{
+    Calibration, CalibrationSettings, Candidate, ImageId, Map, Pose, Recording,
+};
 use whereabouts_index::{IndexSettings, MapIndex, ScoredSlot, SealedGraph, SearchMode, Vectors};
+
+/// What searches and tracks need of an image.
+struct Entry {
+    id: ImageId,
+    pose: Option<Pose>,
+    recording: Option<Recording>,
+}
 
 pub(super) struct LiveMap {
     /// The map as stored; scene and description may change.
@@ -21,11 +31,13 @@ pub(super) struct LiveMap {
     /// Where the sealed graph is stored, so that a restart need not rebuild it.
     graph_file: PathBuf,
     /// By slot, kept in memory so that a search reads no records.
-    entries: RwLock<Vec<Option<LocatedId>>>,
+    entries: RwLock<Vec<Option<Entry>>>,
     /// The slot of the next image. Only the writer thread changes it.
     next_slot: AtomicUsize,
     /// Number of additions, removals and changed poses since the map was loaded.
     changes: AtomicU64,
+    /// The same of images with a pose.
+    located: AtomicU64,
     /// How often poses were changed since the map was created.
     moved: AtomicU64,
 }
@@ -85,6 +97,7 @@ impl LiveMap {
             entries: RwLock::default(),
             next_slot: AtomicUsize::new(0),
             changes: AtomicU64::new(0),
+            located: AtomicU64::new(0),
             moved: AtomicU64::new(0),
         })
     }
@@ -151,14 +164,15 @@ impl LiveMap {
     }
 
     /// Makes a stored image visible to searches.
-    pub fn publish(&self, SearchedImage { image, slot }: SearchedImage) {
+    pub fn publish(&self, SearchedImage { image, slot, recording }: SearchedImage) {
         let mut entries = self.entries.write();
         if entries.len() <= slot {
             entries.resize_with(slot + 1, || None);
         }
-        entries[slot] = Some(image);
+        let is_located = image.pose.is_some();
+        entries[slot] = Some(Entry { id: image.id, pose: image.pose, recording });
         drop(entries);
-        self.changes.fetch_add(1, Ordering::Relaxed);
+        self.count_change(is_located);
         self.index.add(slot);
     }
 
@@ -170,7 +184,7 @@ impl LiveMap {
             entry.pose = stored.image.pose;
         }
         drop(entries);
-        self.changes.fetch_add(1, Ordering::Relaxed);
+        self.count_change(true);
         self.moved.fetch_add(1, Ordering::Relaxed);
     }
 
@@ -178,10 +192,14 @@ impl LiveMap {
     pub fn withdraw(&self, slot: usize) {
         self.index.remove(slot);
         let mut entries = self.entries.write();
-        if let Some(entry) = entries.get_mut(slot) {
-            *entry = None;
-        }
+        let gone = entries.get_mut(slot).and_then(Option::take);
+        drop(entries);
+        self.count_change(gone.is_some_and(|gone| gone.pose.is_some()));
+    }
+
+    fn count_change(&self, is_located: bool) {
         self.changes.fetch_add(1, Ordering::Relaxed);
+        self.located.fetch_add(u64::from(is_located), Ordering::Relaxed);
     }
 
     /// Returns the size of the descriptors and the sealed graph, in bytes.
@@ -194,19 +212,27 @@ impl LiveMap {
         self.changes.load(Ordering::Relaxed)
     }
 
+    /// Returns the number of changes of images with a pose since the map was loaded.
+    pub fn located(&self) -> u64 {
+        self.located.load(Ordering::Relaxed)
+    }
+
     /// Returns how often poses were changed since the map was created.
     pub fn moved(&self) -> u64 {
         self.moved.load(Ordering::Relaxed)
     }
 
-    /// Returns the images that have a pose, in insertion order.
+    /// Returns the images that have a pose, in the order of recording.
     pub fn positions(&self) -> Vec<LocatedImage> {
         let entries = self.entries.read();
-        let located = |(slot, entry): (usize, &Option<LocatedId>)| {
+        let located = |(slot, entry): (usize, &Option<Entry>)| {
             let entry = entry.as_ref()?;
-            Some(LocatedImage { slot, id: entry.id.clone(), pose: entry.pose? })
+            let image = LocatedImage { slot, id: entry.id.clone(), pose: entry.pose? };
+            Some((image, entry.recording))
         };
-        entries.iter().enumerate().filter_map(located).collect()
+        let located = entries.iter().enumerate().filter_map(located).collect();
+        drop(entries);
+        in_order(located)
     }
 
     /// Calls `read` with the descriptor in each slot. Returns `None` for a slot without an image.

@@ -12,7 +12,7 @@ use super::super::changes::queue_rank;
 use super::super::{JobRecord, StoreError};
 pub(super) use super::records::{decode, encode, failed, get, put, transaction_failed};
 use super::webhooks::trees::WebhookTrees;
-use whereabouts_core::{Digest, Image, ImageId, Job, JobState, Map, Pose};
+use whereabouts_core::{Digest, Image, ImageId, Job, JobState, Map, Pose, Recording};
 
 /// The sled trees. Clones share the same database.
 #[derive(Clone)]
@@ -79,6 +79,8 @@ fn open_when_released(config: &sled::Config) -> sled::Result<sled::Db> {
 pub(super) struct StoredImage {
     pub image: Image,
     pub slot: usize,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recording: Option<Recording>,
 }
 
 /// What searches need of a [`StoredImage`]; its other fields take longer to read.
@@ -86,6 +88,8 @@ pub(super) struct StoredImage {
 pub(super) struct SearchedImage {
     pub image: LocatedId,
     pub slot: usize,
+    #[serde(default)]
+    pub recording: Option<Recording>,
 }
 
 /// The id of an image and where it was taken.
@@ -98,7 +102,8 @@ pub(super) struct LocatedId {
 impl From<&StoredImage> for SearchedImage {
     fn from(stored: &StoredImage) -> Self {
         let Image { id, pose, .. } = &stored.image;
-        Self { image: LocatedId { id: id.clone(), pose: *pose }, slot: stored.slot }
+        let image = LocatedId { id: id.clone(), pose: *pose };
+        Self { image, slot: stored.slot, recording: stored.recording }
     }
 }
 

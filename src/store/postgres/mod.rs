@@ -26,6 +26,7 @@ mod processes;
 mod retention;
 mod schema;
 mod statements;
+mod tracks;
 mod usage;
 mod webhooks;
 

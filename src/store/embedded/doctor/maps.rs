@@ -106,7 +106,7 @@ impl Doctor<'_> {
         let (mut damaged, mut sharing) = (Vec::new(), Vec::new());
         let mut slots: HashMap<usize, ImageId> = HashMap::new();
         for stored in self.trees.images_of(map.uid) {
-            let StoredImage { image, slot } = match stored {
+            let StoredImage { image, slot, .. } = match stored {
                 Ok(stored) => stored,
                 Err(error) => {
                     self.report.problem(
