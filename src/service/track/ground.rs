@@ -45,6 +45,8 @@ struct Common {
     mean: Vec<f32>,
     /// The usual difference, 1 − similarity, of neighbours.
     difference: f32,
+    /// The descriptors of the sample: each frame is compared with them.
+    sample: Vec<Option<Descriptor>>,
 }
 
 /// What sets each image apart; NaN until it is needed.
@@ -112,6 +114,12 @@ impl Ground {
         &self.sample
     }
 
+    /// The dot product of a vector and the descriptor of each image of the sample, if it could be read.
+    pub fn sample_similarities(&self, vector: &[f32]) -> impl Iterator<Item = Option<f32>> {
+        let rows = self.common.sample.iter();
+        rows.map(move |row| row.as_ref().map(|row| dot(vector, row.as_slice())))
+    }
+
     /// The mean of the descriptors; empty if none could be read.
     pub fn mean(&self) -> &[f32] {
         &self.common.mean
@@ -143,7 +151,8 @@ impl Ground {
         mean.iter_mut().for_each(|sum| *sum /= count);
         differences.sort_by(f32::total_cmp);
         let usual = differences.get(differences.len() / 2).copied().unwrap_or(1.0);
-        self.common = Common { mean, difference: usual.max(MIN_DIFFERENCE) };
+        let sample = self.sample.iter().map(|image| known.get(image).cloned()).collect();
+        self.common = Common { mean, difference: usual.max(MIN_DIFFERENCE), sample };
         self.learn(&self.sample, known);
     }
 

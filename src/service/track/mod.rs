@@ -180,7 +180,7 @@ impl Tracks {
         // Concurrent frames of one track are processed one after another.
         let mut held = track.lock_owned().await;
         let mut attempts = MAX_ATTEMPTS;
-        let Answered { frames, posterior, warning, is_late } = loop {
+        let Answered { mut estimate, mut posterior, warning } = loop {
             self.refresh(&key, &mut held, &ground).await?;
             // A frame that fails leaves the track as it was.
             let next = held.track.clone();
@@ -199,23 +199,21 @@ impl Tracks {
             }
         };
         drop(held);
-        let mut posterior = posterior;
         loop {
-            let place = (id.clone(), frames);
-            let (on, settings, place_m) =
-                (Arc::clone(&ground), Arc::clone(&self.settings), self.place_m);
-            let whole = Arc::clone(&posterior);
-            let estimate =
-                on_blocking_thread(move || estimate(place, &whole, &on, place_m, &settings))
-                    .await?;
             let Some(image) = estimate.image_id.as_ref().and_then(|id| ground.number(id)) else {
                 return Ok((estimate, warning));
             };
             if self.store.image(map, ground.id(image)).await?.is_some() {
-                return Ok((TrackEstimate { is_late, ..estimate }, warning));
+                return Ok((estimate, warning));
             }
             // Deleted since the positions were read.
             posterior = Arc::new(posterior.renumbered(&|other| (other != image).then_some(other)));
+            let place = (estimate.id, estimate.frames, estimate.is_late);
+            let (on, settings, place_m) =
+                (Arc::clone(&ground), Arc::clone(&self.settings), self.place_m);
+            let whole = Arc::clone(&posterior);
+            let next = on_blocking_thread(move || place_of(place, &whole, &on, place_m, &settings));
+            estimate = next.await?;
         }
     }
 
@@ -228,6 +226,7 @@ impl Tracks {
         (step, frame, evidence): (TrackStep, &Descriptor, Option<FrameEvidence<'_>>),
     ) -> Result<(Track, Answered), ServiceError> {
         let candidates = evidence.map(|evidence| evidence.candidates);
+        let id = step.id.clone();
         next.enter(ground, map.revision);
         let is_informative = candidates.is_some();
         let (frame, on, settings) = (frame.clone(), Arc::clone(ground), Arc::clone(&self.settings));
@@ -239,31 +238,34 @@ impl Tracks {
         .await?;
         let similar = match candidates {
             Some(candidates) => self.similarities(map, ground, &prediction, candidates).await?,
-            None => Similar::default(),
+            None => None,
         };
-        let (on, settings) = (Arc::clone(ground), Arc::clone(&self.settings));
+        let (on, settings, place_m) =
+            (Arc::clone(ground), Arc::clone(&self.settings), self.place_m);
         let (warning, is_late) = (prediction.warning.clone(), prediction.is_late);
         let confidence = evidence.and_then(|evidence| evidence.confidence);
-        let (next, posterior) = on_blocking_thread(move || {
-            let Similar { images, similarities } = similar;
+        on_blocking_thread(move || {
+            let similar = similar.map(|similar| similar.with_sample(&on, &prediction.frame));
+            let Similar { images, similarities } = similar.unwrap_or_default();
             let similar = (images.as_slice(), similarities.as_slice());
             let weights = prediction.weights(similar, confidence, &on, &settings);
             let posterior = next.update(prediction, weights.as_ref(), &on, &settings);
-            (next, posterior)
+            let place = (id, next.frames, is_late);
+            let estimate = place_of(place, &posterior, &on, place_m, &settings);
+            (next, Answered { estimate, posterior, warning })
         })
-        .await?;
-        let frames = next.frames;
-        Ok((next, Answered { frames, posterior, warning, is_late }))
+        .await
     }
 
-    /// How similar the images are that matter to a track.
+    /// How similar the images are that matter to a track, but for the sample of the map; `None` if a reindex ended
+    /// meanwhile, so that the frame only moves the belief.
     async fn similarities(
         &self,
         map: &Map,
         ground: &Arc<Ground>,
         prediction: &Prediction,
         candidates: &[Candidate],
-    ) -> Result<Similar, ServiceError> {
+    ) -> Result<Option<Similar>, ServiceError> {
         // The caller may have asked for more than the filter uses.
         let candidates = &candidates[..candidates.len().min(self.candidates())];
         let candidates: Vec<u32> =
@@ -278,9 +280,8 @@ impl Tracks {
             self.store.similarities(map, prediction.frame.clone(), ground.slots(&images)).await
         };
         match read.await {
-            Ok(similarities) => Ok(Similar { images, similarities }),
-            // A reindex ended meanwhile: this frame only moves the belief.
-            Err(StoreError::Superseded(_)) => Ok(Similar::default()),
+            Ok(similarities) => Ok(Some(Similar { images, similarities })),
+            Err(StoreError::Superseded(_)) => Ok(None),
             Err(error) => Err(error.into()),
         }
     }
@@ -288,12 +289,23 @@ impl Tracks {
 
 /// What the filter says after a frame.
 struct Answered {
-    /// Number of frames so far.
-    frames: u64,
+    estimate: TrackEstimate,
     posterior: Arc<Posterior>,
     /// What the robot should send instead.
     warning: Option<String>,
-    is_late: bool,
+}
+
+/// The answer to a frame: that of a number, of a track.
+fn place_of(
+    (id, frames, is_late): (String, u64, bool),
+    posterior: &Posterior,
+    ground: &Ground,
+    place_m: f64,
+    settings: &TrackSettings,
+) -> TrackEstimate {
+    let estimate = estimate((id, frames), posterior, ground, place_m, settings);
+    // Without an image, it is no answer for another time.
+    TrackEstimate { is_late: is_late && estimate.image_id.is_some(), ..estimate }
 }
 
 /// Images and the similarity of each to a frame.
@@ -301,6 +313,18 @@ struct Answered {
 struct Similar {
     images: Vec<u32>,
     similarities: Vec<Option<f32>>,
+}
+
+impl Similar {
+    /// The same with the sample of the map, sorted by image. These are compared with every frame, and kept in memory.
+    fn with_sample(self, ground: &Ground, frame: &[f32]) -> Self {
+        let sample = ground.sample().iter().copied().zip(ground.sample_similarities(frame));
+        let mut all: Vec<_> =
+            self.images.into_iter().zip(self.similarities).chain(sample).collect();
+        all.sort_unstable_by_key(|(image, _)| *image);
+        let (images, similarities) = all.into_iter().unzip();
+        Self { images, similarities }
+    }
 }
 
 /// Runs CPU-bound work outside the async threads.

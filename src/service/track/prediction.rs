@@ -46,12 +46,13 @@ impl Changes {
 }
 
 impl Prediction {
-    /// The images whose similarity to the frame is needed: those of the belief, the candidates of the search, and the
-    /// sample of the map.
+    /// The images whose similarity to the frame has to be read: those of the belief and the candidates of the search,
+    /// but for the sample of the map.
     pub fn images(&self, candidates: &[u32], ground: &Ground) -> Vec<u32> {
-        let mut images = [self.posterior.belief.images(), candidates, ground.sample()].concat();
+        let mut images = [self.posterior.belief.images(), candidates].concat();
         images.sort_unstable();
         images.dedup();
+        images.retain(|image| ground.sample().binary_search(image).is_err());
         images
     }
 

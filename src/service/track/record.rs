@@ -4,6 +4,8 @@
 //! in their clocks. Probabilities below [`TRACE`] are left out, and numbers of descriptors have 16 bits. What is kept of
 //! earlier frames is left out, the oldest first, where a track would be larger than `track.state_bytes`.
 
+mod messages;
+
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -12,6 +14,10 @@ use jiff::Timestamp;
 use prost::Message;
 use tokio::time::Instant;
 
+use self::messages::{
+    ClockRecord, FramesRecord, KeptRecord, OdometerRecord, OlderRecord, PassedRecord,
+    PosteriorRecord, ReadingRecord, StepRecord, TrackRecord, VectorRecord,
+};
 use super::belief::Belief;
 use super::clock::{Clock, Older, Reading};
 use super::evidence::Frames;
@@ -29,174 +35,6 @@ const TRACE: f32 = 1e-6;
 
 /// Number of images that are stored of a belief for late frames.
 const KEPT_IMAGES: usize = 64;
-
-#[derive(Clone, PartialEq, Message)]
-struct TrackRecord {
-    /// The number of states of an image: a filter with others cannot read this.
-    #[prost(uint32, tag = "1")]
-    states: u32,
-    #[prost(uint32, tag = "2")]
-    revision: u32,
-    #[prost(uint64, tag = "3")]
-    frames: u64,
-    #[prost(int64, tag = "4")]
-    last_frame_us: i64,
-    #[prost(message, optional, tag = "5")]
-    posterior: Option<PosteriorRecord>,
-    #[prost(message, optional, tag = "6")]
-    seen: Option<FramesRecord>,
-    #[prost(message, optional, tag = "7")]
-    odometer: Option<OdometerRecord>,
-    #[prost(message, optional, tag = "8")]
-    clock: Option<ClockRecord>,
-    #[prost(message, repeated, tag = "9")]
-    passed: Vec<PassedRecord>,
-    #[prost(message, repeated, tag = "10")]
-    kept: Vec<KeptRecord>,
-    #[prost(message, repeated, tag = "11")]
-    steps: Vec<StepRecord>,
-}
-
-/// Columns: the slots, the number of states of each, and those states with their probabilities.
-#[derive(Clone, PartialEq, Message)]
-struct PosteriorRecord {
-    #[prost(uint64, repeated, tag = "1")]
-    slots: Vec<u64>,
-    #[prost(uint32, repeated, tag = "2")]
-    counts: Vec<u32>,
-    #[prost(bytes = "vec", tag = "3")]
-    states: Vec<u8>,
-    #[prost(float, repeated, tag = "4")]
-    masses: Vec<f32>,
-    #[prost(double, repeated, tag = "5")]
-    on: Vec<f64>,
-    #[prost(double, repeated, tag = "6")]
-    off: Vec<f64>,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct FramesRecord {
-    #[prost(message, optional, tag = "1")]
-    sum: Option<VectorRecord>,
-    #[prost(double, tag = "2")]
-    weight: f64,
-    #[prost(message, repeated, tag = "3")]
-    last: Vec<VectorRecord>,
-    #[prost(uint32, tag = "4")]
-    repeated: u32,
-    #[prost(double, tag = "5")]
-    alternation: f64,
-    #[prost(uint32, tag = "6")]
-    count: u32,
-    #[prost(message, optional, tag = "7")]
-    centred: Option<VectorRecord>,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct VectorRecord {
-    /// What the largest 16-bit integer stands for.
-    #[prost(float, tag = "1")]
-    scale: f32,
-    #[prost(bytes = "vec", tag = "2")]
-    numbers: Vec<u8>,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct OdometerRecord {
-    #[prost(double, tag = "1")]
-    pending: f64,
-    #[prost(double, tag = "2")]
-    error: f64,
-    #[prost(double, tag = "3")]
-    turn: f64,
-    #[prost(bool, tag = "4")]
-    backwards: bool,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct ClockRecord {
-    #[prost(message, optional, tag = "1")]
-    last: Option<ReadingRecord>,
-    #[prost(int64, optional, tag = "2")]
-    before_step_us: Option<i64>,
-    #[prost(message, optional, tag = "3")]
-    older: Option<OlderRecord>,
-    #[prost(double, optional, tag = "4")]
-    arrivals: Option<f64>,
-    #[prost(double, optional, tag = "5")]
-    captures: Option<f64>,
-    #[prost(uint64, tag = "6")]
-    timed: u64,
-    #[prost(uint32, tag = "7")]
-    same: u32,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct ReadingRecord {
-    #[prost(int64, optional, tag = "1")]
-    captured_us: Option<i64>,
-    /// How long ago the frame arrived when this was stored.
-    #[prost(double, tag = "2")]
-    arrived_s: f64,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct OlderRecord {
-    #[prost(int64, tag = "1")]
-    first_us: i64,
-    #[prost(int64, tag = "2")]
-    newest_us: i64,
-    #[prost(double, tag = "3")]
-    arrived_s: f64,
-    #[prost(uint32, tag = "4")]
-    count: u32,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct PassedRecord {
-    #[prost(int64, optional, tag = "1")]
-    captured_us: Option<i64>,
-    #[prost(int64, tag = "2")]
-    received_us: i64,
-    #[prost(uint64, repeated, tag = "3")]
-    slots: Vec<u64>,
-    #[prost(float, repeated, tag = "4")]
-    masses: Vec<f32>,
-    #[prost(double, tag = "5")]
-    off_map: f64,
-    #[prost(double, optional, tag = "6")]
-    metres: Option<f64>,
-    #[prost(double, tag = "7")]
-    error: f64,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct KeptRecord {
-    #[prost(int64, tag = "1")]
-    captured_us: i64,
-    #[prost(message, optional, tag = "2")]
-    posterior: Option<PosteriorRecord>,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct StepRecord {
-    #[prost(uint64, tag = "1")]
-    frame: u64,
-    #[prost(double, tag = "2")]
-    max_speed: f64,
-    /// The move by odometry, if there is any.
-    #[prost(double, optional, tag = "3")]
-    metres: Option<f64>,
-    #[prost(double, tag = "4")]
-    error: f64,
-    #[prost(double, tag = "5")]
-    speed: f64,
-    /// The time that passed, without odometry.
-    #[prost(double, optional, tag = "6")]
-    time: Option<f64>,
-    #[prost(double, optional, tag = "7")]
-    novelty: Option<f64>,
-}
 
 impl Track {
     /// The track in at most `most` bytes; `None` if it does not fit.

@@ -9,6 +9,11 @@
 //!
 //! where n is the number of images of the place: 1 where no robot can have come to, R where every robot came from there.
 //! The frames in between have said their own already.
+//!
+//! Off the map, the confidence of a verdict is distributed evenly from 0 to 1, and any image may be named. For a robot on
+//! the map, high confidences are more usual: a likelihood ratio of ω + (1 − ω) / (2 √(1 − c)), whose mean off the map is 1,
+//! is therefore evidence of being on the map, as far as the verdict names a place that was expected. A low confidence is
+//! evidence against it.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -38,6 +43,12 @@ pub(super) const VERDICT_STEPS: usize = 64;
 
 /// The most that a verdict may count.
 const MOST: f64 = 20.0;
+
+/// Share of verdicts about frames on the map that are no better than those off it: ω.
+const SAYS_NOTHING: f64 = 0.35;
+
+/// No verdict is more certain than this.
+const LEAST_DOUBT: f64 = 0.01;
 
 /// Standard deviation of the kernel by which the images around that of a verdict are its place, in units of the usual
 /// distance of neighbours.
@@ -133,7 +144,8 @@ impl Track {
         known.sort_unstable_by_key(|(image, _)| *image);
         let weights = Weights::given(known, weight(0.0));
         let Posterior { belief, presence } = &*self.posterior;
-        let ratio = weights.mean(belief, ground.len());
+        let expected = (weights.mean(belief, ground.len()) - 1.0) / (factor - 1.0);
+        let ratio = 1.0 + expected.clamp(0.0, 1.0) * (presence_ratio(confidence) - 1.0);
         self.posterior = Posterior {
             belief: belief.updated(&weights, ground.len(), settings.states),
             presence: presence.updated(&[ratio; LEVELS], factor, 1.0),
@@ -141,6 +153,11 @@ impl Track {
         .into();
         true
     }
+}
+
+/// How much more usual a confidence is on the map than off it.
+fn presence_ratio(confidence: f64) -> f64 {
+    SAYS_NOTHING + (1.0 - SAYS_NOTHING) / (2.0 * (1.0 - confidence).max(LEAST_DOUBT).sqrt())
 }
 
 /// The belief that a robot is at the place of an image, in any direction and at any speed, and the number of images of
@@ -220,7 +237,9 @@ impl Tracks {
         let ground = self.ground(&map).await?;
         let Some(image) = ground.number(image) else { return Ok(()) };
         let verdict = Verdict { frame, image, confidence };
-        let track = self.memory.track(&key, &self.settings);
+        // A track that was evicted is not brought back by it.
+        let known = self.memory.known(&self.settings, |known| *known == key);
+        let Some((_, track)) = known.into_iter().next() else { return Ok(()) };
         let mut held = track.lock_owned().await;
         for _ in 0..MAX_ATTEMPTS {
             self.refresh(&key, &mut held, &ground).await?;

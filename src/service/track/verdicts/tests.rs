@@ -100,17 +100,18 @@ impl Robot {
 fn a_verdict_counts_where_the_robot_has_come_to_since() {
     let mut robot = Robot::new();
     (5..15).for_each(|place| robot.see(place));
-    assert!((0.2..0.8).contains(&robot.at(14)), "{}", robot.at(14));
+    let odds = |probability: f64| probability / (1.0 - probability);
+    let before = [odds(robot.at(14)), odds(robot.at(44))];
     let mut other = Robot { track: robot.track.clone(), ground: robot.ground.clone(), ..robot };
     // The fourth frame was at the place 8, or at 38.
     let mut robot = Robot { track: other.track.clone(), ground: other.ground.clone(), ..other };
     assert!(robot.hears(4, 8, 0.95));
-    assert!(robot.at(14) > 0.9, "{}", robot.at(14));
+    assert!(odds(robot.at(14)) > 5.0 * before[0], "{before:?} {}", robot.at(14));
     assert!(other.hears(4, 38, 0.95));
-    assert!(other.at(44) > 0.9, "{}", other.at(44));
+    assert!(odds(other.at(44)) > 5.0 * before[1], "{before:?} {}", other.at(44));
     // And it is a robot like any other.
     (15..18).for_each(|place| robot.see(place));
-    assert!(robot.at(17) > 0.9, "{}", robot.at(17));
+    assert!(robot.at(17) > 0.8, "{}", robot.at(17));
 }
 
 #[test]
@@ -139,6 +140,16 @@ fn a_wrong_verdict_alone_does_not_move_a_robot_that_is_sure() {
     assert!(before > 0.9);
     robot.hears(robot.track.frames, 40, 0.99);
     assert!(robot.at(21) > 0.5, "{}", robot.at(21));
+}
+
+#[test]
+fn confidences_off_the_map_are_evidence_against_being_on_it_on_average() {
+    let off_map = (0..1000).map(|number| (f64::from(number) + 0.5) / 1000.0);
+    let ratios: Vec<f64> = off_map.map(presence_ratio).collect();
+    let mean = ratios.iter().sum::<f64>() / 1000.0;
+    assert!((0.95..=1.0).contains(&mean), "{mean}");
+    assert!(ratios.iter().map(|ratio| ratio.ln()).sum::<f64>() < 0.0);
+    assert!(presence_ratio(0.95) > 1.5 && presence_ratio(1.0) < 4.0);
 }
 
 #[test]
