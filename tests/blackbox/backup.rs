@@ -93,7 +93,7 @@ pub(crate) async fn in_order(server: &Server, map: &str) -> Vec<String> {
 
 #[tokio::test]
 async fn a_restored_map_has_its_images_in_the_order_of_recording() {
-    let ((_a, from), (b, to)) = (server(), server());
+    let ((a, from), (b, to)) = (server(), server());
     from.put("/maps/m", json!({"scene": "outdoor", "frame": "metric"})).await.expect(201);
     // Neither the ids nor the order of arrival are that of the recordings.
     let drives = [Uuid::now_v7(), Uuid::now_v7()];
@@ -113,7 +113,7 @@ async fn a_restored_map_has_its_images_in_the_order_of_recording() {
     assert_eq!(in_order(&to, "m").await, before);
     // Once more, and what is added later comes last.
     to.post_jpeg("/maps/m/images?id=0&x=99&y=0", reference(40)).await.expect(201);
-    let file = backup(&to, b.path());
+    let file = backup(&to, a.path());
     ok(&run(&from, &["restore", file.to_str().unwrap(), "--as", "again", "--json"]));
     assert_eq!(in_order(&from, "again").await, [before, vec!["0".to_owned()]].concat());
 }
