@@ -2,20 +2,25 @@
 //! one run on drives through the town; on real traverses too, if there are any in `../shared/data` or
 //! `WHEREABOUTS_DATA`. Then how long a step takes in a map of 100,000 images.
 //!
+//! `verdicts` compares tracks with and without the verdicts of `local` on a server instead, and `stored` times steps whose
+//! track is stored (in the PostgreSQL of WHEREABOUTS_TEST_DATABASE_URL, if it is set).
+//!
 //! The arguments name the drives to run, by default all, and `kind=gem` the kind of descriptor, by default the model's.
 //! `TRACK_TRACE=1` prints each answer. `tests/support/drives.rs` describes the other methods.
 
 mod off;
 mod robots;
 mod sets;
+mod verdicts;
 
 use tokio::runtime::Runtime;
 use whereabouts_core::{Descriptor, DescriptorKind, dot};
 use whereabouts_index::SearchMode;
 use whereabouts_testkit::drives;
 
-use self::robots::{Located, Robots, step_at};
+use self::robots::{Located, Robots, Shared, step_at};
 use self::sets::{Drive, Sets};
+use self::verdicts::Localizer;
 
 /// Images of the map in which a step is timed.
 const LARGE: usize = 100_000;
@@ -30,11 +35,13 @@ fn main() -> anyhow::Result<()> {
     let kind = names.iter().find_map(|name| name.strip_prefix("kind="));
     let kind: Option<DescriptorKind> = kind.map(str::parse).transpose()?;
     names.retain(|name| !name.starts_with("kind="));
-    let is_named =
-        |name: &str| names.is_empty() || names.iter().any(|wanted| name.contains(wanted.as_str()));
     let runtime = Runtime::new()?;
     let sets = Sets::new(kind)?;
     let drives = [sets.all()?, off::all(&sets)?].concat();
+    if let Some(at) = names.iter().position(|name| name == "verdicts") {
+        names.remove(at);
+        return runtime.block_on(verdicts_of(&sets, &names));
+    }
     println!(
         "{:<34}{:>6}{:>6}{:>6}{:>8}{:>7}{:>9}   {}",
         "R@1 in percent",
@@ -47,6 +54,8 @@ fn main() -> anyhow::Result<()> {
         Tally::HEADER
     );
     let (mut total, mut by_alone) = (Tally::default(), Tally::default());
+    let is_named =
+        |name: &str| names.is_empty() || names.iter().any(|wanted| name.contains(wanted.as_str()));
     for drive in drives.into_iter().filter(|drive| is_named(&drive.name)) {
         let others = Others::of(&drive);
         let mut tally = Tally::default();
@@ -69,6 +78,39 @@ fn main() -> anyhow::Result<()> {
     if is_named("large") {
         runtime.block_on(large())?;
     }
+    if is_named("stored") {
+        runtime.block_on(stored())?;
+    }
+    Ok(())
+}
+
+/// Drives with and without the verdicts of `local`.
+async fn verdicts_of(sets: &Sets, names: &[String]) -> anyhow::Result<()> {
+    let is_named =
+        |name: &str| names.is_empty() || names.iter().any(|wanted| name.contains(wanted.as_str()));
+    let drives = [sets.all()?, off::all(sets)?].concat();
+    println!("{:<34}{:>8}{:>10}{:>10}{:>10}", "R@1", "times", "verdicts", "odometry", "verdicts");
+    let (mut without, mut with) = (Tally::default(), Tally::default());
+    for drive in drives.into_iter().filter(|drive| is_named(&drive.name)) {
+        let localizer = Localizer::new(&drive, &sets.kind).await?;
+        let mut shares = Vec::new();
+        let mut own = (Tally::default(), Tally::default());
+        for (with_odometry, with_verdicts) in
+            [(false, false), (false, true), (true, false), (true, true)]
+        {
+            let answers = localizer.follow(&drive, (with_odometry, with_verdicts)).await?;
+            shares.push(drive.right(answers.iter().map(|answer| answer.image)));
+            let (tally, own) =
+                if with_verdicts { (&mut with, &mut own.1) } else { (&mut without, &mut own.0) };
+            tally.add(&drive, &answers);
+            own.add(&drive, &answers);
+        }
+        println!(
+            "{:<34}{:>8.1}{:>10.1}{:>10.1}{:>10.1}\n  without {}\n  with    {}",
+            drive.name, shares[0], shares[1], shares[2], shares[3], own.0, own.1
+        );
+    }
+    println!("{}\nall without {without}\nall with    {with}", Tally::HEADER);
     Ok(())
 }
 
@@ -210,6 +252,37 @@ async fn large() -> anyhow::Result<()> {
                 times[times.len() * 95 / 100]
             );
         }
+    }
+    Ok(())
+}
+
+/// Times steps whose track is stored before the answer, against those of a track in memory.
+async fn stored() -> anyhow::Result<()> {
+    let rows = sets::drawn(LARGE / 10, LARGE_DIM)?;
+    let mut medians = Vec::new();
+    for (name, shared) in [
+        ("in memory", None),
+        ("in a file of the data folder", Some(Shared::File)),
+        ("in PostgreSQL", Some(Shared::Postgres)),
+    ] {
+        let Some(robots) = Robots::storing(&rows, shared).await? else {
+            println!("PostgreSQL is left out: WHEREABOUTS_TEST_DATABASE_URL names none");
+            continue;
+        };
+        let mut times = Vec::new();
+        for number in 0..STEPS {
+            let step = step_at(number as f64, Some(1.0))?;
+            times.push(robots.step(step, &rows[1000 + number].0, SearchMode::Exact).await?.1);
+        }
+        let mut times = times.split_off(STEPS / 3);
+        times.sort_by(f64::total_cmp);
+        medians.push(times[times.len() / 2]);
+        println!(
+            "a step of a track {name}: median {:.2} ms, 95th percentile {:.2} ms, {:.2} x",
+            times[times.len() / 2],
+            times[times.len() * 95 / 100],
+            times[times.len() / 2] / medians[0]
+        );
     }
     Ok(())
 }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use async_trait::async_trait;
 use bytes::Bytes;
 use futures_util::{StreamExt, TryStreamExt, future, stream};
 use jiff::{SignedDuration, Timestamp};
@@ -18,7 +19,11 @@ use whereabouts_index::{IndexSettings, SearchMode};
 use whereabouts_server::config::{Config, Overrides};
 use whereabouts_service::{Calibrator, FrameEvidence, Odometry, Principal, TrackStep, Tracks};
 use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
-use whereabouts_store::{BlobStore, DescriptionBounds, MapStore};
+use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
+use whereabouts_store::{
+    BlobStore, DescriptionBounds, MapStore, Objects, StoreError, TrackHead, TrackKey, TrackRead,
+    TrackStore,
+};
 
 use super::LARGE;
 
@@ -42,12 +47,97 @@ pub struct Robots {
     _folder: TempDir,
 }
 
+/// Where tracks are stored before each answer.
+#[derive(Debug, Clone, Copy)]
+pub enum Shared {
+    File,
+    Postgres,
+}
+
+/// Tracks in files, as if another server shared them.
+struct SharedFiles(Arc<EmbeddedStore>);
+
+#[async_trait]
+impl TrackStore for SharedFiles {
+    fn shares_tracks(&self) -> bool {
+        true
+    }
+
+    async fn track(
+        &self,
+        key: &TrackKey,
+        known: Option<u64>,
+        idle: Duration,
+    ) -> Result<TrackRead, StoreError> {
+        self.0.track(key, known, idle).await
+    }
+
+    async fn put_track(
+        &self,
+        key: &TrackKey,
+        before: Option<u64>,
+        next: (u64, Bytes),
+        idle: Duration,
+    ) -> Result<Option<u64>, StoreError> {
+        self.0.put_track(key, before, next, idle).await
+    }
+
+    async fn tracks(
+        &self,
+        map: Uuid,
+        id: Option<&str>,
+        limit: usize,
+        idle: Duration,
+    ) -> Result<Vec<TrackHead>, StoreError> {
+        self.0.tracks(map, id, limit, idle).await
+    }
+
+    async fn prune_tracks(&self, idle: Duration, most: usize) -> Result<usize, StoreError> {
+        self.0.prune_tracks(idle, most).await
+    }
+}
+
+/// The database of WHEREABOUTS_TEST_DATABASE_URL, if there is one.
+async fn database(folder: &Path) -> anyhow::Result<Option<PostgresStore>> {
+    let Ok(url) = std::env::var("WHEREABOUTS_TEST_DATABASE_URL") else { return Ok(None) };
+    let settings = PostgresSettings {
+        url,
+        max_connections: 4,
+        timeout: Duration::from_secs(60),
+        lifetime: Duration::from_secs(60),
+        pin: Duration::from_secs(3600),
+        index: settings(folder).index,
+        index_memory_mib: 64,
+        descriptions: settings(folder).descriptions,
+    };
+    migrate(&settings).await?;
+    let objects = Objects::folder(&folder.join("objects"), Duration::from_secs(60))?;
+    Ok(Some(PostgresStore::open(settings, objects, Uuid::now_v7()).await?))
+}
+
 impl Robots {
     pub async fn new(images: &[(Descriptor, [f64; 2])]) -> anyhow::Result<Self> {
+        let robots = Self::storing(images, None).await?;
+        robots.context("tracks in memory need no database")
+    }
+
+    /// The same with tracks that are stored before each answer; `None` if there is no database for them.
+    pub async fn storing(
+        images: &[(Descriptor, [f64; 2])],
+        shared: Option<Shared>,
+    ) -> anyhow::Result<Option<Self>> {
         let folder = TempDir::new()?;
         let config = Config::load(None, &Overrides::default())?;
         let store = Arc::new(EmbeddedStore::open(&settings(folder.path()))?);
-        let tracks = Tracks::new(store.clone(), config.confidence.place_m, config.track);
+        let stored: Arc<dyn TrackStore> = match shared {
+            None => store.clone(),
+            Some(Shared::File) => Arc::new(SharedFiles(store.clone())),
+            Some(Shared::Postgres) => match database(folder.path()).await? {
+                Some(database) => Arc::new(database),
+                None => return Ok(None),
+            },
+        };
+        let tracks = Tracks::new(store.clone(), stored, config.confidence.place_m, config.track);
         let map = Map {
             uid: Uuid::now_v7(),
             name: "drive".parse()?,
@@ -98,7 +188,7 @@ impl Robots {
             false => Arc::default(),
         };
         let known_confidence = config.localize.known_confidence;
-        Ok(Self { store, tracks, map, calibration, known_confidence, _folder: folder })
+        Ok(Some(Self { store, tracks, map, calibration, known_confidence, _folder: folder }))
     }
 
     /// One step of a track. Returns what the filter answers, and the milliseconds that it took.

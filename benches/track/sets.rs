@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use bytes::Bytes;
 use image::RgbImage;
 use rayon::prelude::*;
 use whereabouts_core::{Descriptor, DescriptorKind};
@@ -22,6 +23,8 @@ pub struct Drive {
     pub name: String,
     /// Descriptors and positions in metres, in the order of recording.
     pub map: Vec<(Descriptor, [f64; 2])>,
+    /// The pictures of the map.
+    pub pictures: Vec<Bytes>,
     /// The number of the place of each image of the map.
     pub places: Vec<usize>,
     pub frames: Vec<Frame>,
@@ -33,6 +36,7 @@ pub struct Drive {
 #[derive(Clone)]
 pub struct Frame {
     pub descriptor: Descriptor,
+    pub picture: Bytes,
     pub seconds: f64,
     pub moved_m: f64,
     /// The number of the place; `None` for a place that has no number.
@@ -76,6 +80,8 @@ impl Describer {
 pub struct Sets {
     pub towns: Vec<TownSet>,
     pub traverses: Vec<Traverse>,
+    /// The kind of the descriptors.
+    pub kind: String,
 }
 
 /// A town: what the map sees, and what a robot sees that drives by later.
@@ -83,6 +89,13 @@ pub struct TownSet {
     pub seed: u64,
     pub map: Vec<(Descriptor, [f64; 2])>,
     pub frames: Vec<(Descriptor, [f64; 2])>,
+    pub pictures: Pictures,
+}
+
+/// The pictures of the places of a set.
+pub struct Pictures {
+    map: Vec<Bytes>,
+    frames: Vec<Bytes>,
 }
 
 /// A real traverse, recorded twice.
@@ -90,6 +103,7 @@ pub struct Traverse {
     pub name: &'static str,
     pub map: Vec<Descriptor>,
     pub frames: Vec<Descriptor>,
+    pub pictures: Pictures,
 }
 
 impl Sets {
@@ -114,10 +128,13 @@ impl Sets {
                 println!("{name} is left out: there is no {}", map.display());
                 continue;
             }
-            let [map, frames] = [described(&describer, &map)?, described(&describer, &queries)?];
-            traverses.push(Traverse { name, map, frames });
+            let [(map, map_pictures), (frames, frame_pictures)] =
+                [described(&describer, &map)?, described(&describer, &queries)?];
+            let pictures = Pictures { map: map_pictures, frames: frame_pictures };
+            traverses.push(Traverse { name, map, frames, pictures });
         }
-        Ok(Self { towns: towns.collect::<anyhow::Result<_>>()?, traverses })
+        let kind = describer.kind.as_str().to_owned();
+        Ok(Self { towns: towns.collect::<anyhow::Result<_>>()?, traverses, kind })
     }
 
     /// The drives on the map: two towns, and real traverses that are driven forwards, backwards, at twice the speed, and
@@ -149,12 +166,14 @@ impl Traverse {
             let moved_m = truth.abs_diff(before) as f64;
             before = *truth;
             let descriptor = self.frames[*truth].clone();
-            Frame { descriptor, seconds: number as f64, moved_m, truth: Some(*truth) }
+            let picture = self.pictures.frames[*truth].clone();
+            Frame { descriptor, picture, seconds: number as f64, moved_m, truth: Some(*truth) }
         });
         Drive {
             name: format!("{}{kind}", self.name),
             map: map.collect(),
             frames: frames.collect(),
+            pictures: places.iter().map(|place| self.pictures.map[*place].clone()).collect(),
             places,
             tolerance: 2,
         }
@@ -178,12 +197,14 @@ impl TownSet {
             before = Some(*here);
             seconds += way / SPEED;
             let descriptor = descriptor.clone();
-            Frame { descriptor, seconds, moved_m: way + 5.0, truth: Some(place) }
+            let picture = self.pictures.frames[place].clone();
+            Frame { descriptor, picture, seconds, moved_m: way + 5.0, truth: Some(place) }
         });
         Drive {
             name: format!("town {}{kind}", self.seed),
             frames: frames.collect(),
             map: places.iter().map(|place| self.map[*place].clone()).collect(),
+            pictures: places.iter().map(|place| self.pictures.map[*place].clone()).collect(),
             places,
             tolerance: 0,
         }
@@ -193,32 +214,45 @@ impl TownSet {
 /// The places of a town in four lights, three in ten behind a van.
 fn town(describer: &Describer, seed: u64, places: usize) -> anyhow::Result<TownSet> {
     let town = Town::new(TownSpec { seed, places, width: 320, height: 240 });
-    let described = |picture: &RgbImage| describer.describe(&encode_jpeg(picture)?);
+    let described = |picture: &RgbImage| -> anyhow::Result<(Descriptor, Bytes)> {
+        let bytes = encode_jpeg(picture)?;
+        Ok((describer.describe(&bytes)?, bytes.into()))
+    };
     let drawn: Vec<_> = (0..places)
         .into_par_iter()
         .map(|place| {
             let (reference, visit) = (town.reference(place), town.query(place, (place / 8) as u32));
             let image =
                 if is_blocked(place) { behind_a_van(visit.image, place) } else { visit.image };
-            let map = (described(&reference.image)?, [reference.x, reference.y]);
-            Ok((map, (described(&image)?, [visit.x, visit.y])))
+            let (map, map_picture) = described(&reference.image)?;
+            let (frame, frame_picture) = described(&image)?;
+            let places = ((map, [reference.x, reference.y]), (frame, [visit.x, visit.y]));
+            Ok((places, (map_picture, frame_picture)))
         })
         .collect::<anyhow::Result<_>>()?;
-    let (map, frames) = drawn.into_iter().unzip();
-    Ok(TownSet { seed, map, frames })
+    let (places, pictures): (Vec<_>, Vec<_>) = drawn.into_iter().unzip();
+    let (map, frames) = places.into_iter().unzip();
+    let (map_pictures, frame_pictures) = pictures.into_iter().unzip();
+    let pictures = Pictures { map: map_pictures, frames: frame_pictures };
+    Ok(TownSet { seed, map, frames, pictures })
 }
 
-/// The descriptors of the pictures of a folder, in the order of their names.
-fn described(describer: &Describer, folder: &Path) -> anyhow::Result<Vec<Descriptor>> {
+/// The descriptors of the pictures of a folder, and the pictures, in the order of their names.
+fn described(
+    describer: &Describer,
+    folder: &Path,
+) -> anyhow::Result<(Vec<Descriptor>, Vec<Bytes>)> {
     let mut files: Vec<PathBuf> = std::fs::read_dir(folder)?
         .map(|entry| Ok(entry?.path()))
         .collect::<std::io::Result<_>>()?;
     files.sort();
     let described = |file: &PathBuf| {
         let bytes = std::fs::read(file)?;
-        describer.describe(&bytes).with_context(|| file.display().to_string())
+        let descriptor = describer.describe(&bytes).with_context(|| file.display().to_string())?;
+        Ok((descriptor, bytes.into()))
     };
-    files.par_iter().map(described).collect()
+    let described: anyhow::Result<Vec<_>> = files.par_iter().map(described).collect();
+    Ok(described?.into_iter().unzip())
 }
 
 /// Images every metre along a spiral, each a little like the one before.

@@ -29,6 +29,8 @@ from urllib.parse import quote
 import httpx
 
 if TYPE_CHECKING:
+    from uuid import UUID
+
     from typing_extensions import Self
 
 Scene: TypeAlias = Literal["outdoor", "indoor"]
@@ -582,9 +584,13 @@ class Whereabouts:
         pose: Pose | None = None,
         captured_at: datetime | None = None,
         tags: Sequence[str] = (),
+        recording: tuple[UUID, int] | None = None,
         deadline_ms: int | None = None,
     ) -> ImageAnswer:
         """Adds an image to a map. Repeating an id is allowed with the same bytes, and 409 with others.
+
+        `recording` is the id of a recording and the number of the image in it: tracks follow the images
+        of a recording in that order, also if they arrive in another.
 
         Repeated with another pose, time or tags, it changes those: see `changed` of the answer. What is
         omitted keeps its value.
@@ -595,6 +601,7 @@ class Whereabouts:
             pose=_given(**asdict(pose)) if pose else None,
             captured_at=_rfc3339(captured_at) if captured_at else None,
             tags=list(tags) or None,
+            recording=recording and {"id": str(recording[0]), "number": recording[1]},
         )
         return self._call(
             ImageAnswer,

@@ -6,7 +6,9 @@ use bytes::Bytes;
 use jiff::Timestamp;
 use serde::{Deserialize, Deserializer, Serialize};
 use utoipa::ToSchema;
-use whereabouts_core::{ExportedImage, Image, ImageField, Map, Pose, PoseInput, PosePatch, moment};
+use whereabouts_core::{
+    ExportedImage, Image, ImageField, Map, Pose, PoseInput, PosePatch, Recording, moment,
+};
 
 /// Metadata of an image to be added.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
@@ -29,6 +31,10 @@ pub struct ImageMeta {
     /// Up to 32 tags of up to 64 characters each.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub tags: Vec<String>,
+    /// Place of the image in a recording; by default, its place in the request, or the order of arrival. Tracks follow
+    /// the images of a recording in its order. It is stored with a new image, and cannot be changed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recording: Option<Recording>,
 }
 
 /// A change of an image (JSON merge patch, RFC 7396): an omitted field keeps its value, and null removes it.

@@ -1,5 +1,7 @@
 //! `whereabouts restore`: restores the maps of a backup to a server, over HTTP.
 
+mod places;
+
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -13,6 +15,7 @@ use reqwest::StatusCode;
 use reqwest::multipart::{Form, Part};
 use serde::{Deserialize, Serialize};
 
+use self::places::Places;
 use super::client::{Client, ServerArg, explained, segment};
 use super::progress::ProgressMeter;
 use whereabouts_api::{ImportedImage, ImportedMap};
@@ -73,7 +76,7 @@ struct RestoredMap {
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let start = Instant::now();
-    let end = verify(&args.file)?;
+    let (end, places) = verify(&args.file)?;
     let maps = select_maps(&args, &end)?;
     if args.check {
         return print_contents(&args, &end);
@@ -82,6 +85,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         client: args.server.client()?,
         progress: ProgressMeter::new("images", maps.iter().map(|map| map.images).sum()),
         concurrency: usize::from(args.concurrency),
+        places,
         maps: Vec::new(),
     };
     let result = restore.send_all(&args, &maps).await;
@@ -98,22 +102,25 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     print(&RestoreReport { file: args.file, maps: restore.maps, seconds }, args.json)
 }
 
-/// Reads the whole file, so that damage is found before anything is sent.
-fn verify(file: &Path) -> anyhow::Result<End> {
+/// Reads the whole file, so that damage is found before anything is sent. Returns also the order of the images.
+fn verify(file: &Path) -> anyhow::Result<(End, Places)> {
     const MEGABYTE: u64 = 1 << 20;
     let refused = || format!("{} was not restored, nothing was changed", file.display());
     let total = std::fs::metadata(file).with_context(refused)?.len() / MEGABYTE;
     let mut reader = Reader::open(file).with_context(refused)?;
     let progress = ProgressMeter::new("MB verified", total as usize);
-    let mut end = None;
+    let (mut end, mut places) = (None, Places::default());
     while let Some(item) = reader.next_item().with_context(refused)? {
         progress.set((reader.bytes() / MEGABYTE) as usize, total as usize);
-        if let Item::End(found) = item {
-            end = Some(found);
+        match item {
+            Item::Map(map, _) => places.begin(map),
+            Item::Image(image, _) => places.add(&image),
+            Item::End(found) => end = Some(found),
+            Item::Manifest(_) | Item::LeftOut(_) => {}
         }
     }
     progress.finish();
-    end.with_context(refused)
+    Ok((end.with_context(refused)?, places.numbered()))
 }
 
 /// Returns the maps that the flags select.
@@ -153,6 +160,7 @@ struct Restore {
     client: Client,
     progress: ProgressMeter,
     concurrency: usize,
+    places: Places,
     /// The maps so far; the last one may be incomplete.
     maps: Vec<RestoredMap>,
 }
@@ -182,8 +190,9 @@ impl Restore {
                         None => None,
                     };
                 }
-                Item::Image(image, bytes) => {
+                Item::Image(mut image, bytes) => {
                     let Some(target) = &target else { continue };
+                    image.recording = self.places.of(&target.map, &image);
                     if in_flight.len() >= self.concurrency
                         && let Some(outcome) = in_flight.next().await
                     {

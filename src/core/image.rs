@@ -1,11 +1,13 @@
 //! Reference images: pictures of a map with the poses they were taken from.
 
+use std::collections::HashMap;
 use std::fmt;
 use std::str::FromStr;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
+use uuid::Uuid;
 
 use super::{Descriptor, Digest, InvalidName, Pose};
 
@@ -223,6 +225,39 @@ impl Image {
     }
 }
 
+/// The place of an image in a recording. Robots drive along the images of a map in the order in which they were
+/// recorded, whatever the order in which they arrive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Recording {
+    /// The recording: a UUID of the sender's choice, the same for all of its images.
+    pub id: Uuid,
+    /// The number of the image in it.
+    pub number: u32,
+}
+
+impl Recording {
+    /// Sorts images in the order of recording. `place` returns the position of an image in the order of addition, and
+    /// its place in a recording. A recording is where its first image was added; images without one are where they were
+    /// added themselves.
+    pub fn sort<T>(images: &mut [T], place: impl Fn(&T) -> (usize, Option<Self>)) {
+        let mut starts: HashMap<Uuid, usize> = HashMap::new();
+        for (position, recording) in images.iter().map(&place) {
+            if let Some(Self { id, .. }) = recording {
+                let start = starts.entry(id).or_insert(position);
+                *start = position.min(*start);
+            }
+        }
+        images.sort_by_key(|image| {
+            let (position, recording) = place(image);
+            let within =
+                recording.and_then(|Self { id, number }| Some((*starts.get(&id)?, number)));
+            let (start, number) = within.unwrap_or((position, 0));
+            (start, number, position)
+        });
+    }
+}
+
 /// An image with its descriptor, as exported and imported.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct ExportedImage {
@@ -231,11 +266,34 @@ pub struct ExportedImage {
     /// The descriptor as base64 of little-endian 32-bit floats. Null if the stored descriptor is damaged.
     #[schema(value_type = Option<String>)]
     pub descriptor: Option<Descriptor>,
+    /// Its position in the order of addition, with gaps where images were removed. Ignored in an import.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub position: Option<u64>,
+    /// Its place in a recording, if its sender said so.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recording: Option<Recording>,
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_recording_is_in_its_own_order_where_its_first_image_was_added() {
+        let of = |id: u128, number| Some(Recording { id: Uuid::from_u128(id), number });
+        let mut images = [
+            (0, None),
+            (1, of(7, 3)),
+            (2, of(9, 0)),
+            (3, None),
+            (4, of(7, 0)),
+            (5, of(9, 1)),
+            (6, of(7, 3)),
+        ];
+        images.reverse();
+        Recording::sort(&mut images, |image| *image);
+        assert_eq!(images.map(|(position, _)| position), [0, 4, 1, 6, 2, 5, 3]);
+    }
 
     #[test]
     fn file_names_common_in_the_field_are_valid_ids() {

@@ -28,7 +28,7 @@ mod utm;
 mod verdict;
 mod webhook;
 
-pub use self::image::{ExportedImage, Image, ImageField, ImageId, MediaType};
+pub use self::image::{ExportedImage, Image, ImageField, ImageId, MediaType, Recording};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};
 pub use confidence::{Calibration, CalibrationSettings, Evidence};
 pub use dense::DenseFeatures;

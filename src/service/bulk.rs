@@ -10,11 +10,12 @@ use futures_util::{Stream, StreamExt, future};
 use serde::{Deserialize, Serialize};
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
 
 use super::images::StatedMeta;
 use super::{Images, NewImage, Principal, ServiceError};
 use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta};
-use whereabouts_core::{Image, ImageId, MapName};
+use whereabouts_core::{Image, ImageId, MapName, Recording};
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
 /// Bounds of bulk uploads.
@@ -77,12 +78,14 @@ type Earlier = HashMap<usize, Arc<OnceLock<SavedImage>>>;
 struct SavedImage {
     answer: ImageAnswer,
     is_new: bool,
+    /// Its place in the recording.
+    recording: Recording,
 }
 
 impl Images {
     /// Stores images as they arrive, each item with its number, and returns the results in the order of the numbers.
     /// A [`BulkItem::Meta`] has the number of the image that it describes, and changes the result of that image. The
-    /// error of one image does not affect the others. The upload ends with the first item over the maximum, with an
+    /// error of one image does not affect the others. An upload is a recording, in the order of its images. It ends with the first item over the maximum, with an
     /// error of the stream, or when `until` ends; images that were read before that are still stored.
     pub async fn add_many<E, O>(
         &self,
@@ -98,6 +101,7 @@ impl Images {
         let mut last_of: HashMap<ImageId, CancellationToken> = HashMap::new();
         let mut done_of: HashMap<usize, CancellationToken> = HashMap::new();
         let mut earlier = Earlier::new();
+        let upload = Uuid::now_v7();
         let (mut taken, mut counted) = (0, 0);
         let until_error = items.scan((), |(), next| {
             future::ready(next.map_err(|error| stream_error = Some(error)).ok())
@@ -112,7 +116,9 @@ impl Images {
             .map(|(number, item)| {
                 let index = counted;
                 counted += usize::from(!matches!(item, BulkItem::Meta(_)));
-                let item = self.checked(index, item);
+                let recording =
+                    Recording { id: upload, number: u32::try_from(index).unwrap_or(u32::MAX) };
+                let item = self.checked(index, recorded(item, recording));
                 let saved = Arc::clone(earlier.entry(number).or_default());
                 let done = CancellationToken::new();
                 let id = item.as_ref().ok().and_then(|(_, id)| id.clone());
@@ -124,7 +130,10 @@ impl Images {
                         before.cancelled().await;
                     }
                     let result = match item {
-                        Ok((item, id)) => self.process(map, caller, index, item, id, &saved).await,
+                        Ok((item, id)) => {
+                            let place = (index, recording);
+                            self.process((map, caller), place, item, id, &saved).await
+                        }
                         Err((id, error)) => Some(BulkResult::Failed(id, error)),
                     };
                     (number, result)
@@ -175,9 +184,8 @@ impl Images {
     /// Processes an item. Returns `None` if the result of its image stays as it is.
     async fn process(
         &self,
-        map: &MapName,
-        caller: &Principal,
-        index: usize,
+        (map, caller): (&MapName, &Principal),
+        (index, recording): (usize, Recording),
         item: BulkItem,
         id: Option<ImageId>,
         saved: &OnceLock<SavedImage>,
@@ -200,7 +208,7 @@ impl Images {
         };
         Some(match result {
             Ok((answer, is_new)) => {
-                let _ = saved.set(SavedImage { answer: answer.clone(), is_new });
+                let _ = saved.set(SavedImage { answer: answer.clone(), is_new, recording });
                 BulkResult::Saved(Box::new(answer), is_new)
             }
             Err(error) => BulkResult::Failed(id, error),
@@ -215,8 +223,9 @@ impl Images {
         saved: SavedImage,
         meta: Result<ImageMeta, ServiceError>,
     ) -> Result<(ImageAnswer, bool), ServiceError> {
-        let SavedImage { answer: ImageAnswer { image, changed, warnings }, is_new } = saved;
-        let described = self.described(map, &image, meta).await;
+        let SavedImage { answer, is_new, recording } = saved;
+        let ImageAnswer { image, changed, warnings } = answer;
+        let described = self.described(map, &image, meta, recording).await;
         let moved = described.as_ref().is_ok_and(|(other, _)| other.image.id != image.id);
         if is_new && (described.is_err() || moved) {
             self.delete(map, &image.id).await?;
@@ -241,8 +250,11 @@ impl Images {
         map: &MapName,
         image: &Image,
         meta: Result<ImageMeta, ServiceError>,
+        recording: Recording,
     ) -> Result<(ImageAnswer, bool), ServiceError> {
         let meta = meta?;
+        let recording = meta.recording.or(Some(recording));
+        let meta = ImageMeta { recording, ..meta };
         let stated = StatedMeta::new(meta.clone())?;
         if stated.id.as_ref().is_none_or(|id| *id == image.id) {
             return Ok((self.restate(map, &image.id, &stated).await?, false));
@@ -270,5 +282,16 @@ impl Images {
                 added => return added,
             }
         }
+    }
+}
+
+/// An image without a place in a recording gets its place in the upload.
+fn recorded(item: BulkItem, place: Recording) -> BulkItem {
+    match item {
+        BulkItem::Image(mut image) => {
+            image.meta.recording.get_or_insert(place);
+            BulkItem::Image(image)
+        }
+        other => other,
     }
 }

@@ -9,7 +9,9 @@ use jiff::Timestamp;
 use super::imaging::PictureFacts;
 use super::{BulkSettings, Keys, Maps, SUPERSEDED_RETRIES, ServiceError};
 use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage};
-use whereabouts_core::{CoordinateFrame, Image, ImageId, Map, MapName, MediaType, Pose, PoseInput};
+use whereabouts_core::{
+    CoordinateFrame, Image, ImageId, Map, MapName, MediaType, Pose, PoseInput, Recording,
+};
 use whereabouts_store::{Added, BlobStore, StoreError};
 use whereabouts_vision::exif::GpsReading;
 use whereabouts_vision::{AdmissionRequest, FeatureSet};
@@ -111,7 +113,8 @@ impl Images {
             if pin.is_none() {
                 pin = Some(self.blobs.put_blob(digest, new.bytes.clone()).await?);
             }
-            match self.maps.store.add_image(&map, image, extraction.descriptor).await {
+            let (descriptor, recording) = (extraction.descriptor, stated.recording);
+            match self.maps.store.add_recorded(&map, image, descriptor, recording).await {
                 // A reindex ended meanwhile, so the descriptor is of the model before it; or the coordinate
                 // frame has changed.
                 Err(StoreError::Superseded(_)) if retries > 0 => retries -= 1,
@@ -216,13 +219,15 @@ pub(super) struct StatedMeta {
     pose: Option<PoseInput>,
     captured_at: Option<Timestamp>,
     tags: Vec<String>,
+    recording: Option<Recording>,
 }
 
 impl StatedMeta {
     pub fn new(meta: ImageMeta) -> Result<Self, ServiceError> {
-        let ImageMeta { id, pose, captured_at, tags } = meta;
+        let ImageMeta { id, pose, captured_at, tags, recording } = meta;
         check_tags(&tags)?;
-        Ok(Self { id: id.map(|id| id.parse()).transpose()?, pose, captured_at, tags })
+        let id = id.map(|id| id.parse()).transpose()?;
+        Ok(Self { id, pose, captured_at, tags, recording })
     }
 
     pub fn pose(&self, map: &Map) -> Result<Option<Pose>, ServiceError> {

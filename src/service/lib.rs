@@ -224,7 +224,7 @@ impl Service {
             },
             localizer: Localizer {
                 maps: maps.clone(),
-                tracks: Tracks::new(store.clone(), place_m, settings.track),
+                tracks: Tracks::new(store.clone(), store.clone(), place_m, settings.track),
                 submitter,
                 jobs: jobs.clone(),
                 recall: RecallCheck::new(settings.recall_check),

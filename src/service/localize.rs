@@ -148,10 +148,11 @@ impl Localizer {
                 // A frame that shows nothing moves the belief, but is no evidence.
                 let evidence =
                     lack.is_none().then(|| FrameEvidence::new(&candidates, &calibration));
+                let key = step.key(&map);
                 let following = self.tracks.follow(&map, step, &extraction.descriptor, evidence);
                 let (track, warning) = following.instrument(traces::stage("track")).await?;
                 warnings.extend(warning);
-                Some(track)
+                Some((key, track))
             }
             None => None,
         };
@@ -180,7 +181,12 @@ impl Localizer {
             let wish = JobWish { chosen, priority: request.priority };
             let submit = self.submitter.submit(&map, frame, compared, wish, id);
             match submit.instrument(traces::stage("submit")).await? {
-                Submission::Queued(job) => (Some(*job), None),
+                Submission::Queued(job) => {
+                    if let Some((key, track)) = track.as_ref().filter(|(_, track)| !track.is_late) {
+                        self.tracks.await_verdict(job.id, key.clone(), track.frames);
+                    }
+                    (Some(*job), None)
+                }
                 Submission::Declined(why)
                     if request.refine == RefineMode::Wait && why.is_shedding() =>
                 {
@@ -208,7 +214,7 @@ impl Localizer {
             model: map.model,
             candidates,
             estimate,
-            track,
+            track: track.map(|(_, track)| track),
             job: job.map(|job| JobLink {
                 id: job.id,
                 href: format!("/jobs/{}", job.id),

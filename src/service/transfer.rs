@@ -116,7 +116,8 @@ impl Transfer {
         bytes: Bytes,
         admission: AdmissionRequest,
     ) -> Result<Added, ServiceError> {
-        let ImportedImage { map: source, image: ExportedImage { image, descriptor } } = from;
+        let ImportedImage { map: source, image } = from;
+        let ExportedImage { image, descriptor, recording, .. } = image;
         let map = self.maps.find(name).await?;
         if !is_compatible(&map, &source) {
             return Err(incompatible(&map, &source));
@@ -142,7 +143,7 @@ impl Transfer {
         };
         let _pin = self.blobs.put_blob(image.digest, bytes).await?;
         // Not retried if the map was reindexed meanwhile: its descriptors are now of another model than this one.
-        Ok(self.maps.store.add_image(&map, image, descriptor).await?)
+        Ok(self.maps.store.add_recorded(&map, image, descriptor, recording).await?)
     }
 }
 

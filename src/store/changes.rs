@@ -3,11 +3,19 @@
 use jiff::Timestamp;
 use uuid::Uuid;
 
-use super::{IdempotencyRecord, JobRecord, Progress, Release, Step, StoreError, StoredDelivery};
+use super::{
+    IdempotencyRecord, JobRecord, LocatedImage, Progress, Release, Step, StoreError, StoredDelivery,
+};
 use whereabouts_core::{
     Attempt, Delivery, DeliveryState, Descriptor, Disposition, Image, Job, JobState, Map, Message,
-    Priority, StoredWebhook, Usage, WebhookEvent,
+    Priority, Recording, StoredWebhook, Usage, WebhookEvent,
 };
+
+/// Returns images in the order of recording.
+pub(super) fn in_order(mut images: Vec<(LocatedImage, Option<Recording>)>) -> Vec<LocatedImage> {
+    Recording::sort(&mut images, |(image, recording)| (image.slot, *recording));
+    images.into_iter().map(|(image, _)| image).collect()
+}
 
 impl JobRecord {
     /// Starts an attempt by a worker.

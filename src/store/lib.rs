@@ -21,6 +21,7 @@ mod objects;
 #[cfg(feature = "postgres")]
 pub mod postgres;
 mod retention;
+mod tracks;
 mod usage;
 mod webhooks;
 
@@ -37,6 +38,7 @@ pub use self::maps::{Added, ExportStore, HardNegatives, IndexState, LocatedImage
 #[cfg(feature = "postgres")]
 pub use self::objects::{ObjectSettings, Objects};
 pub use self::retention::{JobRetention, RemovedJobs, Retention};
+pub use self::tracks::{StoredTrack, TrackHead, TrackKey, TrackRead, TrackStore};
 pub use self::usage::UsageStore;
 pub use self::webhooks::{DeliveryRetention, RemovedDeliveries, StoredDelivery, WebhookStore};
 
@@ -53,6 +55,7 @@ pub trait Store:
     + WebhookStore
     + DescriptionCache
     + Retention
+    + TrackStore
 {
 }
 
@@ -68,5 +71,6 @@ impl<T> Store for T where
         + WebhookStore
         + DescriptionCache
         + Retention
+        + TrackStore
 {
 }

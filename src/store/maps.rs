@@ -8,7 +8,7 @@ use futures_util::future::try_join_all;
 use super::StoreError;
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, Descriptor, ExportedImage, Image, ImageId, Map,
-    MapName, Pose,
+    MapName, Pose, Recording,
 };
 use whereabouts_index::SearchMode;
 
@@ -34,6 +34,9 @@ pub struct IndexState {
     pub changes: u64,
     /// How often poses of images were changed since the map was created.
     pub moved: u64,
+    /// The changes that concern images with a pose, counted like `changes`. A previous release that shares the database
+    /// does not count them.
+    pub located: u64,
 }
 
 /// The hard negatives of one image: images of other places that resemble it most.
@@ -74,7 +77,7 @@ pub trait MapStore: Send + Sync {
     /// Returns the state of a map's index.
     async fn index_state(&self, map: &Map) -> Result<IndexState, StoreError>;
 
-    /// Adds an image, whose bytes must have been stored with [`BlobStore::put_blob`].
+    /// Adds an image, whose bytes must have been stored with [`BlobStore::put_blob`], with its place in a recording.
     ///
     /// # Errors
     /// [`StoreError::Conflict`] if an image with this id has other bytes;
@@ -82,12 +85,22 @@ pub trait MapStore: Send + Sync {
     /// another coordinate frame.
     ///
     /// [`BlobStore::put_blob`]: super::BlobStore::put_blob
+    async fn add_recorded(
+        &self,
+        map: &Map,
+        image: Image,
+        descriptor: Descriptor,
+        recording: Option<Recording>,
+    ) -> Result<Added, StoreError>;
+    /// Adds an image that belongs to no recording.
     async fn add_image(
         &self,
         map: &Map,
         image: Image,
         descriptor: Descriptor,
-    ) -> Result<Added, StoreError>;
+    ) -> Result<Added, StoreError> {
+        self.add_recorded(map, image, descriptor, None).await
+    }
     /// Replaces the record of an image, `current`, by `next`, which has the same id and bytes and another
     /// pose, time or tags. Returns `false`, and changes nothing, if `current` is not what is stored.
     ///
@@ -120,7 +133,7 @@ pub trait MapStore: Send + Sync {
         after: Option<&ImageId>,
         limit: usize,
     ) -> Result<Vec<Image>, StoreError>;
-    /// Returns the images that have a pose, in insertion order.
+    /// Returns the images that have a pose, in the order of recording ([`Recording::sort`]).
     async fn positions(&self, map: &Map) -> Result<Vec<LocatedImage>, StoreError>;
     /// Deletes an image. Returns `false` if there was no such image.
     async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError>;

@@ -5,6 +5,8 @@ use std::process::{Command, Output, Stdio};
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
+use uuid::Uuid;
+use whereabouts_core::{Digest, ExportedImage, Recording};
 
 use super::support::{BINARY, Server, frame, reference, server, shared_server};
 
@@ -69,7 +71,51 @@ fn same(a: &[(String, f64)], b: &[(String, f64)]) {
 
 /// The images of a map with their descriptors, to the last bit.
 async fn images(server: &Server, map: &str) -> Value {
-    server.get(&format!("/maps/{map}/export?limit=1000")).await.expect(200)["images"].take()
+    let mut images =
+        server.get(&format!("/maps/{map}/export?limit=1000")).await.expect(200)["images"].take();
+    for image in images.as_array_mut().unwrap() {
+        // A restored map has the order, but in other words.
+        let image = image.as_object_mut().unwrap();
+        assert!(image.remove("position").is_some_and(|position| position.is_u64()));
+        image.remove("recording");
+    }
+    images
+}
+
+/// The ids of the images of a map in the order of recording, from which the paths of tracks follow.
+pub(crate) async fn in_order(server: &Server, map: &str) -> Vec<String> {
+    let path = format!("/maps/{map}/export?limit=1000");
+    let images = server.get(&path).await.expect(200)["images"].take();
+    let mut images: Vec<ExportedImage> = serde_json::from_value(images).unwrap();
+    Recording::sort(&mut images, |image| (image.position.unwrap() as usize, image.recording));
+    images.into_iter().map(|image| image.image.id.to_string()).collect()
+}
+
+#[tokio::test]
+async fn a_restored_map_has_its_images_in_the_order_of_recording() {
+    let ((a, from), (b, to)) = (server(), server());
+    from.put("/maps/m", json!({"scene": "outdoor", "frame": "metric"})).await.expect(201);
+    // Neither the ids nor the order of arrival are that of the recordings.
+    let drives = [Uuid::now_v7(), Uuid::now_v7()];
+    for arrived in 0..30_usize {
+        let (drive, number) = (arrived % 3, arrived * 7 % 30);
+        let id = Digest::of(&[number as u8]).hex()[..8].to_owned();
+        let place = match drives.get(drive) {
+            Some(recording) => format!("&recording={recording}&number={number}"),
+            None => String::new(),
+        };
+        let path = format!("/maps/m/images?id={id}&x={number}&y={drive}{place}");
+        from.post_jpeg(&path, reference(number)).await.expect(201);
+    }
+    let before = in_order(&from, "m").await;
+    let file = backup(&from, b.path());
+    ok(&restore(&to, &file));
+    assert_eq!(in_order(&to, "m").await, before);
+    // Once more, and what is added later comes last.
+    to.post_jpeg("/maps/m/images?id=0&x=99&y=0", reference(40)).await.expect(201);
+    let file = backup(&to, a.path());
+    ok(&run(&from, &["restore", file.to_str().unwrap(), "--as", "again", "--json"]));
+    assert_eq!(in_order(&from, "again").await, [before, vec!["0".to_owned()]].concat());
 }
 
 #[tokio::test]

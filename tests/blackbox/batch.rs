@@ -7,7 +7,8 @@ use reqwest::Method;
 use reqwest::multipart::{Form, Part};
 use serde_json::{Value, json};
 
-use super::support::{Answer, Server, reference, server, shared_server};
+use super::backup::in_order;
+use super::support::{Answer, Server, jpeg, reference, server, shared_server};
 
 fn picture(form: Form, name: &str, bytes: Vec<u8>) -> Form {
     form.part("image", Part::bytes(bytes).file_name(name.to_owned()))
@@ -42,6 +43,24 @@ fn archive(entries: &[(&str, &[u8])]) -> Vec<u8> {
         builder.append_data(&mut header, name, *bytes).unwrap();
     }
     builder.into_inner().unwrap()
+}
+
+#[tokio::test]
+async fn images_of_a_request_are_recorded_in_its_order() {
+    let (server, map) = shared_server();
+    server.put(&format!("/maps/{map}"), json!({"frame": "metric"})).await.expect(201);
+    // Large pictures are stored after small ones that were sent later.
+    let names: Vec<String> = (0..24).map(|number| format!("{}.jpg", number * 7 % 24)).collect();
+    let mut form = Form::new();
+    for (number, name) in names.iter().enumerate() {
+        let picture =
+            image::RgbImage::from_fn(if number % 5 == 0 { 2400 } else { 64 }, 64, |x, y| {
+                image::Rgb([(x * y) as u8, number as u8 * 9, x as u8])
+            });
+        form = form.part("image", Part::bytes(jpeg(&picture)).file_name(name.clone()));
+    }
+    assert_eq!(send(server, &map, form).await.expect(200)["stored"], 24);
+    assert_eq!(in_order(server, &map).await, names);
 }
 
 #[tokio::test]

@@ -6,6 +6,7 @@ use std::process::{Command, Output};
 use serde_json::Value;
 use tempfile::TempDir;
 
+use super::backup::in_order;
 use super::deployment;
 use super::keys::{Guarded, get};
 use super::support::{BINARY, Server, frame, reference, server, shared_server};
@@ -53,6 +54,26 @@ async fn indexing_a_folder_again_adds_nothing() {
         .await
         .expect(200);
     assert_eq!(image["pose"], serde_json::json!({"x": 110.5, "y": 200.25}));
+}
+
+#[tokio::test]
+async fn a_folder_is_a_recording_in_the_order_of_its_names() {
+    let (server, map) = shared_server();
+    let folder = TempDir::new().unwrap();
+    let names: Vec<String> = (0..72).map(|place| format!("{place}.jpg")).collect();
+    write_places(folder.path(), &names.iter().map(String::as_str).collect::<Vec<_>>());
+    // The first arrive last.
+    let late = names[..20].iter().map(|name| {
+        let path = folder.path().join(name);
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, b"no picture").unwrap();
+        (path, bytes)
+    });
+    let late: Vec<_> = late.collect();
+    assert_eq!(json(&index(server, folder.path(), &map))["added"], 52);
+    late.iter().for_each(|(path, bytes)| std::fs::write(path, bytes).unwrap());
+    assert_eq!(json(&index(server, folder.path(), &map))["added"], 20);
+    assert_eq!(in_order(server, &map).await, names);
 }
 
 #[tokio::test]

@@ -41,6 +41,25 @@ fn same_candidates(a: &Value, b: &Value) {
 }
 
 #[tokio::test]
+async fn a_track_goes_on_after_a_restart() {
+    let dir = TempDir::new().unwrap();
+    let mut server = Server::start(dir.path(), &[]);
+    server.town("m", 16).await;
+    for place in 0..12 {
+        if place == 6 {
+            assert!(server.terminate().success());
+            server = Server::start(dir.path(), &[]);
+        }
+        let at = format!("2026-03-01T12:00:{:02}Z", 2 * place);
+        let path = format!("/localize?map=m&refine=off&track=r&captured_at={at}");
+        let track = server.post_jpeg(&path, frame(place, 0)).await.expect(200)["track"].take();
+        assert_eq!(track["frames"], place + 1, "{track}");
+    }
+    let way = server.get("/maps/m/tracks/r").await.expect(200);
+    assert_eq!(way["places"].as_array().unwrap().len(), 12);
+}
+
+#[tokio::test]
 async fn images_can_be_added_after_a_restart() {
     let dir = TempDir::new().unwrap();
     let server = Server::start(dir.path(), &[]);

@@ -153,6 +153,42 @@ async fn a_key_revoked_at_one_server_is_rejected_by_the_other() {
     .await;
 }
 
+/// What a server says of the next frame of a track.
+async fn track_of(server: &Server, place: usize) -> Value {
+    let at = format!("2026-03-01T12:00:{:02}Z", 2 * place);
+    let path = format!("/localize?map=m&refine=off&track=r&captured_at={at}");
+    server.post_jpeg(&path, frame(place, 0)).await.expect(200)["track"].take()
+}
+
+#[tokio::test]
+#[ignore = "needs the scale-out deployment"]
+async fn any_server_continues_a_track_also_after_one_is_killed() {
+    let dir = TempDir::new().unwrap();
+    let (one, other) = (Server::start(dir.path(), &[]), Server::start(dir.path(), &[]));
+    one.town("m", 24).await;
+    for place in 0..12 {
+        let track = track_of([&one, &other][place % 2], place).await;
+        assert_eq!(track["frames"], place + 1, "{track}");
+    }
+    for server in [&one, &other] {
+        let tracks = server.get("/maps/m/tracks").await.expect(200);
+        assert_eq!(tracks["tracks"][0]["frames"], 12, "{tracks}");
+        let way = server.get("/maps/m/tracks/r").await.expect(200);
+        assert_eq!(way["places"].as_array().unwrap().len(), 12, "{way}");
+    }
+    one.kill();
+    let track = track_of(&other, 12).await;
+    assert_eq!((&track["frames"], &track["image_id"]), (&json!(13), &json!("place-12")), "{track}");
+    let one = Server::start(dir.path(), &[]);
+    let track = track_of(&one, 13).await;
+    assert_eq!((&track["frames"], &track["image_id"]), (&json!(14), &json!("place-13")), "{track}");
+    // Both know of each frame, also of those that they take at the same time.
+    let frames = (14..22).map(|place| track_of([&one, &other][place % 2], place));
+    futures_util::future::join_all(frames).await;
+    let track = track_of(&one, 22).await;
+    assert_eq!(track["frames"], 23, "{track}");
+}
+
 #[test]
 #[ignore = "needs the scale-out deployment"]
 fn a_worker_serves_health_and_metrics_only() {

@@ -4,6 +4,7 @@ use jiff::{SignedDuration, Timestamp};
 use serde_json::{Value, json};
 use whereabouts_town::{Town, TownSpec};
 
+use super::deployment;
 use super::drives::{self, behind_a_van, is_blocked};
 use super::support::{Answer, Server, frame, jpeg, shared_server};
 use super::wait::{eventually, until};
@@ -306,6 +307,8 @@ async fn the_least_recently_used_track_is_evicted() {
         let answer = server.post_jpeg(&path, frame(0, 0)).await.expect(200);
         frames.push(answer["track"]["frames"].as_u64().unwrap());
     }
-    assert_eq!(frames, [1, 1, 2, 1, 3, 1]);
+    assert_eq!(frames[..5], [1, 1, 2, 1, 3]);
+    // The store may have it: with a database always, otherwise if it was written in the last seconds.
+    assert!(frames[5] == 2 || !deployment::is_scale_out() && frames[5] == 1, "{frames:?}");
     assert!(server.log().contains("track.max"), "{}", server.log());
 }

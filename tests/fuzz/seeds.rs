@@ -150,7 +150,8 @@ pub fn archives() -> Vec<Vec<u8>> {
     let left_out = LeftOut { id: "2".parse().unwrap(), why: "damaged".into() };
     let mut writer = Writer::begin(&path, &Manifest::new(vec![map.name.clone()])).unwrap();
     writer.map(&map, None).unwrap();
-    writer.image(&map.name, &ExportedImage { image, descriptor }, &bytes).unwrap();
+    let exported = ExportedImage { image, descriptor, position: None, recording: None };
+    writer.image(&map.name, &exported, &bytes).unwrap();
     writer.left_out(&map.name, &left_out).unwrap();
     let archived = ArchivedMap { name: map.name, images: 1, left_out: vec![left_out] };
     writer.finish(vec![archived]).unwrap();

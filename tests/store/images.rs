@@ -4,9 +4,10 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use futures_util::future::join_all;
+use uuid::Uuid;
 use whereabouts_core::ExportedImage;
 use whereabouts_core::{
-    CoordinateFrame, GeographicPose, Image, ImageId, Map, MetricPose, Pose, dot,
+    CoordinateFrame, GeographicPose, Image, ImageId, Map, MetricPose, Pose, Recording, dot,
 };
 use whereabouts_index::SearchMode;
 use whereabouts_store::{Added, Store, StoreError};
@@ -26,6 +27,7 @@ contract!(
     concurrent_additions_and_removals_of_the_same_bytes_succeed,
     images_of_maps_do_not_mix,
     images_are_exported_in_pages_with_bit_identical_descriptors,
+    images_of_a_recording_are_in_its_order_also_after_a_restart,
 );
 
 async fn the_same_bytes_again_change_nothing_and_other_bytes_are_a_conflict(fixture: &Fixture) {
@@ -320,6 +322,38 @@ async fn images_of_maps_do_not_mix(fixture: &Fixture) {
     assert_eq!(store.image(&two, &in_two.id).await.unwrap(), Some(in_two));
 }
 
+async fn images_of_a_recording_are_in_its_order_also_after_a_restart(fixture: &Fixture) {
+    let store = fixture.open().await;
+    let (map, _) = store.put_map(map("m", 4)).await.unwrap();
+    let drive = Uuid::now_v7();
+    let places = [("first", None), ("c", Some(2)), ("a", Some(0)), ("late", None), ("b", Some(1))];
+    for (id, number) in places {
+        let pose =
+            Some(Pose::Geographic(GeographicPose { lat: 1.0, lon: 2.0, alt: None, heading: None }));
+        let image = Image { pose, ..image(id, id.as_bytes()) };
+        let _pin = store.put_blob(image.digest, Bytes::copy_from_slice(id.as_bytes())).await;
+        let recording = number.map(|number| Recording { id: drive, number });
+        let descriptor = descriptor(&image, 4);
+        store.add_recorded(&map, image, descriptor, recording).await.unwrap();
+    }
+    let ids = async |store: &dyn Store| -> Vec<String> {
+        let images = store.positions(&map).await.unwrap();
+        images.into_iter().map(|image| image.id.to_string()).collect()
+    };
+    let expected = ["first", "a", "b", "c", "late"];
+    assert_eq!(ids(&*store).await, expected);
+    // A correction of an image keeps its place.
+    let current = store.image(&map, &"a".parse().unwrap()).await.unwrap().unwrap();
+    let next = Image { tags: vec!["new".into()], ..current.clone() };
+    assert!(store.replace_image(&map, &current, next).await.unwrap());
+    drop(store);
+    let store = fixture.open().await;
+    assert_eq!(ids(&*store).await, expected);
+    let mut exported = store.export(&map, None, 9).await.unwrap();
+    Recording::sort(&mut exported, |image| (image.position.unwrap() as usize, image.recording));
+    assert_eq!(exported.iter().map(|e| e.image.id.as_str()).collect::<Vec<_>>(), expected);
+}
+
 async fn images_are_exported_in_pages_with_bit_identical_descriptors(fixture: &Fixture) {
     let store = fixture.open().await;
     let (map, _) = store.put_map(map("m", 100)).await.unwrap();
@@ -330,12 +364,20 @@ async fn images_are_exported_in_pages_with_bit_identical_descriptors(fixture: &F
     images.sort_by(|a, b| a.id.cmp(&b.id));
     let expected: Vec<_> = images
         .into_iter()
-        .map(|image| ExportedImage { descriptor: Some(descriptor(&image, 100)), image })
+        .map(|image| ExportedImage {
+            descriptor: Some(descriptor(&image, 100)),
+            image,
+            position: None,
+            recording: None,
+        })
         .collect();
-    assert_eq!(store.export(&map, None, 9).await.unwrap(), expected);
-    assert_eq!(store.export(&map, None, 3).await.unwrap(), expected[..3]);
-    let after = Some(&expected[2].image.id);
-    assert_eq!(store.export(&map, after, 3).await.unwrap(), expected[3..]);
+    let exported = async |after, limit| -> Vec<ExportedImage> {
+        let images = store.export(&map, after, limit).await.unwrap();
+        images.into_iter().map(|image| ExportedImage { position: None, ..image }).collect()
+    };
+    assert_eq!(exported(None, 9).await, expected);
+    assert_eq!(exported(None, 3).await, expected[..3]);
+    assert_eq!(exported(Some(&expected[2].image.id), 3).await, expected[3..]);
     let mut draft = store.draft(next(&map, 5)).await.unwrap();
     fill(draft.as_mut(), 5).await;
     assert!(draft.replace().await.unwrap());

@@ -27,5 +27,6 @@ mod processes;
 mod retention;
 mod schema;
 mod search;
+mod tracks;
 mod usage;
 mod webhooks;

@@ -66,7 +66,8 @@ async fn descriptor_settings_are_fixed_once_there_are_images(fixture: &Fixture) 
         let refused = store.search(&known, query, 1, SearchMode::Fast).await.unwrap_err();
         assert!(matches!(refused, StoreError::NotFound(_)), "{refused}");
         known = changed;
-        let empty = IndexState { images: 0, graph: false, behind: false, changes: 0, moved: 0 };
+        let empty =
+            IndexState { images: 0, graph: false, behind: false, changes: 0, moved: 0, located: 0 };
         assert_eq!(store.index_state(&known).await.unwrap(), empty);
     }
     let superseded = store.put_map(Map { revision: 7, ..known }).await.unwrap_err();

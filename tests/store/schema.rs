@@ -1,12 +1,15 @@
 //! The schema of PostgreSQL: migrations, and stores that are older or newer than it.
 
+use std::time::Duration;
+
+use bytes::Bytes;
 use futures_util::future::join_all;
 use uuid::Uuid;
-use whereabouts_store::StoreError;
 use whereabouts_store::postgres::{PostgresStore, SchemaState, migrate, schema_of};
+use whereabouts_store::{MapStore, StoreError, TrackKey, TrackStore};
 
 use crate::processes::database;
-use crate::support::{Database, Pictures, Tuning};
+use crate::support::{Database, Pictures, Tuning, add, map};
 
 #[tokio::test]
 async fn a_store_is_not_opened_without_its_schema() {
@@ -54,4 +57,33 @@ async fn a_schema_one_step_ahead_is_tolerated_and_two_steps_are_rejected() {
         assert!(matches!(refused, StoreError::Conflict(_)), "{refused}");
         assert!(refused.to_string().contains("version 9001"), "{refused}");
     }
+}
+
+#[tokio::test]
+async fn what_a_server_of_the_previous_release_adds_and_deletes_is_followed() {
+    let database = database().await;
+    let store = database.open(Tuning::default()).await;
+    let (map, _) = store.put_map(map("m", 4)).await.unwrap();
+    add(&store, &map, "new", b"new").await;
+    let before = store.index_state(&map).await.unwrap();
+    // It knows neither places in recordings nor which changes concern poses.
+    let pose = r#"{"lat": 1.0, "lon": 2.0}"#;
+    database
+        .run(&format!(
+            "INSERT INTO images (map_uid, id, digest, record, pose)
+             SELECT map_uid, 'old', digest, record, '{pose}' FROM images;
+             UPDATE image_counts SET images = images + 1, changes = changes + 1"
+        ))
+        .await;
+    let after = store.index_state(&map).await.unwrap();
+    assert_eq!((after.changes, after.located), (before.changes + 1, before.located));
+    let positions = store.positions(&map).await.unwrap();
+    assert_eq!(positions.iter().map(|image| image.id.as_str()).collect::<Vec<_>>(), ["old"]);
+    // It deletes a map without its tracks, which expire.
+    let key = TrackKey { map: map.uid, owner: "-".into(), id: "a".into() };
+    let long = Duration::from_secs(60);
+    let state = (1, Bytes::from_static(b"state"));
+    store.put_track(&key, None, state, long).await.unwrap().unwrap();
+    database.run("DELETE FROM maps").await;
+    assert_eq!(store.prune_tracks(Duration::ZERO, 9).await.unwrap(), 1);
 }

@@ -8,6 +8,7 @@ use anyhow::{Context, anyhow, ensure};
 use bytes::Bytes;
 use futures_util::StreamExt;
 use reqwest::multipart::{Form, Part};
+use uuid::Uuid;
 
 use super::super::client::{Client, MAX_ATTEMPTS, MAX_PAUSE};
 use super::super::message;
@@ -16,7 +17,7 @@ use super::account::{Entry, FailedImage, IndexReport, Outcome, PoseOrigin};
 use super::{Args, map};
 use whereabouts_api::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 use whereabouts_api::{ErrorKind, ImageMeta};
-use whereabouts_core::{ImageField, ImageId, MediaType};
+use whereabouts_core::{Digest, ImageField, ImageId, MediaType, Recording};
 use whereabouts_eval::{Folder, FolderPoses, FoundPose, PictureFile, PoseSource};
 
 /// Images in one request. Several requests at a time keep the server busy while one of them completes.
@@ -36,7 +37,8 @@ pub async fn add_folder(client: &Client, dir: &Path, args: &Args) -> anyhow::Res
 
     let start = Instant::now();
     let progress = ProgressMeter::new("images", folder.pictures.len());
-    let uploader = Uploader { client, path: format!("{path}/images:batch"), poses: &poses };
+    let places = places(&folder.pictures);
+    let uploader = Uploader { client, path: format!("{path}/images:batch"), poses: &poses, places };
     let mut uploads = futures_util::stream::iter(batches(folder.pictures.clone()))
         .map(|batch| uploader.upload(batch))
         .buffer_unordered(usize::from(args.concurrency));
@@ -70,6 +72,17 @@ pub async fn add_folder(client: &Client, dir: &Path, args: &Args) -> anyhow::Res
         folder.pictures.iter().filter_map(|picture| entries.remove(&picture.id)).collect();
     let (rows, seconds) = (poses.account().cloned(), start.elapsed().as_secs_f64());
     Ok(IndexReport::new(args.map.clone(), account, failed, folder.skipped, rows, seconds))
+}
+
+/// The places of pictures in the order of their names. Batches are sent side by side, and arrive in any order. The
+/// same pictures are always the same recording, so that a folder may be sent again.
+fn places(pictures: &[PictureFile]) -> HashMap<ImageId, Recording> {
+    let names: Vec<&str> = pictures.iter().map(|picture| picture.id.as_str()).collect();
+    let digest = Digest::of(names.join("\n").as_bytes());
+    let id = digest.as_bytes().first_chunk().copied().map(Uuid::from_bytes).unwrap_or_default();
+    let numbers = 0..u32::MAX;
+    let places = pictures.iter().zip(numbers);
+    places.map(|(picture, number)| (picture.id.clone(), Recording { id, number })).collect()
 }
 
 fn batches(files: Vec<PictureFile>) -> Vec<Vec<PictureFile>> {
@@ -125,6 +138,8 @@ struct Uploader<'a> {
     client: &'a Client,
     path: String,
     poses: &'a FolderPoses,
+    /// The place of each picture in the recording that the folder is.
+    places: HashMap<ImageId, Recording>,
 }
 
 impl Uploader<'_> {
@@ -198,6 +213,7 @@ impl Uploader<'_> {
             pose: pose.map(Into::into),
             captured_at,
             tags,
+            recording: self.places.get(&picture.id).copied(),
         };
         let meta = serde_json::to_string(&meta)?;
         Ok(PendingImage { picture: picture.clone(), bytes, media_type, meta, source, warnings })

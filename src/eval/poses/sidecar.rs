@@ -43,7 +43,7 @@ fn described(file: &Path, bytes: u64) -> Result<KnownImage, String> {
     let text = std::fs::read(file).map_err(|error| error.to_string())?;
     let text = text.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(&text);
     let meta: ImageMeta = serde_json::from_slice(text).map_err(|error| error.to_string())?;
-    let ImageMeta { id, pose, captured_at, tags } = meta;
+    let ImageMeta { id, pose, captured_at, tags, .. } = meta;
     let mut image = KnownImage { captured_at, tags, ..KnownImage::default() };
     if let Some(pose) = pose.filter(|pose| !pose.is_empty()) {
         let frame = pose.frame().ok_or("a pose needs either lat and lon, or x and y")?;

@@ -4,7 +4,9 @@ use jiff::Timestamp;
 
 use super::proto;
 use whereabouts_api::{MapRefiner, RefineMode};
-use whereabouts_core::{CoordinateFrame, JobState, PoseInput, Priority, RefinerKind, Scene};
+use whereabouts_core::{
+    CoordinateFrame, JobState, PoseInput, Priority, Recording, RefinerKind, Scene,
+};
 use whereabouts_service::ServiceError;
 
 /// Converts the number of an enum; an unknown one is malformed.
@@ -85,6 +87,13 @@ pub(super) fn frame(number: i32) -> Result<Option<CoordinateFrame>, ServiceError
 pub(super) fn moment(moment: prost_types::Timestamp) -> Result<Timestamp, ServiceError> {
     Timestamp::new(moment.seconds, moment.nanos)
         .map_err(|error| ServiceError::unprocessable(format!("captured_at: {error}")))
+}
+
+pub(super) fn recording(recording: proto::Recording) -> Result<Recording, ServiceError> {
+    let id = recording.id.parse().map_err(|error: uuid::Error| {
+        ServiceError::unprocessable(format!("recording.id must be a UUID: {error}"))
+    })?;
+    Ok(Recording { id, number: recording.number })
 }
 
 /// An error of one item among several.

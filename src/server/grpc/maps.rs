@@ -122,7 +122,7 @@ fn image(
     next: AddImagesRequest,
     memory: Option<OwnedSemaphorePermit>,
 ) -> Result<BulkImage, ServiceError> {
-    let AddImagesRequest { map: named, image, id, pose, captured_at, tags } = next;
+    let AddImagesRequest { map: named, image, id, pose, captured_at, tags, recording } = next;
     if !named.is_empty() && named != map.as_str() {
         return Err(ServiceError::malformed(format!(
             "the images of one call go into one map, {map}; call again for another"
@@ -133,6 +133,7 @@ fn image(
         pose: pose.map(convert::pose),
         captured_at: captured_at.map(convert::moment).transpose()?,
         tags,
+        recording: recording.map(convert::recording).transpose()?,
     };
     Ok(BulkImage { bytes: image, meta, memory })
 }

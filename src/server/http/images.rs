@@ -9,6 +9,7 @@ use bytes::Bytes;
 use jiff::Timestamp;
 use serde::Deserialize;
 use utoipa::IntoParams;
+use uuid::Uuid;
 
 use super::body::{JsonBody, Params, PictureBody, Segments, object};
 use super::maps::map_name;
@@ -17,7 +18,7 @@ use super::state::AppState;
 use crate::gate::Problem;
 use crate::gate::Ready;
 use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage, ImagePatch};
-use whereabouts_core::{Image, ImageId, MediaType, PoseInput, moment};
+use whereabouts_core::{Image, ImageId, MediaType, PoseInput, Recording, moment};
 use whereabouts_service::{Deadline, NewImage, ServiceError};
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
@@ -34,6 +35,11 @@ pub(super) struct MetaParams {
     captured_at: Option<Timestamp>,
     /// Tags, separated by commas.
     tags: Option<String>,
+    /// The recording that the image belongs to: a UUID of the sender's choice. Tracks follow the images of a recording
+    /// in the order of their numbers.
+    recording: Option<Uuid>,
+    /// With `recording`: the number of the image in it.
+    number: Option<u32>,
     /// Latitude in degrees, in a `wgs84` map.
     lat: Option<f64>,
     /// Longitude in degrees.
@@ -77,6 +83,8 @@ impl MetaParams {
         self.id.is_none()
             && self.captured_at.is_none()
             && self.tags.is_none()
+            && self.recording.is_none()
+            && self.number.is_none()
             && self.pose().is_none()
     }
 
@@ -86,15 +94,25 @@ impl MetaParams {
         (!pose.is_empty()).then_some(pose)
     }
 
-    fn into_meta(self) -> ImageMeta {
+    fn into_meta(self) -> Result<ImageMeta, Problem> {
         let pose = self.pose();
         let tags = self.tags.map(|tags| tags.split(',').map(|tag| tag.trim().to_owned()).collect());
-        ImageMeta {
+        let recording = match (self.recording, self.number) {
+            (Some(id), Some(number)) => Some(Recording { id, number }),
+            (None, None) => None,
+            _ => {
+                let detail = "recording and number belong together: the UUID of a recording, and the number of \
+                              the image in it";
+                return Err(Problem::new(ErrorKind::Malformed, detail));
+            }
+        };
+        Ok(ImageMeta {
             id: self.id,
             pose,
             captured_at: self.captured_at,
             tags: tags.unwrap_or_default(),
-        }
+            recording,
+        })
     }
 }
 
@@ -145,7 +163,7 @@ pub(super) async fn add_image(
             return Err(Problem::new(ErrorKind::Malformed, detail));
         }
         Some(meta) => meta_from_part(&meta)?,
-        None => params.into_meta(),
+        None => params.into_meta()?,
     };
     let new = NewImage { bytes: body.picture, meta, demand };
     let (answer, new) = service.images.add(&map_name(&map)?, new).await?;

@@ -84,6 +84,7 @@ pub async fn run(
     let dispatcher = Dispatcher::new(Arc::clone(store), counted, settings.clone());
     let service = Arc::new(service);
     state.gate.readiness().open(Arc::clone(&service));
+    let tracked = Arc::clone(&service);
     let mut running = JoinSet::new();
     if role == Role::Serve {
         let until = shutdown.clone();
@@ -94,6 +95,12 @@ pub async fn run(
         running.spawn(async move { service.calibrator.run(until).await });
         let until = shutdown.clone();
         running.spawn(async move { fitting.fitter.run(until).await });
+        let (until, saving) = (shutdown.clone(), Arc::clone(&tracked));
+        running.spawn(async move { saving.localizer.tracks.run(until).await });
+        let (until, heeding) = (shutdown.clone(), Arc::clone(&tracked));
+        running.spawn(async move {
+            heeding.localizer.tracks.heed(&heeding.localizer.jobs, until).await;
+        });
     }
     if let Some(worker) = worker {
         running.spawn(worker.run(shutdown.clone()));
@@ -118,6 +125,7 @@ pub async fn run(
     }
     let idle = move || pools.iter().for_each(|pool| pool.wait_until_idle(drain_timeout));
     tokio::task::spawn_blocking(idle).await.context("the shutdown failed")?;
+    tracked.localizer.tracks.save().await;
     tracing::info!("stopped");
     Ok(())
 }

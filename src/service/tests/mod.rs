@@ -9,6 +9,7 @@ mod limits;
 mod localize;
 mod maps;
 mod retention;
+mod sharing;
 mod submit;
 mod track;
 mod transfer;
@@ -183,6 +184,8 @@ fn settings() -> ServiceSettings {
             candidates: 10,
             states: 64,
             history: 50,
+            stored: 10,
+            state_bytes: 1 << 18,
             known_probability: 0.5,
         },
         confidence: ConfidenceSettings {

@@ -12,7 +12,8 @@ use whereabouts_store::{BlobStore, MapStore};
 const VIEWS: usize = 64;
 
 /// A frame about which the search says nothing: in these small maps, all images are compared.
-const ALONE: FrameEvidence<'static> = FrameEvidence { candidates: &[], confidence: None };
+pub(super) const ALONE: FrameEvidence<'static> =
+    FrameEvidence { candidates: &[], confidence: None };
 
 /// A step that is taken `seconds` after the epoch.
 pub(super) fn step(caller: &Principal, id: &str, seconds: i64) -> TrackStep {

@@ -58,16 +58,15 @@ pub(super) struct Numbered {
     pub belief: Belief,
     /// The probability of having left the map.
     pub left: f64,
+    /// One more than the place of each image, 0 for none: memory that is zero costs nothing where it is not touched, and
+    /// most of a large map is not.
     at: Vec<u32>,
 }
 
-/// No place.
-const NOWHERE: u32 = u32::MAX;
-
 impl Numbered {
     fn new(belief: Belief, count: usize) -> Self {
-        let mut at = vec![NOWHERE; count];
-        for (place, image) in (0..).zip(&belief.images) {
+        let mut at = vec![0; count];
+        for (place, image) in (1..).zip(&belief.images) {
             at[*image as usize] = place;
         }
         Self { belief, left: 0.0, at }
@@ -76,12 +75,12 @@ impl Numbered {
     /// Returns the place of an image, which is added if it is new.
     pub fn place(&mut self, image: u32) -> usize {
         let at = &mut self.at[image as usize];
-        if *at == NOWHERE {
-            *at = self.belief.images.len() as u32;
+        if *at == 0 {
             self.belief.images.push(image);
             self.belief.states.push([0.0; STATES]);
+            *at = self.belief.images.len() as u32;
         }
-        *at as usize
+        *at as usize - 1
     }
 }
 
@@ -89,6 +88,13 @@ impl Belief {
     /// The uniform distribution, before the first frame.
     pub fn uniform() -> Self {
         Self { images: Vec::new(), states: Vec::new(), elsewhere: 1.0 }
+    }
+
+    /// Some images with the probabilities of their states; the rest is spread evenly over the map.
+    pub fn with_rest(images: Vec<u32>, states: Vec<[f32; STATES]>) -> Self {
+        let belief = Self { images, states, elsewhere: 0.0 };
+        let known = belief.total();
+        Self { elsewhere: (1.0 - known).max(0.0), ..belief }.normalised()
     }
 
     /// The images that are told apart.
@@ -196,13 +202,11 @@ impl Belief {
         let kept = self.images.iter().zip(&self.states);
         let kept = kept.filter_map(|(image, states)| Some((number(*image)?, *states)));
         let (images, states): (Vec<_>, Vec<_>) = kept.unzip();
-        let belief = Self { images, states, elsewhere: 0.0 };
-        let known: f64 = belief.masses().iter().map(|(_, mass)| mass).sum();
-        Self { elsewhere: (1.0 - known).max(0.0), ..belief }.normalised()
+        Self::with_rest(images, states)
     }
 
     /// Keeps the `max` most likely images, moves the rest of the probability elsewhere, and normalises the sum.
-    fn pruned(mut self, max: usize) -> Self {
+    pub fn pruned(mut self, max: usize) -> Self {
         self = self.normalised().without_traces();
         if self.images.len() > max {
             let mut masses: Vec<(usize, f64)> =

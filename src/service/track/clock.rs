@@ -58,35 +58,35 @@ const STOPPED: u32 = 40;
 /// The clock of a robot, as its frames show it.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Clock {
-    last: Option<Reading>,
+    pub last: Option<Reading>,
     /// The frame before the clock went ahead by an unusual step, until the next frame.
-    before_step: Option<Timestamp>,
+    pub before_step: Option<Timestamp>,
     /// Frames in a row that are older than the last.
-    older: Option<Older>,
+    pub older: Option<Older>,
     /// The usual time between two arrivals in seconds.
-    arrivals: Option<f64>,
+    pub arrivals: Option<f64>,
     /// The usual time between two frames by the robot's clock, in seconds.
-    captures: Option<f64>,
+    pub captures: Option<f64>,
     /// Number of frames with both times.
-    timed: u64,
+    pub timed: u64,
     /// Frames in a row with the same time.
-    same: u32,
+    pub same: u32,
 }
 
 /// The frame before.
 #[derive(Debug, Clone, Copy)]
-struct Reading {
-    captured_at: Option<Timestamp>,
-    arrived: Instant,
+pub(super) struct Reading {
+    pub captured_at: Option<Timestamp>,
+    pub arrived: Instant,
 }
 
 /// Frames in a row that are older than the last one of a track.
 #[derive(Debug, Clone, Copy)]
-struct Older {
-    first: Timestamp,
-    newest: Timestamp,
-    arrived: Instant,
-    count: u32,
+pub(super) struct Older {
+    pub first: Timestamp,
+    pub newest: Timestamp,
+    pub arrived: Instant,
+    pub count: u32,
 }
 
 /// What the clock says about a frame.

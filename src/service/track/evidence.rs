@@ -117,6 +117,22 @@ impl Weights {
         sums
     }
 
+    /// Weights of some images, sorted by number, and that of all others.
+    pub fn given(known: Vec<(u32, f64)>, rest: f64) -> Self {
+        Self { known, rest, standardised: Vec::new(), sample: Vec::new(), outliers: 0.0 }
+    }
+
+    /// The mean weight where `belief` expects the robot on a map of `count` images.
+    pub fn mean(&self, belief: &Belief, count: usize) -> f64 {
+        let weight = |image: u32| {
+            let at = self.known.binary_search_by_key(&image, |(image, _)| *image);
+            at.map_or(self.rest, |at| self.known[at].1)
+        };
+        let known: f64 = belief.masses().iter().map(|(image, mass)| mass * weight(*image)).sum();
+        let above: f64 = self.known.iter().map(|(_, weight)| weight - self.rest).sum();
+        known + belief.elsewhere() * (self.rest + above / count.max(1) as f64)
+    }
+
     /// The weights by image.
     pub fn known(&self) -> &[(u32, f64)] {
         &self.known
@@ -131,16 +147,16 @@ impl Weights {
 /// The frames of a track so far.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Frames {
-    sum: Vec<f32>,
+    pub sum: Vec<f32>,
     /// The weight of all frames in `sum`.
-    weight: f64,
-    last: VecDeque<Vec<f32>>,
+    pub weight: f64,
+    pub last: VecDeque<Vec<f32>>,
     /// Frames without novelty in a row.
-    repeated: u32,
+    pub repeated: u32,
     /// How often a frame was unlike the last one, but like one before that.
-    alternation: f64,
+    pub alternation: f64,
     /// Number of frames.
-    count: u32,
+    pub count: u32,
 }
 
 impl Frames {

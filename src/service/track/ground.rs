@@ -28,6 +28,8 @@ const MIN_DIFFERENCE: f32 = 1e-6;
 pub(super) struct Ground {
     images: Vec<LocatedImage>,
     numbers: HashMap<ImageId, u32>,
+    /// The images by their slots.
+    by_slot: Vec<(usize, u32)>,
     pub grid: Grid,
     pub paths: Paths,
     /// Images spread evenly over the map; all of a small one.
@@ -43,6 +45,8 @@ struct Common {
     mean: Vec<f32>,
     /// The usual difference, 1 − similarity, of neighbours.
     difference: f32,
+    /// The descriptors of the sample: each frame is compared with them.
+    sample: Vec<Option<Descriptor>>,
 }
 
 /// What sets each image apart; NaN until it is needed.
@@ -59,13 +63,17 @@ impl Ground {
     pub fn new(images: Vec<LocatedImage>) -> Self {
         let images = in_order(images);
         let numbers = images.iter().map(|image| image.id.clone()).zip(0..).collect();
+        let slots = images.iter().map(|image| image.slot);
+        let mut by_slot: Vec<(usize, u32)> = slots.zip(0..).collect();
+        by_slot.sort_unstable();
         let grid = Grid::new(in_a_plane(images.iter().map(|image| &image.pose)));
         let paths = Paths::new(&grid, MIN_SPACING_M);
         let step = images.len().div_ceil(SAMPLE).max(1);
         let sample = (0..images.len() as u32).step_by(step).collect();
         let unknown = vec![f32::NAN; images.len()];
         let traits = Mutex::new(Traits { changes: unknown.clone(), lengths: unknown });
-        Self { images, numbers, grid, paths, sample, common: Common::default(), traits }
+        let common = Common::default();
+        Self { images, numbers, by_slot, grid, paths, sample, common, traits }
     }
 
     /// The number of images.
@@ -85,6 +93,17 @@ impl Ground {
         self.numbers.get(id).copied()
     }
 
+    /// The slot of an image.
+    pub fn slot(&self, number: u32) -> usize {
+        self.images[number as usize].slot
+    }
+
+    /// The image in a slot.
+    pub fn in_slot(&self, slot: usize) -> Option<u32> {
+        let at = self.by_slot.binary_search_by_key(&slot, |(slot, _)| *slot).ok()?;
+        Some(self.by_slot[at].1)
+    }
+
     /// The slots of some images.
     pub fn slots(&self, images: &[u32]) -> Vec<usize> {
         images.iter().map(|image| self.images[*image as usize].slot).collect()
@@ -93,6 +112,12 @@ impl Ground {
     /// Images spread evenly over the map; all of a small one.
     pub fn sample(&self) -> &[u32] {
         &self.sample
+    }
+
+    /// The dot product of a vector and the descriptor of each image of the sample, if it could be read.
+    pub fn sample_similarities(&self, vector: &[f32]) -> impl Iterator<Item = Option<f32>> {
+        let rows = self.common.sample.iter();
+        rows.map(move |row| row.as_ref().map(|row| dot(vector, row.as_slice())))
     }
 
     /// The mean of the descriptors; empty if none could be read.
@@ -126,7 +151,8 @@ impl Ground {
         mean.iter_mut().for_each(|sum| *sum /= count);
         differences.sort_by(f32::total_cmp);
         let usual = differences.get(differences.len() / 2).copied().unwrap_or(1.0);
-        self.common = Common { mean, difference: usual.max(MIN_DIFFERENCE) };
+        let sample = self.sample.iter().map(|image| known.get(image).cloned()).collect();
+        self.common = Common { mean, difference: usual.max(MIN_DIFFERENCE), sample };
         self.learn(&self.sample, known);
     }
 

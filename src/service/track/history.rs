@@ -40,11 +40,11 @@ pub(super) struct Passed {
     pub captured_at: Option<Timestamp>,
     pub received_at: Timestamp,
     /// The most likely images.
-    images: Vec<(u32, f32)>,
-    elsewhere: f64,
-    off_map: f64,
+    pub images: Vec<(u32, f32)>,
+    pub elsewhere: f64,
+    pub off_map: f64,
     /// How far the robot had moved since the frame before; `None` if that is not known.
-    moved: Option<Move>,
+    pub moved: Option<Move>,
 }
 
 /// How far a robot has moved, in metres.

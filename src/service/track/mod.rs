@@ -1,10 +1,11 @@
 //! Tracks: sequences of frames of one robot, whose estimates are filtered over time.
 //!
 //! [`belief`] is the filter over the [`paths`] of a map, [`moves`] and [`speeds`] are its motion model, [`presence`] says
-//! whether the robot is on the map at all, [`posterior`] joins the two, [`evidence`] is what a frame says, [`odometry`] and [`clock`] how the robot says that it moved and when, [`session`] one track, [`ground`] what all tracks in
-//! a map share, [`mod@estimate`] the answer, and [`history`] and [`ways`] the way so far. This file keeps the tracks in memory, bounded in number and age; they do
-//! not survive a restart. The map of tracks is a plain one with strict LRU: moka and quick_cache would evict newcomers
-//! first.
+//! whether the robot is on the map at all, [`posterior`] joins the two, [`evidence`] is what a frame says, [`odometry`]
+//! and [`clock`] how the robot says that it moved and when, [`session`] one track, [`mod@prediction`] what it believes
+//! before a frame, [`verdicts`] what a job says later, [`ground`] and [`grounds`] what all tracks in a map share,
+//! [`mod@estimate`] the answer, and [`history`] and [`ways`] the way so far. [`memory`] keeps tracks, [`sharing`] and
+//! [`record`] store them.
 
 mod belief;
 mod clock;
@@ -12,40 +13,42 @@ mod estimate;
 mod evidence;
 mod grid;
 mod ground;
+mod grounds;
 mod history;
+mod memory;
 mod moves;
 mod odometry;
 mod paths;
 mod posterior;
+mod prediction;
 mod presence;
+mod record;
 mod session;
 mod settings;
+mod sharing;
 mod speeds;
+mod verdicts;
 mod ways;
 
-use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::Duration;
 
 use jiff::Timestamp;
-use parking_lot::Mutex;
-use tokio::sync::Mutex as AsyncMutex;
-use tokio::time::Instant;
-use uuid::Uuid;
 
 use self::estimate::estimate;
-use self::ground::{Ground, Known};
+use self::ground::Ground;
+use self::grounds::Grounds;
+use self::memory::Memory;
 pub use self::odometry::Odometry;
-use self::posterior::MIN_IMAGES;
-use self::session::{Frame, Prediction, Track};
+use self::posterior::{MIN_IMAGES, Posterior};
+use self::prediction::Prediction;
+use self::session::{Frame, Track};
 pub use self::settings::TrackSettings;
+use self::sharing::MAX_ATTEMPTS;
+use self::verdicts::Waiting;
 use super::{Principal, ServiceError};
 use whereabouts_api::{ErrorKind, TrackEstimate};
 use whereabouts_core::{Calibration, Candidate, Descriptor, Map};
-use whereabouts_store::{MapStore, StoreError};
-
-/// Minimum age of the cached positions of a map before they are read again, for maps that grow.
-const POSITIONS_REFRESH: Duration = Duration::from_secs(2);
+use whereabouts_store::{MapStore, StoreError, TrackKey, TrackStore};
 
 /// A frame's place in a track, as the robot states it.
 #[derive(Debug, Clone, PartialEq)]
@@ -82,6 +85,11 @@ impl TrackStep {
         }
         Ok(Self { id, owner: caller.scope().to_owned(), captured_at, odometry })
     }
+
+    /// The name of the track in a map.
+    pub(crate) fn key(&self, map: &Map) -> TrackKey {
+        TrackKey { map: map.uid, owner: self.owner.clone(), id: self.id.clone() }
+    }
 }
 
 /// What a frame says alone.
@@ -104,110 +112,43 @@ impl<'a> FrameEvidence<'a> {
     }
 }
 
-/// A track with the time of its last use.
-#[derive(Debug)]
-struct TrackEntry {
-    last_used: Instant,
-    track: Arc<AsyncMutex<Track>>,
-}
-
-impl TrackEntry {
-    fn is_idle(&self, settings: &TrackSettings) -> bool {
-        self.last_used.elapsed() > Duration::from_secs(settings.idle_s)
-    }
-}
-
-/// What tracks know of one map.
-#[derive(Debug, Clone)]
-struct CachedGround {
-    /// The revision of the map, and the number of changes of its images.
-    version: (u32, u64),
-    read_at: Instant,
-    ground: Arc<Ground>,
-}
-
-/// All tracks, in memory.
+/// All tracks.
 pub struct Tracks {
     store: Arc<dyn MapStore>,
     /// Images closer than this many metres show the same place.
     place_m: f64,
     settings: Arc<TrackSettings>,
-    /// By map, owner and id.
-    tracks: Mutex<HashMap<Key, TrackEntry>>,
-    maps: Mutex<HashMap<Uuid, CachedGround>>,
-    /// Locked while positions are read, so that concurrent frames read them once.
-    loading: AsyncMutex<()>,
+    stored: Arc<dyn TrackStore>,
+    memory: Memory,
+    grounds: Grounds,
+    /// The jobs whose verdicts will be evidence.
+    waiting: Waiting,
 }
 
-/// A map, the owner of a track, and the owner's name for it.
-type Key = (Uuid, String, String);
-
 impl Tracks {
-    /// An empty set of tracks.
-    pub fn new(store: Arc<dyn MapStore>, place_m: f64, settings: TrackSettings) -> Self {
+    /// The tracks in a store.
+    pub fn new(
+        store: Arc<dyn MapStore>,
+        stored: Arc<dyn TrackStore>,
+        place_m: f64,
+        settings: TrackSettings,
+    ) -> Self {
+        let settings = Arc::new(settings);
+        let (memory, grounds) = (Memory::default(), Grounds::default());
         Self {
             store,
             place_m,
-            settings: Arc::new(settings),
-            tracks: Mutex::default(),
-            maps: Mutex::default(),
-            loading: AsyncMutex::default(),
+            stored,
+            memory,
+            grounds,
+            waiting: Waiting::new(settings.max),
+            settings,
         }
     }
 
     /// The number of candidates that the filter uses.
     pub fn candidates(&self) -> usize {
         self.settings.candidates
-    }
-
-    /// Returns a track; a new one if it is not in memory or has been idle for too long.
-    fn track(&self, key: &Key) -> Arc<AsyncMutex<Track>> {
-        let mut tracks = self.tracks.lock();
-        let now = Instant::now();
-        let idle = Duration::from_secs(self.settings.idle_s);
-        if let Some(known) = tracks.get_mut(key)
-            && now.duration_since(known.last_used) <= idle
-        {
-            known.last_used = now;
-            return Arc::clone(&known.track);
-        }
-        tracks.retain(|_, known| now.duration_since(known.last_used) <= idle);
-        if tracks.len() >= self.settings.max
-            && let Some((oldest, _)) = tracks.iter().min_by_key(|(_, known)| known.last_used)
-        {
-            let oldest = oldest.clone();
-            tracing::warn!(
-                track = oldest.2,
-                max = self.settings.max,
-                "the least recently used track was evicted; raise track.max if there are more robots"
-            );
-            tracks.remove(&oldest);
-        }
-        let track = Arc::new(AsyncMutex::new(Track::new()));
-        tracks.insert(key.clone(), TrackEntry { last_used: now, track: Arc::clone(&track) });
-        track
-    }
-
-    fn cached(&self, map: &Map, version: (u32, u64)) -> Option<Arc<Ground>> {
-        let maps = self.maps.lock();
-        let known = maps.get(&map.uid)?;
-        // Descriptors of another revision cannot be compared.
-        // A map that had no poses may have some now.
-        let is_recent = known.ground.len() > 0 && known.read_at.elapsed() < POSITIONS_REFRESH;
-        let fresh = known.version == version || (known.version.0 == version.0 && is_recent);
-        fresh.then(|| Arc::clone(&known.ground))
-    }
-
-    /// Caches what tracks know of a map, and drops those of maps without tracks.
-    fn cache(&self, map: &Map, version: (u32, u64), ground: &Arc<Ground>) {
-        let used: Vec<Uuid> = {
-            let tracks = self.tracks.lock();
-            tracks.keys().map(|(uid, ..)| *uid).collect()
-        };
-        let mut maps = self.maps.lock();
-        maps.retain(|uid, _| used.contains(uid));
-        let known = CachedGround { version, read_at: Instant::now(), ground: Arc::clone(ground) };
-        maps.insert(map.uid, known);
     }
 }
 
@@ -233,16 +174,62 @@ impl Tracks {
                 map.name
             )));
         }
-        let TrackStep { id, owner, .. } = step.clone();
-        let track = self.track(&(map.uid, owner, id.clone()));
+        let key = step.key(map);
+        let id = key.id.clone();
+        let track = self.memory.track(&key, &self.settings);
         // Concurrent frames of one track are processed one after another.
-        let mut track = track.lock_owned().await;
-        // A frame that fails leaves the track as it was.
-        let mut next = track.clone();
-        next.enter(&ground, map.revision);
+        let mut held = track.lock_owned().await;
+        let mut attempts = MAX_ATTEMPTS;
+        let Answered { mut estimate, mut posterior, warning } = loop {
+            self.refresh(&key, &mut held, &ground).await?;
+            // A frame that fails leaves the track as it was.
+            let next = held.track.clone();
+            let frame = (step.clone(), frame, evidence);
+            let (next, answered) = self.advance(map, &ground, next, frame).await?;
+            attempts -= 1;
+            if self.keep(&key, &mut held, next, &ground).await? {
+                break answered;
+            }
+            if attempts == 0 {
+                tracing::warn!(
+                    track = id,
+                    "other servers changed a track all the time: a frame is lost for it"
+                );
+                break answered;
+            }
+        };
+        drop(held);
+        loop {
+            let Some(image) = estimate.image_id.as_ref().and_then(|id| ground.number(id)) else {
+                return Ok((estimate, warning));
+            };
+            if self.store.image(map, ground.id(image)).await?.is_some() {
+                return Ok((estimate, warning));
+            }
+            // Deleted since the positions were read.
+            posterior = Arc::new(posterior.renumbered(&|other| (other != image).then_some(other)));
+            let place = (estimate.id, estimate.frames, estimate.is_late);
+            let (on, settings, place_m) =
+                (Arc::clone(&ground), Arc::clone(&self.settings), self.place_m);
+            let whole = Arc::clone(&posterior);
+            let next = on_blocking_thread(move || place_of(place, &whole, &on, place_m, &settings));
+            estimate = next.await?;
+        }
+    }
+
+    /// Takes a frame into account.
+    async fn advance(
+        &self,
+        map: &Map,
+        ground: &Arc<Ground>,
+        mut next: Track,
+        (step, frame, evidence): (TrackStep, &Descriptor, Option<FrameEvidence<'_>>),
+    ) -> Result<(Track, Answered), ServiceError> {
+        let candidates = evidence.map(|evidence| evidence.candidates);
+        let id = step.id.clone();
+        next.enter(ground, map.revision);
         let is_informative = candidates.is_some();
-        let (frame, on, settings) =
-            (frame.clone(), Arc::clone(&ground), Arc::clone(&self.settings));
+        let (frame, on, settings) = (frame.clone(), Arc::clone(ground), Arc::clone(&self.settings));
         let (mut next, prediction) = on_blocking_thread(move || {
             let frame = Frame { descriptor: frame.as_slice(), is_informative };
             let prediction = next.predict(&step, frame, &on, &settings);
@@ -250,51 +237,35 @@ impl Tracks {
         })
         .await?;
         let similar = match candidates {
-            Some(candidates) => self.similarities(map, &ground, &prediction, candidates).await?,
-            None => Similar::default(),
+            Some(candidates) => self.similarities(map, ground, &prediction, candidates).await?,
+            None => None,
         };
-        let (on, settings) = (Arc::clone(&ground), Arc::clone(&self.settings));
+        let (on, settings, place_m) =
+            (Arc::clone(ground), Arc::clone(&self.settings), self.place_m);
         let (warning, is_late) = (prediction.warning.clone(), prediction.is_late);
         let confidence = evidence.and_then(|evidence| evidence.confidence);
-        let (next, posterior) = on_blocking_thread(move || {
-            let Similar { images, similarities } = similar;
+        on_blocking_thread(move || {
+            let similar = similar.map(|similar| similar.with_sample(&on, &prediction.frame));
+            let Similar { images, similarities } = similar.unwrap_or_default();
             let similar = (images.as_slice(), similarities.as_slice());
             let weights = prediction.weights(similar, confidence, &on, &settings);
             let posterior = next.update(prediction, weights.as_ref(), &on, &settings);
-            (next, posterior)
+            let place = (id, next.frames, is_late);
+            let estimate = place_of(place, &posterior, &on, place_m, &settings);
+            (next, Answered { estimate, posterior, warning })
         })
-        .await?;
-        let frames = next.frames;
-        *track = next;
-        drop(track);
-        let mut posterior = posterior;
-        loop {
-            let place = (id.clone(), frames);
-            let (on, settings, place_m) =
-                (Arc::clone(&ground), Arc::clone(&self.settings), self.place_m);
-            let whole = Arc::clone(&posterior);
-            let estimate =
-                on_blocking_thread(move || estimate(place, &whole, &on, place_m, &settings))
-                    .await?;
-            let Some(image) = estimate.image_id.as_ref().and_then(|id| ground.number(id)) else {
-                return Ok((estimate, warning));
-            };
-            if self.store.image(map, ground.id(image)).await?.is_some() {
-                return Ok((TrackEstimate { is_late, ..estimate }, warning));
-            }
-            // Deleted since the positions were read.
-            posterior = Arc::new(posterior.renumbered(&|other| (other != image).then_some(other)));
-        }
+        .await
     }
 
-    /// How similar the images are that matter to a track.
+    /// How similar the images are that matter to a track, but for the sample of the map; `None` if a reindex ended
+    /// meanwhile, so that the frame only moves the belief.
     async fn similarities(
         &self,
         map: &Map,
         ground: &Arc<Ground>,
         prediction: &Prediction,
         candidates: &[Candidate],
-    ) -> Result<Similar, ServiceError> {
+    ) -> Result<Option<Similar>, ServiceError> {
         // The caller may have asked for more than the filter uses.
         let candidates = &candidates[..candidates.len().min(self.candidates())];
         let candidates: Vec<u32> =
@@ -309,42 +280,32 @@ impl Tracks {
             self.store.similarities(map, prediction.frame.clone(), ground.slots(&images)).await
         };
         match read.await {
-            Ok(similarities) => Ok(Similar { images, similarities }),
-            // A reindex ended meanwhile: this frame only moves the belief.
-            Err(StoreError::Superseded(_)) => Ok(Similar::default()),
+            Ok(similarities) => Ok(Some(Similar { images, similarities })),
+            Err(StoreError::Superseded(_)) => Ok(None),
             Err(error) => Err(error.into()),
         }
     }
+}
 
-    async fn descriptors(
-        &self,
-        map: &Map,
-        ground: &Ground,
-        images: &[u32],
-    ) -> Result<Known, StoreError> {
-        let descriptors = self.store.descriptors(map, ground.slots(images)).await?;
-        let known = images.iter().copied().zip(descriptors);
-        Ok(known.filter_map(|(image, descriptor)| Some((image, descriptor?))).collect())
-    }
+/// What the filter says after a frame.
+struct Answered {
+    estimate: TrackEstimate,
+    posterior: Arc<Posterior>,
+    /// What the robot should send instead.
+    warning: Option<String>,
+}
 
-    async fn ground(&self, map: &Map) -> Result<Arc<Ground>, ServiceError> {
-        let version = (map.revision, self.store.index_state(map).await?.changes);
-        if let Some(ground) = self.cached(map, version) {
-            return Ok(ground);
-        }
-        let _guard = self.loading.lock().await;
-        if let Some(ground) = self.cached(map, version) {
-            return Ok(ground);
-        }
-        let images = self.store.positions(map).await?;
-        let mut ground = on_blocking_thread(move || Ground::new(images)).await?;
-        let sample = ground.sample_with_neighbours();
-        let known = self.descriptors(map, &ground, &sample).await?;
-        ground.learn_common(&known);
-        let ground = Arc::new(ground);
-        self.cache(map, version, &ground);
-        Ok(ground)
-    }
+/// The answer to a frame: that of a number, of a track.
+fn place_of(
+    (id, frames, is_late): (String, u64, bool),
+    posterior: &Posterior,
+    ground: &Ground,
+    place_m: f64,
+    settings: &TrackSettings,
+) -> TrackEstimate {
+    let estimate = estimate((id, frames), posterior, ground, place_m, settings);
+    // Without an image, it is no answer for another time.
+    TrackEstimate { is_late: is_late && estimate.image_id.is_some(), ..estimate }
 }
 
 /// Images and the similarity of each to a frame.
@@ -352,6 +313,18 @@ impl Tracks {
 struct Similar {
     images: Vec<u32>,
     similarities: Vec<Option<f32>>,
+}
+
+impl Similar {
+    /// The same with the sample of the map, sorted by image. These are compared with every frame, and kept in memory.
+    fn with_sample(self, ground: &Ground, frame: &[f32]) -> Self {
+        let sample = ground.sample().iter().copied().zip(ground.sample_similarities(frame));
+        let mut all: Vec<_> =
+            self.images.into_iter().zip(self.similarities).chain(sample).collect();
+        all.sort_unstable_by_key(|(image, _)| *image);
+        let (images, similarities) = all.into_iter().unzip();
+        Self { images, similarities }
+    }
 }
 
 /// Runs CPU-bound work outside the async threads.

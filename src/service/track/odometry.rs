@@ -117,13 +117,13 @@ impl Odometry {
 #[derive(Debug, Clone, Default)]
 pub(super) struct Odometer {
     /// Metres that the belief has not been moved yet.
-    pending: f64,
+    pub pending: f64,
     /// Standard deviation of those.
-    error: f64,
+    pub error: f64,
     /// The turn to the left, in radians, that may be the beginning of going back.
-    turn: f64,
+    pub turn: f64,
     /// Whether the robot moved backwards last.
-    backwards: bool,
+    pub backwards: bool,
 }
 
 /// A move that is large enough to change the belief.

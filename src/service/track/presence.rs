@@ -72,8 +72,8 @@ pub(super) fn most_evidence(confidence: Option<f32>) -> f64 {
 /// The probabilities that a robot is on and off the map, with each clarity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Presence {
-    on: [f64; LEVELS],
-    off: [f64; LEVELS],
+    pub on: [f64; LEVELS],
+    pub off: [f64; LEVELS],
 }
 
 impl Presence {
@@ -127,7 +127,8 @@ impl Presence {
         self
     }
 
-    fn normalised(mut self) -> Self {
+    /// The same with the sum 1.
+    pub fn normalised(mut self) -> Self {
         let levels = || 0..LEVELS;
         let total: f64 = levels().map(|at| self.on[at] + self.off[at]).sum();
         if !total.is_normal() {

@@ -6,14 +6,16 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use tokio::time::Instant;
 
-use super::belief::{Habits, Roads};
+use super::belief::Habits;
 use super::clock::{Arrival, Clock, Elapsed, Tick};
-use super::evidence::{Frames, Weights};
+use super::evidence::Frames;
 use super::ground::Ground;
 use super::history::Passed;
 use super::moves::Motion;
 use super::odometry::{Odometer, Odometry};
 use super::posterior::{FrameWeights, Posterior};
+use super::prediction::{Changes, Prediction, unlike};
+use super::verdicts::VERDICT_STEPS;
 use super::{TrackSettings, TrackStep};
 
 /// Number of beliefs kept for frames that arrive late.
@@ -40,23 +42,36 @@ const SHARED: &str = "the frames of this track alternate between two views, as i
 /// The state of a track between two frames.
 #[derive(Debug, Clone)]
 pub(super) struct Track {
-    posterior: Arc<Posterior>,
+    pub posterior: Arc<Posterior>,
     /// The map that it refers to.
-    ground: Option<Arc<Ground>>,
+    pub ground: Option<Arc<Ground>>,
     /// The revision of that map: descriptors of another one cannot be compared.
-    revision: u32,
+    pub revision: u32,
     pub frames: u64,
     /// When the last frame arrived.
     pub last_frame_at: Timestamp,
-    seen: Frames,
+    pub seen: Frames,
     /// The last frame without what it has in common with others; empty before the first.
-    centred: Vec<f32>,
-    odometer: Odometer,
-    clock: Clock,
+    pub centred: Vec<f32>,
+    pub odometer: Odometer,
+    pub clock: Clock,
     /// What the filter said after the last frames, the oldest first.
     pub passed: VecDeque<Passed>,
     /// The latest posteriors, with the times that their robot stated.
-    kept: VecDeque<(Timestamp, Arc<Posterior>)>,
+    pub kept: VecDeque<(Timestamp, Arc<Posterior>)>,
+    /// The last frames, each with how the robot had moved since the one before, the oldest first.
+    pub steps: VecDeque<Step>,
+}
+
+/// How a robot had moved when a frame was taken.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Step {
+    /// The number of the frame in its track.
+    pub frame: u64,
+    /// `None` if that is not known.
+    pub motion: Option<Motion>,
+    /// The highest speed that is possible, in metres per unit of time.
+    pub max_speed: f64,
 }
 
 /// A frame, as the filter takes it.
@@ -65,27 +80,6 @@ pub(super) struct Frame<'a> {
     pub descriptor: &'a [f32],
     /// Whether it shows anything.
     pub is_informative: bool,
-}
-
-/// What is believed before a frame is taken into account.
-#[derive(Debug, Clone)]
-pub(super) struct Prediction {
-    posterior: Posterior,
-    /// Share of the evidence of the frame that is new.
-    fresh: f64,
-    /// Whether the frame is older than the last one.
-    pub is_late: bool,
-    /// The share by which the frame differs from the one before.
-    unlike: f64,
-    /// The frame without what it has in common with others.
-    pub frame: Vec<f32>,
-    /// What the robot should send instead.
-    pub warning: Option<String>,
-    /// When the frame was taken and when it arrived.
-    times: (Option<Timestamp>, Timestamp),
-    motion: Option<Motion>,
-    /// The highest speed that is possible, in metres per unit of time.
-    max_speed: f64,
 }
 
 impl Track {
@@ -103,6 +97,7 @@ impl Track {
             clock: Clock::default(),
             passed: VecDeque::new(),
             kept: VecDeque::new(),
+            steps: VecDeque::new(),
         }
     }
 
@@ -307,6 +302,10 @@ impl Track {
         if !prediction.is_late {
             self.posterior = Arc::clone(&posterior);
             let moved = motion.map(|motion| posterior.moved(motion, max_speed, ground));
+            if self.steps.len() == VERDICT_STEPS {
+                self.steps.pop_front();
+            }
+            self.steps.push_back(Step { frame: self.frames, motion, max_speed });
             if self.passed.len() >= settings.history {
                 self.passed.pop_front();
             }
@@ -324,70 +323,7 @@ impl Track {
     }
 }
 
-/// The share by which a frame differs from the one before: one minus their cosine.
-fn unlike(before: &[f32], frame: &[f32]) -> f64 {
-    let dot = |a: &[f32], b: &[f32]| f64::from(whereabouts_core::dot(a, b));
-    let lengths = (dot(before, before) * dot(frame, frame)).sqrt();
-    if before.len() != frame.len() || lengths <= 0.0 {
-        return 1.0;
-    }
-    (1.0 - dot(before, frame) / lengths).clamp(0.0, 1.0)
-}
-
 pub(super) fn habits(max_speed: f64, settings: &TrackSettings) -> Habits {
     let TrackSettings { turn, jump, leave, enter, .. } = *settings;
     Habits { max_speed, turn, jump, leave, enter }
-}
-
-/// How much the images of a belief differ from their neighbours.
-struct Changes(Vec<f32>);
-
-impl Changes {
-    /// For motions that do not ask.
-    fn none() -> Self {
-        Self(Vec::new())
-    }
-
-    fn roads<'a>(&'a self, ground: &'a Ground) -> Roads<'a> {
-        Roads { grid: &ground.grid, paths: &ground.paths, changes: &self.0 }
-    }
-}
-
-impl Prediction {
-    /// The images whose similarity to the frame is needed: those of the belief, the candidates of the search, and the
-    /// sample of the map.
-    pub fn images(&self, candidates: &[u32], ground: &Ground) -> Vec<u32> {
-        let mut images = [self.posterior.belief.images(), candidates, ground.sample()].concat();
-        images.sort_unstable();
-        images.dedup();
-        images
-    }
-
-    /// The weights of images by their similarity to the frame, without the mean of the track.
-    pub fn weights(
-        &self,
-        (images, similarities): (&[u32], &[Option<f32>]),
-        confidence: Option<f32>,
-        ground: &Ground,
-        settings: &TrackSettings,
-    ) -> Option<FrameWeights> {
-        let shift = whereabouts_core::dot(&self.frame, ground.mean());
-        let lengths = ground.lengths(images);
-        let known = images.iter().zip(similarities).zip(lengths);
-        let similar: Vec<(u32, f32)> = known
-            .filter_map(|((image, similarity), length)| {
-                Some((*image, ((*similarity)? - shift) / length))
-            })
-            .collect();
-        let is_sample = |image: &u32| ground.sample().binary_search(image).is_ok();
-        let sample: Vec<f32> =
-            similar.iter().filter(|(image, _)| is_sample(image)).map(|(_, s)| *s).collect();
-        let strength = (settings.sharpness * self.fresh, settings.outliers);
-        (!sample.is_empty()).then(|| FrameWeights {
-            weights: Weights::new(&similar, &sample, ground.len(), strength),
-            fresh: self.fresh,
-            unlike: self.unlike,
-            confidence,
-        })
-    }
 }

@@ -11,6 +11,10 @@ const MAX_ODOMETRY_ERROR: f64 = 1000.0;
 /// Maximum number of places of a track that can be configured: smoothing takes time for each.
 const MAX_HISTORY: usize = 1000;
 
+/// Limits of the size of a stored track, in bytes.
+const MIN_STATE_BYTES: usize = 1 << 14;
+const MAX_STATE_BYTES: usize = 1 << 26;
+
 /// Limits of the exponent. Beyond them, single precision makes every image equally likely, or one certain.
 const SHARPNESS: [f64; 2] = [1e-6, 1e6];
 
@@ -44,6 +48,10 @@ pub struct TrackSettings {
     pub states: usize,
     /// Number of last places of each track that are kept, and smoothed when they are asked for.
     pub history: usize,
+    /// Maximum number of tracks in the store; those without a frame for longest are removed.
+    pub stored: usize,
+    /// Maximum size of a track in the store, in bytes.
+    pub state_bytes: usize,
     /// Minimum probability of a known place.
     pub known_probability: f64,
 }
@@ -65,7 +73,17 @@ impl TrackSettings {
         if self.history > MAX_HISTORY {
             return Some(format!("track.history must be at most {MAX_HISTORY}"));
         }
-        let counts = [("max", self.max), ("candidates", self.candidates), ("states", self.states)];
+        if !(MIN_STATE_BYTES..=MAX_STATE_BYTES).contains(&self.state_bytes) {
+            return Some(format!(
+                "track.state_bytes must be from {MIN_STATE_BYTES} to {MAX_STATE_BYTES}"
+            ));
+        }
+        let counts = [
+            ("max", self.max),
+            ("stored", self.stored),
+            ("candidates", self.candidates),
+            ("states", self.states),
+        ];
         let zero = counts.into_iter().find(|(_, count)| *count == 0);
         zero.map(|(name, _)| format!("track.{name} must be at least 1"))
             .or_else(|| share("outliers", self.outliers))

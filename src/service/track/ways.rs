@@ -6,31 +6,41 @@ use super::super::{Principal, ServiceError};
 use super::estimate::place_radius;
 use super::history::{Smoothed, settled, smoothed};
 use super::posterior::MIN_IMAGES;
-use super::session::{Track, habits};
-use super::{Key, Tracks, on_blocking_thread};
+use super::session::habits;
+use super::{Tracks, on_blocking_thread};
 use whereabouts_api::{TrackList, TrackPlace, TrackSummary, TrackWay};
 use whereabouts_core::{Map, Role};
+use whereabouts_store::{TrackHead, TrackKey};
 
 /// Maximum number of tracks in a list.
 const LISTED: usize = 100;
 
 impl Tracks {
-    /// The tracks in a map, those with the latest frames first.
+    /// The tracks in a map, of all servers, those with the latest frames first.
     pub async fn list(&self, map: &Map) -> Result<TrackList, ServiceError> {
-        let mut tracks = self.known(|key| key.0 == map.uid);
+        let mut tracks: Vec<TrackSummary> =
+            self.heads(map, None).await?.into_iter().map(summary).collect();
+        tracks.sort_by_key(|track| std::cmp::Reverse(track.last_frame_at));
         tracks.truncate(LISTED);
-        let mut list = Vec::new();
-        for ((_, owner, id), track) in tracks {
-            let track = track.lock().await;
-            list.push(TrackSummary {
-                id,
-                key: key_of(owner),
-                frames: track.frames,
-                last_frame_at: track.last_frame_at,
-            });
+        Ok(TrackList { tracks })
+    }
+
+    /// The tracks in a map, in the store and in memory; with `id`, only those of this name.
+    async fn heads(&self, map: &Map, id: Option<&str>) -> Result<Vec<TrackHead>, ServiceError> {
+        let mut heads = self.stored.tracks(map.uid, id, LISTED, self.idle()).await?;
+        if self.stored.shares_tracks() {
+            return Ok(heads);
         }
-        list.retain(|track| track.frames > 0);
-        Ok(TrackList { tracks: list })
+        let is_wanted = |key: &TrackKey| key.map == map.uid && id.is_none_or(|id| key.id == id);
+        for (TrackKey { owner, id, .. }, held) in self.memory.known(&self.settings, is_wanted) {
+            let held = held.lock().await;
+            heads.retain(|head| head.owner != owner || head.id != id);
+            if held.track.frames > 0 {
+                let (frames, written_at) = (held.track.frames, held.track.last_frame_at);
+                heads.push(TrackHead { owner, id, frames, written_at });
+            }
+        }
+        Ok(heads)
     }
 
     /// The last places of a track. A robot sees its own tracks; others see those of all keys.
@@ -48,18 +58,23 @@ impl Tracks {
             Principal::ApiKey(key) => key.role != Role::Robot,
         };
         let is_own = |owner: &str| owner == caller.scope();
-        let mut found = self.known(|(uid, owner, known)| {
-            *uid == map.uid && known == id && (may_see_all || is_own(owner))
-        });
-        found.sort_by_key(|((_, owner, _), _)| !is_own(owner));
-        let Some(((_, owner, id), track)) = found.into_iter().next() else {
+        let mut found = self.heads(map, Some(id)).await?;
+        found.retain(|head| may_see_all || is_own(&head.owner));
+        found.sort_by_key(|head| (!is_own(&head.owner), std::cmp::Reverse(head.written_at)));
+        let Some(TrackHead { owner, id, .. }) = found.into_iter().next() else {
             return Err(ServiceError::not_found(format!(
                 "the map {} has no track {id:?}; a track is forgotten {} s after its last frame (track.idle_s)",
                 map.name, self.settings.idle_s
             )));
         };
+        let key = TrackKey { map: map.uid, owner: owner.clone(), id: id.clone() };
         let ground = self.ground(map).await?;
-        let mut track = Track::clone(&*track.lock().await);
+        let mut track = {
+            let held = self.memory.track(&key, &self.settings);
+            let mut held = held.lock().await;
+            self.refresh(&key, &mut held, &ground).await?;
+            held.track.clone()
+        };
         track.enter(&ground, map.revision);
         let (settings, place_m) = (Arc::clone(&self.settings), self.place_m);
         let (frames, name) = (track.frames, map.name.clone());
@@ -86,20 +101,11 @@ impl Tracks {
         .await?;
         Ok(TrackWay { id, map: name, key: key_of(owner), frames, places })
     }
-
-    /// The tracks that a condition holds for and that have not expired, the last used first.
-    fn known(&self, is_wanted: impl Fn(&Key) -> bool) -> Vec<(Key, SharedTrack)> {
-        let tracks = self.tracks.lock();
-        let mut found: Vec<_> = tracks
-            .iter()
-            .filter(|(key, entry)| is_wanted(key) && !entry.is_idle(&self.settings))
-            .collect();
-        found.sort_by_key(|(_, entry)| std::cmp::Reverse(entry.last_used));
-        found.into_iter().map(|(key, entry)| (key.clone(), Arc::clone(&entry.track))).collect()
-    }
 }
 
-type SharedTrack = Arc<tokio::sync::Mutex<Track>>;
+fn summary(TrackHead { owner, id, frames, written_at }: TrackHead) -> TrackSummary {
+    TrackSummary { id, key: key_of(owner), frames, last_frame_at: written_at }
+}
 
 /// The id of the API key that owns a track.
 fn key_of(owner: String) -> Option<String> {

@@ -33,7 +33,7 @@ impl Inner {
                         return Ok(None);
                     }
                     let moved = current.pose != next.pose;
-                    let stored = StoredImage { image: next, slot: stored.slot };
+                    let stored = StoredImage { image: next, ..stored };
                     trees.replace_image(uid, &stored, moved)?;
                     Ok(Some((stored, moved)))
                 },

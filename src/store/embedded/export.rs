@@ -24,8 +24,9 @@ impl ExportStore for EmbeddedStore {
             let images = inner.trees.images_after(uid, after.as_ref()).take(limit);
             images
                 .map(|stored| {
-                    let StoredImage { image, slot } = stored?;
-                    Ok(ExportedImage { image, descriptor: live.vectors.read(slot) })
+                    let StoredImage { image, slot, recording } = stored?;
+                    let (descriptor, position) = (live.vectors.read(slot), Some(slot as u64));
+                    Ok(ExportedImage { image, descriptor, position, recording })
                 })
                 .collect()
         })

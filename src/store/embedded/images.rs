@@ -13,25 +13,29 @@ use super::super::StoreError;
 use super::trees::{
     BlobOwner, Trees, blob_ref_key, decode, encode, failed, get, image_key, transaction_failed,
 };
-use whereabouts_core::{GeographicPose, Image, ImageId, MetricPose, Pose};
+use whereabouts_core::{GeographicPose, Image, ImageId, MetricPose, Pose, Recording};
 
 /// An image and the slot of its descriptor.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct StoredImage {
     pub image: Image,
     pub slot: usize,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recording: Option<Recording>,
 }
 
-/// What searches need of an image: its id and where it was taken.
+/// What searches and tracks need of an image.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct LocatedId {
+pub(super) struct Entry {
     pub id: ImageId,
     pub pose: Option<Pose>,
+    pub recording: Option<Recording>,
 }
 
-impl From<&Image> for LocatedId {
-    fn from(image: &Image) -> Self {
-        Self { id: image.id.clone(), pose: image.pose }
+impl From<&StoredImage> for Entry {
+    fn from(stored: &StoredImage) -> Self {
+        let Image { id, pose, .. } = &stored.image;
+        Self { id: id.clone(), pose: *pose, recording: stored.recording }
     }
 }
 
@@ -40,10 +44,12 @@ const NUMBERS: usize = 7;
 const NO_POSE: u8 = 0;
 const GEOGRAPHIC: u8 = 1;
 const METRIC: u8 = 2;
+/// Added to the kind of the pose of an image that belongs to a recording.
+const RECORDED: u8 = 0x10;
 
-impl LocatedId {
+impl Entry {
     /// The record in sled: the kind of the pose, a bit for each of its numbers that is known, these numbers
-    /// (little-endian), and the id.
+    /// (little-endian), the recording with the image's number in it, if there is one, and the id.
     pub fn to_bytes(&self) -> Vec<u8> {
         let (kind, numbers): (u8, &[Option<f64>]) = match &self.pose {
             None => (NO_POSE, &[]),
@@ -55,7 +61,7 @@ impl LocatedId {
             }
         };
         let mut known = 0_u8;
-        let mut bytes = Vec::with_capacity(2 + 8 * NUMBERS + self.id.as_str().len());
+        let mut bytes = Vec::with_capacity(2 + 8 * NUMBERS + 20 + self.id.as_str().len());
         bytes.extend([kind, 0]);
         for (bit, number) in numbers.iter().enumerate() {
             if let Some(number) = number {
@@ -64,11 +70,16 @@ impl LocatedId {
             }
         }
         bytes[1] = known;
+        if let Some(Recording { id, number }) = &self.recording {
+            bytes[0] |= RECORDED;
+            bytes.extend(id.as_bytes());
+            bytes.extend(number.to_le_bytes());
+        }
         bytes.extend(self.id.as_str().as_bytes());
         bytes
     }
 
-    /// Reads what [`LocatedId::to_bytes`] wrote; `None` if the bytes are anything else.
+    /// Reads what [`Entry::to_bytes`] wrote; `None` if the bytes are anything else.
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
         let (&[kind, known], mut rest) = bytes.split_first_chunk()?;
         let mut numbers = [None; NUMBERS];
@@ -79,7 +90,15 @@ impl LocatedId {
                 rest = others;
             }
         }
-        let pose = match (kind, numbers) {
+        let mut recording = None;
+        if kind & RECORDED != 0 {
+            let (id, others) = rest.split_first_chunk()?;
+            let (number, others) = others.split_first_chunk()?;
+            recording =
+                Some(Recording { id: Uuid::from_bytes(*id), number: u32::from_le_bytes(*number) });
+            rest = others;
+        }
+        let pose = match (kind & !RECORDED, numbers) {
             (NO_POSE, [None, ..]) => None,
             (GEOGRAPHIC, [Some(lat), Some(lon), alt, heading, ..]) => {
                 Some(Pose::Geographic(GeographicPose { lat, lon, alt, heading }))
@@ -90,7 +109,7 @@ impl LocatedId {
             _ => return None,
         };
         let id = std::str::from_utf8(rest).ok()?.parse().ok()?;
-        Some(Self { id, pose })
+        Some(Self { id, pose, recording })
     }
 }
 
@@ -135,22 +154,22 @@ impl Trees {
     }
 
     /// Iterates over the images of a map in a range of slots, by slot.
-    pub fn located_in(
+    pub fn entries_in(
         &self,
         map_uid: Uuid,
         slots: Range<usize>,
-    ) -> impl Iterator<Item = Result<(usize, LocatedId), StoreError>> + use<> {
+    ) -> impl Iterator<Item = Result<(usize, Entry), StoreError>> + use<> {
         let keys = slot_key(map_uid, slots.start)..slot_key(map_uid, slots.end);
         self.slots.range(keys).map(|entry| {
             let (key, value) = entry.map_err(failed)?;
-            Ok((slot_of(&key)?, LocatedId::from_bytes(&value).ok_or_else(damaged)?))
+            Ok((slot_of(&key)?, Entry::from_bytes(&value).ok_or_else(damaged)?))
         })
     }
 
     /// Returns what searches need of the image in a slot.
-    pub fn located(&self, map_uid: Uuid, slot: usize) -> Result<Option<LocatedId>, StoreError> {
+    pub fn entry(&self, map_uid: Uuid, slot: usize) -> Result<Option<Entry>, StoreError> {
         let value = self.slots.get(slot_key(map_uid, slot)).map_err(failed)?;
-        value.map(|value| LocatedId::from_bytes(&value).ok_or_else(damaged)).transpose()
+        value.map(|value| Entry::from_bytes(&value).ok_or_else(damaged)).transpose()
     }
 
     /// Iterates over the slots of a map that list an image.
@@ -168,8 +187,8 @@ impl Trees {
     }
 
     /// Writes again what searches need of an image.
-    pub fn put_located(&self, map_uid: Uuid, stored: &StoredImage) -> Result<(), StoreError> {
-        let (key, value) = located_record(map_uid, stored);
+    pub fn put_entry(&self, map_uid: Uuid, stored: &StoredImage) -> Result<(), StoreError> {
+        let (key, value) = entry_record(map_uid, stored);
         self.slots.insert(key, value).map(drop).map_err(failed)
     }
 
@@ -179,7 +198,7 @@ impl Trees {
         let owner = BlobOwner::Image { map_uid, id: &stored.image.id };
         let reference = blob_ref_key(&stored.image.digest, &owner);
         let value = encode(stored)?;
-        let (slot, located) = located_record(map_uid, stored);
+        let (slot, located) = entry_record(map_uid, stored);
         (&self.images, &self.slots, &self.blob_refs)
             .transaction(|(images, slots, refs)| {
                 images.insert(key.as_slice(), value.as_slice())?;
@@ -199,7 +218,7 @@ impl Trees {
     ) -> Result<(), StoreError> {
         let key = image_key(map_uid, &stored.image.id);
         let value = encode(stored)?;
-        let (slot, located) = located_record(map_uid, stored);
+        let (slot, located) = entry_record(map_uid, stored);
         let count = encode(&(self.moved(map_uid)? + u64::from(moved)))?;
         (&self.images, &self.slots, &self.moves)
             .transaction(|(images, slots, moves)| {
@@ -217,7 +236,7 @@ impl Trees {
     pub fn remove_images(&self, map_uid: Uuid, removed: &[StoredImage]) -> Result<(), StoreError> {
         (&self.images, &self.slots, &self.blob_refs)
             .transaction(|(images, slots, refs)| {
-                for StoredImage { image, slot } in removed {
+                for StoredImage { image, slot, .. } in removed {
                     images.remove(image_key(map_uid, &image.id))?;
                     slots.remove(&slot_key(map_uid, *slot))?;
                     let owner = BlobOwner::Image { map_uid, id: &image.id };
@@ -229,8 +248,8 @@ impl Trees {
     }
 }
 
-fn located_record(map_uid: Uuid, stored: &StoredImage) -> ([u8; 24], Vec<u8>) {
-    (slot_key(map_uid, stored.slot), LocatedId::from(&stored.image).to_bytes())
+fn entry_record(map_uid: Uuid, stored: &StoredImage) -> ([u8; 24], Vec<u8>) {
+    (slot_key(map_uid, stored.slot), Entry::from(stored).to_bytes())
 }
 
 /// The key of a slot; the slots of a map sort by number.
@@ -275,8 +294,10 @@ mod tests {
         let longest = "ü".repeat(ImageId::MAX_BYTES / 2);
         for pose in poses {
             for id in ["0", "a/b.jpg", longest.as_str()] {
-                let located = LocatedId { id: id.parse().unwrap(), pose };
-                assert_eq!(LocatedId::from_bytes(&located.to_bytes()), Some(located));
+                for recording in [None, Some(Recording { id: Uuid::from_u128(9), number: 300 })] {
+                    let entry = Entry { id: id.parse().unwrap(), pose, recording };
+                    assert_eq!(Entry::from_bytes(&entry.to_bytes()), Some(entry));
+                }
             }
         }
     }
@@ -292,17 +313,18 @@ mod tests {
             qz: None,
             qw: None,
         });
-        let sound = LocatedId { id: "a".parse().unwrap(), pose: Some(pose) }.to_bytes();
+        let recording = Some(Recording { id: Uuid::nil(), number: 1 });
+        let sound = Entry { id: "a".parse().unwrap(), pose: Some(pose), recording }.to_bytes();
         for length in 0..sound.len() {
-            assert_eq!(LocatedId::from_bytes(&sound[..length]), None, "{length} bytes");
+            assert_eq!(Entry::from_bytes(&sound[..length]), None, "{length} bytes");
         }
         let altered = |at: usize, byte: u8| {
             let mut bytes = sound.clone();
             bytes[at] = byte;
-            LocatedId::from_bytes(&bytes)
+            Entry::from_bytes(&bytes)
         };
         assert_eq!(altered(0, 3), None, "an unknown kind of pose");
-        assert_eq!(altered(0, NO_POSE), None, "numbers without a pose");
+        assert_eq!(altered(0, RECORDED), None, "numbers without a pose");
         assert_eq!(altered(1, 0b01), None, "a pose without y");
         assert_eq!(altered(sound.len() - 1, 0xff), None, "an id that is not UTF-8");
     }
@@ -316,13 +338,13 @@ mod tests {
             assert_eq!(trees.slot_end(uid).unwrap(), 0);
             for slot in [300, 2, 255, 256] {
                 let id: ImageId = format!("{uid}-{slot}").parse().unwrap();
-                let located = LocatedId { id, pose: None };
-                trees.slots.insert(slot_key(uid, slot), located.to_bytes()).unwrap();
+                let entry = Entry { id, pose: None, recording: None };
+                trees.slots.insert(slot_key(uid, slot), entry.to_bytes()).unwrap();
             }
         }
         for uid in uids {
             assert_eq!(trees.slot_end(uid).unwrap(), 301);
-            let read: Vec<_> = trees.located_in(uid, 0..300).collect::<Result<_, _>>().unwrap();
+            let read: Vec<_> = trees.entries_in(uid, 0..300).collect::<Result<_, _>>().unwrap();
             let slots: Vec<_> = read.iter().map(|(slot, _)| *slot).collect();
             assert_eq!(slots, [2, 255, 256]);
             assert!(read.iter().all(|(slot, one)| one.id.as_str() == format!("{uid}-{slot}")));

@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
+use super::super::changes::in_order;
 use super::super::{HardNegatives, LocatedImage, StoreError};
 use super::blobs::replace_durably;
-use super::images::{LocatedId, StoredImage};
+use super::images::{Entry, StoredImage};
 use super::segments::VectorFiles;
 use super::trees::Trees;
 use parking_lot::RwLock;
@@ -27,11 +28,13 @@ pub(super) struct LiveMap {
     /// Where the sealed graph is stored, so that a restart need not rebuild it.
     graph_file: PathBuf,
     /// By slot, kept in memory so that a search reads no records.
-    entries: RwLock<Vec<Option<LocatedId>>>,
+    entries: RwLock<Vec<Option<Entry>>>,
     /// The slot of the next image. Only the writer thread changes it.
     next_slot: AtomicUsize,
     /// Number of additions, removals and changed poses since the map was loaded.
     changes: AtomicU64,
+    /// The same of images with a pose.
+    located: AtomicU64,
     /// How often poses were changed since the map was created.
     moved: AtomicU64,
 }
@@ -60,11 +63,10 @@ impl LiveMap {
         let starts = (0..end).into_par_iter().step_by(READ_TOGETHER);
         let intact =
             starts.map(|start| self.intact_images(trees, &map, start..start + READ_TOGETHER));
-        let intact: Vec<Vec<(usize, LocatedId)>> = intact.collect::<Result<_, _>>()?;
+        let intact: Vec<Vec<(usize, Entry)>> = intact.collect::<Result<_, _>>()?;
         self.next_slot.fetch_max(end, Ordering::Relaxed);
         self.index.add_all(intact.iter().flatten().map(|(slot, _)| *slot));
-        self.changes
-            .fetch_add(intact.iter().map(Vec::len).sum::<usize>() as u64, Ordering::Relaxed);
+        intact.iter().flatten().for_each(|(_, image)| self.count_change(image.pose.is_some()));
         let mut entries = self.entries.write();
         entries.resize_with(end, || None);
         for (slot, image) in intact.into_iter().flatten() {
@@ -79,9 +81,9 @@ impl LiveMap {
         trees: &Trees,
         map: &Map,
         slots: Range<usize>,
-    ) -> Result<Vec<(usize, LocatedId)>, StoreError> {
+    ) -> Result<Vec<(usize, Entry)>, StoreError> {
         let mut intact = Vec::new();
-        for located in trees.located_in(map.uid, slots) {
+        for located in trees.entries_in(map.uid, slots) {
             let (slot, image) = located?;
             if self.vectors.is_intact(slot) {
                 intact.push((slot, image));
@@ -109,6 +111,7 @@ impl LiveMap {
             entries: RwLock::default(),
             next_slot: AtomicUsize::new(0),
             changes: AtomicU64::new(0),
+            located: AtomicU64::new(0),
             moved: AtomicU64::new(0),
         })
     }
@@ -175,15 +178,16 @@ impl LiveMap {
     }
 
     /// Makes a stored image visible to searches.
-    pub fn publish(&self, StoredImage { image, slot }: &StoredImage) {
-        let slot = *slot;
+    pub fn publish(&self, stored: &StoredImage) {
+        let (slot, entry) = (stored.slot, Entry::from(stored));
+        let is_located = entry.pose.is_some();
         let mut entries = self.entries.write();
         if entries.len() <= slot {
             entries.resize_with(slot + 1, || None);
         }
-        entries[slot] = Some(image.into());
+        entries[slot] = Some(entry);
         drop(entries);
-        self.changes.fetch_add(1, Ordering::Relaxed);
+        self.count_change(is_located);
         self.index.add(slot);
     }
 
@@ -195,7 +199,7 @@ impl LiveMap {
             entry.pose = stored.image.pose;
         }
         drop(entries);
-        self.changes.fetch_add(1, Ordering::Relaxed);
+        self.count_change(true);
         self.moved.fetch_add(1, Ordering::Relaxed);
     }
 
@@ -203,10 +207,14 @@ impl LiveMap {
     pub fn withdraw(&self, slot: usize) {
         self.index.remove(slot);
         let mut entries = self.entries.write();
-        if let Some(entry) = entries.get_mut(slot) {
-            *entry = None;
-        }
+        let gone = entries.get_mut(slot).and_then(Option::take);
+        drop(entries);
+        self.count_change(gone.is_some_and(|gone| gone.pose.is_some()));
+    }
+
+    fn count_change(&self, is_located: bool) {
         self.changes.fetch_add(1, Ordering::Relaxed);
+        self.located.fetch_add(u64::from(is_located), Ordering::Relaxed);
     }
 
     /// Returns the size of the descriptors and the sealed graph, in bytes.
@@ -219,19 +227,27 @@ impl LiveMap {
         self.changes.load(Ordering::Relaxed)
     }
 
+    /// Returns the number of changes of images with a pose since the map was loaded.
+    pub fn located(&self) -> u64 {
+        self.located.load(Ordering::Relaxed)
+    }
+
     /// Returns how often poses were changed since the map was created.
     pub fn moved(&self) -> u64 {
         self.moved.load(Ordering::Relaxed)
     }
 
-    /// Returns the images that have a pose, in insertion order.
+    /// Returns the images that have a pose, in the order of recording.
     pub fn positions(&self) -> Vec<LocatedImage> {
         let entries = self.entries.read();
-        let located = |(slot, entry): (usize, &Option<LocatedId>)| {
+        let located = |(slot, entry): (usize, &Option<Entry>)| {
             let entry = entry.as_ref()?;
-            Some(LocatedImage { slot, id: entry.id.clone(), pose: entry.pose? })
+            let image = LocatedImage { slot, id: entry.id.clone(), pose: entry.pose? };
+            Some((image, entry.recording))
         };
-        entries.iter().enumerate().filter_map(located).collect()
+        let located = entries.iter().enumerate().filter_map(located).collect();
+        drop(entries);
+        in_order(located)
     }
 
     /// Calls `read` with the descriptor in each slot. Returns `None` for a slot without an image.

@@ -17,7 +17,7 @@ use super::trees::{BlobOwner, Trees, blob_ref_key, decode, failed, get, put};
 use super::{EmbeddedStore, Inner, blocking};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Digest, Image, ImageId, Map, MapName,
-    dot,
+    Recording, dot,
 };
 use whereabouts_index::SearchMode;
 
@@ -150,6 +150,7 @@ impl MapStore for EmbeddedStore {
         blocking(move || {
             sweep(map.uid, &inner.trees, &inner.blobs)?;
             remove_folder(&folder_of(&map, &inner.descriptors));
+            inner.tracks.forget(map.uid);
             Ok(true)
         })
         .await
@@ -163,14 +164,16 @@ impl MapStore for EmbeddedStore {
             behind: live.index.is_behind(),
             changes: live.changes(),
             moved: live.moved(),
+            located: live.located(),
         })
     }
 
-    async fn add_image(
+    async fn add_recorded(
         &self,
         map: &Map,
         image: Image,
         descriptor: Descriptor,
+        recording: Option<Recording>,
     ) -> Result<Added, StoreError> {
         let live = self.inner.live_revision(map)?;
         let (map, writing, publishing) = (map.clone(), Arc::clone(&live), Arc::clone(&live));
@@ -181,15 +184,14 @@ impl MapStore for EmbeddedStore {
             .commit(
                 move |trees, touched| {
                     if let Some(present) = trees.image(uid, &image.id)? {
-                        let slot = present.slot;
                         let image = same_bytes(present.image, &image)?;
-                        return Ok((StoredImage { image, slot }, false));
+                        return Ok((StoredImage { image, ..present }, false));
                     }
                     check_frame(&check_revision(trees, &map)?, &image)?;
                     let slot = writing.allocate_slot();
                     writing.vectors.write(slot, descriptor.as_slice())?;
                     touched.vectors.push(Arc::clone(&writing.vectors));
-                    let stored = StoredImage { image, slot };
+                    let stored = StoredImage { image, slot, recording };
                     trees.insert_image(uid, &stored)?;
                     Ok((stored, true))
                 },

@@ -8,6 +8,7 @@
 //! DATA/descriptors/UID/  append-only segments of one map's descriptors, memory-mapped; UID-N/ from
 //!                        its Nth reindex on
 //! DATA/images/ab/…       image bytes by digest
+//! DATA/tracks/UID/       the tracks of robots in one map, which may be lost with the machine
 //! ```
 //!
 //! A single writer thread applies all changes and makes them durable by group commit. The graph of a
@@ -34,6 +35,7 @@ mod schema;
 mod segments;
 #[cfg(test)]
 mod test_records;
+mod tracks;
 mod trees;
 mod usage;
 mod watermark;
@@ -56,6 +58,7 @@ use self::descriptions::DescriptionLru;
 pub use self::doctor::{Examination, Finding, MapReport, Report, Sizes, examine};
 use self::indexer::Indexer;
 use self::live_map::LiveMap;
+use self::tracks::TrackFiles;
 use self::trees::Trees;
 use self::watermark::CommitWatermark;
 use self::writer::Writer;
@@ -103,6 +106,7 @@ struct Inner {
     /// Number of jobs that have ended.
     ended: AtomicUsize,
     descriptions: DescriptionLru,
+    tracks: TrackFiles,
     changes: broadcast::Sender<Uuid>,
     /// Notified when deliveries to webhooks were queued.
     deliveries: watch::Sender<()>,
@@ -128,7 +132,9 @@ impl EmbeddedStore {
         let blobs = Blobs::open(dir.join("images"), settings.min_free_bytes)?;
         orphans::collect_orphans(&trees, &blobs, &descriptors)?;
         let mut loaded = BTreeMap::new();
-        for map in trees.maps()? {
+        let maps = trees.maps()?;
+        let tracks = TrackFiles::open(dir.join("tracks"), &maps)?;
+        for map in maps {
             let name = map.name.clone();
             let live = LiveMap::load(map, &descriptors, settings.index, &trees)?;
             loaded.insert(name, Arc::new(live));
@@ -139,6 +145,7 @@ impl EmbeddedStore {
             writer: Writer::start(trees.clone(), watermark, settings.commit_batch)?,
             indexer: Indexer::start(settings.index_threads)?,
             descriptions: DescriptionLru::load(&trees, settings.descriptions)?,
+            tracks,
             trees,
             blobs,
             maps: RwLock::new(loaded),

@@ -192,7 +192,7 @@ fn list_images_by_slot(dir: &Path) -> Result<(), StoreError> {
     let trees = Trees::open(&dir.join("db"), CACHE_BYTES)?;
     for map in trees.maps()? {
         for stored in trees.images_of(map.uid) {
-            trees.put_located(map.uid, &stored?)?;
+            trees.put_entry(map.uid, &stored?)?;
         }
     }
     trees.flush()
@@ -202,7 +202,7 @@ fn list_images_by_slot(dir: &Path) -> Result<(), StoreError> {
 mod tests {
     use jiff::Timestamp;
 
-    use super::super::images::{LocatedId, StoredImage};
+    use super::super::images::{Entry, StoredImage};
     use super::super::test_records;
     use super::*;
     use crate::Query;
@@ -331,8 +331,10 @@ mod tests {
         let images = [image("a", Some(Pose::Geographic(pose))), image("b", None)];
         let trees = Trees::open(&dir.path().join("db"), CACHE_BYTES).unwrap();
         put(&trees.maps, b"m", &map).unwrap();
-        for (slot, image) in images.clone().into_iter().enumerate() {
-            trees.insert_image(map.uid, &StoredImage { image, slot }).unwrap();
+        let stored =
+            |slot: usize| StoredImage { image: images[slot].clone(), slot, recording: None };
+        for slot in 0..2 {
+            trees.insert_image(map.uid, &stored(slot)).unwrap();
             // Version 2 did not list it.
             trees.forget_slot(map.uid, slot).unwrap();
         }
@@ -341,7 +343,7 @@ mod tests {
         fs::write(dir.path().join(FILE), "2\n").unwrap();
         bring_up_to_date(dir.path()).unwrap();
         let trees = Trees::open(&dir.path().join("db"), CACHE_BYTES).unwrap();
-        let listed = trees.located_in(map.uid, 0..2).collect::<Result<Vec<_>, _>>().unwrap();
-        assert_eq!(listed, [0, 1].map(|slot| (slot, LocatedId::from(&images[slot]))));
+        let listed = trees.entries_in(map.uid, 0..2).collect::<Result<Vec<_>, _>>().unwrap();
+        assert_eq!(listed, [0, 1].map(|slot| (slot, Entry::from(&stored(slot)))));
     }
 }

@@ -21,7 +21,7 @@ pub(super) struct Trees {
     pub maps: sled::Tree,
     /// Map uid, image id → [`StoredImage`](super::images::StoredImage).
     pub images: sled::Tree,
-    /// Map uid, slot → [`LocatedId`](super::images::LocatedId).
+    /// Map uid, slot → [`Entry`](super::images::Entry).
     pub slots: sled::Tree,
     /// Map uid → how often poses of its images were changed.
     pub moves: sled::Tree,

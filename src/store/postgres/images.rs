@@ -10,13 +10,13 @@ use sqlx::Row;
 use sqlx::types::Json;
 use uuid::Uuid;
 
-use super::super::changes::{check_frame, removed, same_bytes};
+use super::super::changes::{check_frame, in_order, removed, same_bytes};
 use super::super::{Added, ExportStore, LocatedImage, StoreError};
 use super::descriptors::{descriptor_of, table};
 use super::search::image_id;
 use super::{Inner, PostgresStore, blobs, count, is_missing_table, record};
 use whereabouts_core::ExportedImage;
-use whereabouts_core::{Descriptor, Image, ImageId, Map, Pose};
+use whereabouts_core::{Descriptor, Image, ImageId, Map, Pose, Recording};
 
 /// Number of rows that a map's counts are spread over, to reduce contention.
 const COUNT_PARTS: i16 = 16;
@@ -30,21 +30,24 @@ impl Inner {
         map: &Map,
         image: Image,
         descriptor: &Descriptor,
+        recording: Option<Recording>,
     ) -> Result<Added, StoreError> {
         let table = table(map.uid, map.revision);
         let sql = format!(
             "WITH map AS (
                  SELECT uid, record FROM maps WHERE uid = $1 AND revision = $2 FOR SHARE),
              added AS (
-                 INSERT INTO images (map_uid, id, digest, record, pose)
-                 SELECT uid, $3, $4, $5::json, $8::json FROM map
+                 INSERT INTO images (map_uid, id, digest, record, pose, recording, number)
+                 SELECT uid, $3, $4, $5::json, $8::json, $9, $10 FROM map
                  ON CONFLICT DO NOTHING RETURNING slot),
              described AS (
                  INSERT INTO {table} (slot, descriptor) SELECT slot, $6::real[]::vector FROM added),
              counted AS (
-                 INSERT INTO image_counts (map_uid, part, images, changes)
-                 SELECT $1, $7, 1, 1 FROM added ON CONFLICT (map_uid, part) DO UPDATE
-                 SET images = image_counts.images + 1, changes = image_counts.changes + 1),
+                 INSERT INTO image_counts (map_uid, part, images, changes, located)
+                 SELECT $1, $7, 1, 1, ($8::json IS NOT NULL)::int FROM added
+                 ON CONFLICT (map_uid, part) DO UPDATE
+                 SET images = image_counts.images + 1, changes = image_counts.changes + 1,
+                     located = image_counts.located + EXCLUDED.located),
              needed AS (
                  UPDATE blobs SET needed = needed + 1
                  WHERE digest = $4 AND EXISTS (SELECT FROM added) RETURNING digest)
@@ -64,6 +67,8 @@ impl Inner {
                 .bind(descriptor.as_slice())
                 .bind(part())
                 .bind(&pose)
+                .bind(recording.map(|recording| recording.id))
+                .bind(recording.map(|recording| i64::from(recording.number)))
                 .fetch_one(&mut *tx)
                 .await;
             let row = match added {
@@ -124,9 +129,10 @@ impl Inner {
         .await?;
         if current.pose != next.pose {
             sqlx::query(
-                "INSERT INTO image_counts (map_uid, part, images, changes, moved)
-                 VALUES ($1, $2, 0, 1, 1) ON CONFLICT (map_uid, part) DO UPDATE
-                 SET changes = image_counts.changes + 1, moved = image_counts.moved + 1",
+                "INSERT INTO image_counts (map_uid, part, images, changes, moved, located)
+                 VALUES ($1, $2, 0, 1, 1, 1) ON CONFLICT (map_uid, part) DO UPDATE
+                 SET changes = image_counts.changes + 1, moved = image_counts.moved + 1,
+                     located = image_counts.located + 1",
             )
             .bind(map.uid)
             .bind(part())
@@ -201,8 +207,9 @@ impl Inner {
     }
 
     pub(super) async fn positions(&self, map: &Map) -> Result<Vec<LocatedImage>, StoreError> {
-        let positions: Vec<(i64, String, Json<Pose>)> = sqlx::query_as(
-            "SELECT i.slot, i.id, i.pose FROM images i JOIN maps m ON m.uid = i.map_uid
+        let positions: Vec<(i64, String, Json<Pose>, Option<Uuid>, Option<i64>)> = sqlx::query_as(
+            "SELECT i.slot, i.id, i.pose, i.recording, i.number
+             FROM images i JOIN maps m ON m.uid = i.map_uid
              WHERE i.map_uid = $1 AND i.pose IS NOT NULL ORDER BY i.slot",
         )
         .bind(map.uid)
@@ -211,10 +218,11 @@ impl Inner {
         if positions.is_empty() {
             self.check_exists(map).await?;
         }
-        let located = |(slot, id, Json(pose)): (i64, String, Json<Pose>)| {
-            Ok(LocatedImage { slot: slot as usize, id: image_id(id)?, pose })
-        };
-        positions.into_iter().map(located).collect()
+        let located = positions.into_iter().map(|(slot, id, Json(pose), recording, number)| {
+            let image = LocatedImage { slot: slot as usize, id: image_id(id)?, pose };
+            Ok((image, in_recording(recording, number)))
+        });
+        Ok(in_order(located.collect::<Result<_, StoreError>>()?))
     }
 
     pub(super) async fn delete_image(&self, map: &Map, id: &ImageId) -> Result<bool, StoreError> {
@@ -228,12 +236,14 @@ impl Inner {
                      SELECT uid FROM maps WHERE uid = $1 AND revision = $2 FOR SHARE),
                  gone AS (
                      DELETE FROM images USING map WHERE map_uid = map.uid AND id = $3
-                     RETURNING slot, digest),
+                     RETURNING slot, digest, pose IS NOT NULL AS is_located),
                  described AS (DELETE FROM {table} WHERE slot IN (SELECT slot FROM gone)),
                  counted AS (
-                     INSERT INTO image_counts (map_uid, part, images, changes)
-                     SELECT $1, $4, -1, 1 FROM gone ON CONFLICT (map_uid, part) DO UPDATE
-                     SET images = image_counts.images - 1, changes = image_counts.changes + 1),
+                     INSERT INTO image_counts (map_uid, part, images, changes, located)
+                     SELECT $1, $4, -1, 1, is_located::int FROM gone
+                     ON CONFLICT (map_uid, part) DO UPDATE
+                     SET images = image_counts.images - 1, changes = image_counts.changes + 1,
+                         located = image_counts.located + EXCLUDED.located),
                  needed AS (
                      UPDATE blobs b SET needed = b.needed - 1 FROM gone WHERE b.digest = gone.digest)
                  SELECT (SELECT count(*) FROM gone) AS gone, (SELECT count(*) FROM map) AS map"
@@ -270,7 +280,7 @@ impl ExportStore for PostgresStore {
         let inner = &self.inner;
         let table = table(map.uid, map.revision);
         let sql = format!(
-            "SELECT i.record, d.descriptor::real[] FROM images i
+            "SELECT i.record, d.descriptor::real[], i.slot, i.recording, i.number FROM images i
              JOIN maps m ON m.uid = i.map_uid AND m.revision = $4
              LEFT JOIN {table} d ON d.slot = i.slot
              WHERE i.map_uid = $1 AND i.id > $2 ORDER BY i.id LIMIT $3"
@@ -282,21 +292,35 @@ impl ExportStore for PostgresStore {
             .bind(i64::from(map.revision));
         inner
             .call(async {
-                let found: Vec<(Json<Image>, Option<Vec<f32>>)> =
-                    match query.fetch_all(&inner.pool).await {
-                        Ok(found) => found,
-                        Err(error) => return Err(inner.explain(map, error).await),
-                    };
+                let found: Vec<ExportedRow> = match query.fetch_all(&inner.pool).await {
+                    Ok(found) => found,
+                    Err(error) => return Err(inner.explain(map, error).await),
+                };
                 if found.is_empty() {
                     inner.check_revision(map).await?;
                 }
-                let exported = |(Json(image), numbers): (Json<Image>, Option<Vec<f32>>)| {
-                    ExportedImage { image, descriptor: numbers.and_then(descriptor_of) }
+                let exported = |(Json(image), numbers, slot, recording, number): ExportedRow| {
+                    let descriptor = numbers.and_then(descriptor_of);
+                    let recording = in_recording(recording, number);
+                    ExportedImage {
+                        image,
+                        descriptor,
+                        position: u64::try_from(slot).ok(),
+                        recording,
+                    }
                 };
                 Ok(found.into_iter().map(exported).collect())
             })
             .await
     }
+}
+
+/// An image, its descriptor, its slot, and its place in a recording.
+type ExportedRow = (Json<Image>, Option<Vec<f32>>, i64, Option<Uuid>, Option<i64>);
+
+/// The place in a recording that is in the columns of an image.
+fn in_recording(id: Option<Uuid>, number: Option<i64>) -> Option<Recording> {
+    Some(Recording { id: id?, number: u32::try_from(number?).ok()? })
 }
 
 /// Chooses an arbitrary row of a map's counts.

@@ -13,6 +13,7 @@ use super::descriptors::create_table;
 use super::{Inner, PostgresStore, counted, record};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, Descriptor, Image, ImageId, Map, MapName,
+    Recording,
 };
 use whereabouts_index::SearchMode;
 
@@ -48,7 +49,8 @@ impl MapStore for PostgresStore {
             "SELECT coalesce(m.indexed_revision = m.revision, false) AS graph,
                  coalesce(sum(c.images), 0)::bigint AS images,
                  coalesce(sum(c.changes), 0)::bigint AS changes,
-                 coalesce(sum(c.moved), 0)::bigint AS moved
+                 coalesce(sum(c.moved), 0)::bigint AS moved,
+                 coalesce(sum(c.located), 0)::bigint AS located
              FROM maps m LEFT JOIN image_counts c ON c.map_uid = m.uid
              WHERE m.uid = $1 GROUP BY m.uid",
         )
@@ -63,18 +65,20 @@ impl MapStore for PostgresStore {
                     behind: false,
                     changes: row.try_get::<i64, _>("changes")?.unsigned_abs(),
                     moved: row.try_get::<i64, _>("moved")?.unsigned_abs(),
+                    located: row.try_get::<i64, _>("located")?.unsigned_abs(),
                 })
             })
             .await
     }
 
-    async fn add_image(
+    async fn add_recorded(
         &self,
         map: &Map,
         image: Image,
         descriptor: Descriptor,
+        recording: Option<Recording>,
     ) -> Result<Added, StoreError> {
-        self.inner.call(self.inner.add_image(map, image, &descriptor)).await
+        self.inner.call(self.inner.add_image(map, image, &descriptor, recording)).await
     }
 
     async fn replace_image(
@@ -310,6 +314,7 @@ impl Inner {
             for rest in [
                 "DELETE FROM frames WHERE map_uid = $1",
                 "DELETE FROM image_counts WHERE map_uid = $1",
+                "DELETE FROM tracks WHERE map_uid = $1",
                 "DELETE FROM deleted_maps WHERE uid = $1",
             ] {
                 sqlx::query(rest).bind(uid).execute(&mut *tx).await?;

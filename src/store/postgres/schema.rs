@@ -35,6 +35,7 @@ fn migrations() -> Vec<Migration> {
         migration(2, "moved", include_str!("../../../migrations/0002_moved.sql")),
         migration(3, "twins", include_str!("../../../migrations/0003_twins.sql")),
         migration(4, "vocabularies", include_str!("../../../migrations/0004_vocabularies.sql")),
+        migration(5, "tracks", include_str!("../../../migrations/0005_tracks.sql")),
     ]
 }
 

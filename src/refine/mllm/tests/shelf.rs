@@ -17,8 +17,8 @@ use crate::QueryFrame;
 use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, Secret, SimilarFrame};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, CoordinateFrame, DayUsage, Descriptor,
-    DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Precision, Priority, StandIn,
-    Usage,
+    DescriptorKind, Digest, Image, ImageId, Map, MapName, MediaType, Precision, Priority,
+    Recording, StandIn, Usage,
 };
 use whereabouts_index::SearchMode;
 use whereabouts_store::{
@@ -210,7 +210,13 @@ impl MapStore for Shelf {
         unused()
     }
 
-    async fn add_image(&self, _: &Map, _: Image, _: Descriptor) -> Result<Added, StoreError> {
+    async fn add_recorded(
+        &self,
+        _: &Map,
+        _: Image,
+        _: Descriptor,
+        _: Option<Recording>,
+    ) -> Result<Added, StoreError> {
         unused()
     }
 

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::super::images::{LocatedId, StoredImage};
+use super::super::images::{Entry, StoredImage};
 use super::super::live_map::folder_of;
 use super::super::orphans::remove_folder;
 use super::super::segments::VectorFiles;
@@ -117,14 +117,14 @@ impl Doctor<'_> {
                     continue;
                 }
             };
-            let listed = self.trees.located(map.uid, stored.slot).ok().flatten();
-            if listed != Some(LocatedId::from(&stored.image)) {
+            let listed = self.trees.entry(map.uid, stored.slot).ok().flatten();
+            if listed != Some(Entry::from(&stored)) {
                 unlisted.push(stored.image.id.clone());
                 if self.options.repair {
-                    self.trees.put_located(map.uid, &stored)?;
+                    self.trees.put_entry(map.uid, &stored)?;
                 }
             }
-            let StoredImage { image, slot } = stored;
+            let StoredImage { image, slot, .. } = stored;
             images += 1;
             if let Some(other) = slots.insert(slot, image.id.clone()) {
                 sharing.push(other);
@@ -262,9 +262,9 @@ mod tests {
         trees.forget_slot(map.uid, 0)?;
         let mut moved = trees.image(map.uid, &"b".parse().unwrap())?.unwrap();
         moved.image.pose = None;
-        trees.put_located(map.uid, &moved)?;
+        trees.put_entry(map.uid, &moved)?;
         moved.slot = 9;
-        trees.put_located(map.uid, &moved)?;
+        trees.put_entry(map.uid, &moved)?;
         trees.flush()?;
         drop(trees);
 
