@@ -6,6 +6,7 @@ mod bulk;
 mod calibration;
 mod cancellation;
 mod corrections;
+mod crossfit;
 mod descriptions;
 mod error;
 mod events;
@@ -233,13 +234,14 @@ impl Service {
             },
             jobs,
             fitter: VocabularyFitter { reindexer: reindexer.clone() },
-            reindexer,
             calibrator: Calibrator {
                 store: store.clone(),
                 refiner: refiner.clone(),
                 settings: settings.confidence.calibration(settings.compared),
                 model_candidates: settings.refiners.model_candidates().unwrap_or(settings.compared),
+                reindexer: reindexer.clone(),
             },
+            reindexer,
             transfer: Transfer { maps: maps.clone(), exports: store.clone(), blobs: store.clone() },
             usage: UsageReports { store: store.clone(), refiner, keep_days: settings.usage_days },
             descriptions: Descriptions { cache: store.clone() },
