@@ -49,6 +49,28 @@ impl Reindexer {
     }
 }
 
+/// Parts of a map, of which each is left out of one fit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Parts {
+    count: usize,
+    /// Images in a row that are in one part.
+    run: usize,
+}
+
+impl Parts {
+    /// Divides a map in which images up to `radius` before and after one show its place. `None` if it is too small.
+    fn of(images: usize, radius: usize) -> Option<Self> {
+        let run = 2 * radius + 1;
+        let count = PARTS.min(images.div_ceil(run));
+        (count > 1 && images > 2).then_some(Self { count, run })
+    }
+
+    /// The part of an image, given by its index in the order of addition.
+    fn part(&self, image: usize) -> usize {
+        image / self.run % self.count
+    }
+}
+
 /// Compares samples, given with their slots in the order of addition, as [`Reindexer::cross_fitted`] says.
 fn compare(
     own: &OwnVocabulary,
@@ -57,16 +79,11 @@ fn compare(
     k: usize,
 ) -> Result<Option<Vec<HardNegatives>>, ServiceError> {
     let count = samples.len();
-    let run = 2 * settings.place_radius(count) + 1;
-    let parts = PARTS.min(count.div_ceil(run));
-    if parts < 2 {
-        return Ok(None);
-    }
-    let part_of = |at: usize| at / run % parts;
+    let Some(parts) = Parts::of(count, settings.place_radius(count)) else { return Ok(None) };
     let mut found = Vec::new();
-    for part in 0..parts {
+    for part in 0..parts.count {
         let (asked, others): (Vec<usize>, Vec<usize>) =
-            (0..count).partition(|at| part_of(*at) == part);
+            (0..count).partition(|at| parts.part(*at) == part);
         let pictures: Vec<&[f32]> =
             others.iter().map(|&at| samples[at].1.expanded.as_slice()).collect();
         let vocabulary = own.fit(&pictures).map_err(ServiceError::unprocessable)?;
@@ -102,4 +119,30 @@ fn compare(
         }
     }
     Ok(Some(found))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_image_is_left_out_of_one_fit_together_with_its_run() {
+        for (images, radius) in [(3, 0), (12, 1), (64, 4), (111, 4), (1000, 4)] {
+            let parts = Parts::of(images, radius).unwrap();
+            let sizes: Vec<usize> = (0..parts.count)
+                .map(|part| (0..images).filter(|image| parts.part(*image) == part).count())
+                .collect();
+            assert_eq!(sizes.iter().sum::<usize>(), images);
+            // Something is left to ask about, and to fit on.
+            assert!(sizes.iter().all(|size| (1..images - 1).contains(size)), "{images}: {sizes:?}");
+            // The image in the middle of a run is left out with all images of its place.
+            let run: Vec<usize> = (0..=2 * radius).map(|image| parts.part(image)).collect();
+            assert!(run.iter().all(|part| *part == 0), "{images}: {run:?}");
+        }
+    }
+
+    #[test]
+    fn a_map_of_one_place_leaves_nothing_out() {
+        assert_eq!([(0, 0), (1, 0), (2, 0), (9, 4)].map(|(n, r)| Parts::of(n, r)), [None; 4]);
+    }
 }

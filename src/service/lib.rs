@@ -233,7 +233,7 @@ impl Service {
                 refiners: settings.refiners.clone(),
             },
             jobs,
-            fitter: VocabularyFitter { reindexer: reindexer.clone() },
+            fitter: VocabularyFitter { reindexer: reindexer.clone(), leases: store.clone() },
             calibrator: Calibrator {
                 store: store.clone(),
                 refiner: refiner.clone(),
