@@ -13,8 +13,7 @@
 //! distribution-free and needs no ground truth.
 //!
 //! The bound holds on average over maps. The confidence of an answer at once holds it for nine maps in ten
-//! ([`NullDistribution`]), because a null distribution of few images is itself a sample, and the images of one map
-//! resemble each other's evidence.
+//! ([`NullDistribution`]), because a null distribution of few images is itself a sample.
 //!
 //! Evidence is relative to the other candidates of the same frame, because conditions such as night lower
 //! the similarity to right and wrong images alike.
@@ -40,7 +39,7 @@ pub const SUPPORT_SHARE: f32 = 0.08;
 #[serde(rename_all = "snake_case")]
 pub enum Evidence {
     /// ln((a + c) / (m + c)), where a is how similar the candidate and its neighbours are to the frame, m the median of
-    /// that over the candidates of other places, and c is 0.1. See [`Calibration::similarity_evidence`].
+    /// that over the candidates of other places, and c is 0.1.
     Similarity(f32),
     /// ln((a + c) / (m + c)), where a regions of the candidate match the frame, m is the mean of the two largest counts
     /// among the candidates of other places, and c is [`SUPPORT_SHARE`] of the regions of the frame. See
