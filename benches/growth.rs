@@ -154,6 +154,7 @@ async fn one_job(store: &EmbeddedStore) -> Vec<f64> {
             image_id: format!("street/{rank:06}.jpg").parse().unwrap(),
             similarity: 0.9,
             pose: None,
+            order: None,
         })
         .collect();
     let query = Uuid::now_v7();

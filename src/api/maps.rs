@@ -202,10 +202,11 @@ pub enum ReindexState {
 pub struct CalibrationState {
     /// Number of images in the map when it was calibrated.
     pub images: usize,
-    /// Number n of images used as queries. The confidence of an unrefined estimate is at most n / (n + 1).
+    /// Number n of images used as queries. The confidence of an unrefined estimate is at most 0.1^(1/n): 22 images are
+    /// the fewest for 0.9.
     pub asked: usize,
-    /// Number of these queries that were also refined, which bounds the confidence of a refined estimate in
-    /// the same way. If it is 0, the confidence of a refined estimate is based on similarity.
+    /// Number n of these queries that were also refined. The confidence of a refined estimate is at most n / (n + 1). If
+    /// it is 0, the confidence of a refined estimate is based on similarity.
     pub refined: usize,
     /// Number of these queries about which the model was asked (`confidence.model_calls`). If it is 0, the model counts
     /// as one that is certain of every wrong image.

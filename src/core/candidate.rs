@@ -16,6 +16,11 @@ pub struct Candidate {
     pub similarity: f32,
     /// Pose of the reference image, if known.
     pub pose: Option<Pose>,
+    /// Position of the reference image in the order of addition, with gaps where images were removed. Known after a
+    /// search; not part of the API, and not stored with a job.
+    #[serde(skip)]
+    #[schema(ignore)]
+    pub order: Option<usize>,
 }
 
 /// A candidate after refinement.
@@ -95,6 +100,7 @@ mod tests {
                 image_id: format!("image-{i}").parse().unwrap(),
                 similarity: 1.0 - i as f32 / 10.0,
                 pose: None,
+                order: None,
             })
             .collect()
     }

@@ -12,6 +12,9 @@
 //! the map but otherwise resemble its images, at most a fraction 1 − c reaches confidence c. The bound is
 //! distribution-free and needs no ground truth.
 //!
+//! The bound holds on average over maps. The confidence of an answer at once holds it for nine maps in ten
+//! ([`NullDistribution`]), because a null distribution of few images is itself a sample.
+//!
 //! Evidence is relative to the other candidates of the same frame, because conditions such as night lower
 //! the similarity to right and wrong images alike.
 
@@ -19,10 +22,9 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 pub use super::null_distribution::NullDistribution;
+use super::resemblance;
+pub use super::resemblance::{COMPARED, neighbour_weights};
 use super::{Candidate, ImageId, Pose};
-
-/// Number of top candidates among which similarities are compared.
-pub const COMPARED: usize = 10;
 
 /// Share of a frame's regions that match a picture of another place by chance.
 pub const CHANCE_SHARE: f32 = 0.02;
@@ -36,7 +38,8 @@ pub const SUPPORT_SHARE: f32 = 0.08;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Evidence {
-    /// Similarity of the candidate minus the median similarity of the other candidates.
+    /// ln((a + c) / (m + c)), where a is how similar the candidate and its neighbours are to the frame, m the median of
+    /// that over the candidates of other places, and c is 0.1.
     Similarity(f32),
     /// ln((a + c) / (m + c)), where a regions of the candidate match the frame, m is the mean of the two largest counts
     /// among the candidates of other places, and c is [`SUPPORT_SHARE`] of the regions of the frame. See
@@ -56,16 +59,6 @@ pub enum Evidence {
 impl Evidence {
     /// The evidence of a verdict that none of the candidates shows the place. Finite, so that it can be stored.
     pub const NONE_OF_THESE: Self = Self::Verdict(f32::MIN);
-
-    /// Computes the evidence for the image `of` from the similarities of the first [`COMPARED`]
-    /// candidates. Returns `None` if the image is not among them or is the only one.
-    pub fn similarity(candidates: &[Candidate], of: &ImageId) -> Option<Self> {
-        let compared = &candidates[..candidates.len().min(COMPARED)];
-        let one = compared.iter().find(|candidate| candidate.image_id == *of)?;
-        let others = compared.iter().filter(|candidate| candidate.image_id != *of);
-        let median = median(others.map(|candidate| candidate.similarity).collect())?;
-        Some(Self::Similarity(one.similarity - median))
-    }
 }
 
 /// How many of that many regions of a frame match a picture of another place by chance.
@@ -76,14 +69,6 @@ pub fn chance(regions: usize) -> f32 {
 /// How many regions are added to the counts of a comparison.
 pub(super) fn support(regions: usize) -> f32 {
     (SUPPORT_SHARE * regions as f32).max(1.0)
-}
-
-/// The median; `None` if `values` is empty.
-fn median(mut values: Vec<f32>) -> Option<f32> {
-    values.sort_by(f32::total_cmp);
-    let (low, high) =
-        (values.get(values.len().checked_sub(1)? / 2)?, values.get(values.len() / 2)?);
-    Some((low + high) / 2.0)
 }
 
 /// Null distributions of one map.
@@ -103,6 +88,9 @@ pub struct Calibration {
     pub complete: bool,
     /// Null distribution of [`Evidence::Similarity`].
     pub similarity: NullDistribution,
+    /// What an image has in common with the one that was added 1, 2, … images later; see [`neighbour_weights`].
+    #[serde(default)]
+    pub neighbours: Vec<f32>,
     /// Null distribution of [`Evidence::Agreement`]; empty without a refiner or until it is measured.
     pub agreement: NullDistribution,
     /// Null distribution of [`Evidence::Verdict`]. Unless the model was asked, it is that of a model that is certain of
@@ -124,6 +112,7 @@ impl Default for Calibration {
             evidence: Self::EVIDENCE,
             complete: false,
             similarity: NullDistribution::default(),
+            neighbours: Vec::new(),
             agreement: NullDistribution::default(),
             verdict: NullDistribution::default(),
             model_asked: 0,
@@ -182,7 +171,7 @@ impl CalibrationSettings {
 
 impl Calibration {
     /// The present definition of [`Evidence`].
-    pub const EVIDENCE: u32 = 3;
+    pub const EVIDENCE: u32 = 4;
 
     /// Confidence that the image `of` shows the place of the frame, in [0, 1). Uses the evidence of the refiner if there
     /// is any and its kind is calibrated, and similarity otherwise. `None` while it is not measured yet.
@@ -204,8 +193,26 @@ impl Calibration {
         }
         let measured = |evidence| self.confidence(evidence);
         // A complete calibration of a map that is too small says nothing, and so does a single candidate.
-        let of_similarity = Evidence::similarity(candidates, of).and_then(measured);
+        let of_similarity = self.similarity_evidence(candidates, of).and_then(measured);
         of_similarity.or((self.is_current() && self.complete).then_some(0.0))
+    }
+
+    /// Returns the evidence for the image `of` by the similarities of the first [`COMPARED`] candidates; `None` if the image
+    /// is not among them or is the only one.
+    pub fn similarity_evidence(&self, candidates: &[Candidate], of: &ImageId) -> Option<Evidence> {
+        let map = (self.images, &self.settings);
+        resemblance::evidence(candidates, of, map, &self.neighbours).map(Evidence::Similarity)
+    }
+
+    /// Returns the share of the null distribution that the evidence of the first candidate exceeds: its confidence without
+    /// the margin for the size of the sample. For uses that add up many frames. `None` while it is not measured.
+    pub fn exceeded(&self, candidates: &[Candidate]) -> Option<f32> {
+        match self.similarity_evidence(candidates, &candidates.first()?.image_id)? {
+            Evidence::Similarity(value) if self.is_current() && !self.similarity.is_empty() => {
+                Some(self.similarity.confidence(value))
+            }
+            _ => None,
+        }
     }
 
     /// Whether it is by the present definition of the evidence.
@@ -221,7 +228,10 @@ impl Calibration {
         let of =
             |null: &NullDistribution, value| (!null.is_empty()).then(|| null.confidence(value));
         match evidence {
-            Evidence::Similarity(value) => of(&self.similarity, value),
+            Evidence::Similarity(value) => {
+                let null = &self.similarity;
+                (!null.is_empty()).then(|| null.assured_confidence(value))
+            }
             Evidence::Agreement(value) => of(&self.agreement, value),
             Evidence::Verdict(value) => of(&self.verdict, value),
             Evidence::Concurring { verdict, agreement } => {
@@ -243,26 +253,15 @@ mod tests {
             image_id: index.to_string().parse().unwrap(),
             similarity,
             pose: None,
+            order: None,
         };
         similarities.iter().enumerate().map(one).collect()
     }
 
     #[test]
-    fn similarity_evidence_is_relative_to_the_median_of_the_first_ten() {
-        let some = candidates(&[0.9, 0.5, 0.4, 0.1]);
-        let of = |index: &str| Evidence::similarity(&some, &index.parse().unwrap());
-        assert_eq!(of("0"), Some(Evidence::Similarity(0.9 - 0.4)));
-        assert_eq!(of("2"), Some(Evidence::Similarity(0.4 - 0.5)));
-        assert_eq!(of("7"), None);
-        assert_eq!(Evidence::similarity(&some[..1], &"0".parse().unwrap()), None);
-        let many = candidates(&[&[0.75][..], &[0.5; 9], &[0.0; 90]].concat());
-        let first = Evidence::similarity(&many, &"0".parse().unwrap());
-        assert_eq!(first, Some(Evidence::Similarity(0.25)));
-    }
-
-    #[test]
     fn a_model_that_says_none_of_these_makes_nothing_known() {
         let some = candidates(&[0.9, 0.1, 0.1]);
+        let assured = NullDistribution::from(vec![0.0; 99]).assured_confidence(1.0);
         let null = NullDistribution::from(vec![0.0; 99]);
         let similarity = null.clone();
         let calibration = Calibration { similarity, verdict: null, ..Calibration::default() };
@@ -275,7 +274,7 @@ mod tests {
         let complete = Calibration { complete: true, ..calibration.clone() };
         let refined = Some(Evidence::Agreement(-5.0));
         let by_similarity = complete.refined_confidence(&some, &"0".parse().unwrap(), refined);
-        assert_eq!(by_similarity, Some(0.99));
+        assert_eq!(by_similarity, Some(assured));
         let agreement = NullDistribution::from(vec![5.0; 99]);
         let both = Calibration { agreement, ..calibration.clone() };
         let concurring = |agreement| Evidence::Concurring { verdict: 1.0, agreement };
@@ -301,7 +300,10 @@ mod tests {
         assert_eq!(of(&Calibration::default()), None);
         let similarity = NullDistribution::from(vec![0.0; 99]);
         let measured = Calibration { similarity, ..Calibration::default() };
-        assert_eq!(of(&measured), Some(0.99));
+        assert!((of(&measured).unwrap() - 0.977).abs() < 1e-3, "{:?}", of(&measured));
+        // Without the margin for the size of the sample.
+        assert_eq!(measured.exceeded(&some), Some(0.99));
+        assert_eq!(Calibration::default().exceeded(&some), None);
         assert_eq!(of(&Calibration { evidence: Calibration::EVIDENCE - 1, ..measured }), None);
         // Nothing can be measured in a map without hard negatives.
         assert_eq!(of(&Calibration { complete: true, ..Calibration::default() }), Some(0.0));

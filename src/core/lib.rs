@@ -20,6 +20,7 @@ mod model_server;
 pub mod moment;
 mod null_distribution;
 mod pose;
+mod resemblance;
 mod secret;
 mod service_time;
 mod spend;

@@ -1,7 +1,16 @@
 //! The evidence that wrong answers of one map have, and the confidence that follows from it; see
 //! [`confidence`](super::confidence).
+//!
+//! There are two confidences. One bounds the share of unknown places that reach it on average over maps. The other bounds
+//! it in nine maps in ten: the values are a sample, and by chance it may lack the most convincing wrong answers.
 
 use serde::{Deserialize, Serialize};
+
+/// The share of maps in which a null distribution may promise too much.
+const SURPRISE: f64 = 0.1;
+
+/// Halvings of the interval in which a bound is sought: more than the precision of the result.
+const BISECTIONS: usize = 30;
 
 /// Evidence values of wrong answers, sorted ascending.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -48,6 +57,58 @@ impl NullDistribution {
         let below = self.0.partition_point(|value| *value < evidence);
         below as f32 / (self.len() + 1) as f32
     }
+
+    /// One minus the largest share of wrong answers with at least this evidence that is compatible with the sample:
+    /// the one-sided bound of Clopper and Pearson (*The use of confidence or fiducial limits*, 1934) at [`SURPRISE`]. At
+    /// most SURPRISE^(1/n), so fewer than 22 samples cannot give 0.9.
+    pub(super) fn assured_confidence(&self, evidence: f32) -> f32 {
+        let n = self.len();
+        let reached = n - self.0.partition_point(|value| *value < evidence);
+        if reached == n {
+            return 0.0;
+        }
+        let (mut low, mut high) = (reached as f64 / n as f64, 1.0);
+        for _ in 0..BISECTIONS {
+            let share = (low + high) / 2.0;
+            match at_most(reached, n, share) > SURPRISE {
+                true => low = share,
+                false => high = share,
+            }
+        }
+        (1.0 - high) as f32
+    }
+}
+
+/// The probability that at most `most` of `n` trials succeed, each with the probability `share`, for `most` < `n` and
+/// `share` from `most / n` to 1.
+fn at_most(most: usize, n: usize, share: f64) -> f64 {
+    // From the largest term downwards; the terms fall at least geometrically.
+    let (k, count) = (most as f64, n as f64);
+    let ln_choose = ln_factorial(n) - ln_factorial(most) - ln_factorial(n - most);
+    let mut term = (ln_choose + k * share.ln() + (count - k) * (1.0 - share).ln()).exp();
+    if most == 0 {
+        return (1.0 - share).powi(i32::try_from(n).unwrap_or(i32::MAX));
+    }
+    let odds = (1.0 - share) / share;
+    let mut sum = 0.0;
+    for successes in (0..=most).rev() {
+        sum += term;
+        term *= successes as f64 / (n - successes + 1) as f64 * odds;
+        if term < 1e-9 * sum {
+            break;
+        }
+    }
+    sum
+}
+
+/// ln n!, by Stirling's series.
+fn ln_factorial(n: usize) -> f64 {
+    if n < 16 {
+        return (1..=n).map(|factor| (factor as f64).ln()).sum();
+    }
+    let x = n as f64;
+    let tau = std::f64::consts::TAU;
+    x * x.ln() - x + (tau * x).ln() / 2.0 + 1.0 / (12.0 * x) - 1.0 / (360.0 * x.powi(3))
 }
 
 #[cfg(test)]
@@ -70,13 +131,68 @@ mod tests {
         assert_eq!(NullDistribution::default().confidence(1.0), 0.0);
     }
 
-    /// Numbers of a heavy-tailed distribution, as evidence has.
-    fn draws(seed: u64) -> impl FnMut() -> f32 {
+    /// Numbers from 0 to 1.
+    fn uniforms(seed: u64) -> impl FnMut() -> f32 {
         let mut state = seed.wrapping_mul(6_364_136_223_846_793_005) | 1;
         move || {
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-            let uniform = ((state >> 40) as f32 + 0.5) / (1 << 24) as f32;
+            ((state >> 40) as f32 + 0.5) / (1 << 24) as f32
+        }
+    }
+
+    /// Numbers of a heavy-tailed distribution, as evidence has.
+    fn draws(seed: u64) -> impl FnMut() -> f32 {
+        let mut uniform = uniforms(seed);
+        move || {
+            let uniform = uniform();
             -uniform.ln() + 0.1 / uniform.sqrt()
+        }
+    }
+
+    #[test]
+    fn an_assured_confidence_is_the_bound_of_clopper_and_pearson() {
+        let assured = |n: usize, reached: usize| {
+            let values = (0..n).map(|value| value as f32).collect::<Vec<f32>>();
+            NullDistribution::from(values).assured_confidence((n - reached) as f32)
+        };
+        // The limits are of exact binomial sums in Python.
+        for (n, reached, limit) in [
+            (22, 0, 0.09937),
+            (21, 0, 0.10385),
+            (80, 4, 0.09744),
+            (80, 5, 0.11285),
+            (179, 12, 0.09773),
+            (256, 19, 0.09981),
+            (10, 3, 0.55173),
+        ] {
+            let expected = 1.0 - limit;
+            let found = assured(n, reached);
+            assert!((found - expected).abs() < 1e-4, "{reached} of {n}: {found}, not {expected}");
+        }
+        assert_eq!((assured(9, 9), assured(5000, 5000)), (0.0, 0.0));
+        // It rises with the evidence, in a large sample too.
+        let all: Vec<f32> = (0..=4000).rev().map(|reached| assured(4000, reached)).collect();
+        assert!(all.is_sorted() && all[4000] > 0.999, "{:?}", &all[3990..]);
+    }
+
+    #[test]
+    fn an_assured_confidence_promises_too_much_in_one_map_of_ten() {
+        for images in [22, 55, 80, 256] {
+            let maps = 1000;
+            let broken = (0..maps).filter(|map| {
+                // Of a uniform distribution, the share above a value is known.
+                let mut uniform = uniforms(map * 1000 + images as u64);
+                let null: Vec<f32> = (0..images).map(|_| uniform()).collect();
+                let null = NullDistribution::from(null);
+                let known_from = null
+                    .0
+                    .iter()
+                    .rev()
+                    .take_while(|value| null.assured_confidence(value.next_up()) >= 0.9);
+                1.0 - known_from.last().unwrap() > 0.1
+            });
+            let share = broken.count() as f32 / maps as f32;
+            assert!((0.03..=0.13).contains(&share), "{images}: {share}");
         }
     }
 

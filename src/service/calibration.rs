@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::ServiceError;
-use whereabouts_core::confidence::{COMPARED, NullDistribution};
-use whereabouts_core::{Calibration, CalibrationSettings, Evidence, Map};
+use super::{Reindexer, ServiceError};
+use whereabouts_core::confidence::{COMPARED, NullDistribution, neighbour_weights};
+use whereabouts_core::{Calibration, CalibrationSettings, Descriptor, Evidence, ImageId, Map};
 use whereabouts_refine::{AttemptPolicy, PaidNegatives, RefineError, Refiner};
 use whereabouts_store::{HardNegatives, IndexState, MapStore};
 
@@ -83,6 +83,8 @@ pub struct Calibrator {
     pub settings: CalibrationSettings,
     /// Number of candidates about which a paid model is asked.
     pub model_candidates: usize,
+    /// Fits vocabularies without the images that are asked about, for maps that have one of their own.
+    pub reindexer: Reindexer,
 }
 
 impl Calibrator {
@@ -147,12 +149,19 @@ impl Calibrator {
         let IndexState { images, moved, .. } = self.store.index_state(map).await?;
         let asked =
             self.store.hard_negatives(map, settings, COMPARED.max(settings.candidates)).await?;
-        let similarity = NullDistribution::from(values(asked.iter().filter_map(|asked| {
-            Evidence::similarity(&asked.others, &asked.others.first()?.image_id)
-        })));
-        let evidence = Calibration::EVIDENCE;
-        let mut measured =
-            Calibration { images, moved, settings, evidence, similarity, ..Calibration::default() };
+        let mut measured = Calibration {
+            images,
+            moved,
+            settings,
+            neighbours: self.neighbours(map, &asked).await?,
+            ..Calibration::default()
+        };
+        let left_out = self.reindexer.cross_fitted(map, settings, COMPARED).await?;
+        let of_similarity = left_out.as_deref().unwrap_or(&asked);
+        measured.similarity =
+            NullDistribution::from(values(of_similarity.iter().filter_map(|asked| {
+                measured.similarity_evidence(&asked.others, &asked.others.first()?.image_id)
+            })));
         self.store.put_calibration(map, measured.clone()).await?;
         if let Some(refiner) = refiner.and_then(Refiner::negative_evidence) {
             let mut found = Vec::new();
@@ -182,6 +191,32 @@ impl Calibrator {
             refined = measured.agreement.len(), model = measured.model_asked, "the map was calibrated"
         );
         Ok(self.store.put_calibration(map, measured).await?)
+    }
+
+    /// Measures what images have in common with those that were added soon after them.
+    async fn neighbours(
+        &self,
+        map: &Map,
+        asked: &[HardNegatives],
+    ) -> Result<Vec<f32>, ServiceError> {
+        let images = self.store.index_state(map).await?.images;
+        let radius = self.settings.place_radius(images);
+        let ids: Vec<ImageId> = asked.iter().map(|asked| asked.image_id.clone()).collect();
+        let slots = self.store.slots(map, &ids).await?;
+        let slots: Vec<usize> =
+            slots.into_iter().flatten().flat_map(|slot| slot..=slot + radius).collect();
+        let descriptors = self.store.descriptors(map, slots).await?;
+        let runs: Vec<&[Option<Descriptor>]> = descriptors.chunks_exact(radius + 1).collect();
+        let (mut near, mut far) = (vec![Vec::new(); radius], Vec::new());
+        for (at, run) in runs.iter().enumerate() {
+            let Some(image) = &run[0] else { continue };
+            for (near, other) in near.iter_mut().zip(&run[1..]) {
+                near.extend(other.as_ref().map(|other| image.similarity(other)));
+            }
+            let other = &runs[(at + runs.len() / 2) % runs.len()][0];
+            far.extend(other.as_ref().map(|other| image.similarity(other)));
+        }
+        Ok(neighbour_weights(&near, &far))
     }
 
     /// Returns the model's verdicts on images of other places, as far as the allowed number of calls goes. Ends with the

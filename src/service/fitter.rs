@@ -1,8 +1,10 @@
 //! Fits vocabularies in the background, once a map has enough images and they have stopped changing.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
+use jiff::{SignedDuration, Timestamp};
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
@@ -10,8 +12,8 @@ use super::fitting::obstacle;
 use super::reindex::{Declined, FitPlan};
 use super::{Reindexer, ServiceError};
 use whereabouts_api::ErrorKind;
-use whereabouts_core::{Map, MapName};
-use whereabouts_store::IndexState;
+use whereabouts_core::{Digest, Map, MapName};
+use whereabouts_store::{DescriptionCache, IndexState};
 
 /// Pause between two scans for maps that have changed. A map whose images did not change in between is settled.
 const SCAN_PAUSE: Duration = Duration::from_secs(3);
@@ -19,10 +21,16 @@ const SCAN_PAUSE: Duration = Duration::from_secs(3);
 /// A vocabulary is fitted again when one in this many of the images of its map was added or removed.
 const CHANGED_SHARE: usize = 5;
 
+/// How long a map is left to the process that began to fit a vocabulary for it: longer than a fit takes. If that process
+/// found the model's vocabulary better, others look at the map themselves afterwards.
+const CLAIMED: SignedDuration = SignedDuration::from_hours(1);
+
 /// Fits the vocabularies of maps.
 pub struct VocabularyFitter {
     /// Replaces the descriptors of a map.
     pub reindexer: Reindexer,
+    /// Lets one process at a time fit a map, by the same leases as purchases of descriptions.
+    pub leases: Arc<dyn DescriptionCache>,
 }
 
 impl VocabularyFitter {
@@ -80,7 +88,15 @@ impl VocabularyFitter {
     async fn fit_if_due(&self, map: &Map, images: usize) -> Result<bool, ServiceError> {
         match self.plan(map, images) {
             Some((before, plan)) if before.is_none_or(|before| has_changed(before, images)) => {
-                self.reindexer.fit_in_background(map, images, plan).await
+                let key = claim_of(map, images);
+                if !self.leases.acquire_lease(&key, Timestamp::now() + CLAIMED).await? {
+                    return Ok(false);
+                }
+                let fitted = self.reindexer.fit_in_background(map, images, plan).await;
+                if fitted.is_err() {
+                    self.leases.release_lease(&key).await?;
+                }
+                fitted
             }
             _ => Ok(false),
         }
@@ -106,6 +122,11 @@ impl VocabularyFitter {
     }
 }
 
+/// Identifies the fit of a map as it is now, on every server of its store.
+fn claim_of(map: &Map, images: usize) -> Digest {
+    Digest::of(format!("vocabulary of {} {} {images}", map.uid, map.revision).as_bytes())
+}
+
 fn has_changed(before: usize, images: usize) -> bool {
     before.abs_diff(images).saturating_mul(CHANGED_SHARE) > before
 }
@@ -113,6 +134,16 @@ fn has_changed(before: usize, images: usize) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_fit_is_claimed_alike_on_every_server_and_anew_when_the_map_has_changed() {
+        let map = crate::tests::map("m");
+        let claim = claim_of(&map, 100);
+        assert_eq!(claim_of(&map.clone(), 100), claim);
+        let replaced = Map { revision: map.revision + 1, ..map.clone() };
+        let others = [claim_of(&map, 120), claim_of(&replaced, 100)];
+        assert!(!others.contains(&claim) && claim_of(&crate::tests::map("m"), 100) != claim);
+    }
 
     #[test]
     fn a_vocabulary_is_fitted_again_when_a_fifth_of_the_map_has_changed() {

@@ -56,10 +56,10 @@ pub(super) struct AgreementRates {
 }
 
 /// An image with both of its descriptors.
-struct Sample {
-    image: Image,
-    shipped: Descriptor,
-    expanded: Vec<f32>,
+pub(super) struct Sample {
+    pub image: Image,
+    pub shipped: Descriptor,
+    pub expanded: Vec<f32>,
 }
 
 impl Reindexer {
@@ -77,26 +77,36 @@ impl Reindexer {
         let own = Arc::new(own);
         let mut samples = Vec::new();
         for image in self.sample(map).await? {
-            let Some(bytes) = self.bytes_of(map, &image).await? else { continue };
-            let _permit = self.maps.reindexes.extraction.acquire().await;
-            let (features, request) =
-                (FeatureSet::DescriptorAndDense, AdmissionRequest::BACKGROUND);
-            let extracting =
-                self.maps.imaging.extract(extractor, bytes, kind.into(), features, request);
-            let extraction =
-                extracting.await.map_err(|error| cannot_reindex(&image, &error.detail))?;
-            let Some(dense) = extraction.dense else { continue };
-            let expanding = Arc::clone(&own);
-            let expanded = blocking(move || Ok(expanding.expand(&dense))).await?;
-            samples.push(Sample { image, shipped: extraction.descriptor, expanded });
+            samples.extend(self.expand(map, image, extractor, kind, &own).await?);
             self.maps.reindexes.set_done(map.uid, samples.len());
         }
         let of = self.maps.store.index_state(map).await?.images;
         blocking(move || decide(&own, samples, of, forced)).await
     }
 
+    /// Both descriptors of an image; `None` if the image was deleted meanwhile or has no local features.
+    pub(super) async fn expand(
+        &self,
+        map: &Map,
+        image: Image,
+        extractor: &Arc<Extractor>,
+        kind: DescriptorKind,
+        own: &Arc<OwnVocabulary>,
+    ) -> Result<Option<Sample>, ServiceError> {
+        let Some(bytes) = self.bytes_of(map, &image).await? else { return Ok(None) };
+        let _permit = self.maps.reindexes.extraction.acquire().await;
+        let (features, request) = (FeatureSet::DescriptorAndDense, AdmissionRequest::BACKGROUND);
+        let extracting =
+            self.maps.imaging.extract(extractor, bytes, kind.into(), features, request);
+        let extraction = extracting.await.map_err(|error| cannot_reindex(&image, &error.detail))?;
+        let Some(dense) = extraction.dense else { return Ok(None) };
+        let expanding = Arc::clone(own);
+        let expanded = blocking(move || Ok(expanding.expand(&dense))).await?;
+        Ok(Some(Sample { image, shipped: extraction.descriptor, expanded }))
+    }
+
     /// The images to fit on: all, or as many as may be, evenly spread.
-    async fn sample(&self, map: &Map) -> Result<Vec<Image>, ServiceError> {
+    pub(super) async fn sample(&self, map: &Map) -> Result<Vec<Image>, ServiceError> {
         let count = self.maps.store.index_state(map).await?.images;
         let step = count.div_ceil(self.settings.max_images).max(1);
         let (mut images, mut last, mut at) = (Vec::new(), None, 0);
@@ -214,7 +224,7 @@ pub(super) fn no_vocabulary(manifest: &Manifest, kind: DescriptorKind) -> Servic
     ))
 }
 
-async fn blocking<T: Send + 'static>(
+pub(super) async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, ServiceError> + Send + 'static,
 ) -> Result<T, ServiceError> {
     let done = tokio::task::spawn_blocking(work).await;

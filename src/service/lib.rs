@@ -6,6 +6,7 @@ mod bulk;
 mod calibration;
 mod cancellation;
 mod corrections;
+mod crossfit;
 mod descriptions;
 mod error;
 mod events;
@@ -232,14 +233,15 @@ impl Service {
                 refiners: settings.refiners.clone(),
             },
             jobs,
-            fitter: VocabularyFitter { reindexer: reindexer.clone() },
-            reindexer,
+            fitter: VocabularyFitter { reindexer: reindexer.clone(), leases: store.clone() },
             calibrator: Calibrator {
                 store: store.clone(),
                 refiner: refiner.clone(),
                 settings: settings.confidence.calibration(settings.compared),
                 model_candidates: settings.refiners.model_candidates().unwrap_or(settings.compared),
+                reindexer: reindexer.clone(),
             },
+            reindexer,
             transfer: Transfer { maps: maps.clone(), exports: store.clone(), blobs: store.clone() },
             usage: UsageReports { store: store.clone(), refiner, keep_days: settings.usage_days },
             descriptions: Descriptions { cache: store.clone() },

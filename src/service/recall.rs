@@ -90,6 +90,7 @@ mod tests {
             image_id: format!("image-{rank}").parse().unwrap(),
             similarity: *similarity,
             pose: None,
+            order: None,
         };
         similarities.iter().enumerate().map(candidate).collect()
     }

@@ -78,14 +78,15 @@ pub trait DescriptionCache: Send + Sync {
     async fn remove_descriptions(&self, keys: &[Digest]) -> Result<usize, StoreError>;
 
     /// Acquires the right to buy the description with this key, so that no two processes pay for the
-    /// same one. The lease expires at `until`. Returns `false` while another process holds it.
+    /// same one, or to do other work that is known by a key. The lease expires at `until`. Returns `false` while another
+    /// process holds it.
     ///
     /// A store with a single process always grants it.
     async fn acquire_lease(&self, key: &Digest, until: Timestamp) -> Result<bool, StoreError> {
         let _ = (key, until);
         Ok(true)
     }
-    /// Releases the lease of this process without a description having been bought.
+    /// Releases the lease of this process without the work having been done.
     async fn release_lease(&self, key: &Digest) -> Result<(), StoreError> {
         let _ = key;
         Ok(())

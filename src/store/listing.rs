@@ -100,7 +100,8 @@ mod tests {
             error: Some("1 of 2 pairs failed".into()),
             ..Job::queued("yard".parse().unwrap(), query.id, RefinerKind::Mllm, now)
         };
-        let candidates = vec![Candidate { rank: 1, image_id, similarity: 0.5, pose: None }];
+        let candidates =
+            vec![Candidate { rank: 1, image_id, similarity: 0.5, pose: None, order: None }];
         JobRecord {
             job,
             map_uid: Uuid::nil(),

@@ -104,6 +104,33 @@ async fn a_map_with_enough_images_gets_its_own_vocabulary_and_says_so() {
 }
 
 #[tokio::test]
+async fn with_an_own_vocabulary_places_outside_the_map_are_not_known_at_once() {
+    const MAPPED: usize = 48;
+    let dir = TempDir::new().unwrap();
+    let server = serve(dir.path(), &[("WHEREABOUTS_REFINE__REFINER", "off")]);
+    server.town("m", MAPPED).await;
+    own(&server).await;
+    let state = eventually_within(Duration::from_secs(60), async || {
+        let state = map(&server).await;
+        if state["calibration"]["images"] == MAPPED { Ok(state) } else { Err(state) }
+    })
+    .await;
+    // Each image was asked about once, by a vocabulary that was fitted without it.
+    assert_eq!(state["calibration"]["asked"], MAPPED);
+    let mut known = Vec::new();
+    for first in [0, 500] {
+        let mut count = 0;
+        for place in first..first + MAPPED {
+            let answer = server.post_jpeg("/localize?map=m&refine=off", frame(place, 0)).await;
+            count += usize::from(answer.expect(200)["estimate"]["known"] == true);
+        }
+        known.push(count);
+    }
+    assert!(known[0] * 3 >= MAPPED, "only {} of {MAPPED} mapped places are known", known[0]);
+    assert!(known[1] * 10 <= MAPPED, "{} of {MAPPED} unknown places are known", known[1]);
+}
+
+#[tokio::test]
 async fn the_vocabulary_survives_kill_9_and_a_backup_carries_it() {
     let dir = TempDir::new().unwrap();
     let data = dir.path().join("data");

@@ -56,6 +56,7 @@ async fn a_job_is_returned_as_submitted(fixture: &Fixture) {
             image_id: format!("東京-{rank}").parse().unwrap(),
             similarity: 1.0 / rank as f32,
             pose: None,
+            order: None,
         })
         .collect();
     submit_record(&*store, given.clone(), b"frame").await;
@@ -215,6 +216,7 @@ async fn steps_add_up_and_a_description_replaces_that_of_the_same_image(fixture:
             image_id: id.parse().unwrap(),
             similarity: 0.5,
             pose: None,
+            order: None,
         })
         .collect();
     let id = given.job.id;

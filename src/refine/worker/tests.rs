@@ -232,6 +232,7 @@ async fn submit(store: &EmbeddedStore, map: &Map) -> Uuid {
             image_id: "image-0".parse().unwrap(),
             similarity: 0.9,
             pose: None,
+            order: None,
         }],
         claims: 0,
         traceparent: None,

@@ -33,6 +33,23 @@ async fn without_a_refiner_similarity_alone_is_measured() {
     assert!(fixture.refiner.measured.lock().is_empty());
 }
 
+#[tokio::test]
+async fn what_neighbours_have_in_common_is_measured_as_far_as_a_place_reaches() {
+    for (place_images, distances) in [(0, 0), (2, 2)] {
+        let change = |settings: &mut crate::ServiceSettings| {
+            settings.confidence.place_images = place_images;
+        };
+        let fixture = Fixture::with(0, change).await;
+        let poses: Vec<_> = (0..40).map(|number| Some(number as f64 * 100.0)).collect();
+        let map = fixture.map("road", &poses).await;
+        fixture.service.calibrator.calibrate(&map, None).await.unwrap();
+        let measured = fixture.store.calibration(&map).await.unwrap().unwrap();
+        assert_eq!(measured.neighbours.len(), distances);
+        assert!(measured.neighbours.iter().all(|weight| (0.5..=1.0).contains(weight)));
+        assert!(measured.neighbours.is_sorted_by(|near, far| near > far));
+    }
+}
+
 #[tokio::test(start_paused = true)]
 async fn a_transient_failure_of_the_refiner_is_retried() {
     let fixture = Fixture::new().await;

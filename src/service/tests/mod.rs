@@ -275,6 +275,7 @@ fn candidates(similar: &[(usize, f32)]) -> Vec<Candidate> {
             image_id: image_id(number),
             similarity,
             pose: None,
+            order: None,
         })
         .collect()
 }

@@ -105,9 +105,7 @@ impl<'a> FrameEvidence<'a> {
     /// The evidence of candidates in a map with this calibration.
     pub fn new(candidates: &'a [Candidate], calibration: &Calibration) -> Self {
         let is_usable = calibration.similarity.len() >= MIN_IMAGES;
-        let first = candidates.first().filter(|_| is_usable);
-        let confidence = first
-            .and_then(|first| calibration.refined_confidence(candidates, &first.image_id, None));
+        let confidence = calibration.exceeded(candidates).filter(|_| is_usable);
         Self { candidates, confidence }
     }
 }

@@ -284,6 +284,7 @@ impl LiveMap {
                 // Rounding can push the cosine of identical pictures slightly above 1.
                 similarity: found.similarity.clamp(-1.0, 1.0),
                 pose: entry.pose,
+                order: Some(found.slot),
             })
             .collect()
     }

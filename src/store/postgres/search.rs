@@ -295,6 +295,7 @@ fn candidates(found: Vec<Found>) -> Vec<Candidate> {
         // Rounding can push the cosine of identical pictures slightly above 1.
         similarity: (found.similarity as f32).clamp(-1.0, 1.0),
         pose: found.pose,
+        order: usize::try_from(found.slot).ok(),
     };
     found.into_iter().enumerate().map(candidate).collect()
 }

@@ -149,6 +149,7 @@ impl Shelf {
             image_id: format!("image-{index}").parse().unwrap(),
             similarity: 0.9,
             pose: None,
+            order: None,
         };
         RefineInput {
             id: Uuid::now_v7(),

@@ -142,6 +142,7 @@ fn negatives(count: usize) -> HardNegatives {
         image_id: format!("image-{index}").parse().unwrap(),
         similarity: 0.9,
         pose: None,
+        order: None,
     };
     HardNegatives {
         image_id: "image-20".parse().unwrap(),
