@@ -14,14 +14,8 @@ pub(super) trait Lanes: Copy {
 
     fn higher(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
 
-    /// `yes` where `a` is above `b`, else `no`.
-    fn where_above(
-        self,
-        a: Self::Vector,
-        b: Self::Vector,
-        yes: Self::Vector,
-        no: Self::Vector,
-    ) -> Self::Vector;
+    /// Replaces the lowest bits of each sum, those that are not in `keep`, by those of `tag`.
+    fn tagged(self, sums: Self::Vector, keep: Self::Vector, tag: Self::Vector) -> Self::Vector;
 }
 
 impl Lanes for V4 {
@@ -44,14 +38,8 @@ impl Lanes for V4 {
     }
 
     #[inline(always)]
-    fn where_above(
-        self,
-        a: Self::Vector,
-        b: Self::Vector,
-        yes: Self::Vector,
-        no: Self::Vector,
-    ) -> Self::Vector {
-        self.select_i32x16(self.cmp_lt_i32x16(b, a), yes, no)
+    fn tagged(self, sums: Self::Vector, keep: Self::Vector, tag: Self::Vector) -> Self::Vector {
+        self.or_i32x16(self.and_i32x16(sums, keep), tag)
     }
 }
 
@@ -75,13 +63,7 @@ impl Lanes for V3 {
     }
 
     #[inline(always)]
-    fn where_above(
-        self,
-        a: Self::Vector,
-        b: Self::Vector,
-        yes: Self::Vector,
-        no: Self::Vector,
-    ) -> Self::Vector {
-        self.select_i32x8(self.cmp_lt_i32x8(b, a), yes, no)
+    fn tagged(self, sums: Self::Vector, keep: Self::Vector, tag: Self::Vector) -> Self::Vector {
+        self.or_i32x8(self.and_i32x8(sums, keep), tag)
     }
 }

@@ -1,14 +1,19 @@
 //! Comparisons against a reference implementation.
 
 use super::*;
+use crate::local::mutual::Comparing;
 use crate::local::nearest::tests::cells;
 
 fn features(count: usize, channels: usize, seed: u32) -> DenseFeatures {
     DenseFeatures::new(1, count, channels, cells(count, channels, seed), None).unwrap()
 }
 
-/// The reference implementation: every similarity in 64 bits.
-fn reference(query: &DenseFeatures, candidate: &DenseFeatures) -> (Vec<i64>, Vec<(usize, i64)>) {
+/// The reference implementation: every similarity in 64 bits, with as many of the lowest given to the tag as `tag` has.
+fn reference(
+    query: &DenseFeatures,
+    candidate: &DenseFeatures,
+    tag: i64,
+) -> (Vec<i64>, Vec<(usize, i64)>) {
     let round = |x: &f32| i64::from((x * ONE).round_ties_even() as i32);
     let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| round(a) * round(b)).sum();
     let channels = query.channels();
@@ -21,6 +26,7 @@ fn reference(query: &DenseFeatures, candidate: &DenseFeatures) -> (Vec<i64>, Vec
         let mut best = (0, i64::MIN);
         for (index, our) in ours.iter().enumerate() {
             let similarity: i64 = dot(our, their);
+            let similarity = (similarity & !tag) | (tag - (index / GROUP) as i64);
             of_query[index] = of_query[index].max(similarity);
             if similarity > best.1 {
                 best = (index, similarity);
@@ -46,6 +52,7 @@ fn every_processor_finds_what_the_reference_implementation_finds() {
             (33, 31, 7),
             (150, 200, 64),
             (70, 60, 385),
+            (1201, 37, 16),
         ] {
             let (query, candidate) = (features(ours, channels, 7), features(theirs, channels, 8));
             let mut integers = Integers::on(processor, &query);
@@ -53,8 +60,10 @@ fn every_processor_finds_what_the_reference_implementation_finds() {
             for _ in 0..2 {
                 integers.find(&features(5, channels, 9), 0.0);
                 let found = integers.find(&candidate, -2.0);
-                let (of_query, of_candidate) = reference(&query, &candidate);
                 let what = format!("{processor:?}: {ours} × {theirs} × {channels}");
+                let tag = i64::from(integers.query.tag);
+                assert!((tag as usize) < 2 * ours.div_ceil(GROUP).next_multiple_of(2), "{what}");
+                let (of_query, of_candidate) = reference(&query, &candidate, tag);
                 let got = integers.found.of_query.iter().map(|x| i64::from(*x));
                 assert_eq!(got.take(ours).collect::<Vec<_>>(), of_query, "{what}");
                 let got = integers.found.of_candidate.iter();
@@ -79,5 +88,40 @@ fn of_equal_cells_the_first_are_matched() {
         let pairs: Vec<_> = found.pairs.iter().map(|p| (p.query, p.candidate)).collect();
         assert_eq!(pairs, [(0, 1), (1, 0)]);
         assert!(found.pairs.iter().all(|pair| (pair.similarity - 1.0).abs() < 1e-4));
+    }
+}
+
+#[test]
+fn every_processor_finds_the_same() {
+    for (ours, theirs) in [(16, 40), (17, 40), (33, 50), (1200, 300)] {
+        let (query, candidate) = (features(ours, 64, 3), features(theirs, 64, 4));
+        let found: Vec<Mutual> = Processor::available()
+            .map(|processor| Integers::on(processor, &query).find(&candidate, 0.0))
+            .collect();
+        for pair in found.windows(2) {
+            assert_eq!(pair[0].pairs, pair[1].pairs, "{ours} × {theirs}");
+            assert_eq!(pair[0].best, pair[1].best, "{ours} × {theirs}");
+        }
+    }
+}
+
+#[test]
+fn matches_are_those_of_floating_point_but_for_near_ties() {
+    let (query, candidate) = (features(1200, 64, 5), features(1200, 64, 6));
+    let mut floats = Comparing::of(&query, true);
+    let floats = floats.find(&query, &candidate, 0.0).unwrap();
+    for processor in Processor::available() {
+        let found = Integers::on(processor, &query).find(&candidate, 0.0);
+        for (ours, theirs) in found.best.iter().zip(&floats.best) {
+            assert!((ours - theirs).abs() < 1e-4, "{ours} {theirs}");
+        }
+        let same = found.pairs.iter().filter(|pair| {
+            floats
+                .pairs
+                .iter()
+                .any(|other| (pair.query, pair.candidate) == (other.query, other.candidate))
+        });
+        let (same, all) = (same.count(), floats.pairs.len());
+        assert!(all > 100 && same * 100 >= all * 98, "{same} of {all}");
     }
 }
