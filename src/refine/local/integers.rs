@@ -12,8 +12,6 @@
 
 mod lanes;
 
-use std::array;
-
 use pulp::NullaryFnOnce;
 use pulp::x86::{V3, V4};
 
@@ -243,11 +241,11 @@ impl<const ROWS: usize, L: Lanes> NullaryFnOnce for Comparison<'_, ROWS, L> {
                         }
                     }
                 }
-                let tags: [L::Vector; PANEL] = array::from_fn(|vector| {
-                    let first =
-                        (index * PANEL + vector) * (size_of::<L::Vector>() / size_of::<i32>());
-                    lanes.splat(query.tag - (first / GROUP) as i32)
-                });
+                let mut tags = [lanes.splat(0); PANEL];
+                for (vector, tag) in tags.iter_mut().enumerate() {
+                    let cell = (index * PANEL + vector) * size_of::<L::Vector>() / size_of::<i32>();
+                    *tag = lanes.splat(query.tag - (cell / GROUP) as i32);
+                }
                 let mut column = columns[index];
                 for row in 0..ROWS {
                     for vector in 0..PANEL {

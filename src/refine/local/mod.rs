@@ -78,7 +78,7 @@ impl Default for LocalSettings {
             vote_temperature: 2.0,
             motion_rounds: 6,
             first: 20,
-            clear_evidence: 0.5,
+            clear_evidence: 0.25,
         }
     }
 }
