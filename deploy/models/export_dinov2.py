@@ -30,6 +30,18 @@ map mixes its descriptors with those of the original: with seeded weights of ViT
 photographs at 224×224, the cosines between the two were at least 0.998 (GeM) and 0.9995 (CLS).
 Processors without VNNI saturate the sums of 8-bit products; measure before you use it there.
 
+`--facet value --layer 31` exports what one block computes instead of the last tokens, and leaves
+out the blocks after it: the queries, keys or values of its attention, or its tokens, counted from 0.
+AnyLoc (Keetha et al., 2023) aggregates the values of block 31 of the giant variant with VLAD:
+
+    [descriptors.vlad]
+    method = "vlad"
+    file = "vocabulary.bin"        # the centres, 16-bit floats
+    centres = 32
+    rows = 1
+    weighting = "none"
+    dimension = 49152              # centres × channels; less with a projection in the file
+
 Not supported: half precision; checkpoints in several files; training checkpoints
 (a teacher or a student, or blocks in chunks); and position embeddings of a grid other than 37×37.
 The manifest cannot describe a pooled output, so the service pools `last_hidden_state` itself and
@@ -92,7 +104,7 @@ mean = [0.485, 0.456, 0.406]
 std = [0.229, 0.224, 0.225]
 
 [output]
-features = "last_hidden_state"
+features = "{features}"
 layout = "tokens"
 channels = {channels}
 stride = 14
@@ -130,6 +142,19 @@ class Variant:
     def hidden(self) -> int:
         """Hidden dimension of the MLP: four times the channels, and two thirds of that if gated."""
         return 4 * self.channels * 2 // 3 if self.swiglu else 4 * self.channels
+
+
+@dataclass(frozen=True)
+class Facet:
+    """What one block computes, to be exported instead of the last tokens."""
+
+    name: str  # query, key, value or token
+    layer: int  # from 0
+
+    @property
+    def output(self) -> str:
+        """The name of the output."""
+        return "facet"
 
 
 PLAIN = {
@@ -549,21 +574,34 @@ def add_mlp(graph: Graph, source: str, block: int, swiglu: bool) -> str:
     )
 
 
-def add_blocks(graph: Graph, variant: Variant, tokens: str) -> str:
-    """Adds the transformer blocks and the final layer normalisation."""
+def add_blocks(graph: Graph, variant: Variant, tokens: str, count: int) -> str:
+    """Adds that many transformer blocks."""
     channels = variant.channels
-    graph.integers("heads.shape", 0, 0, channels // HEAD, HEAD)
-    graph.integers("joined.shape", 0, 0, channels)
-    if not variant.swiglu:
-        graph.constant("gelu.root", 2**0.5)
-        graph.constant("gelu.one", 1.0)
-        graph.constant("gelu.half", 0.5)
-    for block in range(variant.depth):
+    if count:
+        graph.integers("heads.shape", 0, 0, channels // HEAD, HEAD)
+        graph.integers("joined.shape", 0, 0, channels)
+        if not variant.swiglu:
+            graph.constant("gelu.root", 2**0.5)
+            graph.constant("gelu.one", 1.0)
+            graph.constant("gelu.half", 0.5)
+    for block in range(count):
         attention = add_attention(graph, graph.norm(tokens, f"{block}.norm1"), block, channels)
         tokens = graph.node("Add", [tokens, attention], f"{block}.attended")
         mlp = add_mlp(graph, graph.norm(tokens, f"{block}.norm2"), block, variant.swiglu)
         tokens = graph.node("Add", [tokens, mlp], f"{block}.tokens")
-    return graph.node("Identity", [graph.norm(tokens, "norm")], "last_hidden_state")
+    return tokens
+
+
+def add_output(graph: Graph, variant: Variant, tokens: str, facet: Facet | None) -> str:
+    """Adds the blocks and the output: the last tokens, normalised, or the facet of a block."""
+    if facet is None:
+        tokens = add_blocks(graph, variant, tokens, variant.depth)
+        return graph.node("Identity", [graph.norm(tokens, "norm")], "last_hidden_state")
+    if facet.name == "token":
+        tokens = add_blocks(graph, variant, tokens, facet.layer + 1)
+        return graph.node("Identity", [tokens], facet.output)
+    tokens = graph.norm(add_blocks(graph, variant, tokens, facet.layer), f"{facet.layer}.norm1")
+    return graph.node("Identity", [graph.linear(tokens, f"{facet.layer}.{facet.name}")], facet.output)
 
 
 def add_pooling(graph: Graph, variant: Variant, tokens: str, kind: str) -> None:
@@ -590,6 +628,7 @@ def build_model(
     position: str = "original",
     size: list[int] | None = None,
     pool: str | None = None,
+    facet: Facet | None = None,
     int8: bool = False,
     data: BinaryIO | None = None,
 ) -> onnx.ModelProto:
@@ -597,7 +636,7 @@ def build_model(
     external weights, if any."""
     graph = Graph(weights, data, int8=int8)
     tokens = add_embeddings(graph, variant, position, size)
-    tokens = add_blocks(graph, variant, tokens)
+    tokens = add_output(graph, variant, tokens, facet)
     if pool:
         add_pooling(graph, variant, tokens, pool)
 
@@ -605,7 +644,7 @@ def build_model(
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape])
 
     count = 1 + variant.registers + size[0] * size[1] // PATCH**2 if size else "tokens"
-    outputs = [value("last_hidden_state", count, variant.channels)]
+    outputs = [value(tokens, count, variant.channels)]
     if pool:
         outputs.append(value("descriptor", variant.channels))
     model = helper.make_model(
@@ -627,9 +666,11 @@ def build_model(
 # --- Writing -------------------------------------------------------------------------------------
 
 
-def export(folder: Path, name: str, weights: Weights, source: str, choices: dict[str, Any]) -> None:
+def export(
+    folder: Path, base: str, name: str, weights: Weights, source: str, choices: dict[str, Any]
+) -> None:
     """Writes the model and its manifest. Each file is written atomically, the manifest last."""
-    variant = VARIANTS[name.partition("-random")[0]]
+    variant = VARIANTS[base]
     folder.mkdir(parents=True, exist_ok=True)
     files = {file: folder / f".{file}.{os.getpid()}" for file in ("model.onnx.data", "model.onnx")}
     written_data, model_file = files.values()
@@ -672,8 +713,11 @@ def describe(
     if "random" in name:
         description = f"Seeded random weights in the shape of {description}"
     height, width = choices["size"] or (MANIFEST_SIZE, MANIFEST_SIZE)
+    if facet := choices["facet"]:
+        description += f" Its output is the {facet.name} of block {facet.layer}."
     return MANIFEST.format(
         name=name,
+        features=facet.output if facet else "last_hidden_state",
         description=description,
         sha256=digest(model),
         source=json.dumps(source, ensure_ascii=False)[1:-1],  # TOML escapes as JSON does
@@ -724,11 +768,23 @@ def main() -> None:
         "--fixed", type=size_of, metavar="HxW", help="fix the input height and width"
     )
     parser.add_argument("--pool", choices=["cls", "gem"], help="add the output `descriptor`")
+    parser.add_argument(
+        "--facet", choices=["query", "key", "value", "token"], help="export what a block computes"
+    )
+    parser.add_argument("--layer", type=int, metavar="N", help="the block of --facet, from 0")
     parser.add_argument("--int8", action="store_true", help="quantize linear layers to 8 bits")
     arguments = parser.parse_args()
 
     name, variant = arguments.model, VARIANTS[arguments.model]
+    facet = None
+    if arguments.facet:
+        if arguments.layer is None or not 0 <= arguments.layer < variant.depth:
+            parser.error(f"--facet needs --layer 0 to {variant.depth - 1}")
+        facet = Facet(arguments.facet, arguments.layer)
+    elif arguments.layer is not None:
+        parser.error("--layer needs --facet")
     choices = {
+        "facet": facet,
         "position": arguments.position,
         "size": arguments.fixed,
         "pool": arguments.pool,
@@ -742,9 +798,11 @@ def main() -> None:
             weights = random_weights(variant, arguments.random)
             name = f"{name}-random-{arguments.random}"
             source = f"deploy/models/export_dinov2.py --random {arguments.random}"
+        if facet:
+            name = f"{name}-{facet.name}-{facet.layer}"
         if arguments.int8:
             name = f"{name}-int8"
-        export(arguments.folder, name, weights, source, choices)
+        export(arguments.folder, arguments.model, name, weights, source, choices)
     except (WeightsError, OSError, ValueError, KeyError) as error:
         origin_text = arguments.weights or f"seed {arguments.random}"
         sys.exit(f"export_dinov2: cannot create {arguments.folder} from {origin_text}: {error}")

@@ -120,6 +120,12 @@ def other_size(model: ModelProto) -> None:
     set_shape(model.graph.input[0], ["batch", 3, 28, 28])
 
 
+def frozen(model: ModelProto) -> None:
+    """Position embeddings for 224×224, after two registers and the CLS token, in a graph that declares any size."""
+    positions = np.random.default_rng(1).standard_normal((1, 3 + 16 * 16, CHANNELS))
+    after(model, ("Add", [constant(model, "positions", positions.astype(np.float32))], {}))
+
+
 def flat(model: ModelProto) -> None:
     set_shape(model.graph.input[0], ["batch", 3])
 
@@ -144,6 +150,7 @@ CHANGES: dict[str, Callable[[ModelProto], None]] = {
     "bytes-in": lambda model: cast_input(model, TensorProto.UINT8),
     "double-out": lambda model: cast_output(model, TensorProto.DOUBLE),
     "other-size": other_size,
+    "frozen": frozen,
     "flat": flat,
     "fewer-channels": fewer_channels,
     "not-a-number": not_a_number,

@@ -13,6 +13,8 @@ A picture is decoded by Pillow, scaled as 8-bit RGB with an antialiased bicubic 
 normalised with ImageNet's mean and standard deviation:
 
     squash        to width × height, whatever its aspect ratio (torchvision's `resize`)
+    longest_edge  to the longer of both on its longer edge, and in proportion on the other, both in
+                  multiples of 14
     centre_crop   the largest centred crop with the aspect ratio width : height, at subpixel
                   precision, scaled to width × height (Pillow's `ImageOps.fit`). This differs from
                   torchvision's usual resize of the shorter edge followed by a crop, which rounds
@@ -22,6 +24,12 @@ The descriptors, L2-normalised and rounded to six significant digits:
 
     cls   the CLS token after the final layer normalisation
     gem   for each channel, m = mean of x³ over the patch tokens, then sign(m) · |m|^(1/3)
+    vlad  as AnyLoc (Keetha et al., 2023) computes it: the patch tokens L2-normalised, each assigned to
+          the centre of the highest cosine, the residuals of each centre summed and L2-normalised
+
+A case with a facet is about the keys or values of the attention of one block, or its tokens, instead
+of the last tokens, as AnyLoc's extractor hooks them. The centres of `vlad` are tokens of the first
+such case, rounded to 16 bits, and written to `vlad.bin`.
 
 The committed file was made with torch 2.15.0, torchvision 0.29.2, transformers 5.23.0 and Pillow
 13.0.0, on x86_64; it takes about a minute on one core.
@@ -46,8 +54,13 @@ MEAN = [0.485, 0.456, 0.406]
 STD = [0.229, 0.224, 0.225]
 SQUARE, LARGE, OBLONG = (224, 224), (322, 322), (322, 224)  # width, height
 
-# Model, picture, size and resize mode. A vector is 4 to 8 kB of JSON.
-CASES = [
+UPRIGHT, PANORAMA, LONGEST = (224, 322), (560, 140), (434, 434)
+FACET_LAYER = 7
+CENTRES = 4
+
+# Model, picture, size, resize mode and facet. A vector is 4 to 8 kB of JSON.
+Case = tuple[str, str, tuple[int, int], str, str]
+PLAIN_CASES = [
     ("dinov2-small", "town-a.jpg", SQUARE, "squash"),
     ("dinov2-small", "town-a.jpg", SQUARE, "centre_crop"),
     ("dinov2-small", "town-a.jpg", LARGE, "squash"),
@@ -61,6 +74,17 @@ CASES = [
     ("dinov2-base", "town-b.jpg", SQUARE, "squash"),
     ("dinov2-base", "town-b.jpg", LARGE, "squash"),
     ("dinov2-base", "town-b.jpg", OBLONG, "centre_crop"),
+    ("dinov2-small", "town-a.jpg", UPRIGHT, "squash"),
+    ("dinov2-small", "town-b.jpg", PANORAMA, "squash"),
+    ("dinov2-small", "town-b.jpg", LONGEST, "longest_edge"),
+    ("dinov2-with-registers-small", "town-a.jpg", UPRIGHT, "squash"),
+]
+CASES: list[Case] = [(*case, "") for case in PLAIN_CASES] + [
+    ("dinov2-small", "town-a.jpg", LARGE, "squash", "value"),
+    ("dinov2-small", "town-b.jpg", LONGEST, "longest_edge", "value"),
+    ("dinov2-small", "town-a.jpg", LARGE, "squash", "key"),
+    ("dinov2-small", "town-a.jpg", LARGE, "squash", "token"),
+    ("dinov2-with-registers-small", "town-b.jpg", OBLONG, "squash", "value"),
 ]
 
 # The names in transformers 5 of the tensors of export_dinov2.py, outside and inside the blocks.
@@ -123,6 +147,10 @@ def transformers_model(name: str, weights: Weights, depth: int | None = None) ->
 
 def fit(picture: Image.Image, size: tuple[int, int], resize: str) -> torch.Tensor:
     """Converts a picture to model input: 1 × 3 × height × width."""
+    if resize == "longest_edge":
+        scale = max(size) / max(picture.size)
+        size = tuple(round(edge * scale / 14) * 14 for edge in picture.size)
+        resize = "squash"
     width, height = size
     if resize == "squash":
         fitted = transforms.resize(picture, [height, width], InterpolationMode.BICUBIC)
@@ -141,28 +169,66 @@ def descriptors(tokens: torch.Tensor, registers: int) -> dict[str, torch.Tensor]
     }
 
 
+def facet_of(model: torch.nn.Module, facet: str, pixels: torch.Tensor) -> torch.Tensor:
+    """What a block computes for the tokens, [N, 1 + registers + h·w, C]."""
+    block = model.encoder.layer[FACET_LAYER]
+    part = {"token": block, "key": block.attention.k_proj, "value": block.attention.v_proj}[facet]
+    found: list[torch.Tensor] = []
+    hook = part.register_forward_hook(lambda _part, _input, output: found.append(output))
+    model(pixels)
+    hook.remove()
+    output = found[0]
+    return output[0] if isinstance(output, tuple) else output
+
+
+def vlad(patches: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+    """AnyLoc's descriptor of patch tokens [h·w, C]: hard assignment, intra-normalised."""
+    unit = torch.nn.functional.normalize
+    patches = unit(patches)
+    labels = (patches @ unit(centres).T).argmax(dim=1)
+    sums = torch.zeros_like(centres)
+    for centre in range(len(centres)):
+        sums[centre] = (patches[labels == centre] - centres[centre]).sum(dim=0)
+    return unit(unit(sums).flatten(), dim=0)
+
+
 def main() -> None:
-    """Writes expected.json."""
+    """Writes expected.json and vlad.bin."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path, help="folder of the pictures")
     folder: Path = parser.parse_args().folder
     torch.set_num_threads(1)
 
     models: dict[str, torch.nn.Module] = {}
+    centres = torch.empty(0)
     lines = []
-    for name, file, size, resize in CASES:
+    for name, file, size, resize, facet in CASES:
         if name not in models:
             models = {name: transformers_model(name, random_weights(VARIANTS[name], SEED))}
         picture = Image.open(folder / file).convert("RGB")
+        registers = VARIANTS[name].registers
         with torch.inference_mode():
-            tokens = models[name](fit(picture, size, resize)).last_hidden_state
-        for kind, vector in descriptors(tokens, VARIANTS[name].registers).items():
+            pixels = fit(picture, size, resize)
+            if facet:
+                tokens = facet_of(models[name], facet, pixels)
+            else:
+                tokens = models[name](pixels).last_hidden_state
+        vectors = descriptors(tokens, registers)
+        if facet == "value":
+            patches = tokens[0, 1 + registers :]
+            if not len(centres):
+                chosen = patches[:: len(patches) // CENTRES][:CENTRES]
+                centres = torch.nn.functional.normalize(chosen).half().float()
+                (folder / "vlad.bin").write_bytes(centres.half().numpy().astype("<f2").tobytes())
+            vectors["vlad"] = vlad(patches, centres)[None]
+        for kind, vector in vectors.items():
             entry = {
                 "model": name,
                 "seed": SEED,
                 "width": size[0],
                 "height": size[1],
                 "resize": resize,
+                "facet": f"{facet}-{FACET_LAYER}" if facet else "",
                 "kind": kind,
                 "picture": file,
                 "vector": [float(f"{value:.6g}") for value in vector[0].tolist()],

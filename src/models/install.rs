@@ -2,6 +2,7 @@
 
 mod error;
 mod lock;
+mod update;
 
 use std::fs::{self, File};
 use std::io;
@@ -9,6 +10,7 @@ use std::path::{Path, PathBuf};
 
 pub use self::error::InstallError;
 use self::lock::InstallLock;
+pub use self::update::{Difference, Updated};
 use super::catalogue::Entry;
 use super::download::{Download, DownloadSettings, Progress};
 use super::onnx::{ExternalFiles, external_files};
@@ -27,7 +29,12 @@ pub struct ModelsFolder {
 #[derive(Debug)]
 pub enum Pulled {
     /// The model is already installed and intact.
-    Present(PathBuf),
+    Present {
+        /// Folder of the model.
+        folder: PathBuf,
+        /// What its manifest does otherwise than the catalogue's.
+        difference: Option<Difference>,
+    },
     /// The model was downloaded and installed.
     Installed {
         /// Folder of the model.
@@ -100,7 +107,11 @@ impl ModelsFolder {
         let replaced = match target.join(MANIFEST).exists() {
             false => None,
             true => match self.fault(&target, entry) {
-                None => return Ok(Pulled::Present(target)),
+                None => {
+                    let installed = Manifest::read(&target.join(MANIFEST))?;
+                    let difference = Difference::of(&installed, entry);
+                    return Ok(Pulled::Present { folder: target, difference });
+                }
                 fault => fault,
             },
         };

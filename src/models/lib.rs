@@ -12,4 +12,6 @@ mod partial;
 
 pub use catalogue::{Catalogue, CatalogueError, Entry};
 pub use download::{Download, DownloadError, DownloadSettings, Progress};
-pub use install::{Added, InstallError, ModelsFolder, Pulled, VerifiedFiles, verify};
+pub use install::{
+    Added, Difference, InstallError, ModelsFolder, Pulled, Updated, VerifiedFiles, verify,
+};

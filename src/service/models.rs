@@ -114,9 +114,11 @@ fn mismatch(map: &Map, extractor: &Extractor) -> Option<String> {
     };
     Some(if digest != map.model_digest {
         format!(
-            "the map {name} was indexed with the model {model:?} of {}, but the one installed is \
-             {digest}; install the former again, or reindex the map: {reindex}",
-            map.model_digest
+            "the map {name} was indexed with the model {model:?} of {}, but the one installed, which takes {}, is \
+             {digest}; install the former again (or undo a change of its manifest or of model.sizes), or reindex the \
+             map: {reindex}",
+            map.model_digest,
+            extractor.manifest().input
         )
     } else {
         format!(

@@ -7,13 +7,14 @@ use ort::value::TensorRef;
 
 use super::batcher::{Batcher, Layout};
 use super::execution::{Execution, ProviderPreference};
-use super::extractor::{ExtractError, VerifiedModel, sample};
+use super::extractor::{ExtractError, sample};
 use super::manifest;
 use super::pooling::FeatureSet;
 use super::preprocess::Tensor;
 use super::provider::{self, MIN_SIMILARITY};
 use super::runtime::Assets;
 use super::session::{InferenceError, Model};
+use super::verified::VerifiedModel;
 use whereabouts_core::DescriptorKind;
 
 /// A graph of 8 products of 1024 × 1024 matrices, made by deploy/models/make_gemm.py.

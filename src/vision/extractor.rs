@@ -1,15 +1,17 @@
 //! Extraction: from the bytes of a picture to its descriptor and dense features.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use super::batcher::{Batcher, Layout, PendingInference, Pooled};
+use super::batcher::{Batcher, Layout};
 use super::decode::{DecodeError, ImageLimits, Needed, Picture, decode, encode_jpeg};
-use super::execution::{Execution, Provider, ProviderPreference};
+use super::execution::{Execution, ProviderPreference};
+use super::extraction::{Extraction, PendingExtraction, SubmittedPicture};
 use super::information::Information;
-use super::manifest::{Input, MANIFEST, Manifest, ManifestError, file_digest, own_digest};
+use super::manifest::{Input, Manifest, ManifestError, own_digest};
+use super::one_size::OneSize;
 use super::pooling::{
     DescriptorSpec, FeatureSet, Kinds, OwnVocabulary, PoolingError, Vocabulary, VocabularyError,
 };
@@ -17,7 +19,8 @@ use super::preprocess::{self, PreprocessError, Tensor, preprocess};
 use super::provider;
 use super::runtime::{Assets, RuntimeError};
 use super::session::{InferenceError, Model};
-use whereabouts_core::{DenseFeatures, Descriptor, DescriptorKind, Digest, MediaType};
+use super::verified::VerifiedModel;
+use whereabouts_core::{DescriptorKind, Digest};
 
 /// How a model is loaded and its pictures are decoded.
 #[derive(Debug, Clone)]
@@ -70,93 +73,6 @@ pub struct Extractor {
     exact_decode: bool,
 }
 
-/// A decoded picture whose inference is in progress. Dropping it cancels the inference if it has not started.
-#[derive(Debug)]
-pub struct PendingExtraction {
-    inference: PendingInference,
-    picture: SubmittedPicture,
-}
-
-#[derive(Debug)]
-struct SubmittedPicture {
-    digest: Digest,
-    media_type: MediaType,
-    width: u32,
-    height: u32,
-    warnings: Vec<String>,
-    information: Information,
-    decode: Duration,
-    submitted: Instant,
-}
-
-impl PendingExtraction {
-    /// Waits for inference.
-    pub async fn result(self) -> Result<Extraction, ExtractError> {
-        let Self { inference, picture } = self;
-        Ok(picture.with(inference.result().await?))
-    }
-
-    /// Blocks until inference is done.
-    fn wait(self) -> Result<Extraction, ExtractError> {
-        let Self { inference, picture } = self;
-        Ok(picture.with(inference.wait()?))
-    }
-}
-
-impl SubmittedPicture {
-    fn with(self, Pooled { descriptor, dense, batch }: Pooled) -> Extraction {
-        let Self { digest, media_type, width, height, warnings, information, decode, submitted } =
-            self;
-        let times = StageTimes { decode, extract: submitted.elapsed() };
-        Extraction {
-            descriptor,
-            dense,
-            digest,
-            media_type,
-            width,
-            height,
-            warnings,
-            information,
-            times,
-            batch,
-        }
-    }
-}
-
-/// The result of extracting one picture.
-#[derive(Debug)]
-pub struct Extraction {
-    /// Global descriptor.
-    pub descriptor: Descriptor,
-    /// Dense features, if they were requested.
-    pub dense: Option<DenseFeatures>,
-    /// SHA-256 of the picture's bytes.
-    pub digest: Digest,
-    /// Format of the picture.
-    pub media_type: MediaType,
-    /// Width in pixels, after applying the EXIF orientation.
-    pub width: u32,
-    /// Height in pixels, after applying the EXIF orientation.
-    pub height: u32,
-    /// What the sender should know about the picture, such as damage.
-    pub warnings: Vec<String>,
-    /// How much structure the picture has.
-    pub information: Information,
-    /// Durations of the stages.
-    pub times: StageTimes,
-    /// Size of the batch that the picture was part of.
-    pub batch: usize,
-}
-
-/// Durations of the stages of one extraction.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct StageTimes {
-    /// Decoding and resizing.
-    pub decode: Duration,
-    /// Queueing for a session, inference and pooling.
-    pub extract: Duration,
-}
-
 /// Why an extraction failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ExtractError {
@@ -169,6 +85,9 @@ pub enum ExtractError {
     /// Inference failed.
     #[error(transparent)]
     Inference(InferenceError),
+    /// The model takes pictures of one size only, which is another.
+    #[error(transparent)]
+    OneSize(#[from] OneSize),
     /// The output of the model cannot be pooled.
     #[error(transparent)]
     Pooling(#[from] PoolingError),
@@ -202,8 +121,18 @@ impl Extractor {
     /// Loads a model and validates it by running one picture through it. Throughput sessions are loaded in
     /// the background.
     pub fn load(assets: &Assets, settings: &ExtractorSettings) -> Result<Self, ExtractError> {
-        let VerifiedModel { model, own_bases, digests } =
-            VerifiedModel::open(assets, &settings.model, settings.preference.provider)?;
+        let opened = VerifiedModel::open(assets, &settings.model, settings.preference.provider)?;
+        let model = opened.model.clone();
+        Self::start(opened, settings).map_err(|error| match error {
+            ExtractError::Inference(_) | ExtractError::Pooling(_) => {
+                OneSize::of(&model).map_or(error, ExtractError::OneSize)
+            }
+            error => error,
+        })
+    }
+
+    fn start(opened: VerifiedModel, settings: &ExtractorSettings) -> Result<Self, ExtractError> {
+        let VerifiedModel { model, own_bases, digests } = opened;
         let execution = choose_execution(&model, &digests, settings)?;
         let batcher = Batcher::start(&model, execution, settings.layout)?;
         let mut extractor = Self {
@@ -324,38 +253,6 @@ impl Extractor {
     }
 }
 
-/// A model whose files match the digests pinned in its manifest.
-#[derive(Debug)]
-pub(super) struct VerifiedModel {
-    pub model: Model,
-    /// For each kind that can have an own vocabulary, what the digest of its descriptors depends on besides.
-    pub own_bases: BTreeMap<DescriptorKind, Digest>,
-    /// The digest of each kind of descriptor.
-    pub digests: BTreeMap<DescriptorKind, Digest>,
-}
-
-impl VerifiedModel {
-    pub fn open(
-        assets: &Assets,
-        name: &str,
-        provider: Option<Provider>,
-    ) -> Result<Self, ExtractError> {
-        let environment = assets.load_onnxruntime(provider)?;
-        let folder = assets.model(name)?;
-        let manifest = Arc::new(Manifest::read(&folder.join(MANIFEST))?);
-        let file = folder.join(&manifest.file);
-        let files = verified_digests(&folder, &manifest)?;
-        let kinds = Arc::new(Kinds::load(&manifest, &folder)?);
-        let own_bases = manifest.kinds().into_iter();
-        let own_bases =
-            own_bases.filter_map(|kind| Some((kind, manifest.own_base(&files, kind)?))).collect();
-        let digests =
-            manifest.kinds().into_iter().map(|kind| (kind, manifest.digest(&files, kind)));
-        let digests = digests.collect();
-        Ok(Self { model: Model { environment, file, manifest, kinds }, own_bases, digests })
-    }
-}
-
 /// Returns the execution cached by an earlier start under the same conditions, or measures the candidates and
 /// returns the best.
 fn choose_execution(
@@ -408,26 +305,4 @@ pub(super) fn sample(input: &Input) -> Result<Vec<Tensor>, ExtractError> {
         Ok(preprocess(&pixels, (width, height), input)?)
     });
     tensors.collect()
-}
-
-/// Hashes a model's files and checks the digests against those pinned in the manifest.
-fn verified_digests(folder: &Path, manifest: &Manifest) -> Result<Vec<Digest>, ExtractError> {
-    let digests = manifest.files().map(|(file, pinned)| {
-        let file = folder.join(file);
-        let (digest, _) = file_digest(&file).map_err(|error| {
-            ExtractError::ModelFile(format!(
-                "cannot read {}: {error}; `make build` puts the built-in model in place",
-                file.display()
-            ))
-        })?;
-        match pinned {
-            Some(pinned) if pinned != digest => Err(ExtractError::ModelFile(format!(
-                "{} has the digest {digest}, but its manifest pins {pinned}; `whereabouts model verify` \
-                 explains how to repair it",
-                file.display()
-            ))),
-            _ => Ok(digest),
-        }
-    });
-    digests.collect()
 }

@@ -11,10 +11,13 @@ mod bench;
 pub mod decode;
 mod execution;
 pub mod exif;
+mod extraction;
 mod extractor;
 mod information;
+mod input_sizes;
 mod loaded;
 pub mod manifest;
+mod one_size;
 mod pool;
 pub mod pooling;
 pub mod preprocess;
@@ -25,6 +28,7 @@ mod session;
 mod settings;
 mod sync;
 mod trial;
+mod verified;
 
 pub use admission::{
     Admission, AdmissionLevels, AdmissionRequest, AdmissionSettings, Permit, RejectReason,
@@ -34,12 +38,13 @@ pub use batcher::Layout;
 pub use bench::{Bench, BenchFigures, BenchRow, BenchSettings};
 pub use decode::{DecodeError, Foreign, ImageLimits, Needed, Picture};
 pub use execution::{Execution, Provider, ProviderPreference};
-pub use extractor::{
-    ExtractError, Extraction, Extractor, ExtractorSettings, PendingExtraction, StageTimes,
-};
+pub use extraction::{Extraction, PendingExtraction, StageTimes};
+pub use extractor::{ExtractError, Extractor, ExtractorSettings};
 pub use information::{Dead, Information, Uninformative};
+pub use input_sizes::InputSizes;
 pub use loaded::{LoadedModels, LoadedSettings, ModelError};
 pub use manifest::{DataFile, MANIFEST, Manifest, ManifestError, file_digest};
+pub use one_size::OneSize;
 pub use pool::{CpuPool, Overloaded, PoolError};
 pub use pooling::{DescriptorSpec, FeatureSet, OwnVocabulary, Vocabulary};
 pub use provider::{MIN_SIMILARITY, Measurement, Trial};

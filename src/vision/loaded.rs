@@ -9,7 +9,7 @@ use std::time::SystemTime;
 use super::decode::ImageLimits;
 use super::execution::{Execution, ProviderPreference};
 use super::extractor::{Extractor, ExtractorSettings};
-use super::manifest::{MANIFEST, Manifest};
+use super::manifest::{MANIFEST, Manifest, Resize};
 use super::runtime::{Assets, RuntimeError};
 use parking_lot::{Mutex, MutexGuard};
 use whereabouts_core::{DescriptorKind, Digest, Map, Precision};
@@ -161,14 +161,22 @@ impl Shared {
         let loaded = Extractor::load(&self.assets, &settings);
         let extractor = Arc::new(loaded.map_err(|error| broken(name, &error))?);
         let (digest, execution) = (extractor.identity(), extractor.execution());
-        tracing::info!(model = name, %digest, %execution, "model loaded");
+        let input = &extractor.manifest().input;
+        tracing::info!(model = name, %digest, %execution, %input, "model loaded");
+        if input.resize == Resize::CentreCrop {
+            tracing::warn!(
+                model = name,
+                "the manifest crops pictures to their centre, which a place may not be recognised by; `whereabouts model \
+                 pull {name} --update` installs one that takes whole pictures, if this release has it"
+            );
+        }
         self.loaded().push(Loaded { extractor: Arc::clone(&extractor), files });
         Ok(extractor)
     }
 
     fn manifest(&self, name: &str) -> Result<(PathBuf, Manifest), ModelError> {
         let folder = self.assets.model(name).map_err(ModelError::NotInstalled)?;
-        let manifest = Manifest::read(&folder.join(MANIFEST)).map_err(|e| broken(name, &e))?;
+        let manifest = self.assets.manifest(&folder).map_err(|e| broken(name, &e))?;
         if manifest.name != name {
             let why = format!(
                 "the manifest in {} names {:?}; `whereabouts model add --name {name}` installs a \

@@ -4,6 +4,7 @@ mod check;
 mod kinds;
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::fs::File;
 use std::io::{self, Read};
 use std::iter;
@@ -141,6 +142,19 @@ pub struct Input {
     pub std: [f32; 3],
 }
 
+impl fmt::Display for Input {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { width, height, .. } = self;
+        match self.resize {
+            Resize::Squash => write!(f, "the whole picture, stretched to {width}×{height}"),
+            Resize::CentreCrop => write!(f, "a centre crop of {width}×{height}"),
+            Resize::LongestEdge => {
+                write!(f, "the whole picture, its longer edge scaled to {}", width.max(height))
+            }
+        }
+    }
+}
+
 /// How a picture is fitted to the input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -228,6 +242,14 @@ pub enum ManifestError {
         /// Path of the manifest.
         path: PathBuf,
         /// Message of the parser.
+        detail: String,
+    },
+    /// A setting asks for a size that the model cannot take.
+    #[error("model.sizes has {setting:?}, but {detail}")]
+    Size {
+        /// The entry of the setting.
+        setting: String,
+        /// Why it cannot be.
         detail: String,
     },
     /// The values contradict each other.

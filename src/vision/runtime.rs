@@ -9,7 +9,8 @@ use ort::environment::Environment;
 use parking_lot::Mutex;
 
 use super::execution::Provider;
-use super::manifest::MANIFEST;
+use super::input_sizes::InputSizes;
+use super::manifest::{MANIFEST, Manifest, ManifestError};
 
 /// The model name that [`Assets::resolve`] replaces by an installed model.
 pub const AUTO: &str = "auto";
@@ -52,6 +53,7 @@ impl fmt::Display for WhyModel {
 #[derive(Debug, Clone)]
 pub struct Assets {
     candidates: Vec<PathBuf>,
+    sizes: InputSizes,
 }
 
 /// Why ONNX Runtime or a model is unavailable.
@@ -110,7 +112,19 @@ impl Assets {
         let configured = configured.map(Path::to_owned);
         Self {
             candidates: configured.into_iter().chain(next_to_binary).chain([installed]).collect(),
+            sizes: InputSizes::default(),
         }
+    }
+
+    /// The same, with sizes of pictures that replace those of manifests.
+    #[must_use]
+    pub fn with_sizes(self, sizes: InputSizes) -> Self {
+        Self { sizes, ..self }
+    }
+
+    /// Reads the manifest of the model in `folder`, which may be yet to be installed, with the size that is set for it.
+    pub fn manifest(&self, folder: &Path) -> Result<Manifest, ManifestError> {
+        self.sizes.apply(Manifest::read(&folder.join(MANIFEST))?)
     }
 
     /// Finds the folder of the model called `name`.
@@ -233,7 +247,8 @@ mod tests {
             fs::create_dir_all(&folder).unwrap();
             fs::write(folder.join(MANIFEST), "").unwrap();
         }
-        let assets = Assets { candidates: vec![dir.path().to_owned()] };
+        let assets =
+            Assets { candidates: vec![dir.path().to_owned()], sizes: InputSizes::default() };
         (dir, assets)
     }
 

@@ -9,7 +9,8 @@ use ort::value::{Outlet, TensorElementType, ValueType};
 use super::decode::Needed;
 use super::execution::Execution;
 use super::extractor::{ExtractError, SAMPLES, sample};
-use super::manifest::{Input, MANIFEST, Manifest, Resize};
+use super::manifest::{Input, Manifest, Resize};
+use super::one_size::OneSize;
 use super::pooling::{Kinds, LocalFeatures, PoolingError};
 use super::preprocess::{Tensor, preprocess};
 use super::runtime::{Assets, RuntimeError};
@@ -76,6 +77,9 @@ pub enum ModelFault {
         /// The declared shape.
         declared: String,
     },
+    /// The graph takes one size of pictures only, which is another.
+    #[error(transparent)]
+    OneSize(#[from] OneSize),
     /// The output has another shape.
     #[error(
         "the output {name:?} has the shape {got} on a picture of {width}×{height} pixels, which is not what the manifest \
@@ -113,7 +117,10 @@ pub enum ModelFault {
     )]
     Constant,
     /// The model fails on a picture.
-    #[error("the model fails on a picture of {width}×{height} pixels: {reason}")]
+    #[error(
+        "the model fails on a picture of {width}×{height} pixels: {reason}; if it was exported for one size, set that in \
+         [input] of the manifest or in model.sizes, or export it for any size"
+    )]
     Run {
         /// Width of the picture.
         width: usize,
@@ -137,15 +144,26 @@ pub enum ModelFault {
 
 /// Tries the model in `folder`, which need not be installed. Returns notes about what works with restrictions.
 pub fn try_model(assets: &Assets, folder: &Path) -> Result<Vec<String>, ModelFault> {
+    let model = open(assets, folder)?;
+    run_pictures(&model).map_err(|fault| match fault {
+        ModelFault::Load(_) | ModelFault::InputShape { .. } | ModelFault::Run { .. } => {
+            OneSize::of(&model).map_or(fault, ModelFault::OneSize)
+        }
+        fault => fault,
+    })
+}
+
+fn open(assets: &Assets, folder: &Path) -> Result<Model, ModelFault> {
     let environment = assets.load_onnxruntime(None)?;
-    let manifest =
-        Manifest::read(&folder.join(MANIFEST)).map_err(|error| manifest_fault(error.into()))?;
+    let manifest = assets.manifest(folder).map_err(|error| manifest_fault(error.into()))?;
     let manifest = Arc::new(manifest);
     let file = folder.join(&manifest.file);
     let kinds = Kinds::load(&manifest, folder).map_err(|error| manifest_fault(error.into()))?;
-    let kinds = Arc::new(kinds);
-    let model =
-        Model { environment, file, manifest: Arc::clone(&manifest), kinds: Arc::clone(&kinds) };
+    Ok(Model { environment, file, manifest, kinds: Arc::new(kinds) })
+}
+
+fn run_pictures(model: &Model) -> Result<Vec<String>, ModelFault> {
+    let Model { manifest, kinds, .. } = model;
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let load = |max_batch| {
         model.load(Execution::REFERENCE, threads, max_batch).map_err(|error| match error {
@@ -158,11 +176,11 @@ pub fn try_model(assets: &Assets, folder: &Path) -> Result<Vec<String>, ModelFau
         })
     };
     let mut runner = load(1)?;
-    check_interface(&runner, &manifest)?;
+    check_interface(&runner, manifest)?;
     let pictures = sample(&manifest.input).map_err(manifest_fault)?;
     let mut outputs = Vec::new();
     for picture in &pictures {
-        outputs.extend(run(&mut runner, &[picture], &manifest)?);
+        outputs.extend(run(&mut runner, &[picture], manifest)?);
     }
     for kind in kinds.names() {
         let descriptors = outputs.iter().map(|output| kinds.descriptor(&kind.into(), output));
@@ -176,12 +194,12 @@ pub fn try_model(assets: &Assets, folder: &Path) -> Result<Vec<String>, ModelFau
     }
     if manifest.input.resize == Resize::LongestEdge {
         let upright = upright(&manifest.input).map_err(manifest_fault)?;
-        run(&mut runner, &[&upright], &manifest)?;
+        run(&mut runner, &[&upright], manifest)?;
     }
     drop(runner);
     let mut runner = load(2)?;
     let together: Vec<&Tensor> = pictures.iter().take(2).collect();
-    Ok(match run(&mut runner, &together, &manifest) {
+    Ok(match run(&mut runner, &together, manifest) {
         Ok(_) => Vec::new(),
         Err(ModelFault::Run { .. } | ModelFault::OutputShape { .. }) => vec![
             "the graph takes one picture at a time: set model.max_batch = 1, or export it with a dynamic first \

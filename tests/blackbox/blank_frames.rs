@@ -2,6 +2,7 @@
 
 use image::{Rgb, RgbImage};
 use serde_json::Value;
+use whereabouts_testkit::patterns::colour_bars;
 
 use super::support::{Server, frame, jpeg, reference, shared_server, value_of};
 use super::wait::eventually;
@@ -48,16 +49,6 @@ fn blanks() -> Vec<(&'static str, Vec<u8>)> {
 
 /// What a broken camera, a cable or a screen sends instead of a scene, by name.
 fn test_patterns() -> Vec<(String, Vec<u8>)> {
-    const BARS: [[u8; 3]; 8] = [
-        [255; 3],
-        [255, 255, 0],
-        [0, 255, 255],
-        [0, 255, 0],
-        [255, 0, 255],
-        [255, 0, 0],
-        [0, 0, 255],
-        [0; 3],
-    ];
     let drawn = |value: &dyn Fn(u32, u32) -> [u8; 3]| {
         jpeg(&RgbImage::from_fn(640, 480, |x, y| Rgb(value(x, y))))
     };
@@ -65,15 +56,8 @@ fn test_patterns() -> Vec<(String, Vec<u8>)> {
     let mut random = noise(3);
     let blocks: Vec<[u8; 3]> = (0..20 * 15).map(|_| [0; 3].map(|_: u8| random())).collect();
     let mut pictures = vec![
-        ("colour bars".to_owned(), drawn(&|x, _| BARS[(x / 80) as usize])),
-        (
-            "a test card".into(),
-            drawn(&|x, y| match y {
-                320..360 => BARS[7 - (x / 80) as usize],
-                360.. => [[9; 3], [255; 3], [50, 0, 106], [19; 3]][(x / 160) as usize],
-                _ => BARS[(x / 80) as usize],
-            }),
-        ),
+        ("colour bars".to_owned(), jpeg(&colour_bars(false))),
+        ("a test card".into(), jpeg(&colour_bars(true))),
         ("random blocks".into(), drawn(&|x, y| blocks[(y / 32 * 20 + x / 32) as usize])),
         ("a user interface".into(), drawn(&user_interface)),
         ("a vertical gradient".into(), drawn(&|_, y| [(y / 2) as u8; 3])),

@@ -168,6 +168,36 @@ async fn a_map_keeps_its_kind_of_descriptor_until_a_reindex_names_another() {
 }
 
 #[tokio::test]
+async fn descriptors_of_pictures_of_another_size_are_never_mixed() {
+    let bench = Bench::new();
+    bench.install("small", (160, 120), 2);
+    let server = bench.server(&[]);
+    town(&server, "m", "small", 4).await;
+    drop(server);
+
+    // The setting, and then a manifest that crops: each makes another model of it.
+    let sizes = ("WHEREABOUTS_MODEL__SIZES", "[\"small=240x160\"]");
+    let server = bench.server(&[sizes]);
+    let path = "/localize?map=m&refine=off";
+    let why = server.post_jpeg(path, reference(2)).await.problem(409);
+    assert!(why.contains("stretched to 240×160") && why.contains("model.sizes"), "{why}");
+    assert!(why.contains("index --reindex --map m --model small"), "{why}");
+    let path = "/maps/m/images?id=more&lat=45.9&lon=7";
+    server.post_jpeg(path, reference(9)).await.problem(409);
+    begin(&server, "m", json!({})).await;
+    assert_eq!(ended(&server, "m").await["reindex"]["state"], "succeeded");
+    first(&look(&server, "m", 2).await, 2, "small");
+    drop(server);
+
+    // Without the setting the map waits for its model again; with it, nothing has to be done.
+    let server = bench.server(&[]);
+    server.post_jpeg("/localize?map=m&refine=off", reference(2)).await.problem(409);
+    drop(server);
+    let server = bench.server(&[sizes]);
+    first(&look(&server, "m", 2).await, 2, "small");
+}
+
+#[tokio::test]
 async fn maps_of_several_models_are_served_with_a_bounded_number_loaded() {
     let bench = Bench::new();
     bench.install("small", (160, 120), 2);

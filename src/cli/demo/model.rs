@@ -35,7 +35,7 @@ impl PendingChoice {
     /// Resolves the model from what is installed. If that is only the built-in one, begins to probe the hub.
     pub fn begin(args: &Args) -> anyhow::Result<Self> {
         let config = Config::load(None, &Overrides::default().model(args.model.clone()))?;
-        let assets = Assets::locate(config.model.assets());
+        let assets = config.model.installed_in(None);
         let (model, why) = assets.resolve(&config.model.name)?;
         let timeout = Duration::from_secs(config.model.hub_patience_s);
         let reason = match why {

@@ -115,7 +115,7 @@ pub fn show(context: &ModelContext, name: &str, json: bool) -> anyhow::Result<()
     let entry = context.catalogue.find(name);
     let folder = context.assets.model(name).ok();
     let manifest = match (&folder, entry) {
-        (Some(folder), _) => Manifest::read(&folder.join(MANIFEST))?,
+        (Some(folder), _) => context.assets.manifest(folder)?,
         (None, Some(entry)) => entry.manifest.clone(),
         (None, None) => {
             bail!("there is no model {name:?}; `whereabouts model list` shows all models")
@@ -147,6 +147,7 @@ pub fn show(context: &ModelContext, name: &str, json: bool) -> anyhow::Result<()
     println!("  address  {}", address.unwrap_or_else(|| "not in the catalogue".into()));
     println!("  licence  {}", manifest.licence);
     println!("  source   {}", manifest.source);
+    println!("  input    {}", manifest.input);
     for kind in manifest.kinds() {
         let dimension = manifest.dimension(kind).unwrap_or_default();
         let default = if kind == manifest.default_kind() { " (default)" } else { "" };

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 
 pub use self::download::DownloadMeter;
-use whereabouts_models::{Added, Catalogue, ModelsFolder, Pulled};
+use whereabouts_models::{Added, Catalogue, Difference, Entry, ModelsFolder, Pulled, Updated};
 use whereabouts_server::config::{Config, Overrides};
 use whereabouts_vision::{AUTO, Assets, BUILT_IN_MODEL};
 
@@ -53,6 +53,9 @@ enum Action {
     Pull {
         /// Name of a model that `list` shows
         name: String,
+        /// If it is installed, replace its manifest by that of this release; its maps must be reindexed then
+        #[arg(long)]
+        update: bool,
     },
     /// Install a model from a file, after trying it on two pictures
     ///
@@ -98,7 +101,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     match args.action {
         Action::List { json } => inspect::list(&context, json),
         Action::Show { name, json } => inspect::show(&context, &name, json),
-        Action::Pull { name } => pull(&context, &name).await,
+        Action::Pull { name, update } => pull(&context, &name, update).await,
         Action::Add { file, manifest, name } => {
             let add = || {
                 context
@@ -133,7 +136,7 @@ impl ModelContext {
         let config = Config::load(args.config.as_deref(), &Overrides::default())?;
         let catalogue = Catalogue::of(args.catalogue.as_deref())?;
         let assets_dir = args.assets.as_deref().or(config.model.assets()).map(PathBuf::from);
-        let assets = Assets::locate(assets_dir.as_deref());
+        let assets = config.model.installed_in(assets_dir.as_deref());
         Ok(Self { config, catalogue, assets, assets_dir })
     }
 
@@ -169,7 +172,7 @@ pub fn models_folder(dir: Option<&Path>, assets: &Assets) -> anyhow::Result<Mode
     })
 }
 
-async fn pull(context: &ModelContext, name: &str) -> anyhow::Result<()> {
+async fn pull(context: &ModelContext, name: &str, update: bool) -> anyhow::Result<()> {
     let Some(entry) = context.catalogue.find(name) else {
         if name == BUILT_IN_MODEL {
             bail!("{name} is built in: `make build` installs it");
@@ -181,6 +184,10 @@ async fn pull(context: &ModelContext, name: &str) -> anyhow::Result<()> {
             names.join(", ")
         );
     };
+    if update && tokio::task::block_in_place(|| updated(context, entry))? {
+        inspect::print_default_model(context);
+        return Ok(());
+    }
     let (hub, settings) = (&context.config.model.hub, context.config.model.download());
     let mut meter = DownloadMeter::new(name);
     let pulled = context
@@ -191,8 +198,16 @@ async fn pull(context: &ModelContext, name: &str) -> anyhow::Result<()> {
         .with_context(|| format!("{name} was not installed"));
     meter.finish();
     match pulled? {
-        Pulled::Present(folder) => {
+        Pulled::Present { folder, difference } => {
             println!("{name}: already installed and intact, in {}", folder.display());
+            if let Some(Difference { installed, catalogue }) = difference {
+                println!(
+                    "  its manifest takes {installed}; that of this release takes {catalogue}"
+                );
+                println!(
+                    "  adopt that with `whereabouts model pull {name} --update`, and then reindex its maps"
+                );
+            }
         }
         Pulled::Installed { folder, digests, pinned, replaced, notes } => {
             if let Some(fault) = replaced {
@@ -214,6 +229,30 @@ async fn pull(context: &ModelContext, name: &str) -> anyhow::Result<()> {
     inspect::print_default_model(context);
     context.print_assets_setting();
     Ok(())
+}
+
+/// Replaces the manifest of an installed model by the catalogue's. Returns whether the model is installed.
+fn updated(context: &ModelContext, entry: &Entry) -> anyhow::Result<bool> {
+    let name = entry.name();
+    let update = context.folder()?.update(&context.assets, entry);
+    match update.with_context(|| format!("the manifest of {name} was not replaced"))? {
+        Updated::NotInstalled => return Ok(false),
+        Updated::Current(folder) => {
+            println!("{name}: the manifest in {} is up to date", folder.display());
+        }
+        Updated::Replaced { folder, difference, notes } => {
+            let Difference { installed, catalogue } = difference;
+            println!(
+                "{name}: tried on two pictures; the manifest in {} was replaced",
+                folder.display()
+            );
+            notes.iter().for_each(|note| println!("  note: {note}"));
+            println!("  it took {installed}, and takes {catalogue} from now on");
+            println!("  a map of the model is not searched until it is reindexed:");
+            println!("  `whereabouts index --reindex --map MAP --model {name}`");
+        }
+    }
+    Ok(true)
 }
 
 fn select(context: &ModelContext, name: &str) -> anyhow::Result<()> {

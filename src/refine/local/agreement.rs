@@ -31,49 +31,58 @@ struct MotionField {
     height: usize,
     /// The neighbourhood of a match: cells to each side, as `[columns, rows]`.
     reach: [usize; 2],
-    /// Row-major; candidate position minus query position, in fractions of the picture.
-    motions: Vec<Option<[f32; 2]>>,
+    /// Candidate position minus query position, in fractions of the picture, row by row; x and y apart, so that several
+    /// cells are compared at a time. NaN where there is no match, and in a margin of `reach` around the picture.
+    motions: [Vec<f32>; 2],
 }
 
 impl MotionField {
     fn new(query: &DenseFeatures, pairs: &[CellPair], located: &[Match], radius: f32) -> Self {
-        let mut motions = vec![None; query.len()];
-        for (pair, found) in pairs.iter().zip(located) {
-            motions[pair.query] = Some(displacement(found));
-        }
+        let (width, height) = (query.width(), query.height());
         let reach = |cells: usize| ((radius * cells as f32).round() as usize).clamp(1, cells);
-        Self {
-            width: query.width(),
-            height: query.height(),
-            reach: [reach(query.width()), reach(query.height())],
-            motions,
+        let reach = [reach(width), reach(height)];
+        let none = vec![f32::NAN; (width + 2 * reach[0]) * (height + 2 * reach[1])];
+        let mut field = Self { width, height, reach, motions: [none.clone(), none] };
+        for (pair, found) in pairs.iter().zip(located) {
+            let (row, column) = (pair.query / width, pair.query % width);
+            let at = (row + reach[1]) * field.stride() + column + reach[0];
+            for axis in [0, 1] {
+                field.motions[axis][at] = found.candidate[axis] - found.query[axis];
+            }
         }
+        field
     }
 
-    /// Returns the share of the cells around `cell` that moved as it did, 0 to 1. A single such cell may be
-    /// chance and counts as none.
+    /// Cells of a row with its margins.
+    fn stride(&self) -> usize {
+        self.width + 2 * self.reach[0]
+    }
+
+    /// Returns the share of the cells around `cell`, which has a match, that moved as it did, 0 to 1. A single such cell
+    /// may be chance and counts as none.
     fn support(&self, cell: usize, tolerance: [f32; 2]) -> f32 {
-        let Some(motion) = self.motions[cell] else { return 0.0 };
         let (row, column) = (cell / self.width, cell % self.width);
-        let rows = row.saturating_sub(self.reach[1])..(row + self.reach[1] + 1).min(self.height);
-        let columns =
-            column.saturating_sub(self.reach[0])..(column + self.reach[0] + 1).min(self.width);
-        let around = rows.len() * columns.len() - 1;
-        let alike = rows
-            .flat_map(|row| &self.motions[row * self.width..][columns.clone()])
-            .flatten()
-            .filter(|other| within(motion, **other, tolerance))
-            .count()
-            - 1;
+        let within = |at: usize, reach: usize, cells: usize| {
+            (at + reach + 1).min(cells) - at.saturating_sub(reach)
+        };
+        let around =
+            within(row, self.reach[1], self.height) * within(column, self.reach[0], self.width) - 1;
+        let at = (row + self.reach[1]) * self.stride() + column + self.reach[0];
+        let motion = [self.motions[0][at], self.motions[1][at]];
+        let across = 2 * self.reach[0] + 1;
+        let mut alike = 0;
+        for row in row..row + 2 * self.reach[1] + 1 {
+            let first = row * self.stride() + column;
+            let [xs, ys] =
+                [&self.motions[0][first..][..across], &self.motions[1][first..][..across]];
+            for (x, y) in xs.iter().zip(ys) {
+                let [x, y] = [(motion[0] - x) / tolerance[0], (motion[1] - y) / tolerance[1]];
+                // A comparison with NaN is false.
+                alike += u32::from(x * x + y * y <= 1.0);
+            }
+        }
+        // Without the match itself.
+        let alike = alike.saturating_sub(1);
         if alike < 2 { 0.0 } else { alike as f32 / around as f32 }
     }
-}
-
-fn displacement(found: &Match) -> [f32; 2] {
-    [found.candidate[0] - found.query[0], found.candidate[1] - found.query[1]]
-}
-
-fn within(a: [f32; 2], b: [f32; 2], tolerance: [f32; 2]) -> bool {
-    let [x, y] = [(a[0] - b[0]) / tolerance[0], (a[1] - b[1]) / tolerance[1]];
-    x * x + y * y <= 1.0
 }

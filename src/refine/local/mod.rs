@@ -2,7 +2,8 @@
 //! model.
 //!
 //! Matching has four steps, one file each. `mutual` finds mutual nearest neighbours among the cells of two
-//! pictures, with the nearest neighbours from `nearest`. `agreement` keeps the matches whose surroundings
+//! pictures, with the nearest neighbours from `integers`, or on processors without the instructions for it from
+//! `nearest`. `agreement` keeps the matches whose surroundings
 //! moved the same way. `votes` lets each cell of the query share one vote among the candidates, so that
 //! regions that every candidate shows count for little. `motion` fits one motion to the remaining matches.
 //! [`describe`] describes a pair in words, and [`rank`] ranks the candidates.
@@ -11,7 +12,10 @@
 //! does no I/O.
 
 mod agreement;
+mod comparison;
 mod describe;
+#[cfg(target_arch = "x86_64")]
+mod integers;
 mod matching;
 mod motion;
 mod mutual;
@@ -31,10 +35,8 @@ pub(crate) use refiner::{build, fingerprint};
 
 use serde::Serialize;
 
-use mutual::Mutual;
-use nearest::Nearest;
+use mutual::{CellPair, Comparing, Mutual};
 use votes::Votes;
-use whereabouts_core::confidence::chance;
 use whereabouts_core::dense::DenseFeatures;
 
 /// Thresholds of the matcher. The defaults were measured for XFeat. All lengths are fractions of the picture
@@ -60,8 +62,8 @@ pub struct LocalSettings {
     pub motion_rounds: usize,
     /// Candidates that are compared at first. The others are compared only if none of these clearly agrees.
     pub first: usize,
-    /// The evidence from which a candidate clearly agrees: the logarithm of how many times as many of its regions agree
-    /// as of the median of the others.
+    /// The evidence from which a candidate clearly agrees, see
+    /// [`Agreement::evidence`](whereabouts_core::Agreement::evidence).
     pub clear_evidence: f32,
 }
 
@@ -76,7 +78,7 @@ impl Default for LocalSettings {
             vote_temperature: 2.0,
             motion_rounds: 6,
             first: 20,
-            clear_evidence: 0.5,
+            clear_evidence: 0.25,
         }
     }
 }
@@ -125,12 +127,14 @@ pub struct LocalError {
     pub candidate: usize,
 }
 
-/// The candidates that a query was compared with so far.
+/// The candidates that a query was compared with so far, in their order.
 #[derive(Debug, Default)]
 struct Compared {
-    /// In the order of the candidates.
     mutuals: Vec<Mutual>,
-    nearest: Nearest,
+    /// For each, the matches whose surroundings moved the same way.
+    agreeing: Vec<Vec<(CellPair, Match)>>,
+    /// The query, once it was compared with any.
+    query: Option<Comparing>,
 }
 
 /// Matches the dense features of a query with those of its candidates.
@@ -139,12 +143,20 @@ struct Compared {
 #[derive(Debug, Clone, Default)]
 pub struct LocalMatcher {
     settings: LocalSettings,
+    /// Whether cells are compared in floating point also where integers would be faster.
+    exact: bool,
 }
 
 impl LocalMatcher {
     /// Creates a matcher with these settings.
     pub fn new(settings: LocalSettings) -> Self {
-        Self { settings }
+        Self { settings, exact: false }
+    }
+
+    /// Creates a matcher that compares cells in floating point, as processors without AVX2 do, and so finds what these
+    /// find. Others compare in 16-bit integers, which is faster.
+    pub fn in_floats(settings: LocalSettings) -> Self {
+        Self { settings, exact: true }
     }
 
     /// Compares a query with a single candidate, which gets the full vote of every agreeing region.
@@ -156,10 +168,9 @@ impl LocalMatcher {
         query: &DenseFeatures,
         candidate: &DenseFeatures,
     ) -> Result<PairMatch, LocalError> {
-        let min_similarity = self.settings.min_similarity;
-        let mutual = mutual::find(query, candidate, min_similarity, &mut Nearest::default())?;
-        let votes = Votes::count(std::slice::from_ref(&mutual), self.settings.vote_temperature);
-        Ok(self.judge(query, candidate, &mutual, &votes, 0))
+        let mut pairs = self.compare_all(query, &[candidate])?;
+        // One candidate gives one pair.
+        Ok(pairs.swap_remove(0))
     }
 
     /// Compares a query with all its candidates, which are in coarse order. The results are in the same
@@ -184,10 +195,16 @@ impl LocalMatcher {
         candidates: &[&DenseFeatures],
         compared: &mut Compared,
     ) -> Result<(), LocalError> {
-        let (min_similarity, known) = (self.settings.min_similarity, compared.mutuals.len());
-        for candidate in candidates.get(known..).unwrap_or_default() {
-            let found = mutual::find(query, candidate, min_similarity, &mut compared.nearest)?;
-            compared.mutuals.push(found);
+        let Compared { mutuals, agreeing, query: prepared } = compared;
+        let prepared = prepared.get_or_insert_with(|| Comparing::of(query, self.exact));
+        for candidate in candidates.get(mutuals.len()..).unwrap_or_default() {
+            let found = prepared.find(query, candidate, self.settings.min_similarity)?;
+            let (located, tolerance) =
+                (found.located(query, candidate), self.tolerance(query, candidate));
+            let moved_alike =
+                agreement::agreeing(query, &found.pairs, &located, tolerance, &self.settings);
+            agreeing.push(moved_alike.collect());
+            mutuals.push(found);
         }
         Ok(())
     }
@@ -198,47 +215,35 @@ impl LocalMatcher {
         candidates: &[&DenseFeatures],
         compared: &Compared,
     ) -> Vec<PairMatch> {
-        let mutuals = &compared.mutuals;
+        let Compared { mutuals, agreeing, .. } = compared;
         let votes = Votes::count(mutuals, self.settings.vote_temperature);
         let rivals = candidates.len().saturating_sub(1);
         candidates
             .iter()
-            .zip(mutuals)
-            .map(|(candidate, mutual)| self.judge(query, candidate, mutual, &votes, rivals))
+            .zip(mutuals.iter().zip(agreeing))
+            .map(|(candidate, (mutual, agreeing))| {
+                let tolerance = self.tolerance(query, candidate);
+                self.judge(query, tolerance, mutual, agreeing, &votes, rivals)
+            })
             .collect()
-    }
-
-    /// Whether the candidate that would be ranked first agrees so clearly that others need not be compared: whether
-    /// ln((a + c) / (m + c)) reaches `clear_evidence`, where a of its regions match, m is the median of that count over
-    /// the others, and c is that of [`chance`] for the regions of the query.
-    fn is_clear(&self, pairs: &[PairMatch]) -> bool {
-        let Some(&first) = rank(pairs).first() else { return false };
-        let others = pairs.iter().enumerate().filter(|(index, _)| *index != first);
-        let mut others: Vec<usize> = others.map(|(_, pair)| pair.matches.len()).collect();
-        others.sort_unstable();
-        let Some(&median) = others.get(others.len() / 2) else { return false };
-        let chance = chance(pairs[first].cells);
-        let one = pairs[first].matches.len();
-        ((one as f32 + chance) / (median as f32 + chance)).ln() >= self.settings.clear_evidence
     }
 
     fn judge(
         &self,
         query: &DenseFeatures,
-        candidate: &DenseFeatures,
+        tolerance: [f32; 2],
         mutual: &Mutual,
+        agreeing: &[(CellPair, Match)],
         votes: &Votes,
         rivals: usize,
     ) -> PairMatch {
-        let tolerance = self.tolerance(query, candidate);
-        let located = mutual.located(query, candidate);
-        let mut agreeing: Vec<(Match, f32, bool)> =
-            agreement::agreeing(query, &mutual.pairs, &located, tolerance, &self.settings)
-                .map(|(pair, found)| {
-                    let vote = votes.share(pair.query, pair.similarity);
-                    (found, vote, votes.is_best(pair.query, pair.similarity))
-                })
-                .collect();
+        let mut agreeing: Vec<(Match, f32, bool)> = agreeing
+            .iter()
+            .map(|(pair, found)| {
+                let vote = votes.share(pair.query, pair.similarity);
+                (*found, vote, votes.is_best(pair.query, pair.similarity))
+            })
+            .collect();
         agreeing
             .sort_by(|a, b| b.1.total_cmp(&a.1).then(b.0.similarity.total_cmp(&a.0.similarity)));
 

@@ -113,22 +113,70 @@ pub(super) fn fit(
 }
 
 fn propose(matches: &[Match], weights: &[f32], tolerance: [f32; 2], aspect: f32) -> Motion {
+    let all = Located::new(matches, weights, tolerance);
     let mut best = (0.0, Motion::still(aspect));
     for proposer in matches.iter().take(PROPOSERS) {
         for scale in SCALES {
             let shift = [0, 1]
                 .map(|axis| proposer.candidate[axis] - 0.5 - scale * (proposer.query[axis] - 0.5));
             let motion = Motion::scaled(scale, shift, aspect);
-            let mut support = 0.0;
-            for (found, weight) in matches.iter().zip(weights) {
-                support += weight * motion.explains(found, tolerance);
-            }
+            let support = all.support(&motion, tolerance);
             if support > best.0 {
                 best = (support, motion);
             }
         }
     }
     best.1
+}
+
+/// Matches with each coordinate in a row of its own and in units of the tolerance, so that many are tested at a time.
+struct Located {
+    /// By axis; padded to whole lanes.
+    query: [Vec<f32>; 2],
+    candidate: [Vec<f32>; 2],
+    /// 0 for those that only pad.
+    weights: Vec<f32>,
+}
+
+/// Matches that are tested at a time.
+const LANES: usize = 8;
+
+impl Located {
+    fn new(matches: &[Match], weights: &[f32], tolerance: [f32; 2]) -> Self {
+        let padded = matches.len().next_multiple_of(LANES);
+        let row = |of: &dyn Fn(&Match) -> [f32; 2], axis: usize| -> Vec<f32> {
+            let mut row: Vec<f32> = matches.iter().map(|m| of(m)[axis] / tolerance[axis]).collect();
+            row.resize(padded, 0.0);
+            row
+        };
+        let mut weights = weights.to_vec();
+        weights.resize(padded, 0.0);
+        Self {
+            query: [0, 1].map(|axis| row(&|found| found.query, axis)),
+            candidate: [0, 1].map(|axis| row(&|found| found.candidate, axis)),
+            weights,
+        }
+    }
+
+    /// The weights of the matches, each as far as a motion explains it, which scales and shifts.
+    fn support(&self, motion: &Motion, tolerance: [f32; 2]) -> f32 {
+        let [[scale, _, x], [_, _, y]] = motion.matrix;
+        let shift = [x / tolerance[0], y / tolerance[1]];
+        let [query_x, query_y] = [0, 1].map(|axis| self.query[axis].as_chunks::<LANES>().0);
+        let [candidate_x, candidate_y] =
+            [0, 1].map(|axis| self.candidate[axis].as_chunks::<LANES>().0);
+        let rows = query_x.iter().zip(query_y).zip(candidate_x.iter().zip(candidate_y));
+        let mut sums = [0.0; LANES];
+        for (((qx, qy), (cx, cy)), weights) in rows.zip(self.weights.as_chunks::<LANES>().0) {
+            for lane in 0..LANES {
+                let x = scale * qx[lane] + shift[0] - cx[lane];
+                let y = scale * qy[lane] + shift[1] - cy[lane];
+                let inside = (1.0 - x * x - y * y).max(0.0);
+                sums[lane] += weights[lane] * inside * inside;
+            }
+        }
+        sums.iter().sum()
+    }
 }
 
 /// Corrects `motion` by one round of weighted least squares. Coordinates are relative to the picture's

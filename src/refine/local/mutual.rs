@@ -2,6 +2,8 @@
 //!
 //! Positions play no part here; [`agreement`](super::agreement) checks the geometry.
 
+#[cfg(target_arch = "x86_64")]
+use super::integers::Integers;
 use super::nearest::Nearest;
 use super::{LocalError, Match};
 use whereabouts_core::dense::DenseFeatures;
@@ -49,45 +51,83 @@ fn centre(features: &DenseFeatures, cell: usize) -> [f32; 2] {
     [(column as f32 + 0.5) / features.width() as f32, (row as f32 + 0.5) / features.height() as f32]
 }
 
-/// Finds the pairs of cells that are each other's nearest neighbour by cosine similarity and more similar
-/// than `min_similarity`.
-///
-/// A candidate cell is in at most one pair: if several query cells tie for it, as in a repeated pattern,
-/// the first gets it.
-///
-/// `nearest` is working memory, reused from pair to pair.
-pub(super) fn find(
+/// A query that is compared with one candidate after another.
+#[derive(Debug)]
+pub(super) enum Comparing {
+    /// In 16-bit integers.
+    #[cfg(target_arch = "x86_64")]
+    Integers(Box<Integers>),
+    /// In 32-bit floating point, on any processor.
+    Floats(Nearest),
+}
+
+impl Comparing {
+    /// Prepares a query. `exact` compares in floating point also where integers would be faster.
+    pub fn of(query: &DenseFeatures, exact: bool) -> Self {
+        #[cfg(target_arch = "x86_64")]
+        if !exact && let Some(integers) = Integers::of(query) {
+            return Self::Integers(Box::new(integers));
+        }
+        let _ = (query, exact);
+        Self::Floats(Nearest::default())
+    }
+
+    /// Finds the pairs of cells that are each other's nearest neighbour by cosine similarity and more similar than
+    /// `min_similarity`. `query` is the one that this was made of.
+    ///
+    /// A cell is in at most one pair: if several tie for it, as in a repeated pattern, the first gets it.
+    pub fn find(
+        &mut self,
+        query: &DenseFeatures,
+        candidate: &DenseFeatures,
+        min_similarity: f32,
+    ) -> Result<Mutual, LocalError> {
+        let channels = query.channels();
+        if channels != candidate.channels() {
+            return Err(LocalError { query: channels, candidate: candidate.channels() });
+        }
+        Ok(match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Integers(integers) => integers.find(candidate, min_similarity),
+            Self::Floats(nearest) => in_floats(query, candidate, min_similarity, nearest),
+        })
+    }
+}
+
+fn in_floats(
     query: &DenseFeatures,
     candidate: &DenseFeatures,
     min_similarity: f32,
     nearest: &mut Nearest,
-) -> Result<Mutual, LocalError> {
+) -> Mutual {
     let channels = query.channels();
-    if channels != candidate.channels() {
-        return Err(LocalError { query: channels, candidate: candidate.channels() });
-    }
     nearest.find(query.cells(), candidate.cells(), channels);
     for (cell, found) in query.cells().chunks_exact(channels).zip(&mut nearest.of_query) {
         if cell.iter().all(|x| *x == 0.0) {
             found.1 = f32::NEG_INFINITY;
         }
     }
-    Ok(keep_mutual(&nearest.of_query, &nearest.of_candidate, min_similarity))
+    let pairs = mutual(&nearest.of_query, &nearest.of_candidate)
+        .map(|(query, candidate, similarity)| CellPair { query, candidate, similarity })
+        .filter(|pair| pair.similarity > min_similarity);
+    Mutual {
+        pairs: pairs.collect(),
+        best: nearest.of_query.iter().map(|(_, similarity)| *similarity).collect(),
+    }
 }
 
-/// Two cells are mutual nearest neighbours exactly when their similarity is the highest of both its row and
-/// its column.
-fn keep_mutual(nearest: &[(usize, f32)], of_candidate: &[f32], min_similarity: f32) -> Mutual {
-    let mut assigned = vec![false; of_candidate.len()];
-    let mut pairs = Vec::new();
-    for (query, (candidate, similarity)) in nearest.iter().copied().enumerate() {
-        let mutual = similarity > min_similarity && similarity == of_candidate[candidate];
-        if mutual && !assigned[candidate] {
-            assigned[candidate] = true;
-            pairs.push(CellPair { query, candidate, similarity });
-        }
-    }
-    Mutual { pairs, best: nearest.iter().map(|(_, similarity)| *similarity).collect() }
+/// The pairs of a row and a column whose similarity is the highest of both, in the order of the rows. `rows` has for each
+/// row the column with its highest similarity, `columns` the highest similarity of each column.
+pub(super) fn mutual<T: Copy + PartialEq>(
+    rows: &[(usize, T)],
+    columns: &[T],
+) -> impl Iterator<Item = (usize, usize, T)> {
+    let mut assigned = vec![false; columns.len()];
+    rows.iter().copied().enumerate().filter_map(move |(row, (column, similarity))| {
+        let is_new =
+            similarity == columns[column] && !std::mem::replace(&mut assigned[column], true);
+        is_new.then_some((row, column, similarity))
+    })
 }
 
 #[cfg(test)]
@@ -95,9 +135,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_candidate_cell_is_matched_with_one_query_cell_only() {
-        let nearest = [(0, 1.0), (0, 1.0), (1, 0.5)];
-        let mutual = keep_mutual(&nearest, &[1.0, 0.8], 0.0);
-        assert_eq!(mutual.pairs, [CellPair { query: 0, candidate: 0, similarity: 1.0 }]);
+    fn a_column_is_matched_with_one_row_only() {
+        let rows = [(0, 1.0), (0, 1.0), (1, 0.5)];
+        let found: Vec<_> = mutual(&rows, &[1.0, 0.8]).collect();
+        assert_eq!(found, [(0, 0, 1.0)]);
     }
 }

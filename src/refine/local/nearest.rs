@@ -1,4 +1,5 @@
-//! Nearest neighbours: compares every cell of one picture with every cell of another.
+//! Nearest neighbours: compares every cell of one picture with every cell of another, in floating point. This serves
+//! every processor, and is the reference for [`integers`](super::integers).
 //!
 //! Comparing 1,200 cells with as many is a matrix product of 1.4 million similarities, of which only the
 //! highest of each row and each column matter. The product is therefore never stored: the sums of a few
@@ -155,11 +156,11 @@ fn first_highest(highest: &[f32], panel: &[u32]) -> (usize, f32) {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
     /// Reproducible cells with numbers of a realistic size, some of them equal.
-    fn cells(count: usize, channels: usize, seed: u32) -> Vec<f32> {
+    pub fn cells(count: usize, channels: usize, seed: u32) -> Vec<f32> {
         let mut state = seed;
         let mut next = || {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);

@@ -1,7 +1,6 @@
 //! The refiner `local`: fetches dense features, has them matched, and turns the matches into a ranking.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use async_trait::async_trait;
 use futures_util::{StreamExt, TryStreamExt, stream};
@@ -13,6 +12,7 @@ use whereabouts_core::{
 use whereabouts_store::{BlobStore, HardNegatives, MapStore};
 use whereabouts_vision::{CpuPool, Extractor, LoadedModels, ModelError};
 
+use super::comparison::{Comparison, agreement, is_clear};
 use super::matching::{FeatureSource, Matching, joined};
 use super::{LocalMatcher, LocalSettings, Match, PairMatch, Standing, describe, rank};
 use crate::{
@@ -145,49 +145,6 @@ impl NegativeEvidence for LocalRefiner {
     }
 }
 
-/// The outcome of matching a query with those of its candidates that are still in the map.
-struct Comparison {
-    /// The number of candidates.
-    candidates: usize,
-    /// The number of candidates that were looked up; the others were not needed.
-    considered: usize,
-    /// The indices of those that are still in the map.
-    present: Vec<usize>,
-    /// How each of them agrees with the query.
-    pairs: Vec<PairMatch>,
-    /// Indices of the pairs, best first.
-    order: Vec<usize>,
-    /// Duration of the matching, without fetching and extraction.
-    took: Duration,
-    /// Which of all candidates show the same place.
-    same_place: SamePlace,
-    /// The same of those that are present.
-    present_same_place: SamePlace,
-}
-
-impl Comparison {
-    /// Returns how many regions of the query agree with each candidate that is present.
-    fn agreement(&self) -> Agreement {
-        Agreement {
-            regions: self.pairs.first().map_or(0, |pair| pair.cells),
-            matches: self.pairs.iter().map(|pair| pair.matches.len()).collect(),
-            first: self.order.first().copied(),
-            same_place: self.present_same_place.clone(),
-        }
-    }
-
-    /// Returns the same for all candidates; 0 for one that was removed.
-    fn agreement_of_all(&self) -> Agreement {
-        let of_present = self.agreement();
-        let mut matches = vec![0; self.candidates];
-        for (&index, count) in self.present.iter().zip(of_present.matches) {
-            matches[index] = count;
-        }
-        let first = of_present.first.map(|first| self.present[first]);
-        Agreement { matches, first, same_place: self.same_place.clone(), ..of_present }
-    }
-}
-
 impl LocalRefiner {
     async fn compare_input(&self, input: &RefineInput) -> Result<Comparison, RefineError> {
         let extractor = self.models.of(&input.map).await.map_err(no_model)?;
@@ -208,6 +165,11 @@ impl LocalRefiner {
     ) -> Result<Comparison, RefineError> {
         let (mut matching, mut present, mut considered) = (Matching::of(query), Vec::new(), 0);
         let mut early = Vec::new();
+        let (places, images) = self.places_of(map, candidates).await?;
+        let same_place = |present: &[usize]| {
+            let places: Vec<_> = present.iter().map(|&index| places[index]).collect();
+            SamePlace::of(&places, images, &self.places)
+        };
         let first = self.matcher.settings.first.min(candidates.len());
         for end in [first, candidates.len()] {
             let group = &candidates[considered..end];
@@ -227,24 +189,26 @@ impl LocalRefiner {
                 .run(move || matching.extended(&extractor, &dense, &matcher, sources))
                 .await
                 .map_err(|error| RefineError::Transient(error.to_string()))??;
-            if considered == candidates.len() || self.matcher.is_clear(&matching.pairs) {
+            if considered == candidates.len() {
                 break;
             }
             early = rank(&matching.pairs);
+            let agreement = agreement(&matching.pairs, &early, same_place(&present));
+            if is_clear(&agreement, self.matcher.settings.clear_evidence) {
+                break;
+            }
         }
         let Matching { pairs, took, .. } = matching;
-        let same_place = |places: &[_], images| SamePlace::of(places, images, &self.places);
-        let (places, images) = self.places_of(map, candidates).await?;
-        let present_places: Vec<_> = present.iter().map(|&index| places[index]).collect();
+        let every: Vec<usize> = (0..candidates.len()).collect();
         Ok(Comparison {
+            same_place: same_place(&every),
+            present_same_place: same_place(&present),
             candidates: candidates.len(),
             considered,
             present,
             order: joined(early, rank(&pairs)),
             pairs,
             took,
-            same_place: same_place(&places, images),
-            present_same_place: same_place(&present_places, images),
         })
     }
 

@@ -7,7 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use whereabouts_core::Precision;
 use whereabouts_models::DownloadSettings;
-use whereabouts_vision::{Layout, Provider, ProviderPreference, auto, threads_or_cores};
+use whereabouts_vision::{
+    Assets, InputSizes, Layout, Provider, ProviderPreference, auto, threads_or_cores,
+};
 
 /// `[model]`
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -23,6 +25,8 @@ pub struct Model {
     pub precision: Option<Precision>,
     /// Maximum models in memory.
     pub loaded: usize,
+    /// Sizes of pictures that replace those of manifests.
+    pub sizes: InputSizes,
     /// An assets folder that is searched before the default locations; empty for none.
     pub assets: PathBuf,
     /// Total inference threads; 0 for one per core.
@@ -61,6 +65,11 @@ impl Model {
     /// The assets folder that is searched before the default locations, if one is set.
     pub fn assets(&self) -> Option<&Path> {
         Some(self.assets.as_path()).filter(|path| *path != Path::new(""))
+    }
+
+    /// The models in the assets folders, in `dir` first.
+    pub fn installed_in(&self, dir: Option<&Path>) -> Assets {
+        Assets::locate(dir.or(self.assets())).with_sizes(self.sizes.clone())
     }
 
     /// Limits and retries of a download.

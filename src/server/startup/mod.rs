@@ -26,7 +26,7 @@ use whereabouts_service::{
 };
 use whereabouts_store::TokenBuckets;
 use whereabouts_telemetry::LogIssues;
-use whereabouts_vision::{Admission, Assets, CpuPool, ExtractorSettings};
+use whereabouts_vision::{Admission, CpuPool, ExtractorSettings};
 use whereabouts_vision::{LoadedModels, LoadedSettings, WhyModel};
 
 #[cfg(feature = "postgres")]
@@ -280,7 +280,10 @@ fn check_keys(config: &Config, keys: &Keys) -> anyhow::Result<()> {
 
 /// The models, none of them loaded yet, and why the default one was chosen.
 fn models(config: &Config) -> anyhow::Result<(LoadedModels, WhyModel)> {
-    let assets = Assets::locate(config.model.assets());
+    let assets = config.model.installed_in(None);
+    for model in config.model.sizes.models().filter(|model| assets.model(model).is_err()) {
+        tracing::warn!(model, "model.sizes names a model that is not installed");
+    }
     let (model, why) = assets.resolve(&config.model.name)?;
     let extractor = ExtractorSettings {
         model,

@@ -1,6 +1,7 @@
 //! Blank frames of many kinds, and scenes in good and bad conditions.
 
 use image::{Rgb, RgbImage};
+use whereabouts_testkit::patterns::colour_bars;
 
 use super::*;
 use crate::Manifest;
@@ -155,28 +156,6 @@ fn scenes_are_informative_in_good_and_bad_conditions() {
 
 fn shaded(value: impl Fn(u32, u32) -> f32) -> RgbImage {
     RgbImage::from_fn(640, 480, |x, y| Rgb([value(x, y) as u8; 3]))
-}
-
-/// Colour bars: the first row of bars, and two rows below them if it is a whole card.
-fn colour_bars(card: bool) -> RgbImage {
-    const BARS: [[u8; 3]; 8] = [
-        [255; 3],
-        [255, 255, 0],
-        [0, 255, 255],
-        [0, 255, 0],
-        [255, 0, 255],
-        [255, 0, 0],
-        [0, 0, 255],
-        [0; 3],
-    ];
-    RgbImage::from_fn(640, 480, |x, y| {
-        let bar = (x / 80) as usize;
-        Rgb(match y {
-            320..360 if card => BARS[7 - bar],
-            360.. if card => [[9; 3], [255; 3], [50, 0, 106], [19; 3]][bar / 2],
-            _ => BARS[bar],
-        })
-    })
 }
 
 fn is_odd(number: u32) -> f32 {

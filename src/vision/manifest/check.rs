@@ -6,7 +6,7 @@ use super::{Layout, MANIFEST, Manifest};
 
 impl Manifest {
     /// Which values contradict each other, and how.
-    pub(super) fn fault(&self) -> Option<String> {
+    pub(crate) fn fault(&self) -> Option<String> {
         const MAX_EDGE: u32 = 4096;
         const MAX_CHANNELS: usize = 1 << 14;
         let (input, output) = (&self.input, &self.output);
@@ -41,9 +41,16 @@ impl Manifest {
         }
         for (edge, pixels) in [("width", input.width), ("height", input.height)] {
             if pixels == 0 || pixels > MAX_EDGE || pixels % input.multiple != 0 {
+                let largest = MAX_EDGE - MAX_EDGE % input.multiple;
+                let below = (pixels - pixels % input.multiple).min(largest);
+                let near = [below, below.saturating_add(input.multiple).min(largest)];
+                let mut near: Vec<_> =
+                    near.iter().filter(|&&edge| edge > 0).map(u32::to_string).collect();
+                near.dedup();
                 return Some(format!(
-                    "input.{edge} = {pixels} must be a multiple of {} up to {MAX_EDGE}",
-                    input.multiple
+                    "input.{edge} = {pixels} must be a multiple of {} up to {MAX_EDGE}, such as {}",
+                    input.multiple,
+                    near.join(" or ")
                 ));
             }
         }

@@ -26,6 +26,8 @@ struct Expected {
     width: u32,
     height: u32,
     resize: String,
+    /// What of which block the descriptor is of; empty for the last tokens.
+    facet: String,
     kind: DescriptorKind,
     picture: String,
     vector: Vec<f32>,
@@ -65,17 +67,38 @@ fn with_input(root: &Path, exported: &Path, expected: &Expected) -> PathBuf {
         input.insert("width".into(), i64::from(expected.width).into());
         input.insert("height".into(), i64::from(expected.height).into());
         input.insert("resize".into(), expected.resize.clone().into());
+        if !expected.facet.is_empty() {
+            std::fs::copy(vocabulary(), folder.join("vlad.bin")).unwrap();
+            let channels = manifest["output"]["channels"].as_integer().unwrap();
+            let centres = std::fs::metadata(vocabulary()).unwrap().len() as i64 / 2 / channels;
+            let descriptors = toml::toml! { vlad = { method = "vlad", file = "vlad.bin", rows = 1, weighting = "none" } };
+            let mut vlad = descriptors["vlad"].as_table().unwrap().clone();
+            vlad.insert("centres".into(), centres.into());
+            vlad.insert("dimension".into(), (centres * channels).into());
+            let kinds = toml::Table::from_iter([("vlad".to_owned(), vlad.into())]);
+            manifest.insert("descriptors".into(), kinds.into());
+        }
         std::fs::write(folder.join("manifest.toml"), manifest.to_string()).unwrap();
     }
     folder
 }
 
+/// The centres of `vlad`, as the reference chose them.
+fn vocabulary() -> PathBuf {
+    repository().join("tests/fixtures/dinov2/vlad.bin")
+}
+
 /// Compares the descriptors of a model with all that are expected of it.
 fn check(model: &str, options: &[&str], minimum: f64) {
+    check_facet(model, "", options, minimum);
+}
+
+/// Compares the descriptors of what a block computes, written as `value-7`.
+fn check_facet(model: &str, facet: &str, options: &[&str], minimum: f64) {
     let fixtures = repository().join("tests/fixtures/dinov2");
     let text = std::fs::read_to_string(fixtures.join("expected.json")).unwrap();
     let mut expected: Vec<Expected> = serde_json::from_str(&text).unwrap();
-    expected.retain(|expected| expected.model == model);
+    expected.retain(|expected| expected.model == model && expected.facet == facet);
     assert!(!expected.is_empty());
     let root = TempDir::new().unwrap();
     let exported = root.path().join("exported");
@@ -144,6 +167,18 @@ fn the_base_model_equals_the_original() {
 #[test]
 fn the_small_model_with_registers_equals_the_original() {
     check("dinov2-with-registers-small", &[], SAME);
+}
+
+#[test]
+fn what_a_block_computes_equals_the_original_and_so_does_its_vlad() {
+    for (model, name) in [
+        ("dinov2-small", "value"),
+        ("dinov2-small", "key"),
+        ("dinov2-small", "token"),
+        ("dinov2-with-registers-small", "value"),
+    ] {
+        check_facet(model, &format!("{name}-7"), &["--facet", name, "--layer", "7"], SAME);
+    }
 }
 
 #[test]

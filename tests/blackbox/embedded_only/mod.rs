@@ -7,6 +7,7 @@ mod dinov2;
 mod doctor;
 mod documented;
 mod eval;
+mod input_size;
 mod model_files;
 mod models;
 mod needs_openvino;

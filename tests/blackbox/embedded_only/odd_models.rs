@@ -62,7 +62,11 @@ fn a_wrong_model_is_refused_with_what_to_do_and_nothing_is_installed() {
         ("extra-input", &["\"temperature\"", "only input"]),
         ("bytes-in", &["pixel_values", "u8", "f32"]),
         ("double-out", &["last_hidden_state", "f64", "f32"]),
-        ("other-size", &["1 × 3 × 28 × 28", "-1 × 3 × 42 × 56", "[input]"]),
+        (
+            "other-size",
+            &["28×28 pixels only", "is to get 56×42", "input.width = 28", "model.sizes"],
+        ),
+        ("frozen", &["224×224 pixels only", "declares any size", "is to get 56×42", "export"]),
         ("flat", &["cannot load", "standard operators"]),
         ("fewer-channels", &["last_hidden_state", "× 4 on a picture", "[output]"]),
         ("not-a-number", &["not finite", "damaged"]),
@@ -197,7 +201,7 @@ async fn a_download_that_is_no_model_is_refused_and_not_resumed() {
     let page = b"<!DOCTYPE html><title>Sign in</title>".to_vec();
     for (file, words) in [
         (page, ["HTML", "/resolve/"]),
-        (std::fs::read(odd("other-size")).unwrap(), ["pixel_values", "[input]"]),
+        (std::fs::read(odd("other-size")).unwrap(), ["28×28 pixels only", "model.sizes"]),
     ] {
         let hub = Hub::start(file, &[Fault::None]).await;
         let mut command = bench.command(&hub.url, &["pull", "tiny"]);
