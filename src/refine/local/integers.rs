@@ -256,8 +256,8 @@ impl<const ROWS: usize, L: Lanes> NullaryFnOnce for Comparison<'_, ROWS, L> {
                 }
                 columns[index] = column;
             }
-            for row in 0..count {
-                of_candidate.push(first_highest(bytemuck::cast_slice(&best[row]), query.tag));
+            for best in best.iter().take(count) {
+                of_candidate.push(first_highest(bytemuck::cast_slice(best), query.tag));
             }
         }
     }
