@@ -61,7 +61,7 @@ impl Localizer {
         for (number, frame) in drive.frames.iter().enumerate() {
             if let Some(job) = number.checked_sub(LAG).and_then(|before| jobs.get(before)) {
                 let job: &String = job;
-                self.server.get(&format!("/jobs/{job}?wait=60&brief=true")).await.expect(200);
+                self.server.get(&format!("/jobs/{job}?wait=60")).await.expect(200);
             }
             let at =
                 Timestamp::UNIX_EPOCH + SignedDuration::try_from_secs_f64(1e9 + frame.seconds)?;

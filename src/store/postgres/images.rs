@@ -207,7 +207,7 @@ impl Inner {
     }
 
     pub(super) async fn positions(&self, map: &Map) -> Result<Vec<LocatedImage>, StoreError> {
-        let positions: Vec<(i64, String, Json<Pose>, Option<Uuid>, Option<i64>)> = sqlx::query_as(
+        let positions: Vec<LocatedRow> = sqlx::query_as(
             "SELECT i.slot, i.id, i.pose, i.recording, i.number
              FROM images i JOIN maps m ON m.uid = i.map_uid
              WHERE i.map_uid = $1 AND i.pose IS NOT NULL ORDER BY i.slot",
@@ -314,6 +314,9 @@ impl ExportStore for PostgresStore {
             .await
     }
 }
+
+/// The slot of an image, its id, its pose, and its place in a recording.
+type LocatedRow = (i64, String, Json<Pose>, Option<Uuid>, Option<i64>);
 
 /// An image, its descriptor, its slot, and its place in a recording.
 type ExportedRow = (Json<Image>, Option<Vec<f32>>, i64, Option<Uuid>, Option<i64>);
