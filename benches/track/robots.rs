@@ -179,6 +179,7 @@ impl Robots {
             refiner: None,
             settings: config.confidence.calibration(0),
             model_candidates: 0,
+            reindexer: None,
         };
         let calibration = match images.len() < LARGE {
             true => {

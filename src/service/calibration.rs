@@ -83,8 +83,9 @@ pub struct Calibrator {
     pub settings: CalibrationSettings,
     /// Number of candidates about which a paid model is asked.
     pub model_candidates: usize,
-    /// Fits vocabularies without the images that are asked about, for maps that have one of their own.
-    pub reindexer: Reindexer,
+    /// Fits vocabularies without the images that are asked about, for maps that have one of their own; `None` where no map
+    /// has.
+    pub reindexer: Option<Reindexer>,
 }
 
 impl Calibrator {
@@ -156,7 +157,10 @@ impl Calibrator {
             neighbours: self.neighbours(map, &asked).await?,
             ..Calibration::default()
         };
-        let left_out = self.reindexer.cross_fitted(map, settings, COMPARED).await?;
+        let left_out = match &self.reindexer {
+            Some(reindexer) => reindexer.cross_fitted(map, settings, COMPARED).await?,
+            None => None,
+        };
         let of_similarity = left_out.as_deref().unwrap_or(&asked);
         measured.similarity =
             NullDistribution::from(values(of_similarity.iter().filter_map(|asked| {

@@ -16,6 +16,9 @@ use whereabouts_vision::OwnVocabulary;
 /// The number of parts, each of which is left out of one fit.
 const PARTS: usize = 5;
 
+/// At most one in this many images may be left out because it cannot be read.
+const MOST_FAILED: usize = 5;
+
 impl Reindexer {
     /// Samples the images of a map and returns the `k` hardest negatives of each, by a vocabulary that was fitted without
     /// it. `None` if the map has the model's vocabulary, or too few images to leave any out.
@@ -40,10 +43,18 @@ impl Reindexer {
             .filter_map(|(slot, image)| Some((slot?, image)))
             .collect();
         images.sort_unstable_by_key(|(slot, _)| *slot);
-        let mut samples = Vec::with_capacity(images.len());
+        let (count, mut failed) = (images.len(), 0);
+        let mut samples = Vec::with_capacity(count);
         for (slot, image) in images {
-            let sample = self.expand(map, image, &extractor, map.descriptor, &own).await?;
-            samples.extend(sample.map(|sample| (slot, sample)));
+            match self.expand(map, image, &extractor, map.descriptor, &own).await {
+                Ok(sample) => samples.extend(sample.map(|sample| (slot, sample))),
+                // A picture that is damaged does not leave a map without a calibration.
+                Err(error) if (failed + 1) * MOST_FAILED <= count => {
+                    failed += 1;
+                    tracing::debug!(map = %map.name, %error, "an image is left out of a calibration");
+                }
+                Err(error) => return Err(error),
+            }
         }
         blocking(move || compare(&own, &samples, settings, k)).await
     }

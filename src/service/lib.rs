@@ -239,7 +239,7 @@ impl Service {
                 refiner: refiner.clone(),
                 settings: settings.confidence.calibration(settings.compared),
                 model_candidates: settings.refiners.model_candidates().unwrap_or(settings.compared),
-                reindexer: reindexer.clone(),
+                reindexer: Some(reindexer.clone()),
             },
             reindexer,
             transfer: Transfer { maps: maps.clone(), exports: store.clone(), blobs: store.clone() },
