@@ -30,6 +30,7 @@ impl Localizer {
             // The descriptors are those of the other methods.
             ("WHEREABOUTS_VOCABULARY__OWN", "false"),
             ("WHEREABOUTS_REFINE__REFINER", "local"),
+            ("WHEREABOUTS_TRACK__VERDICTS", "true"),
         ];
         let server = Server::start(folder.path(), &settings);
         let map = json!({"scene": "outdoor", "frame": "metric", "descriptor": kind});

@@ -186,6 +186,7 @@ fn settings() -> ServiceSettings {
             history: 50,
             stored: 10,
             state_bytes: 1 << 18,
+            verdicts: true,
             known_probability: 0.5,
         },
         confidence: ConfidenceSettings {

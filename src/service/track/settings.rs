@@ -52,6 +52,8 @@ pub struct TrackSettings {
     pub stored: usize,
     /// Maximum size of a track in the store, in bytes.
     pub state_bytes: usize,
+    /// Whether the verdict of a refiner enters the track of its frame when the job ends.
+    pub verdicts: bool,
     /// Minimum probability of a known place.
     pub known_probability: f64,
 }

@@ -29,6 +29,7 @@ fn settings() -> TrackSettings {
         history: 50,
         stored: 10,
         state_bytes: 1 << 18,
+        verdicts: true,
         known_probability: 0.9,
     }
 }
