@@ -14,6 +14,7 @@ mod twins;
 mod answers;
 mod blobs;
 mod corrections;
+mod crowds;
 mod descriptions;
 mod drafts;
 mod images;

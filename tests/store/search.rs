@@ -17,8 +17,6 @@ use crate::support::{Fixture, Random, Tuning, add, descriptor, eventually, image
 contract!(
     exact_search_equals_brute_force,
     a_graph_has_high_recall_and_finds_no_removed_image,
-    identical_images_crowd_no_other_image_out,
-    a_robot_that_stands_still_hides_no_place,
     a_search_for_more_images_than_there_are_returns_all,
     equal_images_are_ranked_in_the_order_of_addition,
     the_similarity_is_the_cosine_from_one_to_minus_one,
@@ -32,12 +30,12 @@ contract!(
 const BOTH: [SearchMode; 2] = [SearchMode::Fast, SearchMode::Exact];
 
 /// Adds images named by their number, some concurrently.
-async fn add_all(store: &Arc<dyn Store>, map: &Map, descriptors: &[Descriptor]) {
+pub async fn add_all(store: &Arc<dyn Store>, map: &Map, descriptors: &[Descriptor]) {
     add_from(0, store, map, descriptors).await;
 }
 
 /// Adds images named by their number, beginning with `first`.
-async fn add_from(first: usize, store: &Arc<dyn Store>, map: &Map, descriptors: &[Descriptor]) {
+pub async fn add_from(first: usize, store: &Arc<dyn Store>, map: &Map, descriptors: &[Descriptor]) {
     let mut pins = Vec::new();
     for bytes in 0..16_u8 {
         let bytes = Bytes::copy_from_slice(&[bytes]);
@@ -50,7 +48,7 @@ async fn add_from(first: usize, store: &Arc<dyn Store>, map: &Map, descriptors: 
     futures_util::stream::iter(adding).buffer_unordered(16).collect::<Vec<()>>().await;
 }
 
-fn numbers(found: &[Candidate]) -> Vec<usize> {
+pub fn numbers(found: &[Candidate]) -> Vec<usize> {
     found.iter().map(|found| found.image_id.as_str().parse().unwrap()).collect()
 }
 
@@ -84,13 +82,13 @@ async fn exact_search_equals_brute_force(fixture: &Fixture) {
 }
 
 /// Descriptors around a few dozen centres, as those of one building are.
-fn clustered(count: usize, dim: usize) -> Vec<Descriptor> {
+pub fn clustered(count: usize, dim: usize) -> Vec<Descriptor> {
     let mut random = Random(7);
     let centres: Vec<_> = (0..32).map(|_| random.descriptor(dim)).collect();
     (0..count).map(|number| random.near(centres[number % 32].as_slice(), 0.3)).collect()
 }
 
-async fn graph_is_ready(store: &dyn Store, map: &Map) {
+pub async fn graph_is_ready(store: &dyn Store, map: &Map) {
     eventually(async || {
         let state = store.index_state(map).await.unwrap();
         (state.graph && !state.behind).then_some(())
@@ -157,64 +155,6 @@ async fn a_graph_has_high_recall_and_finds_no_removed_image(fixture: &Fixture) {
     let store = fixture.open_with(tuning).await;
     let found = recall(&*store, &removed).await;
     assert!(found >= 0.95, "{found}");
-}
-
-/// A robot that stood still, or tiles without imagery: one descriptor very often, and others around few centres.
-async fn identical_images_crowd_no_other_image_out(fixture: &Fixture) {
-    const TWINS: usize = 600;
-    let store = fixture.open_with(Tuning { exact_up_to: 100, ..Tuning::default() }).await;
-    let (map, _) = store.put_map(map("m", 48)).await.unwrap();
-    let others = clustered(900, 48);
-    let mut descriptors = vec![others[0].clone(); TWINS];
-    descriptors.extend(others);
-    let lost = async |numbers: Vec<usize>| {
-        let mut lost = 0;
-        for number in numbers {
-            let query = descriptors[number].clone();
-            let found = store.search(&map, query, 10, SearchMode::Fast).await.unwrap();
-            assert_eq!(found.len(), 10, "{number}");
-            lost += usize::from((found[0].similarity - 1.0).abs() > 1e-3);
-        }
-        lost
-    };
-    // Some are there before the graph is built, and some are added to it.
-    add_all(&store, &map, &descriptors[..TWINS / 2]).await;
-    graph_is_ready(&*store, &map).await;
-    add_from(TWINS / 2, &store, &map, &descriptors[TWINS / 2..]).await;
-    graph_is_ready(&*store, &map).await;
-    assert_eq!(lost((0..descriptors.len()).collect()).await, 0);
-    // All twins but the last one go, each while the others are found.
-    for number in 0..TWINS - 1 {
-        let id = number.to_string().parse().unwrap();
-        assert!(store.delete_image(&map, &id).await.unwrap());
-        if number % 100 == 0 {
-            assert_eq!(lost(vec![number + 1, TWINS - 1]).await, 0, "{number}");
-        }
-    }
-    assert_eq!(lost(vec![TWINS - 1]).await, 0);
-}
-
-/// What a robot sees that stands still at each of several places: frames that are nearly equal. A search in PostgreSQL may
-/// find others of the same place than the nearest.
-async fn a_robot_that_stands_still_hides_no_place(fixture: &Fixture) {
-    const PLACES: usize = 25;
-    const FRAMES: usize = 120;
-    let store = fixture.open_with(Tuning { exact_up_to: 100, ..Tuning::default() }).await;
-    let (map, _) = store.put_map(map("m", 48)).await.unwrap();
-    let mut random = Random(11);
-    let mut descriptors = Vec::new();
-    for _ in 0..PLACES {
-        let place = random.descriptor(48);
-        descriptors.extend((0..FRAMES).map(|_| random.near(place.as_slice(), 0.02)));
-    }
-    add_all(&store, &map, &descriptors).await;
-    graph_is_ready(&*store, &map).await;
-    for (number, descriptor) in descriptors.iter().enumerate() {
-        let found = store.search(&map, descriptor.clone(), 10, SearchMode::Fast).await.unwrap();
-        assert!(found[0].similarity > 0.995, "{number}: {found:?}");
-        let here = |found: &usize| found / FRAMES == number / FRAMES;
-        assert!(numbers(&found).iter().all(here), "{number}: {found:?}");
-    }
 }
 
 async fn a_search_for_more_images_than_there_are_returns_all(fixture: &Fixture) {
