@@ -1,10 +1,9 @@
 //! The refiner `local`: matches the regions of a query with those of its candidates, without a language
 //! model.
 //!
-//! Matching has four steps, one file each. `mutual` finds mutual nearest neighbours among the cells of two
-//! pictures, with the nearest neighbours from `integers`, or on processors without the instructions for it from
-//! `nearest`. `agreement` keeps the matches whose surroundings
-//! moved the same way. `votes` lets each cell of the query share one vote among the candidates, so that
+//! Matching has four steps. `cell_matcher` finds the mutual nearest neighbours (`mutual`) among the cells of two pictures,
+//! with the nearest neighbours from `integers`, or on processors without the instructions for it from `nearest`.
+//! `agreement` keeps the matches whose surroundings moved the same way. `votes` lets each cell of the query share one vote among the candidates, so that
 //! regions that every candidate shows count for little. `motion` fits one motion to the remaining matches.
 //! [`describe`] describes a pair in words, and [`rank`] ranks the candidates.
 //!
@@ -12,6 +11,7 @@
 //! does no I/O.
 
 mod agreement;
+mod cell_matcher;
 mod comparison;
 mod describe;
 #[cfg(target_arch = "x86_64")]
@@ -35,7 +35,8 @@ pub(crate) use refiner::{build, fingerprint};
 
 use serde::Serialize;
 
-use mutual::{CellPair, Comparing, Mutual};
+use cell_matcher::CellMatcher;
+use mutual::{CellPair, Mutual};
 use votes::Votes;
 use whereabouts_core::dense::DenseFeatures;
 
@@ -134,7 +135,7 @@ struct Compared {
     /// For each, the matches whose surroundings moved the same way.
     agreeing: Vec<Vec<(CellPair, Match)>>,
     /// The query, once it was compared with any.
-    query: Option<Comparing>,
+    query: Option<CellMatcher>,
 }
 
 /// Matches the dense features of a query with those of its candidates.
@@ -196,7 +197,7 @@ impl LocalMatcher {
         compared: &mut Compared,
     ) -> Result<(), LocalError> {
         let Compared { mutuals, agreeing, query: prepared } = compared;
-        let prepared = prepared.get_or_insert_with(|| Comparing::of(query, self.exact));
+        let prepared = prepared.get_or_insert_with(|| CellMatcher::of(query, self.exact));
         for candidate in candidates.get(mutuals.len()..).unwrap_or_default() {
             let found = prepared.find(query, candidate, self.settings.min_similarity)?;
             let (located, tolerance) =

@@ -53,7 +53,7 @@ async fn a_healthy_folder_is_reported_as_healthy() {
         "{said}"
     );
     let (report, code) = report(dir.path(), &[]);
-    assert_eq!((code, &report["version"]), (0, &2.into()));
+    assert_eq!((code, &report["version"]), (0, &3.into()));
     assert_eq!(report["jobs"]["succeeded"], 1);
     assert_eq!(report["maps"][0]["images"], 4);
     for part in ["db", "descriptors", "images", "free"] {

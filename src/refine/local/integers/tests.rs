@@ -1,7 +1,7 @@
 //! Comparisons against a reference implementation.
 
 use super::*;
-use crate::local::mutual::Comparing;
+use crate::local::cell_matcher::CellMatcher;
 use crate::local::nearest::tests::cells;
 
 fn features(count: usize, channels: usize, seed: u32) -> DenseFeatures {
@@ -108,7 +108,7 @@ fn every_processor_finds_the_same() {
 #[test]
 fn matches_are_those_of_floating_point_but_for_near_ties() {
     let (query, candidate) = (features(1200, 64, 5), features(1200, 64, 6));
-    let mut floats = Comparing::of(&query, true);
+    let mut floats = CellMatcher::of(&query, true);
     let floats = floats.find(&query, &candidate, 0.0).unwrap();
     for processor in Processor::available() {
         let found = Integers::on(processor, &query).find(&candidate, 0.0);
