@@ -106,7 +106,7 @@ mod tests {
             key(SearchMode::Fast, None),
             format!(
                 "0.1.0\nreferences-gem\n{}\nFast\n10\nNone\nCalibrationSettings {{ images: 200, \
-                 refined: 20, candidates: 10, place_images: 5, place_m: 25.0 }}\nevidence: 3",
+                 refined: 20, candidates: 10, place_images: 5, place_m: 25.0 }}\nevidence: 4",
                 Digest::of(b"references")
             )
         );

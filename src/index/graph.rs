@@ -4,15 +4,16 @@
 //! Images with equal or nearly equal descriptors ([`ALIKE`]) are one point with several slots: the neighbours of each of
 //! many would be one another, and the rest of the map could not be reached from them.
 //!
-//! `hnsw_rs` does not promise that a point is found. Points are therefore searched for after they were inserted, and
-//! again at least once while the graph doubles; those that are missed are *stray* and are compared with every query.
+//! `hnsw_rs` does not promise that a point is found, and a new point can cost an earlier one its last link. Images are
+//! therefore searched for after they were inserted, after another was inserted near them, and again at least once while
+//! the graph doubles; the points of those that are missed are *stray* and are compared with every query.
 
 use std::collections::{BTreeSet, HashMap};
 use std::hash::{BuildHasher, RandomState};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use hnsw_rs::prelude::{Distance, Hnsw, Neighbour};
-use parking_lot::RwLock;
+use parking_lot::{Mutex, RwLock};
 use rayon::ThreadPool;
 use rayon::prelude::*;
 
@@ -39,18 +40,23 @@ const SAME: f32 = 1e-6;
 /// from one another (`benches/scale`, the set `standing`).
 const ALIKE: f32 = 0.01;
 
-/// Points examined to find one that is alike.
-const EF_ALIKE: usize = 32;
+/// Points near a new one that may lose links to it.
+const NEAR: usize = 32;
+
+/// Points examined to find those near a new one.
+const EF_NEAR: usize = 48;
 
 pub(super) struct Graph {
     hnsw: Hnsw<'static, f32, CosineDistance>,
     points: RwLock<Points>,
     hasher: RandomState,
-    /// Points that a search for their own descriptor misses.
+    /// Points that a search for the descriptor of one of their slots misses.
     stray: RwLock<BTreeSet<usize>>,
-    /// Points below this one were searched for at least once.
+    /// Points near those that were inserted since they were searched for last.
+    suspects: Mutex<BTreeSet<usize>>,
+    /// As many of the inserted images were searched for at least once.
     checked: AtomicUsize,
-    /// The next point to be searched for again.
+    /// The next image to be searched for again.
     again: AtomicUsize,
     ef: usize,
 }
@@ -60,6 +66,8 @@ pub(super) struct Graph {
 struct Points {
     /// Point → slots. The descriptor of the first is that of the point.
     slots: Vec<Vec<usize>>,
+    /// Slot and point of each image, but for those that are equal to another, in the order of insertion.
+    inserted: Vec<(usize, usize)>,
     /// Hash of a descriptor → point. The hash has 64 bits and a random key, so that two descriptors of one map
     /// hardly ever share it.
     by_hash: HashMap<u64, usize>,
@@ -77,6 +85,7 @@ impl Graph {
             points: RwLock::default(),
             hasher: RandomState::new(),
             stray: RwLock::default(),
+            suspects: Mutex::default(),
             checked: AtomicUsize::new(0),
             again: AtomicUsize::new(0),
             ef: settings.ef_search,
@@ -86,41 +95,48 @@ impl Graph {
     pub fn insert(&self, slot: usize, vector: &[f32]) {
         let bytes: &[u8] = bytemuck::cast_slice(vector);
         let hash = self.hasher.hash_one(bytes);
-        let alike = self.hnsw.search(vector, 1, EF_ALIKE);
-        let alike = alike.first().filter(|nearest| nearest.distance < ALIKE);
+        let near = self.hnsw.search(vector, NEAR, EF_NEAR);
+        let alike = near.first().filter(|nearest| nearest.distance < ALIKE);
         let point = {
             let mut points = self.points.write();
-            let known = points.by_hash.get(&hash).copied();
-            if let Some(point) = known.or(alike.map(|nearest| nearest.d_id)) {
+            if let Some(&twin) = points.by_hash.get(&hash) {
+                points.slots[twin].push(slot);
+                return;
+            }
+            if let Some(point) = alike.map(|nearest| nearest.d_id) {
                 points.slots[point].push(slot);
+                points.inserted.push((slot, point));
+                points.by_hash.insert(hash, point);
                 return;
             }
             let point = points.slots.len();
             points.slots.push(vec![slot]);
+            points.inserted.push((slot, point));
             points.by_hash.insert(hash, point);
             point
         };
         self.hnsw.insert((vector, point));
+        self.suspects.lock().extend(near.iter().map(|neighbour| neighbour.d_id));
     }
 
-    /// Searches for the points that were inserted since the last call and for the next `most` of the others, in turn;
-    /// notes those that are missed. Only one thread may call it at a time.
+    /// Searches for the images that were inserted since the last call and for the next `most` of the others, in turn;
+    /// notes the points of those that are missed. Only one thread may call it at a time.
     pub fn check(&self, vectors: &dyn Vectors, most: usize, threads: &ThreadPool) {
         let points = self.points.read();
-        let end = points.slots.len();
+        let end = points.inserted.len();
         let old = self.checked.swap(end, Ordering::Relaxed);
         let from = Some(self.again.load(Ordering::Relaxed)).filter(|from| *from < old).unwrap_or(0);
         let to = old.min(from + most);
         self.again.store(to, Ordering::Relaxed);
-        let is_missed = |point: &usize| {
+        let is_missed = |slot: usize, point: usize| {
             let mut missed = false;
-            // A slot whose row is gone cannot be searched for; one that is alike can.
-            for &slot in points.slots[*point].iter() {
+            // A slot whose row is gone cannot be searched for; another of the same point can.
+            for &slot in std::iter::once(&slot).chain(&points.slots[point]) {
                 let mut stored = false;
                 vectors.scan(slot..slot + 1, &mut |_, vector| {
-                    let found = self.hnsw.search(vector, 1, self.ef);
-                    let is_it = |first: &Neighbour| first.d_id == *point || first.distance <= SAME;
-                    missed = !found.first().is_some_and(is_it);
+                    let found = self.hnsw.search(vector, self.ef, self.ef);
+                    let is_it = |near: &Neighbour| near.d_id == point || near.distance <= SAME;
+                    missed = !found.iter().any(is_it);
                     stored = true;
                 });
                 if stored {
@@ -129,9 +145,12 @@ impl Graph {
             }
             missed
         };
-        let due: Vec<usize> = (from..to).chain(old..end).collect();
-        let missed: Vec<usize> =
-            threads.install(|| due.into_par_iter().filter(is_missed).collect());
+        let suspects = std::mem::take(&mut *self.suspects.lock()).into_iter();
+        let suspects: Vec<_> = suspects.map(|point| (points.slots[point][0], point)).collect();
+        let due: Vec<(usize, usize)> =
+            [&points.inserted[from..to], &points.inserted[old..end], &suspects].concat();
+        let missed = due.into_par_iter().filter(|&(slot, point)| is_missed(slot, point));
+        let missed: Vec<usize> = threads.install(|| missed.map(|(_, point)| point).collect());
         self.stray.write().extend(missed);
     }
 

@@ -27,7 +27,7 @@ pub(super) const WIDENINGS: usize = 3;
 
 /// Up to this many points, comparing every code with that of the query takes no longer than a walk through the graph,
 /// and misses nothing. Tests walk through every graph.
-const SCANNED: usize = if cfg!(test) { 0 } else { 12_000 };
+const SCANNED: Option<usize> = if cfg!(test) { None } else { Some(12_000) };
 
 /// A finished graph over the slots below [`SealedGraph::end`].
 #[derive(Debug, PartialEq)]
@@ -142,7 +142,7 @@ impl SealedGraph {
         if self.is_empty() || query.len() != self.dim() {
             return Vec::new();
         }
-        match self.slots.points() <= SCANNED {
+        match SCANNED.is_some_and(|scanned| self.slots.points() <= scanned) {
             true => self.scan(vectors, query, (k, ef), keep),
             false => self.walk(vectors, query, (k, ef), keep),
         }
