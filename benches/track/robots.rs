@@ -22,7 +22,7 @@ use whereabouts_store::embedded::{EmbeddedSettings, EmbeddedStore};
 use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
 use whereabouts_store::{
     BlobStore, DescriptionBounds, MapStore, Objects, StoreError, TrackHead, TrackKey, TrackRead,
-    TrackStore,
+    TrackState, TrackStore,
 };
 
 use super::LARGE;
@@ -76,7 +76,7 @@ impl TrackStore for SharedFiles {
         &self,
         key: &TrackKey,
         before: Option<u64>,
-        next: (u64, Bytes),
+        next: TrackState,
         idle: Duration,
     ) -> Result<Option<u64>, StoreError> {
         self.0.put_track(key, before, next, idle).await

@@ -38,7 +38,7 @@ pub use self::maps::{Added, ExportStore, HardNegatives, IndexState, LocatedImage
 #[cfg(feature = "postgres")]
 pub use self::objects::{ObjectSettings, Objects};
 pub use self::retention::{JobRetention, RemovedJobs, Retention};
-pub use self::tracks::{StoredTrack, TrackHead, TrackKey, TrackRead, TrackStore};
+pub use self::tracks::{StoredTrack, TrackHead, TrackKey, TrackRead, TrackState, TrackStore};
 pub use self::usage::UsageStore;
 pub use self::webhooks::{DeliveryRetention, RemovedDeliveries, StoredDelivery, WebhookStore};
 

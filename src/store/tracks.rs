@@ -31,6 +31,17 @@ pub struct StoredTrack {
     pub state: Bytes,
 }
 
+/// What a writer knows of a track.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrackState {
+    /// Number of frames so far.
+    pub frames: u64,
+    /// When the last of them arrived.
+    pub last_frame_at: Timestamp,
+    /// What the filter knows.
+    pub state: Bytes,
+}
+
 /// What a reader finds who may know the latest version.
 #[derive(Debug, Clone, PartialEq)]
 pub enum TrackRead {
@@ -51,12 +62,12 @@ pub struct TrackHead {
     pub id: String,
     /// Number of frames so far.
     pub frames: u64,
-    /// When the last of them was stored.
-    pub written_at: Timestamp,
+    /// When the last of them arrived.
+    pub last_frame_at: Timestamp,
 }
 
 /// Tracks of robots. They are derived from frames that a robot goes on sending, so they may be lost when the machine or
-/// the database crashes. They expire `idle` after they were written.
+/// the database crashes. They expire `idle` after their last frame.
 #[async_trait]
 pub trait TrackStore: Send + Sync {
     /// Whether other processes continue the tracks of this one, so that it must store each frame, and read what another
@@ -75,10 +86,10 @@ pub trait TrackStore: Send + Sync {
         &self,
         key: &TrackKey,
         before: Option<u64>,
-        (frames, state): (u64, Bytes),
+        next: TrackState,
         idle: Duration,
     ) -> Result<Option<u64>, StoreError>;
-    /// Returns up to `limit` tracks in a map, those written last first; with `id`, only those of this name.
+    /// Returns up to `limit` tracks in a map, those with the latest frame first; with `id`, only those of this name.
     async fn tracks(
         &self,
         map: Uuid,

@@ -4,9 +4,10 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::future::join_all;
+use jiff::Timestamp;
 use uuid::Uuid;
 use whereabouts_store::postgres::{PostgresStore, SchemaState, migrate, schema_of};
-use whereabouts_store::{MapStore, StoreError, TrackKey, TrackStore};
+use whereabouts_store::{MapStore, StoreError, TrackKey, TrackState, TrackStore};
 
 use crate::processes::database;
 use crate::support::{Database, Pictures, Tuning, add, map};
@@ -82,7 +83,8 @@ async fn what_a_server_of_the_previous_release_adds_and_deletes_is_followed() {
     // It deletes a map without its tracks, which expire.
     let key = TrackKey { map: map.uid, owner: "-".into(), id: "a".into() };
     let long = Duration::from_secs(60);
-    let state = (1, Bytes::from_static(b"state"));
+    let (frames, state) = (1, Bytes::from_static(b"state"));
+    let state = TrackState { frames, last_frame_at: Timestamp::now(), state };
     store.put_track(&key, None, state, long).await.unwrap().unwrap();
     database.run("DELETE FROM maps").await;
     assert_eq!(store.prune_tracks(Duration::ZERO, 9).await.unwrap(), 1);

@@ -5,8 +5,9 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::future::join_all;
+use jiff::Timestamp;
 use uuid::Uuid;
-use whereabouts_store::{Store, StoredTrack, TrackKey, TrackRead};
+use whereabouts_store::{Store, StoredTrack, TrackKey, TrackRead, TrackState};
 
 use crate::support::{Fixture, map};
 
@@ -33,9 +34,13 @@ async fn map_of(store: &dyn Store, name: &str) -> Uuid {
 }
 
 /// Writes a state over a version, and returns the new version.
+fn next(state: Bytes) -> TrackState {
+    TrackState { frames: state.len() as u64, last_frame_at: Timestamp::now(), state }
+}
+
 async fn put(store: &dyn Store, key: &TrackKey, before: Option<u64>, state: &str) -> Option<u64> {
     let state = Bytes::copy_from_slice(state.as_bytes());
-    store.put_track(key, before, (state.len() as u64, state), LONG).await.unwrap()
+    store.put_track(key, before, next(state), LONG).await.unwrap()
 }
 
 async fn read(store: &dyn Store, key: &TrackKey) -> Option<StoredTrack> {
@@ -113,7 +118,7 @@ async fn a_track_that_expired_is_missing_and_begins_anew(fixture: &Fixture) {
     let first = put(&*store, &key, None, "one").await.unwrap();
     let gone = store.track(&key, Some(first + 1), Duration::ZERO).await.unwrap();
     assert_eq!(gone, TrackRead::Missing);
-    let state = || (1, Bytes::from_static(b"two"));
+    let state = || next(Bytes::from_static(b"two"));
     let next = store.put_track(&key, None, state(), Duration::ZERO).await.unwrap().unwrap();
     // A process that knew the first is not led to believe that it still does.
     assert_ne!(next, first);

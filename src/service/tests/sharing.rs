@@ -10,10 +10,11 @@ use uuid::Uuid;
 use super::track::{ALONE, between, road, robot, view};
 use super::{Fixture, image_id, settings};
 use crate::{Principal, Tracks};
+use jiff::Timestamp;
 use whereabouts_api::TrackEstimate;
 use whereabouts_core::{Descriptor, Map};
 use whereabouts_store::embedded::EmbeddedStore;
-use whereabouts_store::{StoreError, TrackHead, TrackKey, TrackRead, TrackStore};
+use whereabouts_store::{StoreError, TrackHead, TrackKey, TrackRead, TrackState, TrackStore};
 
 /// A store that several servers share, which yields before each call so that others get between.
 struct Shared(Arc<EmbeddedStore>);
@@ -38,7 +39,7 @@ impl TrackStore for Shared {
         &self,
         key: &TrackKey,
         before: Option<u64>,
-        next: (u64, Bytes),
+        next: TrackState,
         idle: Duration,
     ) -> Result<Option<u64>, StoreError> {
         tokio::task::yield_now().await;
@@ -174,7 +175,8 @@ async fn a_state_that_cannot_be_read_begins_the_track_anew() {
     let map = road(&fixture, 40).await;
     let key = TrackKey { map: map.uid, owner: "-".into(), id: "robot".into() };
     for state in [&b""[..], b"no track", &[0xff; 64]] {
-        let state = (7, Bytes::copy_from_slice(state));
+        let (frames, state) = (7, Bytes::copy_from_slice(state));
+        let state = TrackState { frames, last_frame_at: Timestamp::now(), state };
         let idle = Duration::from_secs(60);
         assert!(fixture.store.put_track(&key, None, state, idle).await.unwrap().is_some());
         let answer = follow(&server(&fixture, true), &map, 5, &view(5)).await;

@@ -13,7 +13,7 @@ use super::Tracks;
 use super::ground::Ground;
 use super::memory::Held;
 use super::session::Track;
-use whereabouts_store::{TrackKey, TrackRead};
+use whereabouts_store::{TrackKey, TrackRead, TrackState};
 
 /// Pause between two writes of the tracks in memory.
 const SAVE_PAUSE: Duration = Duration::from_secs(5);
@@ -85,7 +85,7 @@ impl Tracks {
             );
             return Ok(Some(before));
         };
-        let state = (track.frames, state);
+        let state = TrackState { frames: track.frames, last_frame_at: track.last_frame_at, state };
         let version = self.stored.put_track(key, before, state, self.idle()).await?;
         Ok(version.map(Some))
     }

@@ -36,8 +36,8 @@ impl Tracks {
             let held = held.lock().await;
             heads.retain(|head| head.owner != owner || head.id != id);
             if held.track.frames > 0 {
-                let (frames, written_at) = (held.track.frames, held.track.last_frame_at);
-                heads.push(TrackHead { owner, id, frames, written_at });
+                let (frames, last_frame_at) = (held.track.frames, held.track.last_frame_at);
+                heads.push(TrackHead { owner, id, frames, last_frame_at });
             }
         }
         Ok(heads)
@@ -60,7 +60,7 @@ impl Tracks {
         let is_own = |owner: &str| owner == caller.scope();
         let mut found = self.heads(map, Some(id)).await?;
         found.retain(|head| may_see_all || is_own(&head.owner));
-        found.sort_by_key(|head| (!is_own(&head.owner), std::cmp::Reverse(head.written_at)));
+        found.sort_by_key(|head| (!is_own(&head.owner), std::cmp::Reverse(head.last_frame_at)));
         let Some(TrackHead { owner, id, .. }) = found.into_iter().next() else {
             return Err(ServiceError::not_found(format!(
                 "the map {} has no track {id:?}; a track is forgotten {} s after its last frame (track.idle_s)",
@@ -103,8 +103,8 @@ impl Tracks {
     }
 }
 
-fn summary(TrackHead { owner, id, frames, written_at }: TrackHead) -> TrackSummary {
-    TrackSummary { id, key: key_of(owner), frames, last_frame_at: written_at }
+fn summary(TrackHead { owner, id, frames, last_frame_at }: TrackHead) -> TrackSummary {
+    TrackSummary { id, key: key_of(owner), frames, last_frame_at }
 }
 
 /// The id of the API key that owns a track.

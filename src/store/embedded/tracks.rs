@@ -16,7 +16,9 @@ use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
 use super::super::tracks::first_version;
-use super::super::{StoreError, StoredTrack, TrackHead, TrackKey, TrackRead, TrackStore};
+use super::super::{
+    StoreError, StoredTrack, TrackHead, TrackKey, TrackRead, TrackState, TrackStore,
+};
 use super::records::{decode, encode};
 use super::{EmbeddedStore, blocking, create_folder};
 use whereabouts_core::{Digest, Map};
@@ -35,15 +37,24 @@ struct Header {
     id: String,
     version: u64,
     frames: u64,
+    last_frame_at: Timestamp,
+    /// A track is written some seconds after its last frame, and its state says how long ago things were then.
     written_at: Timestamp,
 }
 
 impl Header {
     fn age(&self) -> Duration {
-        let age = Timestamp::now().duration_since(self.written_at);
-        // A clock that was set back.
-        Duration::try_from(age).unwrap_or_default()
+        since(self.written_at)
     }
+
+    fn idle(&self) -> Duration {
+        since(self.last_frame_at)
+    }
+}
+
+/// How long ago a moment was; zero if the clock was set back since.
+fn since(moment: Timestamp) -> Duration {
+    Duration::try_from(Timestamp::now().duration_since(moment)).unwrap_or_default()
 }
 
 impl TrackFiles {
@@ -75,10 +86,23 @@ impl TrackFiles {
         remove(fs::remove_dir_all(&folder), &folder);
     }
 
-    /// The tracks in a map, each with its file.
-    fn list(&self, map: &Path) -> Vec<(PathBuf, Header)> {
-        let read = |path: PathBuf| Some((path.clone(), read(&path)?.0));
-        entries(map).into_iter().filter_map(read).collect()
+    /// The tracks in a map.
+    fn list(&self, map: &Path) -> Vec<Header> {
+        entries(map).iter().filter_map(|path| Some(read(path)?.0)).collect()
+    }
+
+    /// All tracks, each with its file. Removes the files that hold none, of which the robots start anew.
+    fn sweep(&self) -> Vec<(PathBuf, Header)> {
+        let paths = entries(&self.folder).into_iter().flat_map(|map| entries(&map));
+        let kept = paths.filter_map(|path| match read(&path) {
+            Some((header, _)) => Some((path, header)),
+            None => {
+                tracing::warn!(path = %path.display(), "a stored track is damaged, and is removed");
+                remove(fs::remove_file(&path), &path);
+                None
+            }
+        });
+        kept.collect()
     }
 }
 
@@ -140,7 +164,7 @@ impl TrackStore for EmbeddedStore {
         blocking(move || {
             Ok(match read(&inner.tracks.path(&key)) {
                 Some((header, _)) if Some(header.version) == known => TrackRead::Unchanged,
-                Some((header, state)) if header.age() <= idle => {
+                Some((header, state)) if header.idle() <= idle => {
                     let (version, age) = (header.version, header.age());
                     TrackRead::Found(StoredTrack { version, age, state })
                 }
@@ -154,7 +178,7 @@ impl TrackStore for EmbeddedStore {
         &self,
         key: &TrackKey,
         before: Option<u64>,
-        (frames, state): (u64, Bytes),
+        next: TrackState,
         idle: Duration,
     ) -> Result<Option<u64>, StoreError> {
         let (inner, key) = (Arc::clone(&self.inner), key.clone());
@@ -162,13 +186,15 @@ impl TrackStore for EmbeddedStore {
             let path = inner.tracks.path(&key);
             let _writing = inner.tracks.writing.lock();
             let stored = read(&path).map(|(header, _)| header);
-            let stored = stored.filter(|header| before.is_some() || header.age() <= idle);
+            let stored = stored.filter(|header| before.is_some() || header.idle() <= idle);
             if stored.map(|header| header.version) != before {
                 return Ok(None);
             }
             let version = before.map_or_else(first_version, |before| before + 1);
             let TrackKey { owner, id, .. } = key;
-            let header = Header { owner, id, version, frames, written_at: Timestamp::now() };
+            let TrackState { frames, last_frame_at, state } = next;
+            let written_at = Timestamp::now();
+            let header = Header { owner, id, version, frames, last_frame_at, written_at };
             write(&path, &header, &state)?;
             Ok(Some(version))
         })
@@ -188,17 +214,16 @@ impl TrackStore for EmbeddedStore {
                 .tracks
                 .list(&inner.tracks.folder_of(map))
                 .into_iter()
-                .map(|(_, header)| header)
-                .filter(|header| header.age() <= idle)
+                .filter(|header| header.idle() <= idle)
                 .filter(|header| id.as_ref().is_none_or(|id| *id == header.id))
                 .collect();
-            headers.sort_by_key(|header| std::cmp::Reverse(header.written_at));
+            headers.sort_by_key(|header| std::cmp::Reverse(header.last_frame_at));
             headers.truncate(limit);
-            let head = |Header { owner, id, frames, written_at, .. }| TrackHead {
+            let head = |Header { owner, id, frames, last_frame_at, .. }| TrackHead {
                 owner,
                 id,
                 frames,
-                written_at,
+                last_frame_at,
             };
             Ok(headers.into_iter().map(head).collect())
         })
@@ -210,12 +235,11 @@ impl TrackStore for EmbeddedStore {
         blocking(move || {
             let files = &inner.tracks;
             let _writing = files.writing.lock();
-            let mut all: Vec<(PathBuf, Header)> =
-                entries(&files.folder).iter().flat_map(|map| files.list(map)).collect();
-            all.sort_by_key(|(_, header)| std::cmp::Reverse(header.written_at));
+            let mut all = files.sweep();
+            all.sort_by_key(|(_, header)| std::cmp::Reverse(header.last_frame_at));
             let mut count = 0;
             for (number, (path, header)) in all.into_iter().enumerate() {
-                if number >= most || header.age() > idle {
+                if number >= most || header.idle() > idle {
                     remove(fs::remove_file(&path), &path);
                     count += 1;
                 }
@@ -223,5 +247,40 @@ impl TrackStore for EmbeddedStore {
             Ok(count)
         })
         .await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::test_records::{map, settings};
+    use super::*;
+    use crate::MapStore;
+
+    #[tokio::test]
+    async fn the_latest_frame_decides_which_tracks_stay_and_damaged_files_go() {
+        const LONG: Duration = Duration::from_secs(600);
+        let dir = tempfile::tempdir().unwrap();
+        let store = EmbeddedStore::open(&settings(dir.path())).unwrap();
+        let (map, _) = store.put_map(map()).await.unwrap();
+        let key = |id: &str| TrackKey { map: map.uid, owner: "-".into(), id: id.into() };
+        // Written in one flush, in any order; the last of them drove a minute ago.
+        for (id, seconds) in [("b", 2), ("a", 1), ("d", 60), ("c", 3)] {
+            let last_frame_at = Timestamp::now() - Duration::from_secs(seconds);
+            let next = TrackState { frames: 1, last_frame_at, state: Bytes::from_static(b"x") };
+            store.put_track(&key(id), None, next, LONG).await.unwrap().unwrap();
+        }
+        let listed = async || -> Vec<String> {
+            let heads = store.tracks(map.uid, None, 9, LONG).await.unwrap();
+            heads.into_iter().map(|head| head.id).collect()
+        };
+        assert_eq!(listed().await, ["a", "b", "c", "d"]);
+        assert_eq!(store.prune_tracks(Duration::from_secs(30), 2).await.unwrap(), 2);
+        assert_eq!(listed().await, ["a", "b"]);
+        let damaged = store.inner.tracks.path(&key("a"));
+        fs::write(&damaged, "damaged").unwrap();
+        assert_eq!(store.track(&key("a"), None, LONG).await.unwrap(), TrackRead::Missing);
+        store.prune_tracks(LONG, 9).await.unwrap();
+        assert!(!damaged.exists());
+        assert_eq!(listed().await, ["b"]);
     }
 }

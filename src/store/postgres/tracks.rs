@@ -4,11 +4,12 @@
 use std::time::Duration;
 
 use async_trait::async_trait;
-use bytes::Bytes;
 use uuid::Uuid;
 
 use super::super::tracks::first_version;
-use super::super::{StoreError, StoredTrack, TrackHead, TrackKey, TrackRead, TrackStore};
+use super::super::{
+    StoreError, StoredTrack, TrackHead, TrackKey, TrackRead, TrackState, TrackStore,
+};
 use super::{PostgresStore, count};
 
 #[async_trait]
@@ -52,7 +53,8 @@ impl TrackStore for PostgresStore {
         &self,
         key: &TrackKey,
         before: Option<u64>,
-        (frames, state): (u64, Bytes),
+        // Written as soon as its last frame was answered.
+        TrackState { frames, state, .. }: TrackState,
         idle: Duration,
     ) -> Result<Option<u64>, StoreError> {
         let next = before.map_or_else(first_version, |before| before + 1);
@@ -107,7 +109,7 @@ impl TrackStore for PostgresStore {
         let head =
             |(owner, id, frames, written_at): (String, String, i64, jiff_sqlx::Timestamp)| {
                 let (frames, written_at) = (frames.unsigned_abs(), written_at.to_jiff());
-                TrackHead { owner, id, frames, written_at }
+                TrackHead { owner, id, frames, last_frame_at: written_at }
             };
         Ok(found.into_iter().map(head).collect())
     }
