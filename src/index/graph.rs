@@ -1,7 +1,7 @@
 //! The graph that takes new images until the next sealing: HNSW (Malkov and Yashunin, 2018) of `hnsw_rs`, which is
 //! searched while it grows.
 //!
-//! Images with equal or nearly equal descriptors ([`ALIKE`]) are one point with several slots: the neighbours of each of
+//! Images with equal or nearly equal descriptors, within [`ALIKE`] of a point, are one point with several slots: the neighbours of each of
 //! many would be one another, and the rest of the map could not be reached from them.
 //!
 //! `hnsw_rs` does not promise that a point is found, and a new point can cost an earlier one its last link. Images are
@@ -18,7 +18,7 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 
 use super::sealed::WIDENINGS;
-use super::{IndexSettings, ScoredSlot, Vectors};
+use super::{ALIKE, IndexSettings, ScoredSlot, Vectors};
 use whereabouts_core::dot;
 
 /// One minus the dot product of unit vectors.
@@ -35,10 +35,6 @@ impl Distance<f32> for CosineDistance {
 
 /// A distance that is zero but for rounding.
 const SAME: f32 = 1e-6;
-
-/// Images that are nearer than this to a point are slots of it. Frames of a robot that stands still are 0.0002 to 0.004
-/// from one another (`benches/scale`, the set `standing`).
-const ALIKE: f32 = 0.01;
 
 /// Points near a new one that may lose links to it.
 const NEAR: usize = 32;

@@ -40,6 +40,10 @@ use whereabouts_core::dot;
 /// A graph over all slots is built in a quarter of the time that `hnsw_rs` takes to insert them one by one.
 const FASTER_AS_A_WHOLE: usize = 4;
 
+/// Images that are nearer to one another than this, one minus their similarity, are nearly equal. Frames of a robot that
+/// stands still are 0.0002 to 0.004 from one another (`benches/scale`, the set `standing`).
+pub const ALIKE: f32 = 0.01;
+
 /// Stored descriptors, by slot.
 pub trait Vectors: Send + Sync {
     /// Numbers in each descriptor.

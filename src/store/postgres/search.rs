@@ -16,7 +16,7 @@ use super::super::{HardNegatives, StoreError};
 use super::descriptors::{descriptor_of, table};
 use super::{Inner, count};
 use whereabouts_core::{CalibrationSettings, Candidate, Descriptor, ImageId, Map, Pose};
-use whereabouts_index::SearchMode;
+use whereabouts_index::{ALIKE, SearchMode};
 
 /// Number of images requested from the index in addition to `k`, to be ranked again.
 const OVERFETCH: usize = 8;
@@ -24,12 +24,9 @@ const OVERFETCH: usize = 8;
 /// The widest beam of pgvector.
 const WIDEST: usize = 1000;
 
-/// Images that are nearer to one another than this share of their distance from the query are a crowd.
+/// Images that are nearer to one another than this share of their distance from the query are a crowd, as are those that
+/// are nearly equal.
 const CROWD_SHARE: f32 = 0.25;
-
-/// Images that are nearer to one another than this, one minus their similarity, are a crowd for any query. Frames of a
-/// robot that stands still are 0.0002 to 0.004 from one another (`benches/scale`, the set `standing`).
-const ALIKE: f32 = 0.01;
 
 /// An image that a search found.
 struct Found {
