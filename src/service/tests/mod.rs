@@ -167,7 +167,7 @@ fn job_settings() -> JobSettings {
     }
 }
 
-fn settings() -> ServiceSettings {
+pub(crate) fn settings() -> ServiceSettings {
     ServiceSettings {
         localize: LocalizeSettings { k: 5, max_k: 20, known_confidence: 0.5 },
         track: TrackSettings {

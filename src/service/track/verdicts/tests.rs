@@ -13,25 +13,7 @@ use whereabouts_store::LocatedImage;
 const PLACES: u32 = 60;
 
 fn settings() -> TrackSettings {
-    TrackSettings {
-        max: 2,
-        idle_s: 600,
-        max_speed_m_s: 10.0,
-        odometry_error: 0.1,
-        outliers: 0.2,
-        turn: 0.005,
-        jump: 0.005,
-        leave: 0.005,
-        enter: 0.02,
-        sharpness: 1.0,
-        candidates: 10,
-        states: 64,
-        history: 50,
-        stored: 10,
-        state_bytes: 1 << 18,
-        verdicts: true,
-        known_probability: 0.9,
-    }
+    TrackSettings { known_probability: 0.9, ..crate::tests::settings().track }
 }
 
 fn view(place: u32) -> Descriptor {
