@@ -136,7 +136,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_fit_is_claimed_alike_on_every_server_and_anew_when_the_map_has_changed() {
+    fn a_fit_is_claimed_alike_on_every_server_and_again_when_the_map_has_changed() {
         let map = crate::tests::map("m");
         let claim = claim_of(&map, 100);
         assert_eq!(claim_of(&map.clone(), 100), claim);

@@ -66,7 +66,7 @@ pub struct TrackHead {
     pub last_frame_at: Timestamp,
 }
 
-/// Tracks of robots. They are derived from frames that a robot goes on sending, so they may be lost when the machine or
+/// Tracks of robots. They are derived from frames that a robot keeps sending, so they may be lost when the machine or
 /// the database crashes. They expire `idle` after their last frame.
 #[async_trait]
 pub trait TrackStore: Send + Sync {

@@ -16,7 +16,7 @@ contract!(
     a_reader_that_knows_the_version_reads_no_state,
     a_write_that_missed_another_changes_nothing,
     of_concurrent_writes_over_one_version_one_succeeds,
-    a_track_that_expired_is_missing_and_begins_anew,
+    a_track_that_expired_is_missing_and_starts_again,
     tracks_are_there_after_a_restart,
     tracks_are_listed_by_map_those_written_last_first,
     expired_tracks_and_the_oldest_of_too_many_are_removed,
@@ -112,7 +112,7 @@ async fn of_concurrent_writes_over_one_version_one_succeeds(fixture: &Fixture) {
     }
 }
 
-async fn a_track_that_expired_is_missing_and_begins_anew(fixture: &Fixture) {
+async fn a_track_that_expired_is_missing_and_starts_again(fixture: &Fixture) {
     let store = fixture.open().await;
     let key = key(map_of(&*store, "m").await, "-", "a");
     let first = put(&*store, &key, None, "one").await.unwrap();

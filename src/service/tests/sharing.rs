@@ -170,7 +170,7 @@ async fn a_track_that_the_store_has_lost_goes_on_from_what_a_server_knows() {
 }
 
 #[tokio::test]
-async fn a_state_that_cannot_be_read_begins_the_track_anew() {
+async fn a_state_that_cannot_be_read_starts_the_track_again() {
     let fixture = Fixture::new().await;
     let map = road(&fixture, 40).await;
     let key = TrackKey { map: map.uid, owner: "-".into(), id: "robot".into() };

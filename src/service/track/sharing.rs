@@ -37,7 +37,7 @@ impl Tracks {
         }
         match self.stored.track(key, held.version, self.idle()).await? {
             TrackRead::Unchanged => {}
-            // It was evicted there, or the database has crashed: it goes on from what is known here.
+            // It was evicted there, or the database has crashed: it continues from what is known here.
             TrackRead::Missing => held.version = None,
             TrackRead::Found(found) => {
                 let track = Track::from_bytes(&found.state, found.age, ground);
@@ -107,7 +107,7 @@ impl Tracks {
                     held.is_saved = version.is_some();
                 }
                 Err(error) => {
-                    tracing::warn!(%error, "a track was not stored; a restart begins it anew");
+                    tracing::warn!(%error, "a track was not stored; after a restart it starts again");
                     return;
                 }
             }

@@ -91,7 +91,7 @@ impl TrackFiles {
         entries(map).iter().filter_map(|path| Some(read(path)?.0)).collect()
     }
 
-    /// All tracks, each with its file. Removes the files that hold none, of which the robots start anew.
+    /// All tracks, each with its file. Removes the files that hold none, whose robots start new tracks.
     fn sweep(&self) -> Vec<(PathBuf, Header)> {
         let paths = entries(&self.folder).into_iter().flat_map(|map| entries(&map));
         let kept = paths.filter_map(|path| match read(&path) {
