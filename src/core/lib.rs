@@ -24,6 +24,7 @@ mod resemblance;
 mod secret;
 mod service_time;
 mod spend;
+mod text_line;
 pub mod units;
 mod utm;
 mod verdict;
@@ -52,6 +53,7 @@ pub use pose::{EARTH_RADIUS_M, GeographicPose, MetricPose, Pose, PoseError, Pose
 pub use secret::Secret;
 pub use service_time::ServiceTime;
 pub use spend::Spent;
+pub use text_line::TextLine;
 pub use utm::{UtmZone, UtmZoneError};
 pub use verdict::{Agreement, Certainty, SamePlace};
 pub use webhook::{

@@ -1,0 +1,18 @@
+//! Text that was read in a picture: signs, shop names, street names, door numbers.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+/// A line of text in a picture.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct TextLine {
+    /// What was read, in Unicode.
+    pub text: String,
+    /// Mean probability of the characters, from 0 to 1, as the recognition model gives it. It is not
+    /// calibrated.
+    pub confidence: f32,
+    /// Corners of the quadrilateral around the line, in reading order: where the text begins at the top,
+    /// where it ends at the top, and then below. Each is `[x, y]` as a fraction of the width and height
+    /// of the picture, after its EXIF orientation was applied.
+    pub corners: [[f32; 2]; 4],
+}
