@@ -6,22 +6,22 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use rayon::{ThreadPool, ThreadPoolBuilder};
-use whereabouts_index::{MapIndex, SearchMode};
+use whereabouts_index::{IndexSettings, MapIndex, SearchMode};
 
 use super::vectors::Set;
-use super::{INDEX, K, median, ms, percentile};
+use super::{K, median, ms, percentile};
 
 /// Points linked in a turn, as in the store.
 const TURN: usize = 64;
 /// Larger maps are built with all threads only, and never through the graph of hnsw_rs, which takes ten times as long.
 const LARGE: usize = 200_000;
 
-pub fn measure(set: &Set) -> anyhow::Result<()> {
+pub fn measure(set: &Set, settings: IndexSettings) -> anyhow::Result<()> {
     let size = set.rows.len();
     let threads = |count| ThreadPoolBuilder::new().num_threads(count).build();
     let all = threads(0)?;
     let before = peak_memory();
-    let index = filled(0..size);
+    let index = filled(settings, 0..size);
     let built = build(&index, set, &all);
     let memory = peak_memory().zip(before).map(|(after, before)| {
         after.saturating_sub(before) as f64 / (size * set.rows.dim * 4) as f64
@@ -39,13 +39,13 @@ pub fn measure(set: &Set) -> anyhow::Result<()> {
     }
     report("all sealed", set, &index, &BTreeSet::from_iter(0..size));
     if size <= LARGE {
-        let one = build(&filled(0..size), set, &threads(1)?);
+        let one = build(&filled(settings, 0..size), set, &threads(1)?);
         let speedup = one.as_secs_f64() / built.as_secs_f64();
         println!(
             "  built in {:.1} s on one thread: {speedup:.2} × as fast on all",
             one.as_secs_f64()
         );
-        let half = filled(0..size * 11 / 20);
+        let half = filled(settings, 0..size * 11 / 20);
         build(&half, set, &all);
         (size * 11 / 20..size).for_each(|slot| half.add(slot));
         build(&half, set, &all);
@@ -89,8 +89,8 @@ fn rebuild(set: &Set, index: &MapIndex, threads: &ThreadPool) -> anyhow::Result<
     Ok(())
 }
 
-fn filled(slots: std::ops::Range<usize>) -> MapIndex {
-    let index = MapIndex::new(INDEX);
+fn filled(settings: IndexSettings, slots: std::ops::Range<usize>) -> MapIndex {
+    let index = MapIndex::new(settings);
     slots.for_each(|slot| index.add(slot));
     index
 }

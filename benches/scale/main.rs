@@ -3,7 +3,8 @@
 //!
 //! `WHEREABOUTS_TEST_SHARED_BUFFERS=4GB tests/postgres.sh target/postgres-venv cargo bench --bench scale -- \
 //! 10000 twins one-picture by-place standing`. A number is as many clustered vectors of 384 dimensions; the names are
-//! those of [`sets`]. With `embedded` or `postgres` only that store is measured, and `embedded` needs no database.
+//! those of [`sets`]. With `embedded` or `postgres` only that store is measured, and `embedded` needs no database. `ef=200`
+//! examines so many points in a search.
 //!
 //! *Recall* is of the ten nearest, against brute force; results that are as similar as the tenth best count. *Lost* are
 //! images whose own descriptor finds neither them nor an equal one first.
@@ -35,8 +36,14 @@ const INDEX: IndexSettings = IndexSettings {
 async fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> =
         std::env::args().skip(1).filter(|argument| !argument.starts_with("--")).collect();
+    let ef = arguments.iter().find_map(|argument| argument.strip_prefix("ef="));
+    let ef_search = ef.map_or(Ok(INDEX.ef_search), str::parse)?;
+    let index = IndexSettings { ef_search, ..INDEX };
     let only = |store: &str| arguments.iter().any(|argument| argument == store);
-    let names = arguments.iter().filter(|name| !["embedded", "postgres"].contains(&name.as_str()));
+    let is_name = |argument: &str| {
+        !["embedded", "postgres"].contains(&argument) && !argument.starts_with("ef=")
+    };
+    let names = arguments.iter().filter(|argument| is_name(argument));
     let mut names: Vec<&str> = names.map(String::as_str).collect();
     if names.is_empty() {
         names = sets::ALL.to_vec();
@@ -45,12 +52,12 @@ async fn main() -> anyhow::Result<()> {
         let name = name.to_owned();
         let set = tokio::task::spawn_blocking(move || sets::named(&name)).await??;
         if !only("postgres") {
-            embedded::measure(&set)?;
+            embedded::measure(&set, index)?;
         }
         if !only("embedded") {
             let url = std::env::var("WHEREABOUTS_TEST_DATABASE_URL")
                 .context("run it through tests/postgres.sh, or with `embedded`")?;
-            postgres::measure(&url, &set).await?;
+            postgres::measure(&url, &set, index).await?;
         }
     }
     Ok(())

@@ -12,21 +12,21 @@ use whereabouts_core::{
     CoordinateFrame, Description, Descriptor, DescriptorKind, Digest, Image, Job, JobState, Map,
     MediaType, Precision, RefinerKind, Scene, Usage,
 };
-use whereabouts_index::SearchMode;
+use whereabouts_index::{IndexSettings, SearchMode};
 use whereabouts_store::postgres::{PostgresSettings, PostgresStore, migrate};
 use whereabouts_store::{
     BlobStore, DescriptionBounds, JobRecord, JobStore, MapStore, Objects, Query, Step,
 };
 
 use super::vectors::{Rows, Set};
-use super::{INDEX, K, median, ms, percentile};
+use super::{K, median, ms, percentile};
 
 const CALLERS: usize = 8;
 const JOBS: usize = 50;
 const STEPS: usize = 10;
 
 /// Fills a database of its own, builds the index, and prints its speed, its recall and the images that it loses.
-pub async fn measure(url: &str, set: &Set) -> anyhow::Result<()> {
+pub async fn measure(url: &str, set: &Set, index: IndexSettings) -> anyhow::Result<()> {
     let (rows, queries, size) = (&set.rows, &set.queries, set.rows.len());
     let name = &set.name;
     let database = format!("scale_{}", Uuid::now_v7().simple());
@@ -41,7 +41,7 @@ pub async fn measure(url: &str, set: &Set) -> anyhow::Result<()> {
         timeout: Duration::from_secs(60),
         lifetime: Duration::from_secs(120),
         pin: Duration::from_secs(60),
-        index: INDEX,
+        index,
         index_memory_mib: 3000,
         descriptions: DescriptionBounds { max_bytes: 1 << 20, max_age: Duration::from_secs(60) },
     };

@@ -21,7 +21,6 @@ mod repair;
 mod sealed;
 mod settings;
 
-use std::collections::HashSet;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -213,15 +212,7 @@ impl MapIndex {
         if let Some(growing) = &graphs.growing {
             // It may already hold slots beyond `graphed`.
             let kept = |slot: usize| slot < graphed && is_live(slot);
-            let mut found = growing.search(vectors, query, (k, ef), &kept);
-            let known: HashSet<usize> = found.iter().map(|found| found.slot).collect();
-            let stray = growing.stray_slots(&kept);
-            for slot in stray.into_iter().filter(|slot| !known.contains(slot)) {
-                vectors.scan(slot..slot + 1, &mut |slot, vector| {
-                    found.push(ScoredSlot { slot, similarity: dot(query, vector) });
-                });
-            }
-            found_in(sealed_end..graphed, found);
+            found_in(sealed_end..graphed, growing.search(vectors, query, (k, ef), &kept));
         }
         exactly(vectors, query, graphed..live.slots.len(), &is_live, &mut best);
         best.into_sorted()
@@ -238,7 +229,8 @@ impl MapIndex {
     pub fn has_work(&self) -> bool {
         // Locked only while the indexer is at work.
         let is_building = || self.building.try_lock().is_none_or(|building| building.is_some());
-        self.is_behind() || is_building() || self.wants_sealing()
+        let is_due = || self.graphs().growing.as_ref().is_some_and(|growing| growing.is_due());
+        self.is_behind() || is_building() || self.wants_sealing() || is_due()
     }
 
     /// Whether a graph over all slots is to be built: as many slots lie beyond the sealed graph as in it, or so many wait
@@ -259,7 +251,7 @@ impl MapIndex {
     /// Processes up to `most` waiting slots; returns the sealed graph, if this completed one. Only one thread may call
     /// it at a time; searches continue meanwhile.
     ///
-    /// New slots go into the growing graph. Once it covers as many slots as the sealed graph, or many slots arrive at
+    /// New slots go into the growing graph, whose images are then searched for again. Once it covers as many slots as the sealed graph, or many slots arrive at
     /// once, a graph over all slots is built, which replaces both: each slot is inserted into a sealed graph a few times
     /// on average, whatever the size of the map. `threads` share the work.
     pub fn catch_up(
@@ -296,6 +288,8 @@ impl MapIndex {
             let mut graphs = self.graphs_mut();
             graphs.growing = Some(growing);
             graphs.graphed = end;
+        } else if let Some(growing) = self.graphs().growing.clone() {
+            growing.check(vectors, most, threads);
         }
         None
     }
