@@ -6,7 +6,8 @@
 //! ```
 //!
 //! All numbers are little-endian. The CRC-32 of a row covers its slot and its numbers, so that it
-//! detects rows that were never written, are torn, or belong to another slot.
+//! detects rows that were never written, are torn, or belong to another slot. A header says nothing
+//! that the map's record does not, so a damaged one is written again.
 
 use std::fs::{self, File};
 use std::io;
@@ -139,9 +140,18 @@ impl VectorFiles {
         let mut found = [0; HEADER_BYTES];
         file.read_exact_at(&mut found, 0)?;
         if found != header {
-            return Err(io::Error::other(
-                "its header is damaged or of another version; restore a backup",
-            ));
+            if is_header(&found) {
+                return Err(io::Error::other(
+                    "its header is of another version or dimension; start the version that wrote it, \
+                     or restore a backup into a new folder",
+                ));
+            }
+            tracing::warn!(
+                file = %path.display(),
+                "the header of a segment is damaged; it is written again, and each row is checked"
+            );
+            file.write_all_at(&header, 0)?;
+            file.sync_data()?;
         }
         // The missing end of a truncated segment reads as zeros, which fail the checksum.
         if file.metadata()?.len() < length {
@@ -218,6 +228,11 @@ impl Vectors for VectorFiles {
     }
 }
 
+/// Whether this is an undamaged header, of whatever version.
+fn is_header(bytes: &[u8; HEADER_BYTES]) -> bool {
+    bytes.starts_with(MAGIC) && bytes[20..24] == crc32fast::hash(&bytes[..20]).to_le_bytes()
+}
+
 fn checksum(slot: &[u8], vector: &[u8]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();
     hasher.update(slot);
@@ -272,6 +287,23 @@ mod tests {
         VectorFiles::open(dir.path().join("m"), 4).unwrap().write(0, &[1.0; 4]).unwrap();
         let error = VectorFiles::open(dir.path().join("m"), 5).map(drop).unwrap_err();
         assert!(error.to_string().contains("header"), "{error}");
+    }
+
+    #[test]
+    fn a_damaged_header_is_written_again_and_loses_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let files = VectorFiles::open(dir.path().join("m"), 4).unwrap();
+        files.write(0, &[1.0; 4]).unwrap();
+        let path = files.path(0);
+        drop(files);
+        for (at, bytes) in
+            [(0, vec![0; HEADER_BYTES]), (3, vec![b'x']), (12, vec![5]), (22, vec![9])]
+        {
+            File::options().write(true).open(&path).unwrap().write_all_at(&bytes, at).unwrap();
+            let files = VectorFiles::open(dir.path().join("m"), 4).unwrap();
+            assert!(files.is_intact(0), "{} bytes at {at}", bytes.len());
+            assert_eq!(fs::read(&path).unwrap()[..HEADER_BYTES], files.header());
+        }
     }
 
     #[test]
