@@ -87,7 +87,10 @@ pub enum DecodeError {
     #[error("the JPEG is truncated: its data ends before its last row; send it whole")]
     Truncated,
     /// The decoder failed.
-    #[error("the {format} cannot be decoded: {reason}")]
+    #[error(
+        "the {format} cannot be decoded: {reason}; check that it arrived whole and send it again, or save it again \
+         with another program"
+    )]
     Damaged {
         /// Format by the magic bytes.
         format: &'static str,

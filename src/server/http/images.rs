@@ -101,8 +101,8 @@ impl MetaParams {
             (Some(id), Some(number)) => Some(Recording { id, number }),
             (None, None) => None,
             _ => {
-                let detail = "recording and number belong together: the UUID of a recording, and the number of \
-                              the image in it";
+                let detail = "recording and number belong together: send both, the UUID of a recording and the \
+                              number of the image in it, or neither";
                 return Err(Problem::new(ErrorKind::Malformed, detail));
             }
         };
