@@ -142,8 +142,7 @@ impl Graph {
         let due = self.due.load(Ordering::Relaxed);
         let to = old.min(from + most.min(due));
         self.again.store(to, Ordering::Relaxed);
-        // What was inserted just now counts as well: without older images none would remain due.
-        self.due.store(due.saturating_sub(to - from + end - old), Ordering::Relaxed);
+        self.due.store(due.saturating_sub(to - from), Ordering::Relaxed);
         let is_missed = |slot: usize, point: usize| {
             let mut missed = false;
             // A slot whose row is gone cannot be searched for; another of the same point can.
