@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino chromium test scale-out conformance console console-bench examples crash fuzz lint features advisories format bench load soak record-examples openapi package clean
+.PHONY: help demo build assets nasm openvino chromium test scale-out conformance console console-bench examples crash fuzz lint features advisories format bench load soak record-examples openapi package wheel clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -24,6 +24,9 @@ nasm:
 openvino: ## Also download ONNX Runtime with OpenVINO, faster on many x86-64 processors
 	deploy/setup/assets.sh --openvino assets
 
+wheel: build ## Build the Python wheel, with the binary, the model and the client, in target/wheels
+	deploy/wheel/build.sh target/wheel-venv target/wheels
+
 chromium:
 	@deploy/setup/chromium.sh
 
@@ -38,6 +41,8 @@ test: assets nasm chromium ## Set up, build and run every test
 	tests/deploy/check.sh $(BINARY) target/deploy-venv
 	tests/mllm/check.sh $(BINARY) target/mllm-venv
 	examples/check.sh $(BINARY) target/examples-venv
+	deploy/wheel/build.sh target/wheel-venv target/wheels
+	tests/wheel/check.sh target/wheels target/wheel-test-venv
 
 scale-out: assets nasm ## Run only the black-box tests of servers and workers on a shared database
 	tests/scale_out.sh $(CARGO) target/postgres-venv

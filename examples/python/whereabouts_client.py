@@ -23,7 +23,7 @@ from datetime import datetime
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, TypeVar, cast, get_args, get_type_hints
 from urllib.parse import quote
 
 import httpx
@@ -44,8 +44,37 @@ JobState: TypeAlias = Literal["queued", "running", "succeeded", "degraded", "fai
 
 T = TypeVar("T")
 
-Picture: TypeAlias = "bytes | str | os.PathLike[str]"
-"""A picture (JPEG, PNG, WebP, TIFF, BMP, GIF or PNM): its bytes or the path of a file."""
+class Pixels(Protocol):
+    """An array of numpy, or one like it, of 8-bit samples: height × width of grey, or height × width × 3 or 4
+    of RGB or RGBA. OpenCV has BGR: pass `frame[:, :, ::-1]`."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+    @property
+    def dtype(self) -> Any: ...
+    def tobytes(self) -> bytes: ...
+
+
+class PilImage(Protocol):
+    """An image of Pillow."""
+
+    @property
+    def size(self) -> tuple[int, int]: ...
+    def convert(self, mode: str) -> Any: ...
+
+
+class ImageMessage(Protocol):
+    """A ROS message `sensor_msgs/Image` with the encoding `rgb8`, `bgr8`, `rgba8`, `bgra8` or `mono8`."""
+
+    encoding: str
+    width: int
+    height: int
+    step: int
+    data: Any
+
+
+Picture: TypeAlias = "bytes | str | os.PathLike[str] | Pixels | PilImage | ImageMessage"
+"""A picture: bytes or path of a file (JPEG, PNG, WebP, TIFF, BMP, GIF or PNM), or pixels in memory."""
 
 
 class Problem(Exception):
@@ -917,10 +946,12 @@ def _segment(text: str) -> str:
 
 def _load(picture: Picture) -> tuple[str, bytes, str]:
     """Returns the file name, bytes and media type of a picture."""
-    if isinstance(picture, bytes):
-        name, data = "picture", picture
-    else:
+    if isinstance(picture, bytes | bytearray | memoryview):
+        name, data = "picture", bytes(picture)
+    elif isinstance(picture, str | os.PathLike):
         name, data = Path(picture).name, Path(picture).read_bytes()
+    else:
+        name, data = "picture", _portable(picture)
     if data.startswith(b"\xff\xd8\xff"):
         return name, data, "image/jpeg"
     if data.startswith(b"\x89PNG\r\n\x1a\n"):
@@ -929,3 +960,55 @@ def _load(picture: Picture) -> tuple[str, bytes, str]:
         return name, data, "image/webp"
     # TIFF, BMP, GIF, PNM and whatever else: the server decides.
     return name, data, "application/octet-stream"
+
+
+_LAYOUTS = {"mono8": "0", "rgb8": "012", "bgr8": "210", "rgba8": "012.", "bgra8": "210."}
+
+
+def _portable(picture: object) -> bytes:
+    """Writes pixels in memory as a portable anymap, which costs a copy and loses nothing but transparency."""
+    if hasattr(picture, "encoding") and hasattr(picture, "step"):
+        message = cast(ImageMessage, picture)
+        layout = _LAYOUTS.get(message.encoding)
+        if layout is None:
+            known = ", ".join(_LAYOUTS)
+            raise ValueError(f"the encoding {message.encoding!r} is none of {known}; convert the image first")
+        width, height, step, data = message.width, message.height, message.step, bytes(message.data)
+        row = width * len(layout)
+        if step < row or len(data) < step * (height - 1) + row:
+            size = f"{width} × {height} pixels of {message.encoding}"
+            raise ValueError(f"{len(data)} bytes in rows of {step} are not {size}; check step and data")
+        rows = b"".join(data[at * step : at * step + row] for at in range(height))
+        return _anymap(width, height, layout, rows)
+    if hasattr(picture, "convert") and hasattr(picture, "size"):
+        rgb = cast(PilImage, picture).convert("RGB")
+        width, height = rgb.size
+        return _anymap(width, height, "012", rgb.tobytes())
+    if hasattr(picture, "shape") and hasattr(picture, "tobytes"):
+        array = cast(Pixels, picture)
+        shape = array.shape if len(array.shape) == 3 else (*array.shape, 1)
+        if str(array.dtype) != "uint8" or len(shape) != 3 or shape[2] not in (1, 3, 4):
+            raise ValueError(
+                f"an array of {array.dtype} with the shape {tuple(array.shape)} is no picture: pass 8-bit "
+                "samples (uint8), height × width of grey, or height × width × 3 of RGB"
+            )
+        height, width, channels = shape
+        layout = {1: "0", 3: "012", 4: "012."}[channels]
+        return _anymap(width, height, layout, array.tobytes())
+    raise TypeError(
+        f"{type(picture).__name__} is no picture: pass the path or the bytes of a file, an array of uint8, "
+        "an image of Pillow or a sensor_msgs/Image"
+    )
+
+
+def _anymap(width: int, height: int, layout: str, samples: bytes) -> bytes:
+    """A PGM or PPM of samples whose channels have this order; `.` is left out."""
+    if layout in ("0", "012"):
+        ordered = samples
+    else:
+        wanted = bytearray(width * height * 3)
+        for channel, target in enumerate(layout):
+            if target != ".":
+                wanted[int(target) :: 3] = samples[channel :: len(layout)]
+        ordered = bytes(wanted)
+    return b"P%d\n%d %d\n255\n" % (5 if layout == "0" else 6, width, height) + ordered

@@ -22,6 +22,7 @@ mod pool;
 pub mod pooling;
 pub mod preprocess;
 mod provider;
+mod python;
 mod raw_pixels;
 mod runtime;
 mod session;

@@ -11,6 +11,7 @@ use parking_lot::Mutex;
 use super::execution::Provider;
 use super::input_sizes::InputSizes;
 use super::manifest::{MANIFEST, Manifest, ManifestError};
+use super::python;
 
 /// The model name that [`Assets::resolve`] replaces by an installed model.
 pub const AUTO: &str = "auto";
@@ -53,6 +54,8 @@ impl fmt::Display for WhyModel {
 #[derive(Debug, Clone)]
 pub struct Assets {
     candidates: Vec<PathBuf>,
+    /// Package folders of Python with an ONNX Runtime of their own.
+    packages: Vec<PathBuf>,
     sizes: InputSizes,
 }
 
@@ -61,8 +64,9 @@ pub struct Assets {
 pub enum RuntimeError {
     /// The shared library was not found.
     #[error(
-        "ONNX Runtime was not found (searched {searched}); run `make build` in the checkout, or set \
-         ORT_DYLIB_PATH to a libonnxruntime of version 1.24 or later"
+        "ONNX Runtime was not found (searched {searched}); run `make build` in the checkout, or `pip install \
+         onnxruntime` where `whereabouts-vpr` is installed, or set ORT_DYLIB_PATH to a libonnxruntime of version \
+         1.24 or later"
     )]
     NoLibrary {
         /// The folders that were searched.
@@ -70,7 +74,8 @@ pub enum RuntimeError {
     },
     /// The shared library cannot be loaded.
     #[error(
-        "ONNX Runtime at {path} cannot be loaded: {reason}; `make build` installs one that can"
+        "ONNX Runtime at {path} cannot be loaded: {reason}; `make build` in the checkout installs one that can, or \
+         `pip install 'onnxruntime>=1.24'` where `whereabouts-vpr` is installed"
     )]
     Library {
         /// Path of the library.
@@ -104,14 +109,19 @@ pub enum RuntimeError {
 
 impl Assets {
     /// Searches the configured folder, if any, and then the default locations: `assets` next to the binary
-    /// or up to three folders above it (for a checkout's `target/release`), and `/usr/lib/whereabouts`.
+    /// or up to three folders above it (for a checkout's `target/release`), the Python package `whereabouts`
+    /// if pip installed the binary, and `/usr/lib/whereabouts`.
     pub fn locate(configured: Option<&Path>) -> Self {
         let binary = std::env::current_exe().unwrap_or_default();
         let next_to_binary = binary.ancestors().skip(1).take(4).map(|folder| folder.join("assets"));
         let installed = PathBuf::from("/usr/lib/whereabouts");
         let configured = configured.map(Path::to_owned);
+        let packages = python::package_folders(&binary);
+        let of_python = packages.iter().map(|packages| python::assets(packages));
+        let candidates = configured.into_iter().chain(next_to_binary).chain(of_python);
         Self {
-            candidates: configured.into_iter().chain(next_to_binary).chain([installed]).collect(),
+            candidates: candidates.chain([installed]).collect(),
+            packages,
             sizes: InputSizes::default(),
         }
     }
@@ -223,13 +233,13 @@ impl Assets {
             .flat_map(|folder| self.candidates.iter().map(move |assets| assets.join(folder)))
             .map(|folder| folder.join(&name))
             .find(|path| path.is_file())
+            .or_else(|| self.packages.iter().find_map(|packages| python::onnxruntime(packages)))
             .ok_or_else(|| RuntimeError::NoLibrary { searched: self.searched() })
     }
 
     fn searched(&self) -> String {
-        let folders: Vec<_> =
-            self.candidates.iter().map(|path| path.display().to_string()).collect();
-        folders.join(", ")
+        let folders = self.candidates.iter().chain(&self.packages);
+        folders.map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
     }
 }
 
@@ -247,8 +257,8 @@ mod tests {
             fs::create_dir_all(&folder).unwrap();
             fs::write(folder.join(MANIFEST), "").unwrap();
         }
-        let assets =
-            Assets { candidates: vec![dir.path().to_owned()], sizes: InputSizes::default() };
+        let candidates = vec![dir.path().to_owned()];
+        let assets = Assets { candidates, packages: Vec::new(), sizes: InputSizes::default() };
         (dir, assets)
     }
 

@@ -174,8 +174,9 @@ fn print_figures(
 
 fn print_commands(localized: &[LocalizedFrame], folders: &DemoFolders) {
     println!("\n5. The same by hand");
-    println!("   target/release/whereabouts serve --data {} &", shown(&folders.data));
-    println!("   target/release/whereabouts index {} --map {MAP}", shown(&folders.map));
+    let command = std::env::args().next().unwrap_or_else(|| "whereabouts".into());
+    println!("   {command} serve --data {} &", shown(&folders.data));
+    println!("   {command} index {} --map {MAP}", shown(&folders.map));
     let frame = localized.first().map_or_else(String::new, |first| shown(&first.frame.file));
     println!(
         "   curl -H 'Content-Type: image/jpeg' --data-binary @{frame} \\\n     \
