@@ -22,6 +22,7 @@ mod mllm;
 mod model;
 mod openapi;
 mod progress;
+mod read;
 mod restore;
 mod serve;
 
@@ -51,6 +52,7 @@ enum Command {
     Migrate(migrate::Args),
     Index(index::Args),
     Localize(localize::Args),
+    Read(read::Args),
     Jobs(jobs::Args),
     Keys(keys::Args),
     Model(model::Args),
@@ -78,6 +80,7 @@ impl Cli {
             Command::Migrate(args) => block_on(migrate::run(args)),
             Command::Index(args) => block_on(index::run(args)),
             Command::Localize(args) => block_on(localize::run(args)),
+            Command::Read(args) => read::run(&args),
             Command::Jobs(args) => block_on(jobs::run(args)),
             Command::Keys(args) => block_on(keys::run(args)),
             Command::Model(args) => block_on(model::run(args)),
