@@ -148,6 +148,7 @@ class RealServer(unittest.TestCase):
             self.assertTrue(job.ended)
             assert job.ranking
             self.assertEqual(job.ranking[0].image_id, f"place-{number:04}.jpg")
+            self.assertEqual(answer.ranking, job.ranking)
 
     def test_without_refinement_there_is_no_job(self) -> None:
         answer = self.service.localize("town", self.frame(0), refine="off")

@@ -91,6 +91,7 @@ impl From<Estimate> for proto::Estimate {
 
 impl From<Answer> for proto::LocalizeResponse {
     fn from(answer: Answer) -> Self {
+        let ranking = answer.ranking.as_ref().map(|ranking| ranking.as_slice()).unwrap_or_default();
         Self {
             query_id: answer.query_id.to_string(),
             map: answer.map.into(),
@@ -105,6 +106,7 @@ impl From<Answer> for proto::LocalizeResponse {
             no_job: answer.no_job.map(Into::into),
             timing: Some(answer.timing_ms.into()),
             warnings: answer.warnings,
+            ranking: ranking.iter().map(Into::into).collect(),
         }
     }
 }

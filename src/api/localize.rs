@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
-use whereabouts_core::{Candidate, Estimate, ImageId, JobState, MapName, Pose};
+use whereabouts_core::{Candidate, Estimate, ImageId, JobState, MapName, Pose, Ranking};
 
 /// How the candidates are refined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
@@ -27,7 +27,7 @@ pub struct Answer {
     pub map: MapName,
     /// Model that computed the descriptor.
     pub model: String,
-    /// The most similar images, best first.
+    /// The most similar images, best first, whether or not they are refined.
     pub candidates: Vec<Candidate>,
     /// The most likely place; null in an empty map.
     #[schema(nullable)]
@@ -39,6 +39,11 @@ pub struct Answer {
     /// The refinement job; null if there is none.
     #[schema(nullable)]
     pub job: Option<JobLink>,
+    /// With `refine=wait`, the refined order of the candidates once the job has ended, to which `estimate` belongs;
+    /// otherwise null. It may have more candidates than the answer.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub ranking: Option<Ranking>,
     /// Why there is no job although one was requested; otherwise null.
     #[serde(default)]
     #[schema(nullable)]

@@ -17,6 +17,7 @@ mod index;
 mod jobs;
 mod keys;
 mod localize;
+mod manual;
 mod migrate;
 mod mllm;
 mod model;
@@ -66,6 +67,8 @@ enum Command {
     Config(config::Args),
     /// Print the OpenAPI description of the HTTP API
     Openapi,
+    Completions(manual::CompletionsArgs),
+    Man(manual::ManArgs),
     Healthcheck(healthcheck::Args),
 }
 
@@ -93,6 +96,8 @@ impl Cli {
             Command::Doctor(args) => doctor::run(args),
             Command::Config(args) => config::run(&args),
             Command::Openapi => openapi::run(),
+            Command::Completions(args) => manual::completions(&args),
+            Command::Man(args) => manual::man(&args),
             Command::Healthcheck(args) => block_on(healthcheck::run(args)),
         };
         match result {

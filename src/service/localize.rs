@@ -200,12 +200,14 @@ impl Localizer {
         let estimate = self.estimate(&candidates, &calibration);
         let mut estimate = estimate.map(|estimate| estimate.unless(uninformative.as_deref()));
         candidates.truncate(k);
+        let mut ranking = None;
         if request.refine == RefineMode::Wait
             && let Some(queued) = &mut job
         {
             let longest = time_left(self.jobs.max_wait, request.deadline);
             *queued = self.jobs.wait_for(queued.id, longest).await?;
             estimate = queued.estimate.clone().or(estimate);
+            ranking = queued.ranking.clone();
         }
         let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
         Ok(Answer {
@@ -220,6 +222,7 @@ impl Localizer {
                 href: format!("/jobs/{}", job.id),
                 state: job.state,
             }),
+            ranking,
             no_job,
             warnings,
             timing_ms: TimingMs {

@@ -161,6 +161,24 @@ async fn a_job_whose_map_was_deleted_ends_with_the_reason() {
 }
 
 #[tokio::test]
+async fn an_answer_that_waited_has_the_refined_order_and_any_other_has_none() {
+    let (server, map) = shared_server();
+    server.town(&map, 3).await;
+    for mode in ["wait", "async", "off"] {
+        let path = format!("/localize?map={map}&refine={mode}");
+        let answer = server.post_jpeg(&path, frame(0, 0)).await.expect(200);
+        if mode == "wait" {
+            let job = server.get(answer["job"]["href"].as_str().unwrap()).await.expect(200);
+            assert_eq!(answer["ranking"].as_array().unwrap().len(), 3);
+            assert_eq!(answer["ranking"], job["ranking"]);
+            assert_eq!(answer["estimate"]["image_id"], answer["ranking"][0]["image_id"]);
+        } else {
+            assert!(answer["ranking"].is_null(), "{mode}: {answer}");
+        }
+    }
+}
+
+#[tokio::test]
 async fn an_ended_job_is_not_cancelled_and_a_succeeded_one_is_not_retried() {
     let (server, map) = shared_server();
     server.town(&map, 2).await;

@@ -240,6 +240,15 @@ class Contract(unittest.TestCase):
             else:
                 self.assertEqual(call().track.frames, 4)
 
+    def test_an_answer_that_waited_has_the_refined_order(self) -> None:
+        frame = pictures("frames")[2][1]
+        for refine, has_order in ((2, True), (3, False)):
+            request = self.message("LocalizeRequest", map="town", image=frame, refine=refine)
+            answer = self.call("LocalizationService", "Localize", request)
+            self.assertEqual(len(answer.ranking) >= len(answer.candidates) > 0, has_order)
+            if has_order:
+                self.assertEqual(answer.ranking[0].image_id, answer.estimate.image_id)
+
     def test_a_job_can_be_watched_until_it_ends(self) -> None:
         frame = pictures("frames")[1][1]
         request = self.message("LocalizeRequest", map="town", image=frame)

@@ -43,7 +43,7 @@ impl Odometry {
     pub fn distance(metres: f64) -> Result<Self, ServiceError> {
         if !(0.0..=MAX_MOVED_M).contains(&metres) {
             return Err(ServiceError::unprocessable(format!(
-                "moved_m is {metres}; it must be the metres moved since the previous frame, 0 to {MAX_MOVED_M}"
+                "moved_m is {metres:?}; it must be the metres moved since the previous frame, 0 to {MAX_MOVED_M}"
             )));
         }
         Ok(Self { metres, error: None, backwards: None, turned: 0.0 })
