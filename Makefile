@@ -3,7 +3,7 @@
 CARGO ?= cargo
 BINARY := target/release/whereabouts
 
-.PHONY: help demo build assets nasm openvino chromium test scale-out conformance console console-bench examples crash fuzz lint features advisories format bench load soak record-examples openapi package wheel clean
+.PHONY: help demo build assets reader nasm openvino chromium test scale-out conformance console console-bench examples crash fuzz lint features advisories format bench load soak record-examples openapi package wheel clean
 
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
@@ -21,6 +21,9 @@ assets: ## Download ONNX Runtime and the built-in model, pinned by version and h
 nasm:
 	@deploy/setup/nasm.sh
 
+reader: ## Also download the reader of scene text, PP-OCRv5, pinned by version and hash
+	deploy/setup/reader.sh assets
+
 openvino: ## Also download ONNX Runtime with OpenVINO, faster on many x86-64 processors
 	deploy/setup/assets.sh --openvino assets
 
@@ -31,7 +34,7 @@ chromium:
 	@deploy/setup/chromium.sh
 
 # Most tests wait for a server: two at a time would leave a two-core machine half idle.
-test: assets nasm chromium ## Set up, build and run every test
+test: assets reader nasm chromium ## Set up, build and run every test
 	RUST_TEST_THREADS=4 tests/postgres.sh target/postgres-venv tests/s3.sh target/s3-venv $(CARGO) test --release --locked --workspace
 	tests/scale_out.sh $(CARGO) target/postgres-venv
 	tests/optional.sh $(CARGO)
@@ -40,6 +43,7 @@ test: assets nasm chromium ## Set up, build and run every test
 	tests/console/check.sh $(BINARY) target/console-venv
 	tests/deploy/check.sh $(BINARY) target/deploy-venv
 	tests/mllm/check.sh $(BINARY) target/mllm-venv
+	tests/reading/check.sh $(BINARY) target/reading-venv
 	examples/check.sh $(BINARY) target/examples-venv
 	deploy/wheel/build.sh target/wheel-venv target/wheels
 	tests/wheel/check.sh target/wheels target/wheel-test-venv

@@ -33,7 +33,7 @@ export PATH=$venv/bin:$PATH PYTHONDONTWRITEBYTECODE=1
 
 step ruff
 ruff check --no-cache .
-ruff check --no-cache --config ruff.toml ../tests/grpc ../tests/wheel ../deploy/wheel
+ruff check --no-cache --config ruff.toml ../tests/grpc ../tests/reading ../tests/wheel ../deploy/wheel
 
 step "mypy --strict"
 types=(mypy --strict --python-version 3.10 --cache-dir "$venv/mypy-cache")
@@ -43,7 +43,7 @@ types=(mypy --strict --python-version 3.10 --cache-dir "$venv/mypy-cache")
 (cd ros2 && "${types[@]}" --ignore-missing-imports --allow-subclassing-any whereabouts_node.py)
 
 step shellcheck
-shellcheck -x ./*.sh "$load"/*.sh ../tests/*.sh ../tests/api/*.sh ../tests/grpc/*.sh ../tests/console/*.sh ../tests/deploy/*.sh ../tests/wheel/*.sh ../deploy/wheel/*.sh
+shellcheck -x ./*.sh "$load"/*.sh ../tests/*.sh ../tests/api/*.sh ../tests/grpc/*.sh ../tests/console/*.sh ../tests/deploy/*.sh ../tests/reading/*.sh ../tests/wheel/*.sh ../deploy/wheel/*.sh
 
 step "tests of the ROS 2 localizer"
 (cd ros2 && timeout 60 python -m unittest)

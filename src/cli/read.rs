@@ -1,9 +1,9 @@
 //! `whereabouts read`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use anyhow::Context;
+use anyhow::bail;
 use serde_json::json;
 use whereabouts_reading::{OnnxReader, Reader, ReaderSettings};
 use whereabouts_server::config::{Config, Overrides};
@@ -45,26 +45,36 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         max_lines: usize::from(args.max_lines),
     };
     let reader = OnnxReader::load(&assets, &settings)?;
-    let limits = ImageLimits { max_pixels: config.image.max_pixels };
+    let limits = config.image.limits();
+    let mut failed = 0;
     for file in &args.files {
-        let shown = file.display();
-        let bytes = std::fs::read(file).with_context(|| format!("cannot read {shown}"))?;
-        let picture =
-            decode(&bytes, limits, Needed::All).with_context(|| format!("cannot read {shown}"))?;
-        let start = Instant::now();
-        let lines = reader.read(&picture).with_context(|| format!("cannot read {shown}"))?;
-        let took_ms = start.elapsed().as_secs_f64() * 1e3;
-        if args.json {
-            let size = [picture.width, picture.height];
-            println!("{}", json!({"file": file, "size": size, "took_ms": took_ms, "lines": lines}));
-            continue;
+        if let Err(error) = read(&reader, file, limits, args.json) {
+            eprintln!("whereabouts: cannot read {}: {error:#}", file.display());
+            failed += 1;
         }
-        println!("{shown}: {} lines in {took_ms:.0} ms", lines.len());
-        for line in &lines {
-            let [x, y] = line.corners[0];
-            let (x, y) = (x * picture.width as f32, y * picture.height as f32);
-            println!("  {:3.0} %  at {x:4.0}, {y:4.0}  {}", line.confidence * 100.0, line.text);
-        }
+    }
+    match failed {
+        0 => Ok(()),
+        _ => bail!("{failed} of {} files could not be read; see above", args.files.len()),
+    }
+}
+
+/// Reads one picture and prints its lines.
+fn read(reader: &OnnxReader, file: &Path, limits: ImageLimits, json: bool) -> anyhow::Result<()> {
+    let picture = decode(&std::fs::read(file)?, limits, Needed::All)?;
+    let start = Instant::now();
+    let lines = reader.read(&picture)?;
+    let took_ms = start.elapsed().as_secs_f64() * 1e3;
+    if json {
+        let size = [picture.width, picture.height];
+        println!("{}", json!({"file": file, "size": size, "took_ms": took_ms, "lines": lines}));
+        return Ok(());
+    }
+    println!("{}: {} lines in {took_ms:.0} ms", file.display(), lines.len());
+    for line in &lines {
+        let [x, y] = line.corners[0];
+        let (x, y) = (x * picture.width as f32, y * picture.height as f32);
+        println!("  {:3.0} %  at {x:4.0}, {y:4.0}  {}", line.confidence * 100.0, line.text);
     }
     Ok(())
 }

@@ -99,6 +99,7 @@ impl Reader for OnnxReader {
                 texts[owner] = text;
             }
         }
+        let size = [pixels.width() as f32, pixels.height() as f32];
         let lines = quads.into_iter().zip(texts).filter_map(|(quad, (text, confidence))| {
             let text = text.trim().to_owned();
             let is_read = !text.is_empty() && confidence >= spec.least_confidence;
