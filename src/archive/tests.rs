@@ -45,7 +45,7 @@ pub(super) fn image(id: &str) -> (ExportedImage, Bytes) {
         created_at: Timestamp::UNIX_EPOCH,
     };
     let descriptor = Some(Descriptor::normalised(vec![1.0, 2.0]).unwrap());
-    (ExportedImage { image, descriptor, position: Some(7), recording: None }, bytes)
+    (ExportedImage { image, descriptor, position: Some(7), recording: None, texts: None }, bytes)
 }
 
 fn archived(name: &str, images: usize) -> ArchivedMap {

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-use super::{Descriptor, Digest, InvalidName, Pose};
+use super::{Descriptor, Digest, ImageTexts, InvalidName, Pose};
 
 /// The id of an image within its map: 1 to 200 bytes of printable text.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, ToSchema)]
@@ -272,6 +272,9 @@ pub struct ExportedImage {
     /// Its place in a recording, if its sender said so.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recording: Option<Recording>,
+    /// What was read in it, if it was read.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub texts: Option<ImageTexts>,
 }
 
 #[cfg(test)]

@@ -12,6 +12,7 @@ mod descriptor_kind;
 mod digest;
 mod estimate;
 mod image;
+mod image_texts;
 mod job;
 mod key;
 mod leftovers;
@@ -25,6 +26,7 @@ mod secret;
 mod service_time;
 mod spend;
 mod text_line;
+pub mod text_search;
 pub mod units;
 mod utm;
 mod verdict;
@@ -41,6 +43,7 @@ pub use descriptor::{Descriptor, DescriptorError, dot};
 pub use descriptor_kind::DescriptorKind;
 pub use digest::Digest;
 pub use estimate::Estimate;
+pub use image_texts::ImageTexts;
 pub use job::{
     DayUsage, Description, Job, JobState, JobVerdict, Priority, RefinerKind, StandIn, Usage,
     utc_day,

@@ -21,6 +21,7 @@ mod objects;
 #[cfg(feature = "postgres")]
 pub mod postgres;
 mod retention;
+mod texts;
 mod tracks;
 mod usage;
 mod webhooks;
@@ -38,6 +39,7 @@ pub use self::maps::{Added, ExportStore, HardNegatives, IndexState, LocatedImage
 #[cfg(feature = "postgres")]
 pub use self::objects::{ObjectSettings, Objects};
 pub use self::retention::{JobRetention, RemovedJobs, Retention};
+pub use self::texts::{TextCandidate, TextCounts, TextStore};
 pub use self::tracks::{StoredTrack, TrackHead, TrackKey, TrackRead, TrackState, TrackStore};
 pub use self::usage::UsageStore;
 pub use self::webhooks::{DeliveryRetention, RemovedDeliveries, StoredDelivery, WebhookStore};
@@ -56,6 +58,7 @@ pub trait Store:
     + DescriptionCache
     + Retention
     + TrackStore
+    + TextStore
 {
 }
 
@@ -72,5 +75,6 @@ impl<T> Store for T where
         + DescriptionCache
         + Retention
         + TrackStore
+        + TextStore
 {
 }

@@ -14,7 +14,7 @@ use jiff::Timestamp;
 use rayon::ThreadPoolBuilder;
 use uuid::Uuid;
 use whereabouts_archive::{ArchivedMap, LeftOut, Manifest, Writer};
-use whereabouts_core::ExportedImage;
+use whereabouts_core::{ExportedImage, ImageTexts, TextLine};
 use whereabouts_core::{
     CoordinateFrame, Descriptor, DescriptorKind, Digest, Image, Map, MediaType, Precision, Scene,
 };
@@ -150,7 +150,9 @@ pub fn archives() -> Vec<Vec<u8>> {
     let left_out = LeftOut { id: "2".parse().unwrap(), why: "damaged".into() };
     let mut writer = Writer::begin(&path, &Manifest::new(vec![map.name.clone()])).unwrap();
     writer.map(&map, None).unwrap();
-    let exported = ExportedImage { image, descriptor, position: None, recording: None };
+    let line = TextLine { text: "Kawa".into(), confidence: 0.5, corners: [[0.5; 2]; 4] };
+    let texts = Some(ImageTexts::read(Digest::of(b"reader"), vec![line]));
+    let exported = ExportedImage { image, descriptor, position: None, recording: None, texts };
     writer.image(&map.name, &exported, &bytes).unwrap();
     writer.left_out(&map.name, &left_out).unwrap();
     let archived = ArchivedMap { name: map.name, images: 1, left_out: vec![left_out] };

@@ -369,6 +369,7 @@ async fn images_are_exported_in_pages_with_bit_identical_descriptors(fixture: &F
             image,
             position: None,
             recording: None,
+            texts: None,
         })
         .collect();
     let exported = async |after, limit| -> Vec<ExportedImage> {

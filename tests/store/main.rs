@@ -28,6 +28,7 @@ mod processes;
 mod retention;
 mod schema;
 mod search;
+mod texts;
 mod tracks;
 mod usage;
 mod webhooks;

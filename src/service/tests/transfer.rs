@@ -14,8 +14,13 @@ fn yard() -> MapName {
 /// The first image of another store, as that exports it.
 fn exported() -> (Vec<u8>, ImportedImage) {
     let (bytes, image) = image(0, Some(1.0));
-    let image =
-        ExportedImage { image, descriptor: Some(descriptor(0)), position: None, recording: None };
+    let image = ExportedImage {
+        image,
+        descriptor: Some(descriptor(0)),
+        position: None,
+        recording: None,
+        texts: None,
+    };
     (bytes, ImportedImage { map: map("other"), image })
 }
 

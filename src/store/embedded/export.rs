@@ -26,7 +26,8 @@ impl ExportStore for EmbeddedStore {
                 .map(|stored| {
                     let StoredImage { image, slot, recording } = stored?;
                     let (descriptor, position) = (live.vectors.read(slot), Some(slot as u64));
-                    Ok(ExportedImage { image, descriptor, position, recording })
+                    let texts = inner.trees.read_texts(uid, &image.id)?;
+                    Ok(ExportedImage { image, descriptor, position, recording, texts })
                 })
                 .collect()
         })

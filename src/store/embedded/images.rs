@@ -10,6 +10,7 @@ use sled::Transactional;
 use uuid::Uuid;
 
 use super::super::StoreError;
+use super::texts::gram_keys;
 use super::trees::{
     BlobOwner, Trees, blob_ref_key, decode, encode, failed, get, image_key, transaction_failed,
 };
@@ -232,15 +233,19 @@ impl Trees {
             .map_err(transaction_failed)
     }
 
-    /// Removes images and their references to bytes.
+    /// Removes images, what was read in them and their references to bytes.
     pub fn remove_images(&self, map_uid: Uuid, removed: &[StoredImage]) -> Result<(), StoreError> {
-        (&self.images, &self.slots, &self.blob_refs)
-            .transaction(|(images, slots, refs)| {
+        (&self.images, &self.slots, &self.blob_refs, &self.texts, &self.text_grams)
+            .transaction(|(images, slots, refs, texts, grams)| {
                 for StoredImage { image, slot, .. } in removed {
                     images.remove(image_key(map_uid, &image.id))?;
                     slots.remove(&slot_key(map_uid, *slot))?;
                     let owner = BlobOwner::Image { map_uid, id: &image.id };
                     refs.remove(blob_ref_key(&image.digest, &owner))?;
+                    let read = texts.remove(image_key(map_uid, &image.id))?;
+                    for key in read.iter().flat_map(|read| gram_keys(map_uid, &image.id, read)) {
+                        grams.remove(key)?;
+                    }
                 }
                 Ok(())
             })

@@ -35,6 +35,7 @@ mod schema;
 mod segments;
 #[cfg(test)]
 mod test_records;
+mod texts;
 mod tracks;
 mod trees;
 mod usage;

@@ -23,6 +23,10 @@ pub(super) struct Trees {
     pub images: sled::Tree,
     /// Map uid, slot → [`Entry`](super::images::Entry).
     pub slots: sled::Tree,
+    /// Map uid, image id → what was read in it.
+    pub texts: sled::Tree,
+    /// Map uid, gram, image id → nothing: the images in whose texts a gram occurs.
+    pub text_grams: sled::Tree,
     /// Map uid → how often poses of its images were changed.
     pub moves: sled::Tree,
     /// Digest, owner → nothing: the references to image bytes.
@@ -103,6 +107,8 @@ impl Trees {
             maps: tree("maps")?,
             images: tree("images")?,
             slots: tree("slots")?,
+            texts: tree("texts")?,
+            text_grams: tree("text_grams")?,
             moves: tree("moves")?,
             blob_refs: tree("blob_refs")?,
             jobs: tree("jobs")?,

@@ -16,7 +16,7 @@ use super::descriptors::{descriptor_of, table};
 use super::search::image_id;
 use super::{Inner, PostgresStore, blobs, count, is_missing_table, record};
 use whereabouts_core::ExportedImage;
-use whereabouts_core::{Descriptor, Image, ImageId, Map, Pose, Recording};
+use whereabouts_core::{Descriptor, Image, ImageId, ImageTexts, Map, Pose, Recording};
 
 /// Number of rows that a map's counts are spread over, to reduce contention.
 const COUNT_PARTS: i16 = 16;
@@ -280,9 +280,10 @@ impl ExportStore for PostgresStore {
         let inner = &self.inner;
         let table = table(map.uid, map.revision);
         let sql = format!(
-            "SELECT i.record, d.descriptor::real[], i.slot, i.recording, i.number FROM images i
+            "SELECT i.record, d.descriptor::real[], i.slot, i.recording, i.number, t.record FROM images i
              JOIN maps m ON m.uid = i.map_uid AND m.revision = $4
              LEFT JOIN {table} d ON d.slot = i.slot
+             LEFT JOIN image_texts t ON t.map_uid = i.map_uid AND t.image = i.id
              WHERE i.map_uid = $1 AND i.id > $2 ORDER BY i.id LIMIT $3"
         );
         let query = sqlx::query_as(AssertSqlSafe(sql))
@@ -299,16 +300,18 @@ impl ExportStore for PostgresStore {
                 if found.is_empty() {
                     inner.check_revision(map).await?;
                 }
-                let exported = |(Json(image), numbers, slot, recording, number): ExportedRow| {
-                    let descriptor = numbers.and_then(descriptor_of);
-                    let recording = in_recording(recording, number);
-                    ExportedImage {
-                        image,
-                        descriptor,
-                        position: u64::try_from(slot).ok(),
-                        recording,
-                    }
-                };
+                let exported =
+                    |(Json(image), numbers, slot, recording, number, texts): ExportedRow| {
+                        let descriptor = numbers.and_then(descriptor_of);
+                        let recording = in_recording(recording, number);
+                        ExportedImage {
+                            image,
+                            descriptor,
+                            position: u64::try_from(slot).ok(),
+                            recording,
+                            texts: texts.map(|Json(texts)| texts),
+                        }
+                    };
                 Ok(found.into_iter().map(exported).collect())
             })
             .await
@@ -318,8 +321,9 @@ impl ExportStore for PostgresStore {
 /// The slot of an image, its id, its pose, and its place in a recording.
 type LocatedRow = (i64, String, Json<Pose>, Option<Uuid>, Option<i64>);
 
-/// An image, its descriptor, its slot, and its place in a recording.
-type ExportedRow = (Json<Image>, Option<Vec<f32>>, i64, Option<Uuid>, Option<i64>);
+/// An image, its descriptor, its slot, its place in a recording, and its texts.
+type ExportedRow =
+    (Json<Image>, Option<Vec<f32>>, i64, Option<Uuid>, Option<i64>, Option<Json<ImageTexts>>);
 
 /// The place in a recording that is in the columns of an image.
 fn in_recording(id: Option<Uuid>, number: Option<i64>) -> Option<Recording> {

@@ -27,6 +27,7 @@ mod retention;
 mod schema;
 mod search;
 mod statements;
+mod texts;
 mod tracks;
 mod usage;
 mod webhooks;

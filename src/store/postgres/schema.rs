@@ -36,6 +36,7 @@ fn migrations() -> Vec<Migration> {
         migration(3, "twins", include_str!("../../../migrations/0003_twins.sql")),
         migration(4, "vocabularies", include_str!("../../../migrations/0004_vocabularies.sql")),
         migration(5, "tracks", include_str!("../../../migrations/0005_tracks.sql")),
+        migration(6, "texts", include_str!("../../../migrations/0006_texts.sql")),
     ]
 }
 

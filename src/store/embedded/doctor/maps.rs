@@ -82,6 +82,18 @@ impl Doctor<'_> {
                 "the next start of the server removes them",
             );
         }
+        let wrong = self.trees.check_texts(&uids, self.options.repair)?;
+        if wrong > 0 {
+            self.report.found(
+                true,
+                format!(
+                    "{wrong} records of the texts that were read in images do not fit together, so searches for text \
+                     miss images"
+                ),
+                "--repair corrects them; the server reads again what is missing then",
+                self.options.repair,
+            );
+        }
         Ok(())
     }
 

@@ -1,0 +1,406 @@
+//! Search in texts that were read: what people type seldom equals what was read.
+//!
+//! Readers take 0 for O, 1 for l and rn for m, lose spaces, accents and apostrophes, and read one sign as two lines.
+//! [`Folded`] makes such spellings equal, [`grams`] finds the images that may match in an index, and [`TextQuery`]
+//! decides which do and how well. A store only counts grams, so every store finds the same.
+
+use std::collections::BTreeSet;
+
+use serde::Serialize;
+use unicode_normalization::UnicodeNormalization;
+use utoipa::ToSchema;
+
+use super::TextLine;
+
+/// How well a text must match, from 0 to 1.
+pub const LEAST_SCORE: f32 = 0.5;
+
+/// What a match that needs only some of the words, or words in another order, is worth at most.
+const WORDS_WORTH: f32 = 0.9;
+
+/// The share of the score that depends on how much of the line is the text that was searched for.
+const WHOLE_LINE_WORTH: f32 = 0.2;
+
+/// The share of the score that is for a text without letters that readers confuse.
+const EXACT_WORTH: f32 = 0.05;
+
+/// A text without what readers and writers get wrong: case, width, accents, punctuation, spaces, and characters that look
+/// alike.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Folded {
+    /// The characters, without spaces.
+    pub chars: Vec<char>,
+    /// The ends of the words in it.
+    pub word_ends: Vec<usize>,
+}
+
+impl Folded {
+    /// Folds a text.
+    pub fn new(text: &str) -> Self {
+        let mut chars = Vec::new();
+        let mut word_ends = Vec::new();
+        let end = |chars: &Vec<char>, ends: &mut Vec<usize>| {
+            if chars.len() > ends.last().copied().unwrap_or(0) {
+                ends.push(chars.len());
+            }
+        };
+        for character in plain(text).chars() {
+            match character {
+                // MARIO'S is also read as MARIOS.
+                '\'' | '\u{2019}' | '\u{2018}' | '`' | '\u{b4}' => {}
+                _ if is_ideographic(character) => {
+                    end(&chars, &mut word_ends);
+                    chars.push(character);
+                }
+                _ if character.is_alphanumeric() || character == '|' => {
+                    if chars.last().is_some_and(|&last| is_ideographic(last)) {
+                        end(&chars, &mut word_ends);
+                    }
+                    push_lookalike(&mut chars, &word_ends, character);
+                }
+                _ => end(&chars, &mut word_ends),
+            }
+        }
+        end(&chars, &mut word_ends);
+        Self { chars, word_ends }
+    }
+
+    /// The words.
+    pub fn words(&self) -> impl Iterator<Item = &[char]> {
+        let starts = std::iter::once(&0).chain(&self.word_ends);
+        starts.zip(&self.word_ends).map(|(&start, &end)| &self.chars[start..end])
+    }
+
+    /// Whether nothing is left.
+    pub fn is_empty(&self) -> bool {
+        self.chars.is_empty()
+    }
+
+    /// The same as text, for keys.
+    pub fn key(&self) -> String {
+        self.chars.iter().collect()
+    }
+}
+
+/// Case, width and accents folded.
+fn plain(text: &str) -> String {
+    let is_accent = |c: char| ('\u{300}'..='\u{36f}').contains(&c);
+    let mut folded = String::with_capacity(text.len());
+    for character in text.nfkd().filter(|&c| !is_accent(c)).nfc().flat_map(char::to_lowercase) {
+        match character {
+            'ß' => folded.push_str("ss"),
+            'æ' => folded.push_str("ae"),
+            'œ' => folded.push_str("oe"),
+            'ø' => folded.push('o'),
+            'ł' => folded.push('l'),
+            'đ' | 'ð' => folded.push('d'),
+            'ı' => folded.push('i'),
+            // Lower case of a capital with a dot.
+            c if is_accent(c) => {}
+            c => folded.push(c),
+        }
+    }
+    folded
+}
+
+/// Adds a character as the one that it is taken for. No two digits become one.
+fn push_lookalike(chars: &mut Vec<char>, word_ends: &[usize], character: char) {
+    let start = word_ends.last().copied().unwrap_or(0);
+    let same = match character {
+        '0' | 'о' | 'ο' => 'o',
+        '1' | 'i' | '|' | 'і' | 'ι' => 'l',
+        '5' | 'ѕ' => 's',
+        '8' => 'b',
+        '2' => 'z',
+        'а' | 'α' => 'a',
+        'е' => 'e',
+        'р' | 'ρ' => 'p',
+        'с' => 'c',
+        'х' => 'x',
+        'у' => 'y',
+        'ー' => '一',
+        other => other,
+    };
+    let last = chars.last().copied().filter(|_| chars.len() > start);
+    match (last, same) {
+        (Some('r'), 'n') => replace_last(chars, 'm'),
+        (Some('v'), 'v') => replace_last(chars, 'w'),
+        _ => chars.push(same),
+    }
+}
+
+fn replace_last(chars: &mut [char], by: char) {
+    if let Some(last) = chars.last_mut() {
+        *last = by;
+    }
+}
+
+/// Whether words of the script are short, or written without spaces: Han, kana, Hangul, Thai, Lao, Khmer and Burmese.
+fn is_ideographic(character: char) -> bool {
+    matches!(u32::from(character),
+        0x0E00..=0x0EFF | 0x1000..=0x109F | 0x1780..=0x17FF | 0x3005..=0x3007 | 0x3040..=0x30FF
+        | 0x3400..=0x4DBF | 0x4E00..=0x9FFF | 0xAC00..=0xD7AF | 0xF900..=0xFAFF | 0x20000..=0x3FFFF)
+}
+
+/// The grams by which an index finds lines: pairs of characters, and single ones of scripts without spaces and of lines
+/// of one character, each hashed. The lines of a sign that was read as two are also joined.
+pub fn grams<'a>(lines: impl IntoIterator<Item = &'a str>) -> BTreeSet<u32> {
+    let mut found = BTreeSet::new();
+    let mut last: Option<char> = None;
+    for line in lines {
+        let Folded { chars, .. } = Folded::new(line);
+        if let (Some(last), Some(&first)) = (last, chars.first()) {
+            found.insert(hash(&[last, first]));
+        }
+        for pair in chars.windows(2) {
+            found.insert(hash(pair));
+        }
+        for single in chars.iter().filter(|&&c| chars.len() == 1 || is_ideographic(c)) {
+            found.insert(hash(&[*single]));
+        }
+        last = chars.last().copied().or(last);
+    }
+    found
+}
+
+/// FNV-1a.
+fn hash(chars: &[char]) -> u32 {
+    let bytes = chars.iter().flat_map(|c| u32::from(*c).to_le_bytes());
+    bytes.fold(0x811c_9dc5, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))
+}
+
+/// A line that matches, or two that do together.
+#[derive(Debug, Clone, PartialEq, Serialize, ToSchema)]
+pub struct TextMatch {
+    /// How well it matches, from 0 to 1: 1 for a line that is the text.
+    pub score: f32,
+    /// The lines that match, by their number in the image, from 0.
+    pub lines: Vec<usize>,
+}
+
+/// A text that is searched for.
+#[derive(Debug, Clone)]
+pub struct TextQuery {
+    plain: String,
+    folded: Folded,
+}
+
+impl TextQuery {
+    /// Returns `None` if the text has neither letters nor digits.
+    pub fn new(text: &str) -> Option<Self> {
+        let folded = Folded::new(text);
+        (!folded.is_empty()).then(|| Self { plain: squeezed(text), folded })
+    }
+
+    /// The grams that an image shares with the text if it matches.
+    pub fn grams(text: &str) -> BTreeSet<u32> {
+        grams([text])
+    }
+
+    /// How well the lines of an image match; `None` if they do not.
+    pub fn matches(&self, lines: &[TextLine]) -> Option<TextMatch> {
+        let folded: Vec<Folded> = lines.iter().map(|line| Folded::new(&line.text)).collect();
+        let singles = (0..lines.len()).map(|at| (vec![at], folded[at].chars.clone()));
+        let joined = (1..lines.len()).map(|at| {
+            let both = [folded[at - 1].chars.as_slice(), &folded[at].chars].concat();
+            (vec![at - 1, at], both)
+        });
+        let mut best: Option<TextMatch> = None;
+        let mut keep = |score: f32, at: Vec<usize>| {
+            // Fewer lines are preferred, then earlier ones.
+            let is_better = best.as_ref().is_none_or(|best| score > best.score + 1e-4);
+            if score >= LEAST_SCORE && is_better {
+                best = Some(TextMatch { score, lines: at });
+            }
+        };
+        for (at, chars) in singles.chain(joined) {
+            if let Some(likeness) = likeness(&self.folded.chars, &chars) {
+                let plain: String = at.iter().map(|&at| squeezed(&lines[at].text)).collect();
+                let exact = if plain.contains(&self.plain) { EXACT_WORTH } else { 0.0 };
+                let share = self.folded.chars.len() as f32 / chars.len().max(1) as f32;
+                let whole = 1.0 - WHOLE_LINE_WORTH * (1.0 - share.min(1.0));
+                keep(likeness * whole * (1.0 - EXACT_WORTH) + exact * whole, at);
+            }
+        }
+        if self.folded.word_ends.len() > 1
+            && let Some((score, at)) = self.by_words(&folded)
+        {
+            keep(score, at);
+        }
+        best
+    }
+
+    /// How many of the words are somewhere in the lines.
+    fn by_words(&self, lines: &[Folded]) -> Option<(f32, Vec<usize>)> {
+        let (mut found, mut at) = (0.0, BTreeSet::new());
+        for word in self.folded.words() {
+            let mut best: Option<(f32, usize)> = None;
+            for (number, line) in lines.iter().enumerate() {
+                // A short word inside another says nothing.
+                let near = match word.len() {
+                    0..=3 => line.words().any(|other| other == word).then_some(1.0),
+                    _ => likeness(word, &line.chars),
+                };
+                if let Some(near) = near
+                    && best.is_none_or(|(score, _)| near > score)
+                {
+                    best = Some((near, number));
+                }
+            }
+            if let Some((score, number)) = best {
+                found += score * word.len() as f32;
+                at.insert(number);
+            }
+        }
+        let score = WORDS_WORTH * found / self.folded.chars.len() as f32;
+        (!at.is_empty()).then(|| (score, at.into_iter().collect()))
+    }
+}
+
+/// Lower case, width and accents folded, without spaces.
+fn squeezed(text: &str) -> String {
+    plain(text).chars().filter(|c| c.is_alphanumeric()).collect()
+}
+
+/// The most edits with which a text of this many characters is still the same.
+pub fn allowed_edits(chars: usize) -> usize {
+    match chars {
+        0..=3 => 0,
+        4..=6 => 1,
+        7..=10 => 2,
+        more => more / 4,
+    }
+}
+
+/// How much of `text` is somewhere in `line`, from 0 to 1; `None` if too many characters differ. Texts of up to two
+/// letters must be the whole line: within others they say nothing.
+pub fn likeness(text: &[char], line: &[char]) -> Option<f32> {
+    let is_short = text.len() <= 2 && !text.iter().any(|&c| is_ideographic(c));
+    if text.is_empty() || line.is_empty() || (is_short && text != line) {
+        return None;
+    }
+    let edits = edits_within(text, line);
+    (edits <= allowed_edits(text.len())).then(|| 1.0 - edits as f32 / text.len() as f32)
+}
+
+/// The fewest insertions, deletions, replacements and swaps of neighbours that turn `text` into a part of `line`.
+fn edits_within(text: &[char], line: &[char]) -> usize {
+    // A column for each character of the line; a match may begin and end anywhere in it.
+    let height = text.len() + 1;
+    let mut before: Vec<usize> = (0..height).collect();
+    let mut earlier = before.clone();
+    let mut fewest = text.len();
+    for (at, &character) in line.iter().enumerate() {
+        let mut column = vec![0; height];
+        for row in 1..height {
+            let replaced = before[row - 1] + usize::from(text[row - 1] != character);
+            let mut least = replaced.min(before[row] + 1).min(column[row - 1] + 1);
+            let is_swap =
+                row > 1 && at > 0 && text[row - 1] == line[at - 1] && text[row - 2] == character;
+            if is_swap {
+                least = least.min(earlier[row - 2] + 1);
+            }
+            column[row] = least;
+        }
+        fewest = fewest.min(column[text.len()]);
+        earlier = std::mem::replace(&mut before, column);
+    }
+    fewest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn lines(texts: &[&str]) -> Vec<TextLine> {
+        let line = |text: &&str| TextLine {
+            text: (*text).into(),
+            confidence: 0.9,
+            corners: [[0.0; 2]; 4],
+        };
+        texts.iter().map(line).collect()
+    }
+
+    fn score(query: &str, read: &[&str]) -> Option<f32> {
+        TextQuery::new(query).unwrap().matches(&lines(read)).map(|found| found.score)
+    }
+
+    #[test]
+    fn what_readers_and_people_get_wrong_is_found() {
+        for (query, read) in [
+            ("kawa cofee", &["Kawa Coffee"][..]),
+            ("Kawa Coffee", &["KAWACOFFEE"]),
+            ("kawa coffee", &["KAWA", "COFFEE"]),
+            ("coffee kawa", &["Kawa Coffee"]),
+            ("marios", &["MARIO'S"]),
+            ("MARIO'S", &["MARIOS"]),
+            ("mario\u{2019}s", &["Mario's pizza"]),
+            ("BOOK", &["B00K"]),
+            ("HOTEL", &["H0TE1"]),
+            ("milk", &["MlLK"]),
+            ("modern", &["modem"]),
+            ("www", &["vvww"]),
+            ("SALE 50", &["5ALE SO"]),
+            ("Żabka", &["ZABKA"]),
+            ("zabka", &["Żabka"]),
+            ("Straße", &["STRASSE"]),
+            ("CAFÉ", &["cafe\u{301}"]),
+            ("İstanbul", &["istanbul"]),
+            ("ＡＢＣ ｓｈｏｐ", &["ABC SHOP"]),
+            ("東京", &["東京駅"]),
+            ("駅", &["東京駅"]),
+            ("ｶﾌｪ", &["カフェ"]),
+            ("7-Eleven", &["7ELEVEn"]),
+            ("pharmcay", &["PHARMACY"]),
+            ("express24", &["EXPRESS 24"]),
+            ("A7", &["a7"]),
+            ("аптека", &["АПТЕКА"]),
+            ("서울", &["서울역"]),
+        ] {
+            assert!(score(query, read).is_some(), "{query:?} in {read:?}");
+            let shared = grams(read.iter().copied());
+            let asked = TextQuery::grams(query);
+            assert!(asked.iter().any(|gram| shared.contains(gram)), "{query:?} {read:?}: no gram");
+        }
+    }
+
+    #[test]
+    fn other_texts_are_not_found() {
+        for (query, read) in [
+            ("bank", &["BOOKS"][..]),
+            ("bar", &["BAKERY"]),
+            ("Kawa Coffee", &["Pharmacy", "24 h"]),
+            ("12", &["1234"]),
+            ("5", &["8"]),
+            ("45", &["48"]),
+            ("東京", &["京都"]),
+            ("a", &["KAWA"]),
+            ("Starbucks", &["Stars", "bus"]),
+        ] {
+            assert_eq!(score(query, read), None, "{query:?} in {read:?}");
+        }
+        assert!(TextQuery::new(" -'!").is_none());
+    }
+
+    #[test]
+    fn better_matches_rank_higher() {
+        let best = score("coffee", &["COFFEE"]).unwrap();
+        assert!((best - 1.0).abs() < 1e-6, "{best}");
+        let ranked = [
+            score("coffee", &["COFFEE"]),
+            score("coffee", &["C0FFEE"]),
+            score("coffee", &["Kawa Coffee"]),
+            score("coffee", &["Kawa Cofee"]),
+        ];
+        assert!(ranked.windows(2).all(|pair| pair[0] > pair[1]), "{ranked:?}");
+    }
+
+    #[test]
+    fn the_lines_that_match_are_named() {
+        let read = lines(&["Bank", "KAWA", "COFFEE", "open"]);
+        let found = TextQuery::new("kawa coffee").unwrap().matches(&read).unwrap();
+        assert_eq!(found.lines, [1, 2]);
+        let found = TextQuery::new("bank").unwrap().matches(&read).unwrap();
+        assert_eq!(found.lines, [0]);
+    }
+}
