@@ -12,6 +12,7 @@ mod jobs;
 mod keys;
 mod localize;
 mod maps;
+mod texts;
 mod tracks;
 mod usage;
 mod webhooks;
@@ -36,6 +37,7 @@ pub use self::maps::{
     CalibrationState, IndexKind, MapChange, MapRefiner, MapState, Reindex, ReindexRequest,
     ReindexState, VocabularyChoice, VocabularyState,
 };
+pub use self::texts::MapTexts;
 pub use self::tracks::{TrackList, TrackPlace, TrackSummary, TrackWay};
 pub use self::usage::{Today, Total, UsageReport};
 pub use self::webhooks::{DeliveryPage, MadeWebhook, NewWebhook};

@@ -3,6 +3,8 @@
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
+
+use super::MapTexts;
 use whereabouts_core::{
     Calibration, CoordinateFrame, DescriptorKind, Digest, MapName, Precision, RefinerKind, Scene,
 };
@@ -97,6 +99,10 @@ pub struct MapState {
     #[serde(default)]
     #[schema(nullable)]
     pub calibration: Option<CalibrationState>,
+    /// How much of the text in the images was read; null if none was and no reader is installed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(nullable)]
+    pub texts: Option<MapTexts>,
     /// The refiner that the map is set to; null for the server's.
     #[serde(default)]
     #[schema(nullable)]

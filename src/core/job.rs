@@ -14,6 +14,7 @@ use uuid::Uuid;
 use super::map::display_as_written;
 use super::{
     Calibration, Candidate, Certainty, Estimate, Evidence, ImageId, InvalidName, MapName, Ranking,
+    TextLine,
 };
 
 /// The method that refines candidates.
@@ -242,6 +243,10 @@ pub struct Job {
     #[serde(default)]
     #[schema(nullable)]
     pub estimate: Option<Estimate>,
+    /// The lines of text in the frame, from top to bottom; null if they were not read.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(nullable)]
+    pub texts: Option<Vec<TextLine>>,
     /// The verdicts of a job of `cascade`, in order: that of `local`, and that of the model if it was asked.
     #[serde(default)]
     pub verdicts: Vec<JobVerdict>,
@@ -293,7 +298,7 @@ impl Job {
 
     /// The job without the results of refinement.
     pub fn summary(self) -> Self {
-        Self { descriptions: Vec::new(), ranking: None, reasoning: None, ..self }
+        Self { descriptions: Vec::new(), ranking: None, reasoning: None, texts: None, ..self }
     }
 
     /// Creates a queued job.
@@ -314,6 +319,7 @@ impl Job {
             reasoning: None,
             reasoning_took_ms: None,
             estimate: None,
+            texts: None,
             verdicts: Vec::new(),
             fresh_since: None,
             usage: Usage::default(),

@@ -10,15 +10,15 @@ use jiff::{SignedDuration, Timestamp};
 use tokio::sync::broadcast::error::RecvError;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
-use whereabouts_core::{Estimate, Job, JobState};
+use whereabouts_core::{Estimate, Job, JobState, TextLine};
 use whereabouts_store::{Claim, JobRecord, JobStore, MapStore, Release, Step, StoreError};
 use whereabouts_telemetry::traces;
 
 use self::in_progress::{InProgress, Turn, Turns};
 use super::store_retry::retry_for;
 use super::{
-    JobServiceTime, JobSettings, NextAttempt, Progress, RefineError, RefineInput, RefineMetrics,
-    Refinement, Refiner,
+    FrameReader, JobServiceTime, JobSettings, NextAttempt, Progress, RefineError, RefineInput,
+    RefineMetrics, Refinement, Refiner,
 };
 
 /// Refines jobs, the oldest first.
@@ -33,6 +33,8 @@ pub struct Worker {
     pub maps: Arc<dyn MapStore>,
     /// The refiner.
     pub refiner: Arc<dyn Refiner>,
+    /// Reads the text in frames, if something does.
+    pub reader: Option<Arc<dyn FrameReader>>,
     /// Counts jobs.
     pub metrics: Arc<RefineMetrics>,
     /// Averages the time that jobs take.
@@ -45,7 +47,7 @@ pub struct Worker {
 
 /// The outcome of one attempt.
 enum AttemptOutcome {
-    Refined(Box<Refinement>),
+    Refined(Box<Refinement>, Option<Vec<TextLine>>),
     Failed(RefineError),
     /// The job was cancelled, or another worker has claimed it.
     ClaimLost,
@@ -122,10 +124,11 @@ impl Worker {
         let traceparent = record.traceparent.as_deref();
         let span = traces::job(job.id, job.refiner.as_str(), job.attempts, traceparent);
         match self.attempt(&record, &turn, shutdown).instrument(span).await {
-            AttemptOutcome::Refined(refinement) => {
+            AttemptOutcome::Refined(refinement, texts) => {
                 self.record_time(began.elapsed());
                 let estimate = self.estimate(&record, &refinement).await;
-                self.finish(claim, succeeded(job, *refinement, estimate)).await
+                let job = Job { texts, ..succeeded(job, *refinement, estimate) };
+                self.finish(claim, job).await
             }
             AttemptOutcome::Failed(error) => self.after_failure(claim, job, error).await,
             AttemptOutcome::ClaimLost => Ok(()),
@@ -178,15 +181,30 @@ impl Worker {
         tokio::select! {
             () = shutdown.cancelled() => AttemptOutcome::ShuttingDown,
             () = self.claim_lost(record.claim()) => AttemptOutcome::ClaimLost,
-            refined = tokio::time::timeout(timeout, self.refine(record, turn)) => match refined {
-                Ok(Ok(refinement)) => AttemptOutcome::Refined(Box::new(refinement)),
-                Ok(Err(error)) => AttemptOutcome::Failed(error),
+            refined = tokio::time::timeout(timeout, self.refine_and_read(record, turn)) => match refined {
+                Ok((Ok(refinement), texts)) => AttemptOutcome::Refined(Box::new(refinement), texts),
+                Ok((Err(error), _)) => AttemptOutcome::Failed(error),
                 Err(_) => AttemptOutcome::Failed(RefineError::Transient(format!(
                     "it took longer than {} s (jobs.timeout_s)",
                     timeout.as_secs()
                 ))),
             },
         }
+    }
+
+    /// Refines a job and reads the text in its frame meanwhile.
+    async fn refine_and_read(
+        &self,
+        record: &JobRecord,
+        turn: &Turn,
+    ) -> (Result<Refinement, RefineError>, Option<Vec<TextLine>>) {
+        let texts = async {
+            match &self.reader {
+                Some(reader) => reader.read_frame(&record.query.digest).await,
+                None => None,
+            }
+        };
+        tokio::join!(self.refine(record, turn), texts)
     }
 
     async fn refine(&self, record: &JobRecord, turn: &Turn) -> Result<Refinement, RefineError> {

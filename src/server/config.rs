@@ -26,8 +26,8 @@ use whereabouts_refine::JobSettings;
 use whereabouts_refine::cascade::CascadeSettings;
 use whereabouts_refine::mllm::MllmSettings;
 use whereabouts_service::{
-    BulkSettings, ConfidenceSettings, IdempotencySettings, LocalizeSettings, TrackSettings,
-    VocabularySettings, WebhookSettings,
+    BulkSettings, ConfidenceSettings, IdempotencySettings, LocalizeSettings, ReadingSettings,
+    TrackSettings, VocabularySettings, WebhookSettings,
 };
 use whereabouts_telemetry::{LogSettings, TraceSettings};
 use whereabouts_vision::ImageSettings;
@@ -61,6 +61,8 @@ pub struct Config {
     pub confidence: ConfidenceSettings,
     /// Vocabularies of maps' own.
     pub vocabulary: VocabularySettings,
+    /// The text in pictures.
+    pub reading: ReadingSettings,
     /// The frames of one robot, one after another.
     pub track: TrackSettings,
     /// Many images in one request.
@@ -212,7 +214,7 @@ impl Config {
         if let Some(why) = self.confidence.validate(self.refine.candidates) {
             return Some(why);
         }
-        if let Some(why) = self.vocabulary.validate() {
+        if let Some(why) = self.vocabulary.validate().or_else(|| self.reading.validate()) {
             return Some(why);
         }
         if self.bulk.memory_bytes < self.server.body_limit_bytes {

@@ -23,6 +23,7 @@ mod maps;
 mod metrics;
 mod models;
 mod readiness;
+mod reading;
 mod recall;
 mod refiners;
 mod reindex;
@@ -60,6 +61,7 @@ pub use self::localize::{LocalizeRequest, LocalizeSettings, Localizer, Retrieved
 pub use self::maps::Maps;
 pub use self::metrics::{AttemptOutcome, ServiceMetrics};
 pub use self::readiness::{Readiness, ReadinessPhase};
+pub use self::reading::{Reading, ReadingSettings};
 pub use self::recall::RecallCheck;
 pub use self::refiners::{AllowedRefiners, Chosen};
 pub use self::reindex::{Reindexer, Reindexes};
@@ -95,6 +97,8 @@ pub struct Service {
     pub fitter: VocabularyFitter,
     /// Calibration of confidence.
     pub calibrator: Calibrator,
+    /// The text in images and frames.
+    pub reading: Arc<Reading>,
     /// Export and import of maps.
     pub transfer: Transfer,
     /// Usage reports.
@@ -131,6 +135,8 @@ pub struct ServiceParts {
     pub pool: CpuPool,
     /// The refiner, if one is configured.
     pub refiner: Option<Arc<dyn Refiner>>,
+    /// Reads the text in images and frames.
+    pub reading: Arc<Reading>,
     /// The cache of dense features.
     pub dense: Arc<DenseCache>,
     /// The average time of a job.
@@ -172,7 +178,7 @@ impl Service {
     /// Builds all use cases over the same dependencies.
     pub fn new(parts: ServiceParts, settings: ServiceSettings) -> Self {
         let ServiceParts { store, process, keys, models, admission, pool, refiner, .. } = parts;
-        let ServiceParts { dense, job_service_time, metrics, .. } = parts;
+        let ServiceParts { dense, job_service_time, metrics, reading, .. } = parts;
         let (keys, admission) = (Arc::new(keys), Arc::new(admission));
         let imaging = Imaging {
             maps: store.clone(),
@@ -188,6 +194,7 @@ impl Service {
             reindexes: Arc::default(),
             vocabulary: settings.vocabulary,
             refiners: settings.refiners.clone(),
+            reading: Arc::clone(&reading),
         };
         let jobs = Jobs {
             store: store.clone(),
@@ -242,7 +249,12 @@ impl Service {
                 reindexer: Some(reindexer.clone()),
             },
             reindexer,
-            transfer: Transfer { maps: maps.clone(), exports: store.clone(), blobs: store.clone() },
+            transfer: Transfer {
+                maps: maps.clone(),
+                exports: store.clone(),
+                blobs: store.clone(),
+                texts: store.clone(),
+            },
             usage: UsageReports { store: store.clone(), refiner, keep_days: settings.usage_days },
             descriptions: Descriptions { cache: store.clone() },
             idempotency: Idempotency {
@@ -253,6 +265,7 @@ impl Service {
             keys,
             webhooks: Webhooks { store: store.clone(), settings: settings.webhooks },
             retention: store,
+            reading,
             dense,
             metrics,
             maps,

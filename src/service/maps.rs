@@ -8,7 +8,8 @@ use uuid::Uuid;
 use super::fitting::obstacle;
 use super::models::{descriptor_of, kind_of};
 use super::{
-    AllowedRefiners, Imaging, Reindexes, SUPERSEDED_RETRIES, ServiceError, VocabularySettings,
+    AllowedRefiners, Imaging, Reading, Reindexes, SUPERSEDED_RETRIES, ServiceError,
+    VocabularySettings,
 };
 use whereabouts_api::{
     CalibrationState, ErrorKind, IndexKind, MapChange, MapRefiner, MapState, VocabularyChoice,
@@ -30,6 +31,8 @@ pub struct Maps {
     pub vocabulary: VocabularySettings,
     /// The refiners to which a map may be set.
     pub refiners: AllowedRefiners,
+    /// What knows how much of a map was read.
+    pub reading: Arc<Reading>,
 }
 
 impl Maps {
@@ -156,6 +159,7 @@ impl Maps {
         let IndexState { images, graph, behind, .. } = self.store.index_state(&map).await?;
         let calibration = self.store.calibration(&map).await?;
         let vocabulary = self.vocabulary_of(&map, images).await;
+        let texts = self.reading.state_of(&map, images).await?;
         let index = match (graph, behind) {
             (false, _) => IndexKind::Exact,
             (true, true) => IndexKind::Building,
@@ -174,6 +178,7 @@ impl Maps {
             images,
             index,
             calibration: calibration.as_deref().map(CalibrationState::from),
+            texts,
             refiner: map.refiner,
             description: map.description,
             reindex,

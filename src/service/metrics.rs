@@ -6,6 +6,7 @@ use std::time::Duration;
 use prometheus_client::encoding::EncodeLabelSet;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use whereabouts_store::RemovedJobs;
 use whereabouts_telemetry::metrics::{Registry, latency, register};
@@ -27,6 +28,10 @@ pub struct ServiceMetrics {
     uninformative_frames: Family<WhyLabels, Counter>,
     damaged_pictures: Counter,
     webhook_attempts: Family<OutcomeLabels, Counter>,
+    images_read: Family<OutcomeLabels, Counter>,
+    lines_read: Counter,
+    images_unread: Family<MapLabels, Gauge>,
+    read_seconds: Histogram,
 }
 
 /// The outcome of an attempt to deliver a message to a webhook.
@@ -59,6 +64,11 @@ struct CheckLabels {
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
 struct WhyLabels {
     why: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct MapLabels {
+    map: String,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
@@ -122,6 +132,30 @@ impl ServiceMetrics {
                  (will not be retried)",
                 Family::default(),
             ),
+            images_read: register(
+                registry,
+                "images_read",
+                "Images whose text was read, by outcome: read, or failed (will not be tried again)",
+                Family::default(),
+            ),
+            lines_read: register(
+                registry,
+                "lines_read",
+                "Lines of text that were read in images",
+                Counter::default(),
+            ),
+            images_unread: register(
+                registry,
+                "images_unread",
+                "Images of a map whose text is not read yet",
+                Family::default(),
+            ),
+            read_seconds: register(
+                registry,
+                "read_seconds",
+                "Time from the decision to read an image until its text was known",
+                Histogram::new(exponential_buckets(0.05, 2.0, 10)),
+            ),
         }
     }
 
@@ -172,6 +206,20 @@ impl ServiceMetrics {
             self.removed_jobs.get_or_create(&RemovedLabels { why }).inc_by(jobs as u64);
         }
         self.removed_frame_bytes.inc_by(removed.bytes);
+    }
+
+    /// Counts an image that was read or could not be.
+    pub fn image_read(&self, succeeded: bool, lines: usize, took: Duration) {
+        let outcome = if succeeded { "read" } else { "failed" };
+        self.images_read.get_or_create(&OutcomeLabels { outcome }).inc();
+        self.lines_read.inc_by(lines as u64);
+        self.read_seconds.observe(took.as_secs_f64());
+    }
+
+    /// Shows how many images of a map are not read yet.
+    pub fn images_unread(&self, map: &str, images: usize) {
+        let labels = MapLabels { map: map.to_owned() };
+        self.images_unread.get_or_create(&labels).set(i64::try_from(images).unwrap_or(i64::MAX));
     }
 
     /// Counts an attempt to deliver a message to a webhook.

@@ -14,7 +14,7 @@ use whereabouts_api::{
 use whereabouts_core::{
     Digest, ExportedImage, Image, ImageId, Map, MapName, MapVocabulary, MediaType,
 };
-use whereabouts_store::{Added, BlobStore, ExportStore, StoreError};
+use whereabouts_store::{Added, BlobStore, ExportStore, StoreError, TextStore};
 use whereabouts_vision::{AdmissionRequest, FeatureSet};
 
 /// Maximum dimension of an imported descriptor.
@@ -28,6 +28,8 @@ pub struct Transfer {
     pub exports: Arc<dyn ExportStore>,
     /// The bytes of the images.
     pub blobs: Arc<dyn BlobStore>,
+    /// What was read in the images.
+    pub texts: Arc<dyn TextStore>,
 }
 
 impl Transfer {
@@ -117,7 +119,7 @@ impl Transfer {
         admission: AdmissionRequest,
     ) -> Result<Added, ServiceError> {
         let ImportedImage { map: source, image } = from;
-        let ExportedImage { image, descriptor, recording, .. } = image;
+        let ExportedImage { image, descriptor, recording, texts, .. } = image;
         let map = self.maps.find(name).await?;
         if !is_compatible(&map, &source) {
             return Err(incompatible(&map, &source));
@@ -143,7 +145,12 @@ impl Transfer {
         };
         let _pin = self.blobs.put_blob(image.digest, bytes).await?;
         // Not retried if the map was reindexed meanwhile: its descriptors are now of another model than this one.
-        Ok(self.maps.store.add_recorded(&map, image, descriptor, recording).await?)
+        let added = self.maps.store.add_recorded(&map, image, descriptor, recording).await?;
+        // Those of an image that is there already stay.
+        if let (Added::Created(image), Some(texts)) = (&added, texts) {
+            self.texts.put_texts(&map, image, texts).await?;
+        }
+        Ok(added)
     }
 }
 

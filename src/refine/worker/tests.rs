@@ -129,6 +129,7 @@ impl Fixture {
             jobs: store.clone(),
             maps: store.clone(),
             refiner: refiner.clone(),
+            reader: None,
             metrics: Arc::new(RefineMetrics::register(&mut registry(), Arc::default())),
             service_time: JobServiceTime::default(),
             settings: settings(workers, in_progress),

@@ -19,10 +19,13 @@ use crate::config::Config;
 use crate::gate::{Connections, Gate, GateSettings};
 use crate::http::{About, AppState};
 use crate::router::{router, worker_router};
-use whereabouts_refine::{DenseCache, JobServiceTime, Refiner, RefinerContext, RefinerSet, Worker};
+use whereabouts_reading::{OnnxReader, ReadError, Reader, ReaderSettings};
+use whereabouts_refine::{
+    DenseCache, FrameReader, JobServiceTime, Refiner, RefinerContext, RefinerSet, Worker,
+};
 use whereabouts_service::{
-    AllowedRefiners, Dispatcher, Janitor, Keys, Limits, Service, ServiceParts, ServiceSettings,
-    Webhooks,
+    AllowedRefiners, Dispatcher, Janitor, Keys, Limits, Reading, ReadingSettings, Service,
+    ServiceParts, ServiceSettings, Webhooks,
 };
 use whereabouts_store::TokenBuckets;
 use whereabouts_telemetry::LogIssues;
@@ -95,6 +98,8 @@ pub async fn run(
         running.spawn(async move { service.calibrator.run(until).await });
         let until = shutdown.clone();
         running.spawn(async move { fitting.fitter.run(until).await });
+        let (until, reading) = (shutdown.clone(), Arc::clone(&tracked.reading));
+        running.spawn(async move { reading.run(until).await });
         let (until, saving) = (shutdown.clone(), Arc::clone(&tracked));
         running.spawn(async move { saving.localizer.tracks.run(until).await });
         let (until, heeding) = (shutdown.clone(), Arc::clone(&tracked));
@@ -185,8 +190,8 @@ pub struct Parts {
     pub service: Service,
     /// Refines jobs, if this process is to.
     pub worker: Option<Worker>,
-    /// Pools that decode and compare. The process waits for them before it exits.
-    pub pools: [CpuPool; 2],
+    /// Pools that decode, compare and read. The process waits for them before it exits.
+    pub pools: [CpuPool; 3],
     /// The parts that further refiners can be built from.
     pub refiners: RefinerContext,
 }
@@ -203,7 +208,15 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
     // Besides jobs, of which as many as there are threads use it, by themselves or in place of another refiner,
     // calibration and the display of matches use it, one task at a time each.
     let refining = CpuPool::new("refine", config.jobs.workers.max(1), config.jobs.workers + 2)?;
-    let pools = [pool.clone(), refining.clone()];
+    let admission = Admission::new(admission);
+    let reading = Arc::new(Reading::new(
+        reader(config),
+        store.clone(),
+        admission.clone(),
+        config.image.limits(),
+        Arc::clone(&metrics.service),
+    )?);
+    let pools = [pool.clone(), refining.clone(), reading.pool()];
     let dense = Arc::new(DenseCache::new(config.refine.dense_cache_bytes));
     let refiners = RefinerContext {
         store: store.clone(),
@@ -228,6 +241,7 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         jobs: store.clone(),
         maps: store.clone(),
         refiner: Arc::clone(refiner),
+        reader: reading.is_installed().then(|| Arc::clone(&reading) as Arc<dyn FrameReader>),
         metrics: Arc::clone(&metrics.refine),
         service_time: Arc::clone(&job_service_time),
         settings: config.jobs,
@@ -241,7 +255,8 @@ pub fn build(config: &Config, metrics: Arc<Metrics>) -> anyhow::Result<Parts> {
         process,
         keys,
         models,
-        admission: Admission::new(admission),
+        admission,
+        reading,
         pool,
         refiner,
         dense,
@@ -276,6 +291,29 @@ fn check_keys(config: &Config, keys: &Keys) -> anyhow::Result<()> {
         ),
     }
     Ok(())
+}
+
+/// The reader of text in pictures, if it is configured and installed. Everything else works without.
+fn reader(config: &Config) -> Option<Arc<dyn Reader>> {
+    let ReadingSettings { reader: name, threads, max_lines } = config.reading.clone();
+    if name.is_empty() {
+        return None;
+    }
+    let settings = ReaderSettings { name, threads, max_lines };
+    match OnnxReader::load(&config.model.installed_in(None), &settings) {
+        Ok(reader) => {
+            tracing::info!(reader = settings.name, "text in pictures is read");
+            Some(Arc::new(reader))
+        }
+        Err(why @ ReadError::NotInstalled { .. }) => {
+            tracing::info!(%why, "text in pictures is not read");
+            None
+        }
+        Err(error) => {
+            tracing::error!(%error, "text in pictures is not read");
+            None
+        }
+    }
 }
 
 /// The models, none of them loaded yet, and why the default one was chosen.

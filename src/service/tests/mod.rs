@@ -8,6 +8,7 @@ mod jobs;
 mod limits;
 mod localize;
 mod maps;
+mod reading;
 mod retention;
 mod sharing;
 mod submit;
@@ -35,6 +36,7 @@ use whereabouts_core::{
     MediaType, MetricPose, Pose, Precision, RefinerKind, Scene,
 };
 use whereabouts_index::IndexSettings;
+use whereabouts_reading::Reader;
 use whereabouts_refine::{
     NegativeEvidence, PaidMeasurement, PaidNegatives, Progress, RefineError, RefineInput,
     Refinement,
@@ -69,6 +71,15 @@ impl Fixture {
 
     /// Use cases with other settings, over a disk on which `min_free_bytes` must stay free.
     async fn with(min_free_bytes: u64, change: impl FnOnce(&mut ServiceSettings)) -> Self {
+        Self::reading(None, min_free_bytes, change).await
+    }
+
+    /// Use cases with a reader of text.
+    async fn reading(
+        reader: Option<Arc<dyn Reader>>,
+        min_free_bytes: u64,
+        change: impl FnOnce(&mut ServiceSettings),
+    ) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let store = Arc::new(open(&folder.path().join("store"), min_free_bytes));
         let refiner = Arc::new(ScriptedRefiner::default());
@@ -86,17 +97,22 @@ impl Fixture {
         };
         let mut registry = registry();
         let rejections = Arc::new(Rejections::register(&mut registry));
+        let metrics = Arc::new(ServiceMetrics::register(&mut registry, rejections));
+        let admission = Admission::new(admission);
+        let reading =
+            Reading::new(reader, store.clone(), admission.clone(), limits, Arc::clone(&metrics));
         let parts = ServiceParts {
             store: store.clone(),
             process: Uuid::now_v7(),
             keys: Keys::load(store.clone()).await.unwrap(),
             models: LoadedModels::new(Assets::locate(Some(folder.path())), models),
-            admission: Admission::new(admission),
+            admission,
+            reading: Arc::new(reading.unwrap()),
             pool: CpuPool::new("test", 1, 1).unwrap(),
             refiner: Some(refiner.clone()),
             dense: Arc::new(DenseCache::new(1 << 20)),
             job_service_time: JobServiceTime::default(),
-            metrics: Arc::new(ServiceMetrics::register(&mut registry, rejections)),
+            metrics,
         };
         let mut settings = settings();
         change(&mut settings);
