@@ -10,6 +10,8 @@ use whereabouts_core::{
     ExportedImage, Image, ImageField, Map, Pose, PoseInput, PosePatch, Recording, moment,
 };
 
+use super::ImageMatch;
+
 /// Metadata of an image to be added.
 #[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -79,13 +81,21 @@ pub struct ImageAnswer {
     pub warnings: Vec<String>,
 }
 
-/// A page of images, sorted by id.
+/// A page of images, sorted by id; in a search for text, the best match first.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct ImagePage {
     /// Images on this page.
     pub images: Vec<Image>,
     /// `cursor=` of the request for the next page; null on the last page.
     pub next_cursor: Option<String>,
+    /// What matches in each of the images, in the same order; only in a search for text.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable)]
+    pub matches: Option<Vec<ImageMatch>>,
+    /// How many images of the map are not read yet, and may match later; only in a search for text.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable)]
+    pub unread: Option<usize>,
 }
 
 /// A page of images with their descriptors, sorted by id.

@@ -37,7 +37,7 @@ pub use self::maps::{
     CalibrationState, IndexKind, MapChange, MapRefiner, MapState, Reindex, ReindexRequest,
     ReindexState, VocabularyChoice, VocabularyState,
 };
-pub use self::texts::MapTexts;
+pub use self::texts::{ImageMatch, ImageState, MapTexts};
 pub use self::tracks::{TrackList, TrackPlace, TrackSummary, TrackWay};
 pub use self::usage::{Today, Total, UsageReport};
 pub use self::webhooks::{DeliveryPage, MadeWebhook, NewWebhook};

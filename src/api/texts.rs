@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
-use whereabouts_core::Digest;
+use whereabouts_core::{Digest, Image, ImageId, ImageTexts, TextLine};
 
 /// How much of a map was read.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -20,4 +20,28 @@ pub struct MapTexts {
     pub waiting: Option<usize>,
     /// Number of lines of text in the images that were read.
     pub lines: usize,
+}
+
+/// An image whose text matches what was searched for.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ImageMatch {
+    /// The id of the image.
+    #[schema(value_type = String)]
+    pub image_id: ImageId,
+    /// How well it matches, from 0.5 to 1: 1 if a line is the text. It is no probability.
+    pub score: f32,
+    /// The lines that match.
+    pub lines: Vec<TextLine>,
+}
+
+/// An image and the text that was read in it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct ImageState {
+    /// The image.
+    #[serde(flatten)]
+    pub image: Image,
+    /// What was read in it; null if it was not read yet, or no reader is installed.
+    #[serde(default)]
+    #[schema(nullable)]
+    pub texts: Option<ImageTexts>,
 }

@@ -182,7 +182,7 @@ impl Images {
             .then(|| images.get(limit - 1).map(|image| image.id.to_string()))
             .flatten();
         images.truncate(limit);
-        Ok(ImagePage { images, next_cursor })
+        Ok(ImagePage { images, next_cursor, matches: None, unread: None })
     }
 
     /// Returns the bytes of an image as they were uploaded, or as a JPEG whose longer edge is at most `max_edge`

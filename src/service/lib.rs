@@ -32,6 +32,7 @@ mod retention;
 mod submit;
 #[cfg(test)]
 mod tests;
+mod text_search;
 mod track;
 mod transfer;
 mod usage;

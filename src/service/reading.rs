@@ -8,13 +8,14 @@ use async_trait::async_trait;
 use jiff::{SignedDuration, Timestamp};
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
+use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 use whereabouts_api::MapTexts;
 use whereabouts_core::{Digest, Image, ImageTexts, Map, TextLine};
 use whereabouts_reading::Reader;
 use whereabouts_refine::FrameReader;
-use whereabouts_store::{IndexState, Store, StoreError, TextCounts};
+use whereabouts_store::{IndexState, Store, StoreError, TextCounts, TextStore};
 use whereabouts_vision::{Admission, AdmissionRequest, CpuPool, ImageLimits, decode};
 
 use super::{ServiceError, ServiceMetrics};
@@ -75,6 +76,8 @@ pub struct Reading {
     pool: CpuPool,
     metrics: Arc<ServiceMetrics>,
     counts: Mutex<BTreeMap<Uuid, (Instant, TextCounts)>>,
+    /// Limits searches for text to one at a time.
+    pub(super) searching: Semaphore,
 }
 
 /// What became of an image.
@@ -95,7 +98,13 @@ impl Reading {
         metrics: Arc<ServiceMetrics>,
     ) -> std::io::Result<Self> {
         let pool = CpuPool::new("reading", 1, QUEUE)?;
-        Ok(Self { reader, store, admission, limits, pool, metrics, counts: Mutex::default() })
+        let (counts, searching) = (Mutex::default(), Semaphore::new(1));
+        Ok(Self { reader, store, admission, limits, pool, metrics, counts, searching })
+    }
+
+    /// What was read.
+    pub(super) fn texts(&self) -> &dyn TextStore {
+        self.store.as_ref()
     }
 
     /// Whether there is a reader.

@@ -14,10 +14,10 @@ use jiff::Timestamp;
 use rayon::ThreadPoolBuilder;
 use uuid::Uuid;
 use whereabouts_archive::{ArchivedMap, LeftOut, Manifest, Writer};
-use whereabouts_core::{ExportedImage, ImageTexts, TextLine};
 use whereabouts_core::{
     CoordinateFrame, Descriptor, DescriptorKind, Digest, Image, Map, MediaType, Precision, Scene,
 };
+use whereabouts_core::{ExportedImage, ImageTexts, TextLine};
 use whereabouts_index::{IndexSettings, MapIndex, Vectors};
 use whereabouts_town::{Town, TownSpec};
 

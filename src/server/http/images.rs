@@ -17,8 +17,8 @@ use super::pixels::PixelParams;
 use super::state::AppState;
 use crate::gate::Problem;
 use crate::gate::Ready;
-use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage, ImagePatch};
-use whereabouts_core::{Image, ImageId, MediaType, PoseInput, Recording, moment};
+use whereabouts_api::{ErrorKind, ImageAnswer, ImageMeta, ImagePage, ImagePatch, ImageState};
+use whereabouts_core::{ImageId, MediaType, PoseInput, Recording, moment};
 use whereabouts_service::{Deadline, NewImage, ServiceError};
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
@@ -198,33 +198,54 @@ pub(super) struct PageParams {
     pub limit: Option<usize>,
 }
 
-/// List the images of a map, by id
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ImageListParams {
+    /// Only images in which this text of at most 100 characters was read, the best match first. Case, accents, width,
+    /// spaces, some typing errors and what readers confuse (0 and O, 1 and l, rn and m) make no difference. `matches`
+    /// says what matches and where.
+    #[param(max_length = 100)]
+    text: Option<String>,
+    /// `next_cursor` of the previous page.
+    cursor: Option<String>,
+    /// Images in a page, 1 to 1000; 100 by default.
+    limit: Option<usize>,
+}
+
+/// List the images of a map, by id, or search for text in them
 #[utoipa::path(get, path = "/maps/{map}/images", tag = "images",
-    params(("map" = String, Path), PageParams), responses(
+    params(("map" = String, Path), ImageListParams), responses(
     (status = 200, body = ImagePage),
+    (status = 400, body = Problem, description = "cursor is not that of such a list", content_type = "application/problem+json"),
     (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
-    (status = 422, body = Problem, description = "limit is out of range", content_type = "application/problem+json"),
+    (status = 409, body = Problem, description = "The text in the images was not read: no reader is installed, or not yet", content_type = "application/problem+json"),
+    (status = 422, body = Problem, description = "limit is out of range, or text has no letters or is too long", content_type = "application/problem+json"),
 ))]
 pub(super) async fn list_images(
     Ready(service): Ready,
     Segments(map): Segments<String>,
-    Params(page): Params<PageParams>,
+    Params(page): Params<ImageListParams>,
 ) -> Result<Json<ImagePage>, Problem> {
+    if let Some(text) = &page.text {
+        let found = service.images.find(&map_name(&map)?, text, page.cursor.as_deref(), page.limit);
+        return Ok(Json(found.await?));
+    }
     let cursor = page.cursor.as_deref().map(image_id).transpose()?;
     Ok(Json(service.images.list(&map_name(&map)?, cursor.as_ref(), page.limit).await?))
 }
 
-/// One image
+/// One image, with the text that was read in it
 #[utoipa::path(get, path = "/maps/{map}/images/{id}", tag = "images",
     params(("map" = String, Path), ("id" = String, Path)), responses(
-    (status = 200, body = Image),
+    (status = 200, body = ImageState),
     (status = 404, body = Problem, description = "No such image", content_type = "application/problem+json"),
 ))]
 pub(super) async fn get_image(
     Ready(service): Ready,
     Segments((map, id)): Segments<(String, String)>,
-) -> Result<Json<Image>, Problem> {
-    Ok(Json(service.images.get(&map_name(&map)?, &image_id(&id)?).await?))
+) -> Result<Json<ImageState>, Problem> {
+    Ok(Json(service.images.state(&map_name(&map)?, &image_id(&id)?).await?))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]

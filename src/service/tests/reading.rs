@@ -169,3 +169,64 @@ async fn without_a_reader_a_map_says_nothing_of_texts() {
     let map = fixture.map("m", &[None]).await;
     assert_eq!(fixture.service.maps.get(&map.name).await.unwrap().texts, None);
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_search_finds_pages_of_what_was_read_the_best_first() {
+    let fixture = with_reader(&Arc::default()).await;
+    let map = fixture.map("m", &[]).await;
+    let pages = async |text: &str, limit: usize| {
+        let (mut found, mut cursor) = (Vec::new(), None);
+        loop {
+            let page = fixture.service.images.find(&map.name, text, cursor.as_deref(), Some(limit));
+            let page = page.await.unwrap();
+            let matches = page.matches.unwrap();
+            assert!(
+                page.images
+                    .iter()
+                    .map(|image| &image.id)
+                    .eq(matches.iter().map(|found| &found.image_id))
+            );
+            assert!(matches.len() <= limit);
+            found.extend(matches);
+            cursor = page.next_cursor;
+            if cursor.is_none() {
+                return found;
+            }
+        }
+    };
+    assert!(pages("kawa", 5).await.is_empty(), "an empty map has nothing to find");
+    for (number, text) in
+        ["KAWA\nCOFFEE", "Bank", "Kawa Coffee", "KAVVA C0FFEE", "coffee"].into_iter().enumerate()
+    {
+        add(&fixture, &map, number, written(text.as_bytes())).await;
+    }
+    let error = fixture.service.images.find(&map.name, "kawa", None, None).await.unwrap_err();
+    assert_eq!(error.kind, whereabouts_api::ErrorKind::Conflict);
+    assert!(error.detail.contains("5 images wait"), "{}", error.detail);
+    read_all(&fixture, &map).await;
+    let all = pages("kawa cofee", 10).await;
+    let ids: Vec<&str> = all.iter().map(|found| found.image_id.as_str()).collect();
+    assert_eq!(ids, ["image-0", "image-2", "image-3"]);
+    assert!(all.windows(2).all(|pair| pair[0].score >= pair[1].score), "{all:?}");
+    assert_eq!(
+        all[0].lines.iter().map(|line| line.text.as_str()).collect::<Vec<_>>(),
+        ["KAWA", "COFFEE"]
+    );
+    for limit in 1..4 {
+        assert_eq!(pages("kawa cofee", limit).await, all, "{limit} in a page");
+    }
+    for (text, cursor) in [("", None), ("- '", None), (&*"a".repeat(101), None), ("a", Some("x"))] {
+        assert!(fixture.service.images.find(&map.name, text, cursor, None).await.is_err());
+    }
+    let state = fixture.service.images.state(&map.name, &image_id(1)).await.unwrap();
+    assert_eq!(state.texts.unwrap().lines[0].text, "Bank");
+}
+
+#[tokio::test]
+async fn a_search_without_a_reader_says_how_to_get_one() {
+    let fixture = Fixture::new().await;
+    let map = fixture.map("m", &[None]).await;
+    let error = fixture.service.images.find(&map.name, "kawa", None, None).await.unwrap_err();
+    assert_eq!(error.kind, whereabouts_api::ErrorKind::Conflict);
+    assert!(error.detail.contains("make reader"), "{}", error.detail);
+}
