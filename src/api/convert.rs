@@ -247,6 +247,7 @@ impl From<Job> for proto::Job {
             trace_id: job.trace_id.unwrap_or_default(),
             fresh_since: job.fresh_since.map(moment_to),
             verdicts: job.verdicts.into_iter().map(Into::into).collect(),
+            texts: job.texts.into_iter().flatten().map(Into::into).collect(),
         }
     }
 }
@@ -295,6 +296,7 @@ impl From<MapState> for proto::Map {
             created_at: Some(moment_to(map.created_at)),
             refiner: map.refiner.map_or(proto::Refiner::Unspecified, refiner_to).into(),
             vocabulary: map.vocabulary.map(vocabulary_to),
+            texts: map.texts.map(Into::into),
         }
     }
 }

@@ -13,6 +13,8 @@ mod keys;
 mod localize;
 mod maps;
 mod texts;
+#[cfg(feature = "grpc")]
+mod texts_convert;
 mod tracks;
 mod usage;
 mod webhooks;

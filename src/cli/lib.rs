@@ -10,6 +10,7 @@ mod demo;
 mod descriptions;
 mod doctor;
 mod eval;
+mod find;
 mod healthcheck;
 #[cfg(test)]
 mod help_tests;
@@ -54,6 +55,7 @@ enum Command {
     Index(index::Args),
     Localize(localize::Args),
     Read(read::Args),
+    Find(find::Args),
     Jobs(jobs::Args),
     Keys(keys::Args),
     Model(model::Args),
@@ -84,6 +86,7 @@ impl Cli {
             Command::Index(args) => block_on(index::run(args)),
             Command::Localize(args) => block_on(localize::run(args)),
             Command::Read(args) => read::run(&args),
+            Command::Find(args) => block_on(find::run(args)),
             Command::Jobs(args) => block_on(jobs::run(args)),
             Command::Keys(args) => block_on(keys::run(args)),
             Command::Model(args) => block_on(model::run(args)),

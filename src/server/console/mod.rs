@@ -41,6 +41,7 @@ const ASSETS: &[(&str, &str)] = assets![
     "plan.js",
     "points.js",
     "style.css",
+    "texts.js",
     "tracks.js",
     "try.js",
     "words.js",

@@ -8,8 +8,9 @@ use super::proto::add_image_result::Outcome;
 use super::proto::map_service_server::MapService;
 use super::proto::{
     AddImageResult, AddImagesRequest, AddImagesResponse, DeleteMapRequest, DeleteMapResponse,
-    GetMapRequest, GetMapResponse, ListMapsRequest, ListMapsResponse, PutMapRequest,
-    PutMapResponse, Stored, UpdateImageRequest, UpdateImageResponse,
+    FindImagesRequest, FindImagesResponse, GetMapRequest, GetMapResponse, ListMapsRequest,
+    ListMapsResponse, PutMapRequest, PutMapResponse, Stored, UpdateImageRequest,
+    UpdateImageResponse,
 };
 use super::{Api, CallContext, convert, status};
 use whereabouts_api::{ImageAnswer, ImageMeta, ImagePatch, MapChange};
@@ -88,9 +89,29 @@ impl MapService for Api {
         let answer = context.update_image(request.into_inner()).await.map_err(status::of)?;
         Ok(Response::new(answer))
     }
+
+    async fn find_images(
+        &self,
+        request: Request<FindImagesRequest>,
+    ) -> Result<Response<FindImagesResponse>, Status> {
+        let context = self.context(request.extensions()).map_err(status::of)?;
+        let answer = context.find_images(request.into_inner()).await.map_err(status::of)?;
+        Ok(Response::new(answer))
+    }
 }
 
 impl CallContext {
+    async fn find_images(
+        &self,
+        request: FindImagesRequest,
+    ) -> Result<FindImagesResponse, ServiceError> {
+        let FindImagesRequest { map, text, limit, cursor } = request;
+        let limit = (limit > 0).then_some(limit as usize);
+        let cursor = (!cursor.is_empty()).then_some(cursor.as_str());
+        let page = self.service.images.find(&self.map(&map)?, &text, cursor, limit).await?;
+        Ok(page.into())
+    }
+
     async fn update_image(
         &self,
         request: UpdateImageRequest,

@@ -68,7 +68,8 @@ pub(crate) fn routes<S: Clone + Send + Sync + 'static>(gate: &Gate) -> Routes<S>
             operator.pictures().bulk().changes(),
             maps.clone(),
         )
-        .call("/whereabouts.v1.MapService/UpdateImage", operator.changes(), maps)
+        .call("/whereabouts.v1.MapService/UpdateImage", operator.changes(), maps.clone())
+        .call("/whereabouts.v1.MapService/FindImages", operator, maps)
         .call("/whereabouts.v1.JobService/GetJob", robot.waits(Waits::Always), jobs.clone())
         .call("/whereabouts.v1.JobService/WatchJob", robot.streams(), jobs.clone())
         .call("/whereabouts.v1.JobService/ListJobs", operator, jobs.clone())

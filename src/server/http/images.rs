@@ -228,8 +228,8 @@ pub(super) async fn list_images(
     Params(page): Params<ImageListParams>,
 ) -> Result<Json<ImagePage>, Problem> {
     if let Some(text) = &page.text {
-        let found = service.images.find(&map_name(&map)?, text, page.cursor.as_deref(), page.limit);
-        return Ok(Json(found.await?));
+        let (map, cursor) = (map_name(&map)?, page.cursor.as_deref());
+        return Ok(Json(service.images.find(&map, text, cursor, page.limit).await?));
     }
     let cursor = page.cursor.as_deref().map(image_id).transpose()?;
     Ok(Json(service.images.list(&map_name(&map)?, cursor.as_ref(), page.limit).await?))

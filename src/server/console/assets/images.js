@@ -3,6 +3,7 @@
 import { address, call, contentOf, isAbort, picture } from "./api.js";
 import { announce, confirm, facts, failure, fill, h } from "./dom.js";
 import { ago, moment, pose } from "./format.js";
+import { readIn } from "./texts.js";
 
 export function imageCard(map, image, { signal, removed, close, corrected }) {
   const said = h("div");
@@ -15,10 +16,16 @@ export function imageCard(map, image, { signal, removed, close, corrected }) {
       removed();
     } catch (problem) { if (!isAbort(problem)) fill(said, failure(problem)); }
   };
+  const shown = picture(contentOf(map.name, image.id, 800), `The image ${image.id}`, { signal, gone: "The picture is gone." });
+  const texts = h("div");
+  // The list of images has no texts.
+  call(address(["maps", map.name, "images", image.id]), { signal })
+    .then((state) => fill(texts, readIn(shown, state.texts?.lines), state.texts?.error && h("p", { class: "muted small" }, `Its text cannot be read: ${state.texts.error}`)))
+    .catch(() => {});
   const time = (at) => at && h("span", {}, ago(at), h("span", { class: "muted small" }, ` · ${moment(at)}`));
   return [
     h("div", { class: "heading" }, h("h2", { class: "wrap" }, image.id), h("button", { type: "button", class: "quiet heading-end", onclick: close }, "Close")),
-    picture(contentOf(map.name, image.id, 800), `The image ${image.id}`, { signal, gone: "The picture is gone." }),
+    shown, texts,
     facts(["Pose", pose(image.pose)], ["Taken", time(image.captured_at)], ["Stored", time(image.created_at)],
       ["Size", `${image.width} × ${image.height} pixels`],
       ["Tags", image.tags?.length ? h("span", { class: "tags" }, image.tags.map((tag) => h("span", { class: "tag" }, tag))) : null]),

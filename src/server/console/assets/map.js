@@ -60,11 +60,18 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
     return of.reason ? `the model's: ${of.reason}` : "the model's";
   }
 
+  function read({ read: done, failed, waiting, lines }) {
+    const parts = [`read in ${plural(done, "image")}, ${plural(lines, "line")}`];
+    if (failed) parts.push(`${count(failed)} cannot be read`);
+    if (waiting) parts.push(`${count(waiting)} waiting`);
+    return parts.join("; ");
+  }
+
   function settings() {
     return h("section", { class: "card" }, h("h2", {}, "This map"), facts(
       ["Scene", map.scene], ["Poses", map.frame], ["Model", `${map.model}, ${map.precision} precision`], ["Descriptor", `${map.descriptor}, ${count(map.dim)} dimensions`],
       ...(map.vocabulary ? [["Vocabulary", vocabulary(map.vocabulary)]] : []),
-      ["Search", searched(map)], ["Reindex", reindexed(map)],
+      ["Text", map.texts ? read(map.texts) : null], ["Search", searched(map)], ["Reindex", reindexed(map)],
       ["Confidence", map.calibration ? `calibrated on ${plural(map.calibration.asked, "image")}` : "not calibrated yet"], ["Created", moment(map.created_at)]),
       h("details", {}, h("summary", {}, "Delete this map"), h("p", {}, "Needs the role admin. Deletes all images of the map."),
         h("button", { type: "button", class: "danger", onclick: remove }, "Delete the map…")));

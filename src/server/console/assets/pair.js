@@ -3,6 +3,7 @@
 import { address, call, contentOf, frameOf, isAbort, picture } from "./api.js";
 import { fill, h } from "./dom.js";
 import { cost, count, duration, plural } from "./format.js";
+import { readIn } from "./texts.js";
 import { apart } from "./words.js";
 
 const EDGE = 1024;
@@ -19,9 +20,11 @@ export function pictures(job, imageId, { signal }) {
   const options = { signal, loaded: () => redraw() };
   const frame = picture(frameOf(job.id, EDGE), "The frame", { ...options, gone: "The frame is no longer stored, or this server does not serve frames." });
   const image = picture(contentOf(job.map, imageId, EDGE), `Candidate ${imageId}`, { ...options, gone: "The image is no longer in the map." });
+  const texts = h("div");
   const stage = h("div", { class: "pair" },
-    h("figure", {}, frame, h("figcaption", {}, "Frame")),
-    h("figure", {}, image, h("figcaption", {}, "Candidate ", h("code", {}, imageId))), lines);
+    h("figure", {}, frame, h("figcaption", {}, "Frame"), readIn(frame, job.texts)),
+    h("figure", {}, image, h("figcaption", {}, "Candidate ", h("code", {}, imageId)), texts), lines);
+  call(address(["maps", job.map, "images", imageId]), { signal }).then((state) => fill(texts, readIn(image, state.texts?.lines))).catch(() => {});
   const all = h("div", {}, stage, bar);
   if (job.refiner === "mllm") return all;
 
