@@ -1,4 +1,4 @@
-"""Compares `whereabouts read` with rapidocr on drawn signs. Arguments: the command and the reader's folder."""
+"""Compares `whereabouts read` with rapidocr on drawn signs. Arguments: command and folder of the reader."""
 
 import json
 import subprocess
