@@ -257,6 +257,25 @@ fn identical_images_that_arrive_in_the_growing_graph_crowd_no_other_image_out() 
 }
 
 #[test]
+fn of_equal_images_that_arrive_in_the_growing_graph_the_first_are_found() {
+    let mut rows = around(1000, 0.6, 2000, 32);
+    let picture = rows.0[1200].clone();
+    rows.0[1200..1500].fill(picture.clone());
+    let index = MapIndex::new(DEFAULTS);
+    (0..1100).for_each(|slot| index.add(slot));
+    caught_up(&index, &rows);
+    // So many arrive at once that several threads insert them.
+    (1100..1500).for_each(|slot| index.add(slot));
+    let several = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
+    while index.has_work() {
+        index.catch_up(&rows, 1000, &several);
+    }
+    let found = index.search(&rows, &picture, 10, SearchMode::Fast);
+    assert!(index.graphs().growing.is_some());
+    assert!(found.iter().map(|found| found.slot).eq(1200..1210), "{found:?}");
+}
+
+#[test]
 fn many_images_that_arrive_at_once_are_built_into_a_new_graph() {
     let rows = around(1000, 0.6, 2000, 32);
     for (at_once, is_whole) in [(400, false), (600, true)] {
