@@ -258,14 +258,14 @@ fn identical_images_that_arrive_in_the_growing_graph_crowd_no_other_image_out() 
 
 #[test]
 fn of_equal_images_that_arrive_in_the_growing_graph_the_first_are_found() {
-    let mut rows = around(1000, 0.6, 2000, 32);
+    let mut rows = around(1000, 0.6, 1400, 32);
     let picture = rows.0[1200].clone();
-    rows.0[1200..1500].fill(picture.clone());
+    rows.0[1200..1400].fill(picture.clone());
     let index = MapIndex::new(DEFAULTS);
     (0..1100).for_each(|slot| index.add(slot));
     caught_up(&index, &rows);
     // So many arrive at once that several threads insert them.
-    (1100..1500).for_each(|slot| index.add(slot));
+    (1100..1400).for_each(|slot| index.add(slot));
     let several = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
     while index.has_work() {
         index.catch_up(&rows, 1000, &several);
