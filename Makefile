@@ -22,7 +22,7 @@ nasm:
 	@deploy/setup/nasm.sh
 
 reader: ## Also download the reader of scene text, PP-OCRv5, pinned by version and hash
-	deploy/setup/reader.sh assets
+	deploy/setup/assets.sh --reader assets
 
 openvino: ## Also download ONNX Runtime with OpenVINO, faster on many x86-64 processors
 	deploy/setup/assets.sh --openvino assets

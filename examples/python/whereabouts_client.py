@@ -382,13 +382,13 @@ class Answer:
     """None for an empty map."""
     job: JobLink | None = None
     """The refinement job, if there is one."""
-    ranking: tuple[RankedCandidate, ...] | None = None
-    """With `refine="wait"`, the refined order once the job has ended."""
     no_job: NoJob | None = None
     track: TrackEstimate | None = None
     """None without a track."""
     warnings: tuple[str, ...] = ()
     """What the sender should know about the frame, such as damage in transit."""
+    ranking: tuple[RankedCandidate, ...] | None = None
+    """With `refine="wait"`, the refined order once the job has ended."""
 
 
 @dataclass(frozen=True)

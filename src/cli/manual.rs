@@ -1,6 +1,5 @@
 //! `whereabouts completions` and `whereabouts man`.
 
-use std::io::Cursor;
 use std::path::PathBuf;
 
 use anyhow::Context;
@@ -39,9 +38,9 @@ pub fn completions(args: &CompletionsArgs) -> anyhow::Result<()> {
 pub fn man(args: &ManArgs) -> anyhow::Result<()> {
     let command = Cli::command();
     let Some(folder) = &args.out else {
-        let mut page = Cursor::new(Vec::new());
+        let mut page = Vec::new();
         clap_mangen::Man::new(command).render(&mut page)?;
-        print!("{}", String::from_utf8(page.into_inner())?);
+        print!("{}", String::from_utf8(page)?);
         return Ok(());
     };
     std::fs::create_dir_all(folder)

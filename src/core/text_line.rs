@@ -11,8 +11,8 @@ pub struct TextLine {
     /// Mean probability of the characters, from 0 to 1, as the recognition model gives it. It is not
     /// calibrated.
     pub confidence: f32,
-    /// Corners of the quadrilateral around the line, in reading order: where the text begins at the top,
-    /// where it ends at the top, and then below. Each is `[x, y]` as a fraction of the width and height
-    /// of the picture, after its EXIF orientation was applied.
+    /// Corners of the quadrilateral around the line: top left, top right, bottom right, bottom left in the
+    /// picture, whichever way the text runs. Each is `[x, y]` as a fraction of the width and height of the
+    /// picture, after its EXIF orientation was applied.
     pub corners: [[f32; 2]; 4],
 }

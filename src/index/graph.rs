@@ -66,7 +66,7 @@ pub(super) struct Graph {
 /// The points of a graph and their slots.
 #[derive(Default)]
 struct Points {
-    /// Point → the slots of each of its descriptors. The first descriptor is that of the point.
+    /// Point → the slots of each of its descriptors, ascending. The first descriptor is that of the point.
     slots: Vec<Vec<Vec<usize>>>,
     /// Slot and point of each image, but for those that are equal to another, in the order of insertion.
     inserted: Vec<(usize, usize)>,
@@ -103,7 +103,10 @@ impl Graph {
         let point = {
             let mut points = self.points.write();
             if let Some(&(point, place)) = points.by_hash.get(&hash) {
-                points.slots[point][place].push(slot);
+                let equal = &mut points.slots[point][place];
+                // Several threads insert, and of equal images the first ones are results.
+                let at = equal.partition_point(|other| *other < slot);
+                equal.insert(at, slot);
                 return;
             }
             let joined = alike.map(|nearest| nearest.d_id);

@@ -251,9 +251,9 @@ impl MapIndex {
     /// Processes up to `most` waiting slots; returns the sealed graph, if this completed one. Only one thread may call
     /// it at a time; searches continue meanwhile.
     ///
-    /// New slots go into the growing graph, whose images are then searched for again. Once it covers as many slots as the sealed graph, or many slots arrive at
-    /// once, a graph over all slots is built, which replaces both: each slot is inserted into a sealed graph a few times
-    /// on average, whatever the size of the map. `threads` share the work.
+    /// New slots go into the growing graph, whose images are then searched for again. Once it covers as many slots as the
+    /// sealed graph, or many slots arrive at once, a graph over all slots is built, which replaces both: each slot is
+    /// inserted into a sealed graph a few times on average, whatever the size of the map. `threads` share the work.
     pub fn catch_up(
         &self,
         vectors: &dyn Vectors,

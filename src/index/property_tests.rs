@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 
 use proptest::prelude::*;
 
-use super::test_rows::Rows;
+use super::test_rows::{Rows, around};
+use super::tests::{DEFAULTS, caught_up, grown, lost};
 use super::*;
 
 /// A step in the life of an index. Numbers are taken modulo what exists.
@@ -192,5 +193,68 @@ proptest! {
         }
         // The fast search may miss few neighbours: 98 of 100 must be found.
         prop_assert!(right * 100 >= all * 98 || all - right <= 2, "recall is {right}/{all}");
+    }
+}
+
+/// Images around as many places as there are sizes, each `jitter` from its place, in an order that `seed` decides.
+fn crowds(seed: u64, sizes: &[usize], jitter: f32) -> Rows {
+    let count = sizes.iter().sum::<usize>();
+    let centres = around(sizes.len(), 0.0, sizes.len(), 16);
+    let noise = around(count, 0.0, count, 16);
+    let cluster = sizes.iter().enumerate().flat_map(|(of, size)| vec![of; *size]);
+    let mut rows: Vec<Vec<f32>> = cluster
+        .zip(&noise.0)
+        .map(|(of, noise)| {
+            let row: Vec<f32> =
+                centres.0[of].iter().zip(noise).map(|(x, y)| x + jitter * y).collect();
+            let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
+            row.into_iter().map(|x| x / norm).collect()
+        })
+        .collect();
+    let mut state = seed | 1;
+    for last in (1..rows.len()).rev() {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        rows.swap(last, (state >> 33) as usize % (last + 1));
+    }
+    Rows(rows)
+}
+
+const NARROW: IndexSettings =
+    IndexSettings { m: 8, ef_construction: 64, ef_search: 64, ..DEFAULTS };
+
+#[test]
+fn an_image_that_later_ones_cut_off_is_found_when_the_graph_is_at_rest() {
+    // hnsw_rs leaves the image in slot 457 without a link here, in most runs.
+    let rows = crowds(6_902_787_870_804_197_264, &[56, 104, 118, 111, 6, 109], 0.3);
+    for _ in 0..8 {
+        let index = grown(&rows, 297, NARROW);
+        assert!(index.graphs().growing.is_some());
+        assert_eq!(lost(&index, &rows), 0);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
+
+    /// Any small map with twins and near twins, in any order, partly sealed and partly removed: each image that is
+    /// left finds itself or a twin first, and every point of the sealed graph can be reached.
+    #[test]
+    fn every_image_finds_itself_first(
+        seed in any::<u64>(),
+        sizes in prop::collection::vec(1_usize..120, 1..12),
+        jitter in prop::sample::select(vec![0.0_f32, 0.05, 0.3]),
+        sealed_share in 0.0_f64..1.0,
+        removed in 0_usize..5,
+    ) {
+        let rows = crowds(seed, &sizes, jitter);
+        let count = rows.0.len();
+        let index = grown(&rows, (count as f64 * sealed_share) as usize, NARROW);
+        if removed > 0 {
+            (0..count).step_by(removed + 1).for_each(|slot| index.remove(slot));
+            caught_up(&index, &rows);
+        }
+        prop_assert_eq!(lost(&index, &rows), 0);
+        let sealed = index.graphs().sealed.clone();
+        prop_assert_eq!(sealed.map_or(0, |sealed| sealed.unreachable()), 0);
     }
 }

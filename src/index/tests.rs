@@ -1,7 +1,5 @@
 //! Search, sealing and removal on vectors in memory.
 
-use proptest::prelude::*;
-
 use super::test_rows::*;
 use super::*;
 
@@ -190,14 +188,14 @@ fn an_empty_map_returns_nothing() {
 }
 
 /// Builds whatever waits to be built.
-fn caught_up(index: &MapIndex, rows: &Rows) {
+pub(super) fn caught_up(index: &MapIndex, rows: &Rows) {
     while index.has_work() {
         index.catch_up(rows, 1000, &threads());
     }
 }
 
 /// The number of live slots whose own descriptor finds neither them nor a twin first.
-fn lost(index: &MapIndex, rows: &Rows) -> usize {
+pub(super) fn lost(index: &MapIndex, rows: &Rows) -> usize {
     let misses = |slot: &usize| {
         let found = index.search(rows, &rows.0[*slot], 10, SearchMode::Fast);
         found.first().is_none_or(|first| rows.0[first.slot] != rows.0[*slot])
@@ -208,7 +206,7 @@ fn lost(index: &MapIndex, rows: &Rows) -> usize {
 
 /// An index of all rows: the first `sealed` of them in the sealed graph, the rest in the growing one, because they
 /// arrive a few at a time.
-fn grown(rows: &Rows, sealed: usize, settings: IndexSettings) -> MapIndex {
+pub(super) fn grown(rows: &Rows, sealed: usize, settings: IndexSettings) -> MapIndex {
     let index = MapIndex::new(settings);
     (0..sealed).for_each(|slot| index.add(slot));
     caught_up(&index, rows);
@@ -222,7 +220,7 @@ fn grown(rows: &Rows, sealed: usize, settings: IndexSettings) -> MapIndex {
     index
 }
 
-const DEFAULTS: IndexSettings = IndexSettings {
+pub(super) const DEFAULTS: IndexSettings = IndexSettings {
     exact_up_to: 0,
     m: 16,
     ef_construction: 200,
@@ -254,6 +252,25 @@ fn identical_images_that_arrive_in_the_growing_graph_crowd_no_other_image_out() 
     let index = grown(&rows, 1600, DEFAULTS);
     assert!(index.graphs().growing.is_some(), "the rest is in the growing graph");
     assert_eq!(lost(&index, &rows), 0);
+}
+
+#[test]
+fn of_equal_images_that_arrive_in_the_growing_graph_the_first_are_found() {
+    let mut rows = around(1000, 0.6, 1400, 32);
+    let picture = rows.0[1200].clone();
+    rows.0[1200..1400].fill(picture.clone());
+    let index = MapIndex::new(DEFAULTS);
+    (0..1100).for_each(|slot| index.add(slot));
+    caught_up(&index, &rows);
+    // They arrive at once, and several threads insert them.
+    (1100..1400).for_each(|slot| index.add(slot));
+    let several = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
+    while index.has_work() {
+        index.catch_up(&rows, 1000, &several);
+    }
+    let found = index.search(&rows, &picture, 10, SearchMode::Fast);
+    assert!(index.graphs().growing.is_some());
+    assert!(found.iter().map(|found| found.slot).eq(1200..1210), "{found:?}");
 }
 
 #[test]
@@ -319,68 +336,5 @@ fn a_graph_file_with_an_index_out_of_bounds_is_refused() {
             let _ = read.search(&rows, &rows.0[0], (5, 32), |_| true);
             let _ = read.unreachable();
         }
-    }
-}
-
-/// Images around as many places as there are sizes, each `jitter` from its place, in an order that `seed` decides.
-fn crowds(seed: u64, sizes: &[usize], jitter: f32) -> Rows {
-    let count = sizes.iter().sum::<usize>();
-    let centres = around(sizes.len(), 0.0, sizes.len(), 16);
-    let noise = around(count, 0.0, count, 16);
-    let cluster = sizes.iter().enumerate().flat_map(|(of, size)| vec![of; *size]);
-    let mut rows: Vec<Vec<f32>> = cluster
-        .zip(&noise.0)
-        .map(|(of, noise)| {
-            let row: Vec<f32> =
-                centres.0[of].iter().zip(noise).map(|(x, y)| x + jitter * y).collect();
-            let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
-            row.into_iter().map(|x| x / norm).collect()
-        })
-        .collect();
-    let mut state = seed | 1;
-    for last in (1..rows.len()).rev() {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-        rows.swap(last, (state >> 33) as usize % (last + 1));
-    }
-    Rows(rows)
-}
-
-const NARROW: IndexSettings =
-    IndexSettings { m: 8, ef_construction: 64, ef_search: 64, ..DEFAULTS };
-
-#[test]
-fn an_image_that_later_ones_cut_off_is_found_when_the_graph_is_at_rest() {
-    // hnsw_rs leaves the image in slot 457 without a link here, in most runs.
-    let rows = crowds(6_902_787_870_804_197_264, &[56, 104, 118, 111, 6, 109], 0.3);
-    for _ in 0..8 {
-        let index = grown(&rows, 297, NARROW);
-        assert!(index.graphs().growing.is_some());
-        assert_eq!(lost(&index, &rows), 0);
-    }
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
-
-    /// Any small map with twins and near twins, in any order, partly sealed and partly removed: each image that is
-    /// left finds itself or a twin first, and every point of the sealed graph can be reached.
-    #[test]
-    fn every_image_finds_itself_first(
-        seed in any::<u64>(),
-        sizes in prop::collection::vec(1_usize..120, 1..12),
-        jitter in prop::sample::select(vec![0.0_f32, 0.05, 0.3]),
-        sealed_share in 0.0_f64..1.0,
-        removed in 0_usize..5,
-    ) {
-        let rows = crowds(seed, &sizes, jitter);
-        let count = rows.0.len();
-        let index = grown(&rows, (count as f64 * sealed_share) as usize, NARROW);
-        if removed > 0 {
-            (0..count).step_by(removed + 1).for_each(|slot| index.remove(slot));
-            caught_up(&index, &rows);
-        }
-        prop_assert_eq!(lost(&index, &rows), 0);
-        let sealed = index.graphs().sealed.clone();
-        prop_assert_eq!(sealed.map_or(0, |sealed| sealed.unreachable()), 0);
     }
 }

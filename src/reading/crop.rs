@@ -20,10 +20,9 @@ pub(super) fn straightened(
     let across = distance(a, b).max(distance(d, c)).max(1.0);
     let down = distance(a, d).max(distance(b, c)).max(1.0);
     let (columns, rows) = (across as u32, down as u32);
-    let upright = RgbImage::from_fn(columns.max(1), rows.max(1), |x, y| {
+    let upright = RgbImage::from_fn(columns, rows, |x, y| {
         // A rectangle of the detector is one in the picture too, but for the scales of both axes.
-        let (s, t) =
-            ((x as f32 + 0.5) / columns.max(1) as f32, (y as f32 + 0.5) / rows.max(1) as f32);
+        let (s, t) = ((x as f32 + 0.5) / columns as f32, (y as f32 + 0.5) / rows as f32);
         let place = |axis: usize| {
             let (top, bottom) =
                 (a[axis] + s * (b[axis] - a[axis]), d[axis] + s * (c[axis] - d[axis]));

@@ -2,13 +2,11 @@
 
 use image::RgbImage;
 use image::imageops::{FilterType, resize};
-use ort::session::Session;
-use ort::value::TensorRef;
-use parking_lot::Mutex;
 
 use super::ReadError;
 use super::geometry::{Point, Quad, Rectangle, contains};
 use super::manifest::DetectorSpec;
+use super::model::Model;
 use super::tensor::fill;
 
 /// Sides of the input are multiples of this many pixels.
@@ -20,8 +18,7 @@ const NARROWEST: [f32; 2] = [3.0, 5.0];
 
 #[derive(Debug)]
 pub(super) struct Detector {
-    pub session: Mutex<Session>,
-    pub input: String,
+    pub model: Model,
     pub spec: DetectorSpec,
     /// Most lines of a picture: those with the most pixels.
     pub max_lines: usize,
@@ -49,27 +46,20 @@ impl Detector {
         let (across, down) = (across as usize, down as usize);
         let mut planes = vec![0.0; 3 * across * down];
         fill(&mut planes, across, input, self.spec.mean, self.spec.std);
-        let tensor = TensorRef::from_array_view(([1, 3, down, across], planes.as_slice()))?;
-        let mut session = self.session.lock();
-        let outputs = session.run(ort::inputs![self.input.as_str() => tensor])?;
-        let (_, output) = outputs
-            .iter()
-            .next()
-            .ok_or_else(|| ReadError::Model("the detector has no output".into()))?;
-        let (_, map) = output.try_extract_tensor::<f32>()?;
-        if map.len() != across * down {
-            let why =
-                format!("the detector gives {} numbers for {across} × {down} pixels", map.len());
-            return Err(ReadError::Model(why));
-        }
-        let (by_x, by_y) = (width as f32 / across as f32, height as f32 / down as f32);
-        let mut lines: Vec<Quad> = Vec::new();
-        for region in regions(map, across, self.spec.pixel_threshold, self.max_lines) {
-            if let Some(line) = self.line(map, across, region) {
-                lines.push(line.map(|[x, y]| {
-                    [(x * by_x).clamp(0.0, width as f32), (y * by_y).clamp(0.0, height as f32)]
-                }));
+        let mut lines: Vec<Quad> = self.model.run([1, 3, down, across], &planes, |_, map| {
+            if map.len() != across * down {
+                return Err(ReadError::Model(format!(
+                    "the detector gives {} numbers for {across} × {down} pixels",
+                    map.len()
+                )));
             }
+            let regions = regions(map, across, self.spec.pixel_threshold, self.max_lines);
+            Ok(regions.into_iter().filter_map(|region| self.line(map, across, region)).collect())
+        })?;
+        let (width, height) = (width as f32, height as f32);
+        let (by_x, by_y) = (width / across as f32, height / down as f32);
+        for [x, y] in lines.iter_mut().flatten() {
+            (*x, *y) = ((*x * by_x).clamp(0.0, width), (*y * by_y).clamp(0.0, height));
         }
         lines.sort_by(|a, b| a[0][1].total_cmp(&b[0][1]).then(a[0][0].total_cmp(&b[0][0])));
         Ok(lines)

@@ -3,7 +3,7 @@
 /// A point in a picture: x to the right, y down, in pixels.
 pub(super) type Point = [f32; 2];
 
-/// Corners of a quadrilateral: top left, top right, bottom right, bottom left of what is upright in it.
+/// Corners of a quadrilateral: top left, top right, bottom right, bottom left in the picture.
 pub(super) type Quad = [Point; 4];
 
 pub(super) fn distance(a: Point, b: Point) -> f32 {
@@ -11,7 +11,7 @@ pub(super) fn distance(a: Point, b: Point) -> f32 {
 }
 
 /// The convex hull of points, in order (Andrew's monotone chain, 1979).
-pub(super) fn hull(mut points: Vec<Point>) -> Vec<Point> {
+fn hull(mut points: Vec<Point>) -> Vec<Point> {
     points.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
     points.dedup();
     if points.len() < 3 {

@@ -8,6 +8,7 @@ mod crop;
 mod detector;
 mod geometry;
 mod manifest;
+mod model;
 mod reader;
 mod recogniser;
 mod tensor;
@@ -15,7 +16,7 @@ mod tensor;
 use whereabouts_core::{Digest, TextLine};
 use whereabouts_vision::Picture;
 
-pub use self::manifest::{Manifest, READER_MANIFEST};
+pub use self::manifest::Manifest;
 pub use self::reader::{OnnxReader, ReaderSettings};
 
 /// Reads the text in pictures. A call is CPU-bound.

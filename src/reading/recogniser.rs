@@ -1,12 +1,10 @@
 //! Reads straightened lines of text.
 
 use image::RgbImage;
-use ort::session::Session;
-use ort::value::TensorRef;
-use parking_lot::Mutex;
 
 use super::ReadError;
 use super::manifest::RecogniserSpec;
+use super::model::Model;
 use super::tensor::fill;
 
 /// Lines are padded to at least this width, as those that the model was trained on.
@@ -20,8 +18,7 @@ const BLANK: usize = 0;
 
 #[derive(Debug)]
 pub(super) struct Recogniser {
-    pub session: Mutex<Session>,
-    pub input: String,
+    pub model: Model,
     pub spec: RecogniserSpec,
     /// The text of each class.
     pub keys: Vec<String>,
@@ -44,33 +41,24 @@ impl Recogniser {
                 fill(planes, width, &lines[at], self.spec.mean, self.spec.std);
             }
             let shape = [batch.len(), 3, height, width];
-            let tensor = TensorRef::from_array_view((shape, planes.as_slice()))?;
-            let mut session = self.session.lock();
-            let outputs = session.run(ort::inputs![self.input.as_str() => tensor])?;
-            let (_, output) = outputs
-                .iter()
-                .next()
-                .ok_or_else(|| ReadError::Model("the recogniser has no output".into()))?;
-            let (shape, numbers) = output.try_extract_tensor::<f32>()?;
-            let classes = shape
-                .last()
-                .copied()
-                .and_then(|last| usize::try_from(last).ok())
-                .unwrap_or_default();
-            if classes != self.keys.len() {
-                let why = format!(
-                    "the recogniser gives {classes} classes, its keys are {}",
-                    self.keys.len()
-                );
-                return Err(ReadError::Model(why));
-            }
-            let steps = numbers.len() / batch.len() / classes;
-            if steps == 0 {
-                return Err(ReadError::Model("the recogniser gives no steps".into()));
-            }
-            for (&at, numbers) in batch.iter().zip(numbers.chunks_exact(steps * classes)) {
-                texts[at] = self.decode(numbers);
-            }
+            self.model.run(shape, &planes, |shape, numbers| {
+                let classes =
+                    shape.last().and_then(|last| usize::try_from(*last).ok()).unwrap_or(0);
+                if classes != self.keys.len() {
+                    let keys = self.keys.len();
+                    let why =
+                        format!("the recogniser gives {classes} classes, its keys are {keys}");
+                    return Err(ReadError::Model(why));
+                }
+                let steps = numbers.len() / batch.len() / classes.max(1);
+                if steps == 0 {
+                    return Err(ReadError::Model("the recogniser gives no steps".into()));
+                }
+                for (&at, numbers) in batch.iter().zip(numbers.chunks_exact(steps * classes)) {
+                    texts[at] = self.decode(numbers);
+                }
+                Ok(())
+            })?;
         }
         Ok(texts)
     }

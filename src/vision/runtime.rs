@@ -139,11 +139,17 @@ impl Assets {
 
     /// Finds the folder of the model called `name`.
     pub fn model(&self, name: &str) -> Result<PathBuf, RuntimeError> {
+        self.folder(name, MANIFEST).ok_or_else(|| RuntimeError::NoModel {
+            name: name.to_owned(),
+            searched: self.searched(),
+        })
+    }
+
+    /// Finds the folder of this name in `models/` that has this manifest.
+    pub fn folder(&self, name: &str, manifest: &str) -> Option<PathBuf> {
         let is_plain = !name.is_empty() && !name.contains(['/', '\\']) && name != "..";
-        let folders = self.candidates.iter().map(|folder| folder.join("models").join(name));
-        folders.into_iter().find(|folder| is_plain && folder.join(MANIFEST).is_file()).ok_or_else(
-            || RuntimeError::NoModel { name: name.to_owned(), searched: self.searched() },
-        )
+        let mut folders = self.candidates.iter().map(|folder| folder.join("models").join(name));
+        folders.find(|folder| is_plain && folder.join(manifest).is_file())
     }
 
     /// Resolves a model name. [`AUTO`] becomes the chosen model, else the first of [`PREFERRED_MODELS`] that
@@ -237,7 +243,8 @@ impl Assets {
             .ok_or_else(|| RuntimeError::NoLibrary { searched: self.searched() })
     }
 
-    fn searched(&self) -> String {
+    /// The folders that are searched, for messages.
+    pub fn searched(&self) -> String {
         let folders = self.candidates.iter().chain(&self.packages);
         folders.map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
     }

@@ -23,6 +23,8 @@ const PICTURES: usize = 240;
 const QUICK: Duration = Duration::from_secs(10);
 /// Every map has a graph, which has to catch up after a kill.
 const GRAPH: (&str, &str) = ("WHEREABOUTS_INDEX__EXACT_UP_TO", "0");
+/// Descriptors stay those of the vocabulary that the map has.
+const NO_FITTING: (&str, &str) = ("WHEREABOUTS_VOCABULARY__OWN", "false");
 const EXACT: (&str, &str) = ("WHEREABOUTS_INDEX__EXACT_UP_TO", "1000000");
 
 fn number(name: &str, default: usize) -> usize {
@@ -77,10 +79,10 @@ impl Driver {
         self.clients.iter().map(|client| client.ledger.images.len()).sum()
     }
 
-    fn start(&mut self, index: (&str, &str)) -> Server {
+    fn start(&mut self, settings: &[(&str, &str)]) -> Server {
         let start = Instant::now();
         // Graphs are rebuilt often, and segments are compacted often.
-        let settings = [index, ("WHEREABOUTS_INDEX__MAX_DEAD_SHARE", "0.1")];
+        let settings = [settings, &[("WHEREABOUTS_INDEX__MAX_DEAD_SHARE", "0.1")]].concat();
         let server = Server::start(self.dir.path(), &settings);
         self.slowest = self.slowest.max(start.elapsed());
         assert!(start.elapsed() < QUICK, "the start took {:?}", start.elapsed());
@@ -91,7 +93,7 @@ impl Driver {
         if self.random.below(4) == 0 {
             self.kill_while_starting();
         }
-        let server = self.start(GRAPH);
+        let server = self.start(&[GRAPH]);
         self.check(&server, 8).await;
         let url = server.url.clone();
         let mut working = Vec::new();
@@ -183,7 +185,7 @@ impl Driver {
 
     /// Asserts that everything is there, that every job ends, and that the graph finds what exact search finds.
     async fn end(&mut self) {
-        let server = self.start(GRAPH);
+        let server = self.start(&[GRAPH, NO_FITTING]);
         self.check(&server, usize::MAX).await;
         let jobs: Vec<String> =
             self.clients.iter().flat_map(|client| client.ledger.jobs.clone()).collect();
@@ -195,7 +197,7 @@ impl Driver {
         until(async || server.get("/maps/shared").await.expect(200)["index"] == "hnsw").await;
         let graph = self.answers(&server).await;
         server.kill();
-        let server = self.start(EXACT);
+        let server = self.start(&[EXACT, NO_FITTING]);
         let exact = self.answers(&server).await;
         let all: usize = exact.iter().map(Vec::len).sum();
         let same: usize = exact

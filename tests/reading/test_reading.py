@@ -1,4 +1,4 @@
-"""Compares `whereabouts read` with rapidocr on drawn signs: arguments are the command and the folder of the reader."""
+"""Compares `whereabouts read` with rapidocr on drawn signs. Arguments: command and folder of the reader."""
 
 import json
 import subprocess
@@ -15,7 +15,9 @@ from rapidocr import RapidOCR
 COMMAND, READER = sys.argv[1], Path(sys.argv[2]).resolve()
 
 
-def sign(text: str, size: int, colours: tuple[str, str] = ("black", "white"), degrees: float = 0.0) -> Image.Image:
+def sign(
+    text: str, size: int, colours: tuple[str, str] = ("black", "white"), degrees: float = 0.0
+) -> Image.Image:
     """A sign with a margin, turned counterclockwise on grey."""
     font = ImageFont.load_default(size)
     left, top, right, bottom = font.getbbox(text)
@@ -39,8 +41,14 @@ SIGNS = {
     "turned to the right": (street((sign("BAKERY", 44, degrees=-15), (200, 150))), ["BAKERY"]),
     "running downwards": (street((sign("HARDWARE", 40, degrees=-90), (300, 100))), ["HARDWARE"]),
     "running upwards": (street((sign("HARDWARE", 40, degrees=90), (300, 100))), ["HARDWARE"]),
-    "two side by side": (street((sign("TOYS", 40), (60, 200)), (sign("BANK", 40), (360, 200))), ["BANK", "TOYS"]),
-    "one above the other": (street((sign("HOTEL", 40), (200, 60)), (sign("ROOM 24", 40), (200, 300))), ["HOTEL", "ROOM 24"]),
+    "two side by side": (
+        street((sign("TOYS", 40), (60, 200)), (sign("BANK", 40), (360, 200))),
+        ["BANK", "TOYS"],
+    ),
+    "one above the other": (
+        street((sign("HOTEL", 40), (200, 60)), (sign("ROOM 24", 40), (200, 300))),
+        ["HOTEL", "ROOM 24"],
+    ),
     "a wide picture": (street((sign("GROCERY", 60), (1200, 200)), size=(2000, 500)), ["GROCERY"]),
     "a portrait": (street((sign("CINEMA", 60), (60, 700)), size=(480, 1200)), ["CINEMA"]),
 }
@@ -63,6 +71,13 @@ def distance(a: np.ndarray, b: np.ndarray) -> float:
     """The largest distance of the bounds of two quadrilaterals, in pixels."""
     bounds = [np.concatenate([corners.min(0), corners.max(0)]) for corners in (a, b)]
     return float(np.abs(bounds[0] - bounds[1]).max())
+
+
+def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Runs `whereabouts read`."""
+    environment = {"PATH": "/usr/bin:/bin", "WHEREABOUTS_MODEL__ASSETS": str(READER.parent.parent)}
+    command = [COMMAND, "read", *arguments]
+    return subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
 
 
 class Reading(unittest.TestCase):
@@ -100,8 +115,7 @@ class Reading(unittest.TestCase):
         for number, picture in enumerate(pictures):
             files.append(self.folder / f"{number}.png")
             picture.save(files[-1])
-        environment = {"PATH": "/usr/bin:/bin", "WHEREABOUTS_MODEL__ASSETS": str(READER.parent.parent)}
-        ran = subprocess.run([COMMAND, "read", "--json", *files], capture_output=True, text=True, env=environment)
+        ran = run("--json", *files)
         self.assertEqual(ran.returncode, 0, ran.stderr)
         return [json.loads(line) for line in ran.stdout.splitlines()]
 
@@ -133,7 +147,7 @@ class Reading(unittest.TestCase):
     def test_a_reader_that_is_missing_or_damaged_is_an_error_that_says_what_to_do(self) -> None:
         picture = self.folder / "sign.png"
         SIGNS["one sign"][0].save(picture)
-        ran = subprocess.run([COMMAND, "read", "--reader", "none", picture], capture_output=True, text=True)
+        ran = run("--reader", "none", picture)
         self.assertEqual(ran.returncode, 1)
         self.assertIn("make reader", ran.stderr)
 
@@ -141,8 +155,7 @@ class Reading(unittest.TestCase):
         picture, other = self.folder / "sign.png", self.folder / "notes.txt"
         SIGNS["one sign"][0].save(picture)
         other.write_text("no picture")
-        environment = {"PATH": "/usr/bin:/bin", "WHEREABOUTS_MODEL__ASSETS": str(READER.parent.parent)}
-        ran = subprocess.run([COMMAND, "read", other, picture], capture_output=True, text=True, env=environment)
+        ran = run(other, picture)
         self.assertEqual(ran.returncode, 1)
         self.assertIn("PHARMACY", ran.stdout)
         self.assertIn("notes.txt", ran.stderr)

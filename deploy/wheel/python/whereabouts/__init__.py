@@ -79,7 +79,7 @@ def _in_thread(
 
 
 class AsyncClient:
-    """The same for asyncio: each call runs in a thread of the default executor, with the arguments of `Client`.
+    """The same for asyncio: each call runs in a thread of the default executor. Arguments: those of `Client`.
 
     A call that is cancelled is not awaited any more, but its request may still be carried out.
     """
