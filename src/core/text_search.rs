@@ -71,6 +71,20 @@ impl Folded {
         starts.zip(&self.word_ends).map(|(&start, &end)| &self.chars[start..end])
     }
 
+    /// This text and another one behind it.
+    fn followed_by(&self, other: &Self) -> Self {
+        let shift = self.chars.len();
+        Self {
+            chars: [self.chars.as_slice(), &other.chars].concat(),
+            word_ends: self
+                .word_ends
+                .iter()
+                .copied()
+                .chain(other.word_ends.iter().map(|end| end + shift))
+                .collect(),
+        }
+    }
+
     /// Whether nothing is left.
     pub fn is_empty(&self) -> bool {
         self.chars.is_empty()
@@ -142,21 +156,22 @@ fn is_ideographic(character: char) -> bool {
         | 0x3400..=0x4DBF | 0x4E00..=0x9FFF | 0xAC00..=0xD7AF | 0xF900..=0xFAFF | 0x20000..=0x3FFFF)
 }
 
-/// The grams by which an index finds lines: pairs of characters, and single ones of scripts without spaces and of lines
+/// The grams by which an index finds lines: pairs of characters, and single ones of scripts without spaces and of words
 /// of one character, each hashed. The lines of a sign that was read as two are also joined.
 pub fn grams<'a>(lines: impl IntoIterator<Item = &'a str>) -> BTreeSet<u32> {
     let mut found = BTreeSet::new();
     let mut last: Option<char> = None;
     for line in lines {
-        let Folded { chars, .. } = Folded::new(line);
+        let folded = Folded::new(line);
+        for word in folded.words().filter(|word| word.len() == 1) {
+            found.insert(hash(word));
+        }
+        let chars = folded.chars;
         if let (Some(last), Some(&first)) = (last, chars.first()) {
             found.insert(hash(&[last, first]));
         }
         for pair in chars.windows(2) {
             found.insert(hash(pair));
-        }
-        for single in chars.iter().filter(|&&c| chars.len() == 1 || is_ideographic(c)) {
-            found.insert(hash(&[*single]));
         }
         last = chars.last().copied().or(last);
     }
@@ -200,11 +215,9 @@ impl TextQuery {
     /// How well the lines of an image match; `None` if they do not.
     pub fn matches(&self, lines: &[TextLine]) -> Option<TextMatch> {
         let folded: Vec<Folded> = lines.iter().map(|line| Folded::new(&line.text)).collect();
-        let singles = (0..lines.len()).map(|at| (vec![at], folded[at].chars.clone()));
-        let joined = (1..lines.len()).map(|at| {
-            let both = [folded[at - 1].chars.as_slice(), &folded[at].chars].concat();
-            (vec![at - 1, at], both)
-        });
+        let singles = (0..lines.len()).map(|at| (vec![at], folded[at].clone()));
+        let joined =
+            (1..lines.len()).map(|at| (vec![at - 1, at], folded[at - 1].followed_by(&folded[at])));
         let mut best: Option<TextMatch> = None;
         let mut keep = |score: f32, at: Vec<usize>| {
             // Fewer lines are preferred, then earlier ones.
@@ -213,11 +226,11 @@ impl TextQuery {
                 best = Some(TextMatch { score, lines: at });
             }
         };
-        for (at, chars) in singles.chain(joined) {
-            if let Some(likeness) = likeness(&self.folded.chars, &chars) {
+        for (at, line) in singles.chain(joined) {
+            if let Some(likeness) = likeness(&self.folded.chars, &line) {
                 let plain: String = at.iter().map(|&at| squeezed(&lines[at].text)).collect();
                 let exact = if plain.contains(&self.plain) { EXACT_WORTH } else { 0.0 };
-                let share = self.folded.chars.len() as f32 / chars.len().max(1) as f32;
+                let share = self.folded.chars.len() as f32 / line.chars.len().max(1) as f32;
                 let whole = 1.0 - WHOLE_LINE_WORTH * (1.0 - share.min(1.0));
                 keep(likeness * whole * (1.0 - EXACT_WORTH) + exact * whole, at);
             }
@@ -236,12 +249,7 @@ impl TextQuery {
         for word in self.folded.words() {
             let mut best: Option<(f32, usize)> = None;
             for (number, line) in lines.iter().enumerate() {
-                // A short word inside another says nothing.
-                let near = match word.len() {
-                    0..=3 => line.words().any(|other| other == word).then_some(1.0),
-                    _ => likeness(word, &line.chars),
-                };
-                if let Some(near) = near
+                if let Some(near) = likeness(word, line)
                     && best.is_none_or(|(score, _)| near > score)
                 {
                     best = Some((near, number));
@@ -272,37 +280,56 @@ pub fn allowed_edits(chars: usize) -> usize {
     }
 }
 
-/// How much of `text` is somewhere in `line`, from 0 to 1; `None` if too many characters differ. Texts of up to two
-/// letters must be the whole line: within others they say nothing.
-pub fn likeness(text: &[char], line: &[char]) -> Option<f32> {
-    let is_short = text.len() <= 2 && !text.iter().any(|&c| is_ideographic(c));
-    if text.is_empty() || line.is_empty() || (is_short && text != line) {
+/// The most letters of a text that must be words of their own. Within other words, short texts are found by chance: BAR
+/// in BARBER.
+const SHORT: usize = 3;
+
+/// The most letters of a text that must be words of their own if they are not all right: BANK is one edit from a part of
+/// BAKER & SON.
+const SHORT_IF_WRONG: usize = 6;
+
+/// How much of `text` is somewhere in `line`, from 0 to 1; `None` if too many characters differ, or if the text is short
+/// and is no word of the line.
+pub fn likeness(text: &[char], line: &Folded) -> Option<f32> {
+    if text.is_empty() || line.is_empty() {
         return None;
     }
-    let edits = edits_within(text, line);
+    let mut edits = match text.len() {
+        0..=SHORT => edits_within(text, line, true),
+        _ => edits_within(text, line, false),
+    };
+    if edits > 0 && text.len() <= SHORT_IF_WRONG {
+        edits = edits_within(text, line, true);
+    }
     (edits <= allowed_edits(text.len())).then(|| 1.0 - edits as f32 / text.len() as f32)
 }
 
-/// The fewest insertions, deletions, replacements and swaps of neighbours that turn `text` into a part of `line`.
-fn edits_within(text: &[char], line: &[char]) -> usize {
-    // A column for each character of the line; a match may begin and end anywhere in it.
+/// The fewest insertions, deletions, replacements and swaps of neighbours that turn `text` into a part of `line`: any
+/// part, or one that begins and ends with words.
+fn edits_within(text: &[char], line: &Folded, whole_words: bool) -> usize {
+    let Folded { chars, word_ends } = line;
+    let is_bound = |at: usize| !whole_words || at == 0 || word_ends.binary_search(&at).is_ok();
+    // A column for each character of the line. A match may begin at each bound, and end there.
     let height = text.len() + 1;
     let mut before: Vec<usize> = (0..height).collect();
     let mut earlier = before.clone();
     let mut fewest = text.len();
-    for (at, &character) in line.iter().enumerate() {
+    for (at, &character) in chars.iter().enumerate() {
         let mut column = vec![0; height];
+        column[0] = if is_bound(at + 1) { 0 } else { before[0] + 1 };
         for row in 1..height {
             let replaced = before[row - 1] + usize::from(text[row - 1] != character);
             let mut least = replaced.min(before[row] + 1).min(column[row - 1] + 1);
             let is_swap =
-                row > 1 && at > 0 && text[row - 1] == line[at - 1] && text[row - 2] == character;
+                row > 1 && at > 0 && text[row - 1] == chars[at - 1] && text[row - 2] == character;
             if is_swap {
                 least = least.min(earlier[row - 2] + 1);
             }
             column[row] = least;
         }
-        fewest = fewest.min(column[text.len()]);
+        if is_bound(at + 1) {
+            fewest = fewest.min(column[text.len()]);
+        }
         earlier = std::mem::replace(&mut before, column);
     }
     fewest
@@ -354,6 +381,14 @@ mod tests {
             ("pharmcay", &["PHARMACY"]),
             ("express24", &["EXPRESS 24"]),
             ("A7", &["a7"]),
+            ("A7", &["A7 Nord"]),
+            ("5", &["5 Main Street"]),
+            ("bar", &["Snack-Bar"]),
+            ("bank", &["BANKHAUS"]),
+            ("bamk", &["City Bank"]),
+            ("hotel", &["GRAND H0TFL"]),
+            ("pharmcay", &["24HPHARMACY"]),
+            ("カフエ", &["東京カフェ館"]),
             ("аптека", &["АПТЕКА"]),
             ("서울", &["서울역"]),
         ] {
@@ -369,6 +404,11 @@ mod tests {
         for (query, read) in [
             ("bank", &["BOOKS"][..]),
             ("bar", &["BAKERY"]),
+            ("bar", &["BARBER"]),
+            ("bank", &["BAKER&SON"]),
+            ("tank", &["THANKS"]),
+            ("cafe", &["SCARFE"]),
+            ("market", &["SUPERMARKEN"]),
             ("Kawa Coffee", &["Pharmacy", "24 h"]),
             ("12", &["1234"]),
             ("5", &["8"]),
