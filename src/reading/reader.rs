@@ -11,6 +11,9 @@ use super::model::Model;
 use super::recogniser::Recogniser;
 use super::{ReadError, Reader};
 
+/// Raised when the processing here changes what is read with the same models, so that images are read again.
+const PROCESSING: u32 = 1;
+
 /// How a reader is loaded.
 #[derive(Debug, Clone)]
 pub struct ReaderSettings {
@@ -43,6 +46,8 @@ impl OnnxReader {
         let keys = folder.join(&recogniser.keys);
         let keys = std::fs::read_to_string(&keys)
             .map_err(|error| ReadError::File(format!("cannot read {}: {error}", keys.display())))?;
+        let digest =
+            Digest::of(format!("{digest}, processing {PROCESSING}, {max_lines} lines").as_bytes());
         Ok(Self {
             digest,
             detector: Detector {

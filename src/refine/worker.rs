@@ -200,7 +200,7 @@ impl Worker {
     ) -> (Result<Refinement, RefineError>, Option<Vec<TextLine>>) {
         let texts = async {
             match &self.reader {
-                Some(reader) => reader.read_frame(&record.query.digest).await,
+                Some(reader) => reader.read_frame(&record.job.map, &record.query.digest).await,
                 None => None,
             }
         };

@@ -222,6 +222,11 @@ impl ServiceMetrics {
         self.images_unread.get_or_create(&labels).set(i64::try_from(images).unwrap_or(i64::MAX));
     }
 
+    /// Forgets how many images of a map are not read, since it is gone.
+    pub fn forget_images_unread(&self, map: &str) {
+        self.images_unread.remove(&MapLabels { map: map.to_owned() });
+    }
+
     /// Counts an attempt to deliver a message to a webhook.
     pub fn webhook_attempt(&self, outcome: AttemptOutcome) {
         let outcome = match outcome {

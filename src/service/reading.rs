@@ -12,7 +12,7 @@ use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 use whereabouts_api::MapTexts;
-use whereabouts_core::{Digest, Image, ImageTexts, Map, TextLine};
+use whereabouts_core::{Digest, Image, ImageTexts, Map, MapName, TextLine};
 use whereabouts_reading::Reader;
 use whereabouts_refine::FrameReader;
 use whereabouts_store::{IndexState, Store, StoreError, TextCounts, TextStore};
@@ -80,12 +80,29 @@ pub struct Reading {
     pub(super) searching: Semaphore,
 }
 
+/// A map at the last scan.
+struct Seen {
+    name: MapName,
+    /// Its number of images and its version when all of them were read.
+    settled: Option<(usize, u64)>,
+}
+
 /// What became of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Outcome {
     Done,
     /// Another process reads it.
     Elsewhere,
+    /// It can be read another time: its bytes are missing, or the process ends.
+    Later,
+}
+
+/// A picture that was not read.
+enum NotRead {
+    /// It cannot be: it is damaged, or the model fails on it.
+    Never(String),
+    /// It may be readable later.
+    Later(String),
 }
 
 impl Reading {
@@ -120,7 +137,7 @@ impl Reading {
     /// Reads the images that were not read, until `shutdown`.
     pub async fn run(&self, shutdown: CancellationToken) {
         let Some(reader) = &self.reader else { return };
-        let mut settled = BTreeMap::new();
+        let mut seen = BTreeMap::new();
         let mut pause = SCAN_PAUSE;
         loop {
             tokio::select! {
@@ -129,7 +146,7 @@ impl Reading {
             }
             let read = tokio::select! {
                 () = shutdown.cancelled() => return,
-                read = self.read_new(reader, &mut settled) => read,
+                read = self.read_new(reader, &mut seen) => read,
             };
             pause = SCAN_PAUSE;
             match read {
@@ -145,16 +162,22 @@ impl Reading {
     async fn read_new(
         &self,
         reader: &Arc<dyn Reader>,
-        settled: &mut BTreeMap<Uuid, (usize, u64)>,
+        seen: &mut BTreeMap<Uuid, Seen>,
     ) -> Result<Duration, ServiceError> {
         let began = Instant::now();
         let maps = self.store.maps().await?;
-        settled.retain(|uid, _| maps.iter().any(|map| map.uid == *uid));
-        self.counts.lock().retain(|uid, _| maps.iter().any(|map| map.uid == *uid));
+        let is_there = |uid: &Uuid| maps.iter().any(|map| map.uid == *uid);
+        for (_, gone) in seen.extract_if(.., |uid, _| !is_there(uid)) {
+            self.metrics.forget_images_unread(gone.name.as_str());
+        }
+        self.counts.lock().retain(|uid, _| is_there(uid));
         let mut reading = Duration::ZERO;
         for map in maps {
             let IndexState { images, changes, .. } = self.store.index_state(&map).await?;
-            if settled.get(&map.uid) == Some(&(images, changes)) {
+            let state = (images, changes);
+            let name = map.name.clone();
+            let seen = seen.entry(map.uid).or_insert(Seen { name, settled: None });
+            if seen.settled == Some(state) {
                 continue;
             }
             let (mut after, mut elsewhere) = (None, false);
@@ -165,12 +188,12 @@ impl Reading {
                 let began = Instant::now();
                 for image in &page {
                     elsewhere |= self.read_image(reader, &map, image).await? == Outcome::Elsewhere;
-                    self.show_waiting(reader, &map).await?;
                 }
                 reading += began.elapsed();
+                self.show_waiting(reader, &map).await?;
             }
             if !elsewhere {
-                settled.insert(map.uid, (images, changes));
+                seen.settled = Some(state);
             }
         }
         Ok(began.elapsed().saturating_sub(reading))
@@ -197,7 +220,7 @@ impl Reading {
         }
         let read = self.read_claimed(reader, map, image).await;
         self.store.release_lease(&key).await?;
-        read.map(|()| Outcome::Done)
+        read
     }
 
     async fn read_claimed(
@@ -205,24 +228,28 @@ impl Reading {
         reader: &Arc<dyn Reader>,
         map: &Map,
         image: &Image,
-    ) -> Result<(), ServiceError> {
+    ) -> Result<Outcome, ServiceError> {
         // Another process may have read it since it was listed.
         let known = self.store.texts(map, std::slice::from_ref(&image.id)).await?.pop().flatten();
         if known.is_some_and(|known| known.reader == reader.digest()) {
-            return Ok(());
+            return Ok(Outcome::Done);
         }
         let began = Instant::now();
         let texts = match self.read(reader, &image.digest, true).await? {
             Ok(lines) => ImageTexts::read(reader.digest(), lines),
-            Err(why) => {
+            Err(NotRead::Never(why)) => {
                 tracing::warn!(map = %map.name, image = %image.id, why, "the text of an image cannot be read");
                 ImageTexts::failed(reader.digest(), &why)
+            }
+            Err(NotRead::Later(why)) => {
+                tracing::warn!(map = %map.name, image = %image.id, why, "the text of an image was not read");
+                return Ok(Outcome::Later);
             }
         };
         self.metrics.image_read(texts.error.is_none(), texts.lines.len(), began.elapsed());
         // An image that was removed meanwhile needs no texts.
         self.store.put_texts(map, image, texts).await?;
-        Ok(())
+        Ok(Outcome::Done)
     }
 
     /// Reads a picture. In the background, it is begun when no request waits.
@@ -231,24 +258,24 @@ impl Reading {
         reader: &Arc<dyn Reader>,
         picture: &Digest,
         in_background: bool,
-    ) -> Result<Result<Vec<TextLine>, String>, StoreError> {
+    ) -> Result<Result<Vec<TextLine>, NotRead>, StoreError> {
         let permit = match in_background {
             // Background work is never rejected.
             true => self.admission.acquire(AdmissionRequest::BACKGROUND).await.ok(),
             false => None,
         };
         let Some(bytes) = self.store.blob(picture).await? else {
-            return Ok(Err("its bytes are missing from the store".into()));
+            return Ok(Err(NotRead::Later("its bytes are missing from the store".into())));
         };
         let (reader, limits) = (Arc::clone(reader), self.limits);
         let read = move || {
             let picture = decode::decode(&bytes, limits, decode::Needed::All)
-                .map_err(|error| error.to_string())?;
+                .map_err(|error| NotRead::Never(error.to_string()))?;
             // Others may begin: what follows has a thread of its own.
             drop(permit);
-            reader.read(&picture).map_err(|error| error.to_string())
+            reader.read(&picture).map_err(|error| NotRead::Never(error.to_string()))
         };
-        Ok(self.pool.run(read).await.unwrap_or_else(|error| Err(error.to_string())))
+        Ok(self.pool.run(read).await.unwrap_or_else(|error| Err(NotRead::Later(error.to_string()))))
     }
 
     /// How much of a map was read; `None` if nothing was and there is no reader.
@@ -265,6 +292,13 @@ impl Reading {
         let TextCounts { read, failed, lines } = counts;
         let waiting = reader.map(|_| images.saturating_sub(read + failed));
         Ok(Some(MapTexts { reader, read, failed, waiting, lines }))
+    }
+
+    /// Whether this reader has read text in a map.
+    async fn has_texts(&self, map: &MapName, reader: &Arc<dyn Reader>) -> Result<bool, StoreError> {
+        let Some(map) = self.store.map(map).await? else { return Ok(false) };
+        let images = self.store.index_state(&map).await?.images;
+        Ok(self.counted(&map, images, Some(&reader.digest())).await?.lines > 0)
     }
 
     async fn counted(
@@ -288,14 +322,21 @@ impl Reading {
 
 #[async_trait]
 impl FrameReader for Reading {
-    async fn read_frame(&self, frame: &Digest) -> Option<Vec<TextLine>> {
+    async fn read_frame(&self, map: &MapName, frame: &Digest) -> Option<Vec<TextLine>> {
         let reader = self.reader.as_ref()?;
-        match self.read(reader, frame, false).await {
-            Ok(Ok(lines)) => Some(ImageTexts::read(reader.digest(), lines).lines),
-            Ok(Err(why)) => {
+        let read = async {
+            match self.has_texts(map, reader).await? {
+                true => self.read(reader, frame, false).await.map(Some),
+                false => Ok(None),
+            }
+        };
+        match read.await {
+            Ok(Some(Ok(lines))) => Some(ImageTexts::read(reader.digest(), lines).lines),
+            Ok(Some(Err(NotRead::Never(why) | NotRead::Later(why)))) => {
                 tracing::warn!(why, "the text of a frame cannot be read");
                 None
             }
+            Ok(None) => None,
             Err(error) => {
                 tracing::debug!(%error, "the text of a frame was not read");
                 None

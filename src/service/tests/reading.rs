@@ -153,14 +153,48 @@ async fn an_image_is_begun_only_when_no_frame_waits() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn frames_are_read_and_those_that_cannot_be_have_no_texts() {
-    let fixture = with_reader(&Arc::default()).await;
+async fn frames_are_read_where_there_are_texts_to_compare_them_with() {
+    let reader = Arc::new(Fake::default());
+    let fixture = with_reader(&reader).await;
+    let map = fixture.map("m", &[]).await;
     let frame = Bytes::from(written(b"Pharmacy"));
     let digest = Digest::of(&frame);
     let _pin = fixture.store.put_blob(digest, frame).await.unwrap();
-    let read = fixture.service.reading.read_frame(&digest).await.unwrap();
-    assert_eq!(read[0].text, "Pharmacy");
-    assert_eq!(fixture.service.reading.read_frame(&Digest::of(b"none")).await, None);
+    let read = async |digest| fixture.service.reading.read_frame(&map.name, &digest).await;
+    assert_eq!(read(digest).await, None, "nothing was read in the map");
+    assert_eq!(reader.calls.load(Ordering::Relaxed), 0);
+    add(&fixture, &map, 0, written(b"Bank")).await;
+    read_all(&fixture, &map).await;
+    assert_eq!(read(digest).await.unwrap()[0].text, "Pharmacy");
+    assert_eq!(read(Digest::of(b"none")).await, None);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_image_whose_bytes_are_missing_is_read_when_they_are_back() {
+    let fixture = with_reader(&Arc::default()).await;
+    let map = fixture.map("m", &[]).await;
+    let bytes = written(b"Bank");
+    let lost = Image { digest: Digest::of(&bytes), ..image(0, None).1 };
+    fixture.store.add_image(&map, lost.clone(), descriptor(0)).await.unwrap();
+    let last = add(&fixture, &map, 1, written(b"Cafe")).await;
+    let shutdown = CancellationToken::new();
+    let (reading, until) = (Arc::clone(&fixture.service.reading), shutdown.clone());
+    let running = tokio::spawn(async move { reading.run(until).await });
+    let texts = async |image: &Image| {
+        fixture.store.texts(&map, std::slice::from_ref(&image.id)).await.unwrap().remove(0)
+    };
+    let is_read = async |image: &Image| {
+        while texts(image).await.is_none() {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(60), is_read(&last)).await.unwrap();
+    assert_eq!(texts(&lost).await, None, "it is not marked as one that cannot be read");
+    shutdown.cancel();
+    running.await.unwrap();
+    let _pin = fixture.store.put_blob(lost.digest, bytes.into()).await.unwrap();
+    read_all(&fixture, &map).await;
+    assert_eq!(texts(&lost).await.unwrap().lines[0].text, "Bank");
 }
 
 #[tokio::test]
