@@ -54,7 +54,7 @@ scale-out: assets nasm ## Run only the black-box tests of servers and workers on
 conformance: build ## Fuzz the API against its OpenAPI description with thousands of generated requests
 	tests/api/conformance.sh $(BINARY) target/api-venv 150
 
-console: build chromium ## Test the operator console in a browser
+console: build reader chromium ## Test the operator console in a browser
 	tests/console/check.sh $(BINARY) target/console-venv
 
 console-bench: build chromium ## Measure the first view of the console on a server with many jobs and images

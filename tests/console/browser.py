@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import time
 import unittest
 import urllib.request
 
@@ -83,6 +84,13 @@ class Console(unittest.TestCase):
         self.pages = [*getattr(self, "pages", []), page]
         page.goto(f"{URL}/{path}")
         return page
+
+    def until_read(self):
+        """Waits until the text in all images of the town is read."""
+        until = time.monotonic() + 120
+        while call("GET", "/maps/town")["texts"]["waiting"]:
+            self.assertLess(time.monotonic(), until, "the images of the town are not read")
+            time.sleep(0.1)
 
     def ended_job(self):
         return call("GET", "/jobs?state=succeeded&limit=1")["jobs"][0]

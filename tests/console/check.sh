@@ -5,7 +5,7 @@
 #     check.sh BINARY VENV
 #
 # VENV is the folder of a Python virtual environment with playwright (requirements.txt); it is created if missing.
-# The browser is chromium from the PATH, or the one in CHROMIUM. With SCREENSHOTS=FOLDER, screenshots of the
+# The browser is chromium from the PATH, or the one in CHROMIUM. The reader must be installed (`make reader`). With SCREENSHOTS=FOLDER, screenshots of the
 # views are written there. Takes about two minutes. Exits with 1 if anything fails.
 set -euo pipefail
 # shellcheck source-path=SCRIPTDIR source=../server.sh

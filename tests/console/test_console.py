@@ -248,6 +248,51 @@ class Maps(Console):
         page.get_by_role("button", name="place-0007.jpg").click()
         expect(page.locator(".chosen-image h2")).to_have_text("place-0007.jpg")
 
+    def test_images_are_found_by_the_signs_in_them_with_a_box_around_each(self):
+        self.until_read()
+        sign = next(line["text"] for id in range(12) for line in
+                    call("GET", f"/maps/town/images/place-{id:04}.jpg")["texts"]["lines"] if len(line["text"]) >= 7)
+        typed = sign[:2] + sign[3:]
+        found = call("GET", f"/maps/town/images?text={urllib.parse.quote(typed)}")
+        best = found["matches"][0]
+        page = self.page("#/maps/town")
+        expect(page.locator(".facts", has_text="read in 12 images")).to_be_visible()
+        page.get_by_label("Search all images").fill(typed)
+        first = page.locator(".images li").first
+        expect(first).to_contain_text(best["image_id"])
+        expect(first).to_contain_text(best["lines"][0]["text"])
+        first.get_by_role("button").click()
+        shown = page.locator(".chosen-image")
+        expect(shown.locator(".picture.here")).to_be_visible()
+        texts = call("GET", f"/maps/town/images/{best['image_id']}")["texts"]["lines"]
+        expect(shown.locator(".boxes polygon")).to_have_count(len(texts))
+        expect(shown.locator(".read li")).to_have_count(len(texts))
+        picture = shown.locator("img").bounding_box()
+        for at, line in enumerate(texts):
+            # The bounds of the browser include the stroke; their centre does not depend on it.
+            box = shown.locator(".boxes polygon").nth(at).bounding_box()
+            for axis, side, origin in ((0, "width", "x"), (1, "height", "y")):
+                along = [corner[axis] for corner in line["corners"]]
+                wanted = picture[origin] + picture[side] * (min(along) + max(along)) / 2
+                self.assertAlmostEqual(box[origin] + box[side] / 2, wanted, delta=1)
+        # The line of a box lights up under the pointer.
+        shown.locator(".read li").first.hover()
+        expect(shown.locator(".boxes polygon").first).to_have_class("lit")
+        page.get_by_label("Search all images").fill("!!")
+        expect(page.locator(".images li")).to_have_count(0)
+
+    def test_a_job_shows_what_was_read_in_both_pictures(self):
+        self.until_read()
+        jobs = (call("GET", f"/jobs/{localize(number, 'wait')['job']['id']}") for number in range(12))
+        job = next(job for job in jobs if job["texts"])
+        page = self.page(f"#/jobs/{job['id']}")
+        expect(page.locator(".pair .picture.here")).to_have_count(2)
+        frame = page.locator(".pair figure").first
+        expect(frame.locator(".boxes polygon")).to_have_count(len(job["texts"]))
+        expect(frame.locator(".read li").first).to_contain_text(job["texts"][0]["text"])
+        best = call("GET", f"/maps/town/images/{urllib.parse.quote(job['ranking'][0]['image_id'])}")["texts"]["lines"]
+        expect(page.locator(".pair figure").nth(1).locator(".boxes polygon")).to_have_count(len(best))
+
     def test_the_plan_can_be_moved_with_the_keyboard(self):
         page = self.page("#/maps/town")
         self.settled(page, "map")

@@ -12,6 +12,7 @@ import { tracksCard } from "./tracks.js";
 const PAGE = 1000;
 const MOST = 100_000; // maximum number of images loaded automatically
 const LISTED = 100;
+const MARKED = 20; // maximum number of images with a searched text that are marked on the plan
 
 export async function show({ root, argument: name, query, signal, setQuery, title, fail }) {
   title(`Map ${name}`);
@@ -32,7 +33,7 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
   const legend = h("div", { class: "over legend" });
   const tool = (label, sign, act) => h("button", { type: "button", "aria-label": label, title: label, onclick: act }, sign);
   const overlay = h("input", { type: "checkbox", id: "coverage", onchange: () => { plan.coverage = overlay.checked; plan.touch(); } });
-  const search = h("input", { id: "image-q", type: "search", placeholder: "id or tag", spellcheck: "false", oninput: listSoon });
+  const search = h("input", { id: "image-q", type: "search", placeholder: map.texts ? "id, tag or text of a sign" : "id or tag", maxlength: "100", spellcheck: "false", oninput: listSoon });
   const listed = h("p", { class: "muted small", role: "status" });
   const list = h("ul", { class: "images", tabindex: "-1" });
   const planCard = h("section", { class: "card plan", "aria-label": "Plan" }, canvas,
@@ -112,19 +113,44 @@ export async function show({ root, argument: name, query, signal, setQuery, titl
   function listSoon() {
     // Debounced: during a drag, the list is not redrawn with each frame.
     clearTimeout(listing);
-    listing = setTimeout(drawList, 200);
+    listing = setTimeout(() => { drawList(); searchTexts(); }, 200);
+  }
+  // What was read in images, for the text that is in the field.
+  let signs = { text: "", images: [], lines: new Map(), said: "" };
+  let asking = null;
+  async function searchTexts() {
+    const text = search.value.trim();
+    if (!map.texts || text === signs.text) return;
+    asking?.abort();
+    asking = new AbortController();
+    signs = { text, images: [], lines: new Map(), said: "" };
+    if (text) {
+      try {
+        const answer = await call(address(["maps", name, "images"], { text, limit: LISTED }), { signal: AbortSignal.any([signal, asking.signal]) });
+        const unread = answer.unread ? `; the text in ${plural(answer.unread, "image")} is not read yet` : "";
+        signs = { text, images: answer.images, said: unread, lines: new Map(answer.matches.map((one) => [one.image_id, one.lines.map((line) => line.text).join(" / ")])) };
+      } catch (problem) {
+        if (isAbort(problem)) return;
+        // A text without letters can still be part of an id.
+        signs.said = problem.status === 422 ? "" : `; ${problem.detail}`;
+      }
+    }
+    if (!query.get("query")) plan.setMarkers(signs.images.slice(0, MARKED).map((image, at) => ({ pose: image.pose, label: String(at + 1), kind: "candidate" })));
+    drawList();
   }
   signal.addEventListener("abort", () => clearTimeout(listing));
   function drawList() {
     const text = search.value.trim().toLowerCase();
-    const found = text ? images.filter((image) => [image.id, ...(image.tags ?? [])].join("\n").toLowerCase().includes(text)) : [...plan.inView(), ...images.filter((image) => !image.pose)];
-    found.sort((a, b) => (a.id < b.id ? -1 : 1));
+    const named = text ? images.filter((image) => [image.id, ...(image.tags ?? [])].join("\n").toLowerCase().includes(text)) : [...plan.inView(), ...images.filter((image) => !image.pose)];
+    named.sort((a, b) => (a.id < b.id ? -1 : 1));
+    const found = text ? [...signs.images, ...named.filter((image) => !signs.lines.has(image.id))] : named;
     const what = text ? `${plural(found.length, "image")} found` : `${plural(found.length, "image")} of ${count(images.length)}`;
     let told = found.length > LISTED ? `${what}; the first ${LISTED} are listed, zoom in or search for the others` : what;
-    if (!found.length && images.length) told += text ? "" : "; press 0 on the plan, or ⤢, to show everything";
+    if (text) told += signs.said;
+    else if (!found.length && images.length) told += "; press 0 on the plan, or ⤢, to show everything";
     if (listed.textContent !== told) listed.textContent = told;
     fill(list, found.slice(0, LISTED).map((image) => h("li", {}, h("button", { type: "button", "data-id": image.id, "aria-pressed": String(image.id === chosen?.id), onclick: () => choose(image, { focus: true }) },
-      h("span", {}, image.id), h("span", { class: "muted" }, image.pose ? ago(image.captured_at ?? image.created_at) : "no pose")))));
+      h("span", {}, image.id), h("span", { class: "muted" }, (text && signs.lines.get(image.id)) || (image.pose ? ago(image.captured_at ?? image.created_at) : "no pose"))))));
   }
 
   function changed() {
