@@ -1,6 +1,7 @@
 """Tests the server with a gRPC client that learns the contract only through reflection."""
 
 import contextlib
+import functools
 import json
 import os
 import pathlib
@@ -14,6 +15,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from typing import Any
+from urllib.parse import quote
 
 import grpc
 from google.protobuf.descriptor_pool import DescriptorPool
@@ -221,6 +223,37 @@ class Contract(unittest.TestCase):
         self.assertEqual((pose.lat, pose.lon), tuple(same["estimate"]["pose"][f] for f in ("lat", "lon")))
         self.assertFalse(answer.HasField("job") or answer.HasField("track"))
         self.assertGreater(answer.timing.total_ms, 0)
+
+    def test_images_are_found_by_the_text_in_them_like_over_http(self) -> None:
+        deadline = time.monotonic() + 60
+        while over_http("GET", "/maps/town")["texts"]["waiting"]:
+            assert time.monotonic() < deadline, "the images were not read"
+            time.sleep(0.2)
+        counts = over_http("GET", "/maps/town")["texts"]
+        of_map = self.call("MapService", "GetMap", self.message("GetMapRequest", map="town")).map.texts
+        self.assertEqual(
+            (of_map.reader, of_map.read, of_map.lines), (counts["reader"], counts["read"], counts["lines"])
+        )
+        images = over_http("GET", "/maps/town/images")["images"]
+        states = [over_http("GET", f"/maps/town/images/{image['id']}") for image in images]
+        lines = [line["text"] for state in states for line in state["texts"]["lines"]]
+        sign = next(text for text in lines if len(text) > 5)
+        expected, found, cursor = over_http("GET", f"/maps/town/images?text={quote(sign)}")["matches"], [], ""
+        while cursor or not found:
+            asked = self.message("FindImagesRequest", map="town", text=sign, limit=1, cursor=cursor)
+            page = self.call("MapService", "FindImages", asked)
+            found += [(one.image.id, one.score, [line.text for line in one.lines]) for one in page.found]
+            cursor = page.next_cursor
+        lines = [[line["text"] for line in one["lines"]] for one in expected]
+        self.assertEqual([one[0] for one in found], [one["image_id"] for one in expected])
+        self.assertEqual([one[2] for one in found], lines)
+        best = page.found[0].lines[0].corners
+        self.assertTrue(len(best) == 4 and all(0 <= at.x <= 1 and 0 <= at.y <= 1 for at in best), best)
+        for wrong in ("", "!!", "x" * 101):
+            message = self.message("FindImagesRequest", map="town", text=wrong)
+            find = functools.partial(self.call, "MapService", "FindImages", message)
+            refused = self.refused(grpc.StatusCode.INVALID_ARGUMENT, find)
+            self.assertIn("text has", refused.details())
 
     def test_a_track_accumulates_frames(self) -> None:
         for number, (_, frame) in enumerate(pictures("frames")[:3], 1):
