@@ -272,8 +272,8 @@ pub struct ExportedImage {
     /// Its place in a recording, if its sender said so.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recording: Option<Recording>,
-    /// What was read in it, if it was read.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    /// What was read in it; null if it was not read yet, or no reader is installed.
+    #[serde(default)]
     pub texts: Option<ImageTexts>,
 }
 

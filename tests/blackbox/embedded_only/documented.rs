@@ -21,9 +21,9 @@ const MOST: usize = 3;
 /// Fields whose text may change, or differs between machines.
 const DIFFERS: [&str; 6] = ["text", "reasoning", "detail", "request_id", "provider", "precision"];
 
-/// Fields that background work may have filled in already or not: the calibration of a map, and attempts at a
-/// delivery.
-const UNDER_WAY: [&str; 3] = [".calibration", ".last_attempt_at", ".last_error"];
+/// Fields that background work may have filled in already or not: the calibration of a map, what was read in an
+/// image, and attempts at a delivery.
+const UNDER_WAY: [&str; 4] = [".calibration", ".texts", ".last_attempt_at", ".last_error"];
 
 /// Lists whose contents depend on the history of the server.
 const HAPPENED: [&str; 2] = [".minutes", ".errors"];
