@@ -31,6 +31,7 @@ pub mod units;
 mod utm;
 mod verdict;
 mod webhook;
+pub mod words;
 
 pub use self::image::{ExportedImage, Image, ImageField, ImageId, MediaType, Recording};
 pub use candidate::{Candidate, RankedCandidate, Ranking, RankingError};

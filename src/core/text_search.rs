@@ -97,7 +97,7 @@ impl Folded {
 }
 
 /// Case, width and accents folded.
-fn plain(text: &str) -> String {
+pub(super) fn plain(text: &str) -> String {
     let is_accent = |c: char| ('\u{300}'..='\u{36f}').contains(&c);
     let mut folded = String::with_capacity(text.len());
     for character in text.nfkd().filter(|&c| !is_accent(c)).nfc().flat_map(char::to_lowercase) {
@@ -150,7 +150,7 @@ fn replace_last(chars: &mut [char], by: char) {
 }
 
 /// Whether words of the script are short, or written without spaces: Han, kana, Hangul, Thai, Lao, Khmer and Burmese.
-fn is_ideographic(character: char) -> bool {
+pub(super) fn is_ideographic(character: char) -> bool {
     matches!(u32::from(character),
         0x0E00..=0x0EFF | 0x1000..=0x109F | 0x1780..=0x17FF | 0x3005..=0x3007 | 0x3040..=0x30FF
         | 0x3400..=0x4DBF | 0x4E00..=0x9FFF | 0xAC00..=0xD7AF | 0xF900..=0xFAFF | 0x20000..=0x3FFFF)
