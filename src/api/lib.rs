@@ -18,6 +18,7 @@ mod texts_convert;
 mod tracks;
 mod usage;
 mod webhooks;
+mod words;
 
 pub use self::batch::{BatchAnswer, BatchOutcome, BatchProblem, BatchResult};
 #[cfg(feature = "client")]
@@ -43,6 +44,9 @@ pub use self::texts::{ImageMatch, ImageState, MapTexts};
 pub use self::tracks::{TrackList, TrackPlace, TrackSummary, TrackWay};
 pub use self::usage::{Today, Total, UsageReport};
 pub use self::webhooks::{DeliveryPage, MadeWebhook, NewWebhook};
+pub use self::words::{
+    NamedSign, SeenSign, WordsAnswer, WordsCandidate, WordsEstimate, WordsRequest, WordsTimingMs,
+};
 
 /// The messages and services generated from `proto/`.
 #[cfg(feature = "grpc")]

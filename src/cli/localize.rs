@@ -1,19 +1,24 @@
 //! `whereabouts localize`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use serde_json::Value;
 
-use super::client::{ServerArg, segment};
-use whereabouts_api::Answer;
+use super::client::{Client, ServerArg, segment};
+use whereabouts_api::{Answer, WordsAnswer, WordsRequest};
 use whereabouts_core::{Job, MapName, MediaType, Pose, RefinerKind};
 
-/// Localize an image on a server
+/// Localize an image, or a description in words, on a server
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// Image file: JPEG, PNG, WebP, TIFF, BMP, GIF or PNM
-    file: PathBuf,
+    #[arg(required_unless_present = "text")]
+    file: Option<PathBuf>,
+    /// Instead of an image: what is there, above all what signs say, such as "opposite the pharmacy, KAWA COFFEE is on
+    /// its left". Needs a map whose images were read (`make reader`)
+    #[arg(long, conflicts_with_all = ["file", "refine"])]
+    text: Option<String>,
     /// Map to search
     #[arg(long)]
     map: MapName,
@@ -35,8 +40,28 @@ pub struct Args {
 
 pub async fn run(args: Args) -> anyhow::Result<()> {
     let client = args.server.client()?;
-    let frame = std::fs::read(&args.file)
-        .with_context(|| format!("cannot read {}", args.file.display()))?;
+    match (&args.text, &args.file) {
+        (Some(text), _) => by_words(&client, &args, text).await,
+        (None, Some(file)) => by_frame(&client, &args, file).await,
+        // The parser asks for one of them.
+        (None, None) => Ok(()),
+    }
+}
+
+async fn by_words(client: &Client, args: &Args, text: &str) -> anyhow::Result<()> {
+    let path = format!("/localize?map={}&k={}", segment(args.map.as_str()), args.k);
+    let request = client.post(&path).json(&WordsRequest { text: text.to_owned() });
+    let answer: Value = client.json(request).await?;
+    if args.json {
+        println!("{answer}");
+        return Ok(());
+    }
+    print_words(&serde_json::from_value(answer)?);
+    Ok(())
+}
+
+async fn by_frame(client: &Client, args: &Args, file: &Path) -> anyhow::Result<()> {
+    let frame = std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))?;
     // The server decides about bytes of an unknown format.
     let media_type = MediaType::sniff(&frame).map_or("application/octet-stream", MediaType::as_str);
     let mode = if args.refine { "wait" } else { "off" };
@@ -63,6 +88,43 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
         println!("not refined: {}", reason.detail);
     }
     Ok(())
+}
+
+fn print_words(answer: &WordsAnswer) {
+    let signs = answer.signs.iter().map(|sign| match sign.images {
+        0 => format!("{:?} (nowhere)", sign.text),
+        1 => format!("{:?} (1 image)", sign.text),
+        more => format!("{:?} ({more} images)", sign.text),
+    });
+    let signs: Vec<String> = signs.collect();
+    if !signs.is_empty() {
+        println!("signs: {}", signs.join(", "));
+    }
+    for candidate in &answer.candidates {
+        let lines = candidate.signs.iter().flat_map(|sign| &sign.lines);
+        let lines: Vec<&str> = lines.map(|line| line.text.as_str()).collect();
+        println!(
+            "{:3}  {:.3}  {}  {}  {}",
+            candidate.rank,
+            candidate.probability,
+            candidate.image_id,
+            format_pose(candidate.pose),
+            lines.join(" / ")
+        );
+    }
+    match &answer.estimate {
+        Some(estimate) => println!(
+            "estimate: {} {}, probability {:.3} ({})",
+            estimate.image_id,
+            format_pose(estimate.pose),
+            estimate.probability,
+            answer.reason.as_deref().unwrap_or("a known place")
+        ),
+        None => println!("not found: {}", answer.reason.as_deref().unwrap_or("no image fits")),
+    }
+    for warning in &answer.warnings {
+        eprintln!("warning: {warning}");
+    }
 }
 
 fn print_answer(answer: &Answer) {

@@ -38,6 +38,7 @@ mod transfer;
 mod usage;
 mod vocabularies;
 mod webhooks;
+mod words;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -74,6 +75,7 @@ pub use self::transfer::Transfer;
 pub use self::usage::UsageReports;
 pub use self::vocabularies::{Vocabularies, VocabularySettings};
 pub use self::webhooks::{Dispatcher, WebhookSettings, Webhooks};
+pub use self::words::{WordsLocalizer, WordsQuery};
 use whereabouts_refine::{DenseCache, JobServiceTime, JobSettings, Refiner};
 use whereabouts_store::{Retention, Store};
 use whereabouts_vision::{Admission, CpuPool, LoadedModels};
@@ -90,6 +92,8 @@ pub struct Service {
     pub images: Images,
     /// Localization of frames.
     pub localizer: Localizer,
+    /// Finds places by descriptions.
+    pub words: WordsLocalizer,
     /// Refinement jobs.
     pub jobs: Jobs,
     /// Reindexing of maps.
@@ -239,6 +243,11 @@ impl Service {
                 recall: RecallCheck::new(settings.recall_check),
                 settings: settings.localize,
                 refiners: settings.refiners.clone(),
+            },
+            words: WordsLocalizer {
+                maps: maps.clone(),
+                settings: settings.localize,
+                places: settings.confidence.calibration(settings.compared),
             },
             jobs,
             fitter: VocabularyFitter { reindexer: reindexer.clone(), leases: store.clone() },

@@ -85,6 +85,15 @@ impl LocalizeSettings {
         (self.max_k > MAX_CANDIDATES || self.k > self.max_k)
             .then(|| format!("localize.k <= localize.max_k <= {MAX_CANDIDATES} must hold"))
     }
+
+    /// The number of candidates in an answer, if `k` was asked for.
+    pub(super) fn checked_k(&self, k: Option<usize>) -> Result<usize, ServiceError> {
+        let (k, most) = (k.unwrap_or(self.k), self.max_k);
+        if (1..=most).contains(&k) {
+            return Ok(k);
+        }
+        Err(ServiceError::unprocessable(format!("k is {k}; it must be between 1 and {most}")))
+    }
 }
 
 /// Localizes frames: coarse retrieval, tracks, and the jobs that refine the answers.
@@ -109,7 +118,7 @@ impl Localizer {
     /// Answers with the most similar images and queues their refinement.
     pub async fn localize(&self, request: LocalizeRequest) -> Result<Answer, ServiceError> {
         let start = Instant::now();
-        let k = self.checked_k(request.k)?;
+        let k = self.settings.checked_k(request.k)?;
         if request.frame.is_empty() {
             return Err(empty_body());
         }
@@ -274,17 +283,6 @@ impl Localizer {
                 }
             }
         }
-    }
-
-    fn checked_k(&self, k: Option<usize>) -> Result<usize, ServiceError> {
-        let k = k.unwrap_or(self.settings.k);
-        if (1..=self.settings.max_k).contains(&k) {
-            return Ok(k);
-        }
-        Err(ServiceError::unprocessable(format!(
-            "k is {k}; it must be between 1 and {}",
-            self.settings.max_k
-        )))
     }
 
     /// The estimate by coarse retrieval alone: the first candidate with its confidence.

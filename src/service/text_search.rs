@@ -128,7 +128,11 @@ impl Images {
 }
 
 /// Refuses a search where nothing was read, and says what to do.
-fn check_read(map: &Map, images: usize, read: Option<&MapTexts>) -> Result<(), ServiceError> {
+pub(super) fn check_read(
+    map: &Map,
+    images: usize,
+    read: Option<&MapTexts>,
+) -> Result<(), ServiceError> {
     let name = &map.name;
     let why = match read {
         _ if images == 0 => return Ok(()),

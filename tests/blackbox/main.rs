@@ -46,6 +46,7 @@ mod track;
 mod track_clocks;
 mod vocabulary;
 mod webhooks;
+mod words;
 
 use whereabouts_testkit::{
     deployment, drives, mock_hub, mock_mllm, receiver, server as support, wait,

@@ -3,20 +3,21 @@
 use axum::extract::{Request, State};
 use axum::{Extension, Json};
 use jiff::Timestamp;
-use serde::Deserialize;
-use utoipa::IntoParams;
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
 use super::body::{Params, PictureBody};
 use super::maps::map_name;
 use super::pixels::PixelParams;
 use super::state::AppState;
+use super::words;
 use crate::gate::IdempotencyId;
 use crate::gate::Problem;
 use crate::gate::Ready;
-use whereabouts_api::{Answer, RefineMode};
+use whereabouts_api::{Answer, RefineMode, WordsAnswer, WordsRequest};
 use whereabouts_core::{Priority, RefinerKind, moment};
 use whereabouts_service::{
-    Deadline, LocalizeRequest, Odometry, Principal, ServiceError, TrackStep,
+    Deadline, LocalizeRequest, Odometry, Principal, ServiceError, TrackStep, WordsQuery,
 };
 use whereabouts_vision::{AdmissionRequest, WorkClass};
 
@@ -28,6 +29,9 @@ pub(super) struct LocalizeParams {
     map: String,
     /// Number of candidates, 1 to 100.
     k: Option<usize>,
+    /// A description of the place instead of a frame, above all what signs say: at most 500 characters. The body is then
+    /// empty. A description in the body, as JSON, is the same.
+    text: Option<String>,
     /// `async` (default): a job refines the candidates in the background. `wait`: the answer waits for the
     /// job. `off`: no job.
     #[serde(default)]
@@ -88,6 +92,24 @@ impl LocalizeParams {
         }
     }
 
+    /// Refuses what a description cannot have.
+    fn check_words(&self) -> Result<(), ServiceError> {
+        let given = [
+            ("refiner", self.refiner.is_some()),
+            ("refine=wait", self.refine == RefineMode::Wait),
+            ("track", self.track.is_some()),
+            ("captured_at", self.captured_at.is_some()),
+            ("odometry", self.has_odometry()),
+            ("encoding", self.encoding.is_some()),
+        ];
+        match given.iter().find(|(_, is_given)| *is_given) {
+            Some((name, _)) => Err(ServiceError::unprocessable(format!(
+                "{name} is for frames; a description has no job, no track and no pixels. Leave it out"
+            ))),
+            None => Ok(()),
+        }
+    }
+
     fn has_odometry(&self) -> bool {
         let numbers = [self.moved_m, self.dx, self.dy, self.dyaw];
         numbers.iter().any(Option::is_some) || self.covariance.is_some()
@@ -132,12 +154,25 @@ struct FrameForm {
     image: Vec<u8>,
 }
 
-/// Localize a frame
+/// What `/localize` answers.
+#[derive(Serialize, ToSchema)]
+#[serde(untagged)]
+pub(super) enum LocalizeAnswer {
+    /// Of a frame.
+    Frame(Box<Answer>),
+    /// Of a description.
+    Words(Box<WordsAnswer>),
+}
+
+/// Localize a frame, or a description in words
 ///
 /// Answers with the most similar images of the map. A job then compares the frame with the first of them
 /// (`refine.local_candidates` or `refine.candidates`, independent of `k`) and ranks those again. Under load,
 /// jobs are shed before frames: `refine=async` then answers with `job: null` and the reason in `no_job`, and
 /// `refine=wait` answers 429.
+///
+/// With `text`, or a JSON body, the place is searched for by the signs that the description names, among those that were
+/// read in the images of the map. There is no job, and the answer is a `WordsAnswer`.
 #[utoipa::path(post, path = "/localize", tag = "localize", 
     params(LocalizeParams, ("X-Deadline-Ms" = Option<u32>, Header, minimum = 1, maximum = 3_600_000,
         description = "Milliseconds from arrival that the client waits for the answer. A request that \
@@ -146,14 +181,14 @@ struct FrameForm {
                        refined or not.")),
     request_body(content(
         (Vec<u8> = "image/jpeg"), (Vec<u8> = "image/png"), (Vec<u8> = "image/*"),
-        (FrameForm = "multipart/form-data"),
+        (FrameForm = "multipart/form-data"), (WordsRequest = "application/json"),
     )),
     responses(
-        (status = 200, body = Answer),
+        (status = 200, body = LocalizeAnswer),
         (status = 400, body = Problem, description = "Malformed, or an empty body", content_type = "application/problem+json"),
         (status = 403, body = Problem, description = "The refiner is not allowed, or may cost more than that of the map", content_type = "application/problem+json"),
         (status = 404, body = Problem, description = "No such map", content_type = "application/problem+json"),
-        (status = 409, body = Problem, description = "The map's model is not installed, or has changed meanwhile", content_type = "application/problem+json"),
+        (status = 409, body = Problem, description = "The map's model is not installed, or has changed meanwhile; or no text was read in the map", content_type = "application/problem+json"),
         (status = 408, body = Problem, description = "The body arrived too slowly", content_type = "application/problem+json"),
         (status = 413, body = Problem, description = "Too large", content_type = "application/problem+json"),
         (status = 415, body = Problem, description = "Not a supported image type", content_type = "application/problem+json"),
@@ -168,7 +203,14 @@ pub(super) async fn localize(
     Params(mut params): Params<LocalizeParams>,
     Deadline(deadline): Deadline,
     request: Request,
-) -> Result<Json<Answer>, Problem> {
+) -> Result<Json<LocalizeAnswer>, Problem> {
+    let (words, request) = words::of(params.text.take(), request, &state).await?;
+    if let Some(text) = words {
+        params.check_words()?;
+        let query = WordsQuery { map: map_name(&params.map)?, text, k: params.k };
+        let answer = service.words.localize(query).await?;
+        return Ok(Json(LocalizeAnswer::Words(Box::new(answer))));
+    }
     let idempotency_id =
         request.extensions().get().map(|IdempotencyId(id): &IdempotencyId| id.clone());
     let map = map_name(&params.map)?;
@@ -189,5 +231,6 @@ pub(super) async fn localize(
         track,
         idempotency_id,
     };
-    Ok(Json(service.localizer.localize(request).await?))
+    let answer = service.localizer.localize(request).await?;
+    Ok(Json(LocalizeAnswer::Frame(Box::new(answer))))
 }

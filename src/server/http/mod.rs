@@ -19,6 +19,7 @@ mod tracks;
 mod transfer;
 mod usage;
 mod webhooks;
+mod words;
 
 use axum::extract::DefaultBodyLimit;
 use axum::http::Method;
