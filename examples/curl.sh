@@ -115,6 +115,8 @@ call 200 -H "$jpeg" --data-binary "@$second" \
 call 200 "$url/maps/curl-example/tracks"
 call 200 "$url/maps/curl-example/tracks/robot-7"
 call 404 -H "$jpeg" --data-binary "@$first" "$url/localize?map=curl-nowhere"
+# A description instead of a frame. 409: nothing was read in the map, because no reader is installed or it goes on.
+call '200|409' "$url/localize?map=curl-example" -d '{"text": "opposite the pharmacy"}'
 
 # Jobs. A succeeded job cannot be retried.
 call 200 "$url/jobs/$job?wait=30"

@@ -407,6 +407,27 @@ class ScriptedServer(unittest.TestCase):
             self.assertEqual((method, path), ("POST", "/localize?map=m&k=7&refine=async"))
             self.assertEqual((headers["Content-Type"], headers["X-Deadline-Ms"]), ("image/jpeg", "250"))
 
+    def test_a_description_is_localized(self) -> None:
+        line = {"text": "PHARMACY", "confidence": 0.99, "corners": [[0.1, 0.2]] * 4}
+        candidate = {
+            "rank": 1, "image_id": "a", "pose": {"x": 1, "y": 2}, "probability": 0.7,
+            "signs": [{"text": "pharmacy", "lines": [line]}],
+        }  # fmt: skip
+        estimate = {"image_id": "a", "pose": {"x": 1, "y": 2}, "probability": 0.75, "known": False}
+        answer = {
+            "map": "m", "candidates": [candidate], "estimate": estimate, "reason": "name another sign",
+            "signs": [{"text": "pharmacy", "is_name": False, "images": 1}], "unread": 0, "warnings": [],
+            "timing_ms": {"total": 1.5},
+        }  # fmt: skip
+        script = Script((200, {}, json.dumps(answer)))
+        with script.serving() as url, Whereabouts(url) as service:
+            found = service.localize_text("m", "opposite the pharmacy", k=3)
+        self.assertEqual(script.requests[0][:2], ("POST", "/localize?map=m&k=3&text=opposite+the+pharmacy"))
+        assert found.estimate
+        self.assertEqual((found.estimate.probability, found.estimate.known), (0.75, False))
+        self.assertEqual(found.candidates[0].signs[0].lines[0].text, "PHARMACY")
+        self.assertEqual(found.signs[0].images, 1)
+
     def test_requests_are_not_retried_by_default(self) -> None:
         script = Script(problem(429, 0), LOCALIZED)
         with script.serving() as url, Whereabouts(url) as service, self.assertRaises(Problem) as raised:

@@ -232,6 +232,8 @@ class MapState:
     created_at: datetime
     vocabulary: VocabularyState | None = None
     """The vocabulary of the descriptors; None if this kind has none."""
+    texts: MapTexts | None = None
+    """How much of the map was read; None if no reader is installed and nothing was read."""
     reindex: Reindex | None = None
     calibration: CalibrationState | None = None
     """None until the map is calibrated, soon after images are added. Every confidence is None until then."""
@@ -392,6 +394,95 @@ class Answer:
 
 
 @dataclass(frozen=True)
+class MapTexts:
+    """How much of a map was read."""
+
+    read: int
+    failed: int
+    lines: int
+    reader: str | None = None
+    waiting: int | None = None
+    """Images that will be read; None without a reader."""
+
+
+@dataclass(frozen=True)
+class TextLine:
+    """A line of text that was read in an image."""
+
+    text: str
+    confidence: float
+    """Mean probability of the characters, not calibrated."""
+    corners: tuple[tuple[float, ...], ...]
+    """Top left, top right, bottom right, bottom left, as shares of width and height."""
+
+
+@dataclass(frozen=True)
+class SeenSign:
+    """A sign of a description that was read in an image."""
+
+    text: str
+    """What the description says."""
+    lines: tuple[TextLine, ...]
+
+
+@dataclass(frozen=True)
+class WordsCandidate:
+    """An image that fits a description."""
+
+    rank: int
+    image_id: str
+    pose: Pose | None
+    probability: float
+    """That this image shows the place, 0 to 1."""
+    signs: tuple[SeenSign, ...]
+
+
+@dataclass(frozen=True)
+class WordsEstimate:
+    """The most likely place of a description."""
+
+    image_id: str
+    pose: Pose | None
+    probability: float
+    """Of the place: the sum over the images that show it, 0 to 1."""
+    known: bool
+
+
+@dataclass(frozen=True)
+class NamedSign:
+    """A sign that a description names."""
+
+    text: str
+    is_name: bool
+    images: int
+    """Number of images in which it was read."""
+
+
+@dataclass(frozen=True)
+class WordsTimingMs:
+    """Duration of a search by words in milliseconds."""
+
+    total: float
+
+
+@dataclass(frozen=True)
+class WordsAnswer:
+    """The answer to a description in words."""
+
+    map: str
+    candidates: tuple[WordsCandidate, ...]
+    """The images that fit, best first; empty if none shows any of the signs."""
+    signs: tuple[NamedSign, ...]
+    unread: int
+    """Images that are not read, and may show any sign."""
+    timing_ms: WordsTimingMs
+    estimate: WordsEstimate | None = None
+    reason: str | None = None
+    """Why the place is not known, and what would help; None if it is."""
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Usage:
     """The cost of a refinement."""
 
@@ -483,6 +574,8 @@ class Job:
     """Descriptions from before this time are bought again."""
     verdicts: tuple[JobVerdict, ...] = ()
     """What each refiner of a cascade found: `local`, and the model if it was asked."""
+    texts: tuple[TextLine, ...] | None = None
+    """What was read in the frame; None if nothing is read in its map."""
 
     @property
     def ended(self) -> bool:
@@ -738,6 +831,10 @@ class Whereabouts:
             repeatable=idempotency_key is not None,
             content=data,
         )
+
+    def localize_text(self, map: str, text: str, *, k: int | None = None) -> WordsAnswer:
+        """Finds a place by a description, above all by what signs say, among what was read in the map."""
+        return self._call(WordsAnswer, "POST", "/localize", params=_given(map=map, k=k, text=text))
 
     def job(self, id: str, *, wait_s: float = 0.0) -> Job:
         """Returns a job. With `wait_s`, the server waits that many seconds for it to end (at most 60 with its

@@ -35,7 +35,9 @@ from .client import (
     JobVerdict,
     Keep,
     MapState,
+    MapTexts,
     MetricPose,
+    NamedSign,
     NoJob,
     PairDescribed,
     Picture,
@@ -48,7 +50,9 @@ from .client import (
     Refiner,
     Reindex,
     RelativePose,
+    SeenSign,
     StandIn,
+    TextLine,
     TimingMs,
     TrackEstimate,
     TrackHypothesis,
@@ -57,6 +61,10 @@ from .client import (
     Usage,
     VocabularyState,
     Whereabouts,
+    WordsAnswer,
+    WordsCandidate,
+    WordsEstimate,
+    WordsTimingMs,
 )
 
 if TYPE_CHECKING:
@@ -105,6 +113,7 @@ class AsyncClient:
     update_image = _in_thread(Client.update_image)
     delete_image = _in_thread(Client.delete_image)
     localize = _in_thread(Client.localize)
+    localize_text = _in_thread(Client.localize_text)
     job = _in_thread(Client.job)
     wait_for_job = _in_thread(Client.wait_for_job)
 
@@ -135,7 +144,9 @@ __all__ = [
     "JobVerdict",
     "Keep",
     "MapState",
+    "MapTexts",
     "MetricPose",
+    "NamedSign",
     "NoJob",
     "PairDescribed",
     "Picture",
@@ -148,7 +159,9 @@ __all__ = [
     "Refiner",
     "Reindex",
     "RelativePose",
+    "SeenSign",
     "StandIn",
+    "TextLine",
     "TimingMs",
     "TrackEstimate",
     "TrackHypothesis",
@@ -157,4 +170,8 @@ __all__ = [
     "Usage",
     "VocabularyState",
     "Whereabouts",
+    "WordsAnswer",
+    "WordsCandidate",
+    "WordsEstimate",
+    "WordsTimingMs",
 ]
