@@ -88,9 +88,9 @@ advisories: ## Check dependencies for known vulnerabilities; fetches the RustSec
 format: ## Format the code
 	$(CARGO) fmt
 
-bench: build ## Run the benchmarks against their peers (downloads some gigabytes)
+bench: build reader ## Run the benchmarks against their peers (downloads some gigabytes)
 	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked --bench preprocess --bench inference \
-		--bench search --bench localize --bench refine --bench mllm --bench store --bench town --bench track
+		--bench search --bench localize --bench refine --bench mllm --bench store --bench town --bench track --bench words
 
 load: build ## Overload test: ten times the load the server can handle
 	$(CARGO) bench --locked --bench overload
