@@ -323,7 +323,7 @@ class Contract(unittest.TestCase):
                     "LocalizeRequest", map="town", image=frames[number % len(frames)], refine=3
                 )
                 yield self.message("LocalizeStreamRequest", frame_number=number, frame=frame)
-                time.sleep(0.005)
+                time.sleep(0.001)
 
         answers = list(self.call("LocalizationService", "LocalizeStream", fast()))
         numbers = [answer.frame_number for answer in answers]
