@@ -258,7 +258,13 @@ async fn memory() {
         ("WHEREABOUTS_REFINE__DENSE_CACHE_BYTES", "8388608"),
     ];
     let server = start(&dir, &mock, &small).await;
-    let town = Town::new(TownSpec { places: 1000, width: 320, height: 240, seed: 3 });
+    let town = Town::new(TownSpec {
+        places: 1000,
+        width: 320,
+        height: 240,
+        seed: 3,
+        ..TownSpec::default()
+    });
     let began = Instant::now();
     let mut resident = Vec::new();
     for number in 0..JOBS {

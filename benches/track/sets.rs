@@ -213,7 +213,7 @@ impl TownSet {
 
 /// The places of a town in four lights, three in ten behind a van.
 fn town(describer: &Describer, seed: u64, places: usize) -> anyhow::Result<TownSet> {
-    let town = Town::new(TownSpec { seed, places, width: 320, height: 240 });
+    let town = Town::new(TownSpec { seed, places, width: 320, height: 240, ..TownSpec::default() });
     let described = |picture: &RgbImage| -> anyhow::Result<(Descriptor, Bytes)> {
         let bytes = encode_jpeg(picture)?;
         Ok((describer.describe(&bytes)?, bytes.into()))

@@ -3,13 +3,16 @@
 //! Every street is its own small world with a local frame (see [`geometry`](super::geometry)) and
 //! a position on the town plan, spaced so that streets never overlap.
 
+use super::TownScene;
 use super::camera::Pose;
 use super::dice::Dice;
 use super::geometry::{Rgb, Vec3, vec3};
-use super::styles::{BRANDS, Brand, STYLES, Style};
+use super::styles::{BRANDS, Brand, MALL, STYLES, Style};
 
 pub(super) const PLACES_PER_STREET: usize = 8;
 const PLACE_SPACING: f32 = 17.0;
+/// Width of a shop front of a mall: two to a place, so that each place looks the same.
+const SHOP_WIDTH: f32 = PLACE_SPACING / 2.0;
 const STREET_PITCH: f64 = 320.0;
 const STREETS_PER_ROW: usize = 6;
 
@@ -140,32 +143,75 @@ pub(super) struct Street {
 }
 
 impl Street {
-    pub fn new(seed: u64, index: usize) -> Street {
+    pub fn new(scene: TownScene, seed: u64, index: usize) -> Street {
         let dice = Dice::new(seed).fork(index as u64);
         let mut plan = dice.fork(1);
-        let column = index % STREETS_PER_ROW;
-        let row = index / STREETS_PER_ROW;
         let bearing = f64::from(plan.between(0.0, std::f32::consts::TAU));
+        let bare = Street {
+            origin: (
+                (index % STREETS_PER_ROW) as f64 * STREET_PITCH,
+                (index / STREETS_PER_ROW) as f64 * STREET_PITCH,
+            ),
+            bearing,
+            lots: Vec::new(),
+            backdrop: Vec::new(),
+            trees: Vec::new(),
+            fixtures: Vec::new(),
+            crossings: Vec::new(),
+            dice,
+        };
+        match scene {
+            TownScene::Streets => bare.with_houses(plan),
+            TownScene::Mall => bare.with_shops(&Dice::new(seed), plan),
+        }
+    }
+
+    fn with_houses(self, mut plan: Dice) -> Street {
         let taste = Taste::new(&mut plan);
         let mut lots = Vec::new();
         for side in [1.0, -1.0] {
             fill_side(side, &taste, &mut plan, &mut lots);
         }
-        let mut backdrop = Vec::new();
-        for side in [1.0, -1.0] {
-            back_row(side, &taste, &mut plan, &mut backdrop);
-            close_end(side, &taste, &mut plan, &mut backdrop);
-        }
+        let backdrop = backdrop(&taste, &mut plan);
         Street {
-            origin: (column as f64 * STREET_PITCH, row as f64 * STREET_PITCH),
-            bearing,
-            trees: plant(&mut dice.fork(2)),
-            fixtures: furnish(&mut dice.fork(3)),
+            trees: plant(&mut self.dice.fork(2)),
+            fixtures: furnish(&mut self.dice.fork(3)),
             crossings: vec![plan.between(5.0, 55.0), plan.between(70.0, 115.0)],
             lots,
             backdrop,
-            dice,
+            ..self
         }
+    }
+
+    /// A row of equal shop fronts on both sides, which differ in their names. `building` draws what all streets of the mall
+    /// share, and `names` the names in this one.
+    fn with_shops(self, building: &Dice, mut names: Dice) -> Street {
+        let mut shared = building.fork(1);
+        let taste = Taste { shops: 1.0, ..Taste::new(&mut shared) };
+        let plan = Terrace {
+            setback: 0.0,
+            bays: 3,
+            width: SHOP_WIDTH,
+            ..Terrace::new(&taste, &mut shared)
+        };
+        let shops = ((STREET_END - STREET_START) / SHOP_WIDTH).ceil() as usize;
+        let mut lots = Vec::new();
+        for side in [1.0, -1.0] {
+            for shop in 0..shops {
+                let start = STREET_START + shop as f32 * SHOP_WIDTH;
+                let at = Frontage::beside(side, start, SHOP_WIDTH, FRONT);
+                lots.push(Lot::Built(Building {
+                    ground: GroundFloor::Shop(&MALL[names.below(MALL.len())]),
+                    // The same panes, curtains and lamps in each.
+                    colour: plan.colour,
+                    mirrored: false,
+                    seed: 0,
+                    ..plan.house(at, &taste, &mut shared)
+                }));
+            }
+        }
+        let backdrop = backdrop(&taste, &mut shared);
+        Street { lots, backdrop, fixtures: lamps(), ..self }
     }
 
     /// Draws that belong to this street; `tag` names their purpose.
@@ -205,6 +251,27 @@ impl Street {
         let level = elevation.cos();
         vec3(level * yaw.cos(), level * yaw.sin(), elevation.sin())
     }
+}
+
+/// What is seen through gaps and at the ends of a street.
+fn backdrop(taste: &Taste, dice: &mut Dice) -> Vec<Building> {
+    let mut backdrop = Vec::new();
+    for side in [1.0, -1.0] {
+        back_row(side, taste, dice, &mut backdrop);
+        close_end(side, taste, dice, &mut backdrop);
+    }
+    backdrop
+}
+
+/// Lamps at equal distances, two to a place.
+fn lamps() -> Vec<(Fixture, Vec3)> {
+    let count = ((STREET_END - STREET_START) / SHOP_WIDTH) as usize;
+    let lamp = |at: usize| {
+        let side = if at.is_multiple_of(2) { 1.0 } else { -1.0 };
+        let x = STREET_START + at as f32 * SHOP_WIDTH;
+        (Fixture::Lamp, vec3(x, side * (KERB + 0.45), PAVEMENT_HEIGHT))
+    };
+    (0..count).map(lamp).collect()
 }
 
 /// Distribution of buildings in one street.

@@ -47,9 +47,21 @@ pub use light::Light;
 /// distance alone is a fair criterion.
 pub const SUCCESS_RADIUS_M: f64 = 10.0;
 
+/// What is built along the streets of a town.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum TownScene {
+    /// Houses and shops in the styles of each street.
+    #[default]
+    Streets,
+    /// Shop fronts of one style, which differ in the names on their signs only.
+    Mall,
+}
+
 /// Parameters of a town and its pictures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TownSpec {
+    /// What is built.
+    pub scene: TownScene,
     /// Seed of the town. Towns with the same seed are identical to the last pixel.
     pub seed: u64,
     /// Number of places; 0 is treated as 1.
@@ -62,7 +74,7 @@ pub struct TownSpec {
 
 impl Default for TownSpec {
     fn default() -> Self {
-        TownSpec { seed: 7, places: 60, width: 640, height: 480 }
+        TownSpec { scene: TownScene::Streets, seed: 7, places: 60, width: 640, height: 480 }
     }
 }
 
@@ -113,7 +125,8 @@ impl Town {
         let place = place % self.places();
         let (street, pose) = self.survey(place);
         let mut dice = street.dice(1_000 + place as u64);
-        self.photograph(place, &street, pose, Light::Day, Bustle::SURVEY, &mut dice)
+        let (bustle, _) = self.bustle();
+        self.photograph(place, &street, pose, Light::Day, bustle, &mut dice)
     }
 
     /// Renders a later visit to a place. Each `variant` is a different visit, and any four consecutive
@@ -124,12 +137,24 @@ impl Town {
         let mut dice = street.dice(2_000 + place as u64).fork(u64::from(variant) + 1);
         let first = street.dice(3_000 + place as u64).below(Light::ALL.len());
         let light = Light::ALL[(first + variant as usize) % Light::ALL.len()];
-        let pose = revisit(survey, &mut dice);
-        self.photograph(place, &street, pose, light, Bustle::EVERYDAY, &mut dice)
+        let pose = match self.spec.scene {
+            TownScene::Streets => revisit(survey, (2.2, 1.2, 13.0), &mut dice),
+            TownScene::Mall => revisit(survey, (4.0, 2.5, 18.0), &mut dice),
+        };
+        let (_, bustle) = self.bustle();
+        self.photograph(place, &street, pose, light, bustle, &mut dice)
+    }
+
+    /// The traffic when the map was surveyed, and at later visits.
+    fn bustle(&self) -> (Bustle, Bustle) {
+        match self.spec.scene {
+            TownScene::Streets => (Bustle::SURVEY, Bustle::EVERYDAY),
+            TownScene::Mall => (Bustle::BEFORE_OPENING, Bustle::SHOPPERS),
+        }
     }
 
     fn survey(&self, place: usize) -> (Street, Pose) {
-        let street = Street::new(self.spec.seed, place / PLACES_PER_STREET);
+        let street = Street::new(self.spec.scene, self.spec.seed, place / PLACES_PER_STREET);
         let pose = street.survey_pose(place % PLACES_PER_STREET);
         (street, pose)
     }
@@ -160,11 +185,13 @@ impl Town {
     }
 }
 
-/// The camera pose of a later visit to a place.
-fn revisit(survey: Pose, dice: &mut Dice) -> Pose {
-    let turn = dice.between(-13.0, 13.0).to_radians();
+/// The camera pose of a later visit to a place: at most so many metres along and across the street away, and turned by at
+/// most so many degrees.
+fn revisit(survey: Pose, (along, across, turned): (f32, f32, f32), dice: &mut Dice) -> Pose {
+    let turn = dice.between(-turned, turned).to_radians();
     Pose {
-        eye: survey.eye + vec3(dice.between(-2.2, 2.2), dice.between(-1.2, 1.2), dice.around(0.25)),
+        eye: survey.eye
+            + vec3(dice.between(-along, along), dice.between(-across, across), dice.around(0.25)),
         yaw: survey.yaw + turn,
         pitch: survey.pitch + dice.around(3.0).to_radians(),
         roll: dice.around(1.5).to_radians(),

@@ -5,10 +5,10 @@ use super::font;
 use super::geometry::{Panel, vec3};
 use super::layout::{GroundFloor, Lot, Street};
 use super::styles::BRANDS;
-use super::{Light, SUCCESS_RADIUS_M, Shot, Town, TownSpec};
+use super::{Light, SUCCESS_RADIUS_M, Shot, Town, TownScene, TownSpec};
 
 fn town(seed: u64, places: usize, width: u32, height: u32) -> Town {
-    Town::new(TownSpec { seed, places, width, height })
+    Town::new(TownSpec { seed, places, width, height, ..TownSpec::default() })
 }
 
 fn distance(one: &Shot, other: &Shot) -> f64 {
@@ -121,7 +121,7 @@ fn the_view_of_a_slanted_panel_inverts_its_projection() {
 fn styles_and_chain_shops_recur_in_many_streets() {
     let mut streets_of: HashMap<&str, usize> = HashMap::new();
     for index in 0..10 {
-        let mut names: Vec<&str> = Street::new(7, index)
+        let mut names: Vec<&str> = Street::new(TownScene::Streets, 7, index)
             .lots
             .iter()
             .filter_map(|lot| match lot {
@@ -152,5 +152,36 @@ fn every_sign_can_be_written_in_the_font() {
             });
             assert!(inked || letter.is_empty(), "{letter}");
         }
+    }
+}
+
+#[test]
+fn the_shops_of_a_mall_differ_in_their_names_only() {
+    let [one, other] = [0, 3].map(|index| Street::new(TownScene::Mall, 7, index));
+    let names = |street: &Street| -> Vec<&str> {
+        let shop = |lot: &Lot| match lot {
+            Lot::Built(building) => match building.ground {
+                GroundFloor::Shop(brand) => Some((brand.name, building.floors, building.at.width)),
+                GroundFloor::Home { .. } => None,
+            },
+            _ => None,
+        };
+        let shops: Vec<_> = street.lots.iter().map(|lot| shop(lot).expect("a shop")).collect();
+        assert!(shops.iter().all(|shop| (shop.1, shop.2) == (shops[0].1, shops[0].2)));
+        shops.into_iter().map(|shop| shop.0).collect()
+    };
+    let (one, other) = (names(&one), names(&other));
+    assert!(one.len() == other.len() && one != other);
+    let names = one.iter().chain(&other);
+    assert!(names.clone().all(|name| font::text_width(name) > 0.0));
+}
+
+#[test]
+fn a_query_in_a_mall_is_near_its_place() {
+    let town =
+        Town::new(TownSpec { scene: TownScene::Mall, seed: 7, places: 24, width: 1, height: 1 });
+    for place in 0..town.places() {
+        let (reference, query) = (town.reference(place), town.query(place, 0));
+        assert!(distance(&reference, &query) < SUCCESS_RADIUS_M / 2.0 + 0.5);
     }
 }

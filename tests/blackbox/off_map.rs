@@ -19,7 +19,7 @@ const PLACES: usize = 48;
 const STREET: usize = 8;
 
 fn town(seed: u64) -> Town {
-    Town::new(TownSpec { seed, places: PLACES, width: 320, height: 240 })
+    Town::new(TownSpec { seed, places: PLACES, width: 320, height: 240, ..TownSpec::default() })
 }
 
 fn id(place: usize) -> String {

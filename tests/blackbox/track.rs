@@ -90,7 +90,13 @@ fn names(places: Vec<usize>) -> Vec<String> {
 
 #[tokio::test]
 async fn a_track_is_located_better_than_its_frames_and_than_simple_filters() {
-    let town = Town::new(TownSpec { seed: 11, places: PLACES, width: 320, height: 240 });
+    let town = Town::new(TownSpec {
+        seed: 11,
+        places: PLACES,
+        width: 320,
+        height: 240,
+        ..TownSpec::default()
+    });
     let (server, map) = shared_server();
     metric_map(server, &map, &town).await;
     let visits: Vec<Visit> = (0..PLACES).map(|place| (place, (place / 8) as u32)).collect();
@@ -150,7 +156,13 @@ fn all_similarities(answer: &Value) -> Vec<f32> {
 
 /// A town of six streets, and its map.
 async fn small_town(server: &Server, map: &str) -> Town {
-    let town = Town::new(TownSpec { seed: 11, places: 48, width: 320, height: 240 });
+    let town = Town::new(TownSpec {
+        seed: 11,
+        places: 48,
+        width: 320,
+        height: 240,
+        ..TownSpec::default()
+    });
     metric_map(server, map, &town).await;
     town
 }

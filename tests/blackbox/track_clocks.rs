@@ -16,7 +16,13 @@ const START: f64 = 1_700_000_000.0;
 const PAUSE: f64 = 2.0;
 
 async fn town(server: &Server, map: &str) -> Town {
-    let town = Town::new(TownSpec { seed: 11, places: PLACES, width: 320, height: 240 });
+    let town = Town::new(TownSpec {
+        seed: 11,
+        places: PLACES,
+        width: 320,
+        height: 240,
+        ..TownSpec::default()
+    });
     metric_map(server, map, &town).await;
     town
 }

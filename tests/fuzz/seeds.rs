@@ -22,7 +22,8 @@ use whereabouts_index::{IndexSettings, MapIndex, Vectors};
 use whereabouts_town::{Town, TownSpec};
 
 pub fn pictures() -> Vec<Vec<u8>> {
-    let town = Town::new(TownSpec { seed: 3, places: 2, width: 96, height: 64 });
+    let town =
+        Town::new(TownSpec { seed: 3, places: 2, width: 96, height: 64, ..TownSpec::default() });
     let pixels: RgbImage = town.reference(0).image;
     let mut jpeg = Vec::new();
     JpegEncoder::new_with_quality(&mut jpeg, 80).encode_image(&pixels).unwrap();

@@ -291,7 +291,7 @@ impl Answer {
 }
 
 fn town() -> Town {
-    Town::new(TownSpec { seed: 11, places: 1000, width: 320, height: 240 })
+    Town::new(TownSpec { seed: 11, places: 1000, width: 320, height: 240, ..TownSpec::default() })
 }
 
 /// The value of a metric, named with its labels, in what [`Server::metrics`] gives.

@@ -9,9 +9,10 @@ mod report;
 mod town;
 
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use clap::ValueEnum;
 use tokio::net::TcpListener;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
@@ -22,11 +23,14 @@ use self::report::Reporter;
 use self::town::{DemoFolders, Frame};
 use super::client::{Client, ServerArg};
 use super::index;
-use whereabouts_api::Answer;
+use whereabouts_api::{Answer, MapState, MapTexts};
 use whereabouts_core::{Job, Scene};
 use whereabouts_server::config::{Config, Overrides};
 use whereabouts_server::startup::{self, Role};
-use whereabouts_town::TownSpec;
+use whereabouts_town::{TownScene, TownSpec};
+
+/// Pause between two looks at how much is read.
+const READ_PAUSE: Duration = Duration::from_millis(200);
 
 /// The map's name.
 const MAP: &str = "town";
@@ -40,6 +44,9 @@ pub struct Args {
     /// Folder for the images and the data; replaces the output of an earlier demo
     #[arg(long, value_name = "DIR", default_value = "demo-out")]
     out: PathBuf,
+    /// What is built in the town
+    #[arg(long, value_enum, default_value_t)]
+    scene: SceneArg,
     /// Number of places in the town; each has one map image and one frame
     #[arg(long, value_name = "N", default_value_t = 40)]
     #[arg(value_parser = clap::value_parser!(u16).range(2..=5000))]
@@ -61,6 +68,16 @@ pub struct Args {
     json: bool,
 }
 
+/// What is built in the town.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+enum SceneArg {
+    /// Streets with houses and shops of many styles
+    #[default]
+    Streets,
+    /// Shop fronts of one style that differ in the names on their signs only; for `make reader`
+    Mall,
+}
+
 /// One frame with the server's answer and the job.
 pub(super) struct LocalizedFrame {
     frame: Frame,
@@ -74,8 +91,12 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     // The hub may answer while the town is rendered.
     let pending = PendingChoice::begin(&args)?;
     let folders = DemoFolders::create(&args.out)?;
-    let spec =
-        TownSpec { seed: args.seed, places: usize::from(args.places), ..TownSpec::default() };
+    let scene = match args.scene {
+        SceneArg::Streets => TownScene::Streets,
+        SceneArg::Mall => TownScene::Mall,
+    };
+    let places = usize::from(args.places);
+    let spec = TownSpec { scene, seed: args.seed, places, ..TownSpec::default() };
     reporter.heading("1. A town");
     let frames = town::render(spec, &folders)?;
     reporter.rendered(&folders, frames.len(), start.elapsed());
@@ -87,6 +108,7 @@ pub async fn run(args: Args) -> anyhow::Result<()> {
     let client = server.address.client()?;
     let indexed = index_town(&client, &server.address, &folders).await?;
     reporter.indexed(&indexed, &server.address.server);
+    reporter.read(read_signs(&client).await?.as_ref());
 
     reporter.heading("3. Frames from the same places on another day");
     let localized = localize_all(&client, frames).await?;
@@ -115,6 +137,19 @@ async fn index_town(
         server: server.clone(),
     };
     index::add_folder(client, &folders.map, &args).await
+}
+
+/// Waits until the signs in the images are read, so that jobs can compare them; `None` without a reader.
+async fn read_signs(client: &Client) -> anyhow::Result<Option<MapTexts>> {
+    loop {
+        let map: MapState = client.json(client.get(&format!("/maps/{MAP}"))).await?;
+        match map.texts {
+            Some(MapTexts { waiting: Some(waiting), .. }) if waiting > 0 => {
+                tokio::time::sleep(READ_PAUSE).await;
+            }
+            texts => return Ok(texts),
+        }
+    }
 }
 
 /// Posts the frames one after another, as a robot would, and then waits for their jobs.

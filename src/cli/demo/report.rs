@@ -5,6 +5,7 @@ use std::time::Duration;
 use super::super::localize::format_pose;
 use super::town::DemoFolders;
 use super::{LocalizedFrame, MAP, ModelChoice, index, shown};
+use whereabouts_api::MapTexts;
 use whereabouts_core::Pose;
 use whereabouts_town::SUCCESS_RADIUS_M;
 
@@ -65,6 +66,18 @@ impl Reporter {
     pub fn indexed(self, report: &index::IndexReport, server: &str) {
         if !self.json {
             println!("   indexed {} images at {server} in {:.1} s", report.images, report.seconds);
+        }
+    }
+
+    pub fn read(self, texts: Option<&MapTexts>) {
+        if self.json {
+            return;
+        }
+        match texts {
+            Some(texts) => {
+                println!("   read {} lines on signs in {} images", texts.lines, texts.read)
+            }
+            None => println!("   signs are not read; `make reader` installs what reads them"),
         }
     }
 
