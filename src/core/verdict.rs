@@ -73,7 +73,7 @@ pub struct Agreement {
     pub regions: usize,
     /// The number of them that match, for each candidate in coarse order; 0 for one that was removed.
     pub matches: Vec<usize>,
-    /// The candidate that the regions alone put first, if there is one.
+    /// The candidate that `local` puts first, by regions and signs, if there is one.
     pub first: Option<usize>,
     /// Which candidates show the same place.
     pub same_place: SamePlace,

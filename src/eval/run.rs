@@ -22,7 +22,8 @@ use whereabouts_core::{
 };
 use whereabouts_index::SearchMode;
 use whereabouts_refine::{
-    AttemptPolicy, DenseKey, Progress, QueryFrame, RefineError, RefineInput, Refinement, Refiner,
+    AttemptPolicy, DenseKey, FrameTexts, Progress, QueryFrame, RefineError, RefineInput,
+    Refinement, Refiner,
 };
 use whereabouts_service::{Retrieved, Service};
 use whereabouts_store::Step;
@@ -236,6 +237,7 @@ impl Evaluator<'_> {
                 digest,
                 descriptor: Some(extraction.descriptor),
                 uninformative: extraction.information.lack().is_some(),
+                texts: FrameTexts::default(),
             },
             candidates,
             priority: Priority::Normal,

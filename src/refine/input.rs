@@ -8,7 +8,7 @@ use whereabouts_core::{
 };
 use whereabouts_store::{HardNegatives, JobRecord, MapStore};
 
-use super::RefineError;
+use super::{FrameTexts, RefineError};
 
 /// A camera frame, and the images that the search found for it.
 #[derive(Debug, Clone)]
@@ -44,6 +44,8 @@ pub struct QueryFrame {
     pub descriptor: Option<Descriptor>,
     /// Whether it shows nothing by which a place can be known.
     pub uninformative: bool,
+    /// The text in it.
+    pub texts: FrameTexts,
 }
 
 impl RefineInput {
@@ -77,6 +79,7 @@ impl RefineInput {
                 digest: record.query.digest,
                 descriptor,
                 uninformative: record.query.uninformative.is_some(),
+                texts: FrameTexts::default(),
             },
             candidates: record.candidates.clone(),
             priority: record.job.priority,
@@ -103,6 +106,7 @@ impl RefineInput {
                 digest: image.digest,
                 descriptor: None,
                 uninformative: false,
+                texts: FrameTexts::default(),
             },
             candidates: negatives.others.clone(),
             priority: Priority::Low,

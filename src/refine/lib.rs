@@ -29,7 +29,7 @@ use whereabouts_core::ServiceTime;
 pub use attempts::{AttemptPolicy, NextAttempt};
 pub use choice::RefinerSet;
 pub use dense_cache::{DenseCache, DenseKey};
-pub use frame_reader::FrameReader;
+pub use frame_reader::{FrameReader, FrameTexts};
 pub use input::{QueryFrame, RefineInput};
 pub use job_settings::JobSettings;
 pub use local::LocalRefiner;

@@ -17,8 +17,8 @@ use whereabouts_telemetry::traces;
 use self::in_progress::{InProgress, Turn, Turns};
 use super::store_retry::retry_for;
 use super::{
-    FrameReader, JobServiceTime, JobSettings, NextAttempt, Progress, RefineError, RefineInput,
-    RefineMetrics, Refinement, Refiner,
+    FrameReader, FrameTexts, JobServiceTime, JobSettings, NextAttempt, Progress, QueryFrame,
+    RefineError, RefineInput, RefineMetrics, Refinement, Refiner,
 };
 
 /// Refines jobs, the oldest first.
@@ -198,19 +198,29 @@ impl Worker {
         record: &JobRecord,
         turn: &Turn,
     ) -> (Result<Refinement, RefineError>, Option<Vec<TextLine>>) {
-        let texts = async {
-            match &self.reader {
-                Some(reader) => reader.read_frame(&record.job.map, &record.query.digest).await,
-                None => None,
+        let texts = match self.reader.clone() {
+            Some(reader) => {
+                let (map, frame) = (record.job.map.clone(), record.query.digest);
+                FrameTexts::of(async move { reader.read_frame(&map, &frame).await })
             }
+            None => FrameTexts::default(),
         };
-        tokio::join!(self.refine(record, turn), texts)
+        let (refinement, texts) =
+            tokio::join!(self.refine(record, turn, texts.clone()), texts.get());
+        (refinement, texts.map(|lines| lines.to_vec()))
     }
 
-    async fn refine(&self, record: &JobRecord, turn: &Turn) -> Result<Refinement, RefineError> {
+    async fn refine(
+        &self,
+        record: &JobRecord,
+        turn: &Turn,
+        texts: FrameTexts,
+    ) -> Result<Refinement, RefineError> {
+        let input = RefineInput::of_job(record, self.maps.as_ref()).await?;
         let input = RefineInput {
             attempts_left: self.settings.attempts.saturating_sub(record.job.attempts),
-            ..RefineInput::of_job(record, self.maps.as_ref()).await?
+            frame: QueryFrame { texts, ..input.frame },
+            ..input
         };
         let progress = JobProgress { jobs: self.jobs.as_ref(), claim: record.claim(), turn };
         self.refiner.refine(&input, &progress).await

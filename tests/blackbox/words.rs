@@ -1,17 +1,22 @@
-//! Localization from words alone, over HTTP and the command line.
+//! Signs in jobs, and localization from words alone, over HTTP and the command line.
 
 use std::process::Command;
 
 use serde_json::{Value, json};
 
-use whereabouts_town::{Town, TownSpec};
+use whereabouts_town::{Town, TownScene, TownSpec};
 
 use super::support::{Server, jpeg, reference, server};
 use super::wait::eventually;
 
-/// Indexes the first places of the town of the demo, large enough to be read, and waits until they are.
-async fn readable_town(server: &Server, map: &str, places: usize) {
-    let town = Town::new(TownSpec { places: 40, ..TownSpec::default() });
+/// A town with pictures that are large enough to be read.
+fn readable(scene: TownScene) -> Town {
+    Town::new(TownSpec { scene, places: 40, ..TownSpec::default() })
+}
+
+/// Indexes the first places of a town, and waits until their images are read.
+async fn index_and_read(server: &Server, map: &str, town: &Town, places: usize) {
+    server.put(&format!("/maps/{map}"), json!({})).await.expect(201);
     for place in 0..places {
         let shot = town.reference(place);
         let path = format!("/maps/{map}/images?id=place-{place}&lat=45.{place:03}&lon=7");
@@ -32,8 +37,7 @@ async fn said(server: &Server, text: &str) -> Value {
 #[tokio::test]
 async fn a_place_is_found_by_the_signs_that_a_description_names() {
     let (_dir, server) = server();
-    server.put("/maps/m", json!({})).await.expect(201);
-    readable_town(&server, "m", 8).await;
+    index_and_read(&server, "m", &readable(TownScene::Streets), 8).await;
     let found = said(&server, "opposite the pharmacy, MARIO'S is on the left").await;
     let first = &found["candidates"][0];
     assert_eq!(first["image_id"], "place-0", "{found}");
@@ -137,4 +141,31 @@ async fn without_a_reader_a_description_is_refused_with_what_to_install() {
     let answer = server.post("/localize?map=m&text=KAWA", "", Vec::new()).await;
     let problem = answer.problem(409);
     assert!(problem.contains("make reader"), "{problem}");
+}
+
+#[tokio::test]
+async fn equal_shop_fronts_are_told_apart_by_their_signs() {
+    const PLACES: usize = 12;
+    let (_dir, server) = server();
+    let mall = readable(TownScene::Mall);
+    index_and_read(&server, "m", &mall, PLACES).await;
+    let mut right = 0;
+    for place in 0..PLACES {
+        let frame = jpeg(&mall.query(place, 0).image);
+        let answer = server.post_jpeg("/localize?map=m&refine=wait", frame).await.expect(200);
+        let first = &answer["ranking"][0]["image_id"];
+        let is_right = *first == format!("place-{place}");
+        right += usize::from(is_right);
+        assert!(
+            is_right || answer["estimate"]["known"] == false,
+            "a confident wrong answer: {answer}"
+        );
+        let job = server.get(answer["job"]["href"].as_str().unwrap()).await.expect(200);
+        let of_first =
+            job["descriptions"].as_array().unwrap().iter().find(|one| one["image_id"] == *first);
+        let text = of_first.unwrap()["text"].as_str().unwrap();
+        assert!(!is_right || text.contains("Both show the sign \u{2018}"), "{text}");
+    }
+    // By chance it would be one in twelve.
+    assert!(right >= PLACES - 2, "{right} of {PLACES} frames were right");
 }

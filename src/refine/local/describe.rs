@@ -1,6 +1,11 @@
 //! The description of a pair: how much agrees, where, how it moved, what has no counterpart, and a verdict.
 
+use super::signs::SignEvidence;
 use super::{Motion, PairMatch};
+use whereabouts_core::TextLine;
+
+/// The most signs that a sentence names.
+const SIGNS_NAMED: usize = 3;
 
 /// The names of the ninths of a picture, row by row.
 const NINTHS: [&str; 9] = [
@@ -53,6 +58,31 @@ pub fn describe(pair: &PairMatch, standing: Standing) -> String {
     sentences.push(parts.gaps());
     sentences.extend(verdict(standing));
     sentences.join(" ")
+}
+
+/// Says which signs of the frame a candidate shows, in at most two sentences, each with a space before it.
+pub fn describe_signs(frame: &[TextLine], signs: &SignEvidence) -> String {
+    let named = |lines: &[usize]| -> Vec<String> {
+        let most = lines.iter().take(SIGNS_NAMED).filter_map(|&line| frame.get(line));
+        most.map(|line| format!("\u{2018}{}\u{2019} ({})", line.text, ninth(line))).collect()
+    };
+    let mut said = String::new();
+    if !signs.shared.is_empty() {
+        said += &format!(" Both show the sign {}.", list(&named(&signs.shared)));
+    }
+    if !signs.missing.is_empty() {
+        let missing = list(&named(&signs.missing));
+        said += &format!(" The frame's {missing} is missing from the candidate.");
+    }
+    said
+}
+
+/// The part of the picture where a line is.
+fn ninth(line: &TextLine) -> &'static str {
+    let [x, y] =
+        [0, 1].map(|axis| line.corners.iter().map(|corner| corner[axis]).sum::<f32>() / 4.0);
+    let third = |at: f32| ((at * 3.0) as usize).min(2);
+    NINTHS[third(y) * 3 + third(x)]
 }
 
 fn nothing_agrees(pair: &PairMatch) -> String {

@@ -5,7 +5,7 @@
 //! with the nearest neighbours from `integers`, or on processors without the instructions for it from `nearest`.
 //! `agreement` keeps the matches whose surroundings moved the same way. `votes` lets each cell of the query share one vote among the candidates, so that
 //! regions that every candidate shows count for little. `motion` fits one motion to the remaining matches.
-//! [`describe`] describes a pair in words, and [`rank`] ranks the candidates.
+//! `signs` adds what was read in the pictures. [`describe`] describes a pair in words, and [`rank`] ranks the candidates.
 //!
 //! [`LocalRefiner`] fetches the features of a job and makes a refinement of the matches. The matcher itself
 //! does no I/O.
@@ -22,12 +22,13 @@ mod mutual;
 mod nearest;
 mod rank;
 mod refiner;
+mod signs;
 mod votes;
 
 #[cfg(test)]
 mod tests;
 
-pub use describe::{Standing, describe};
+pub use describe::{Standing, describe, describe_signs};
 pub use motion::Motion;
 pub use rank::rank;
 pub use refiner::LocalRefiner;

@@ -7,14 +7,17 @@ use futures_util::{StreamExt, TryStreamExt, stream};
 use tokio::sync::Semaphore;
 use whereabouts_core::{
     Agreement, CalibrationSettings, Candidate, Certainty, Description, Digest, Evidence, ImageId,
-    Map, PairRegion, Pose, Ranking, RefinerKind, SamePlace, Usage,
+    Map, PairRegion, Pose, Ranking, RefinerKind, SamePlace, TextLine, Usage,
 };
-use whereabouts_store::{BlobStore, HardNegatives, MapStore};
+use whereabouts_store::{BlobStore, HardNegatives, MapStore, TextStore};
 use whereabouts_vision::{CpuPool, Extractor, LoadedModels, ModelError};
 
 use super::comparison::{Comparison, agreement, is_clear};
 use super::matching::{FeatureSource, Matching, joined};
-use super::{LocalMatcher, LocalSettings, Match, PairMatch, Standing, describe, rank};
+use super::signs::{self, SignEvidence};
+use super::{
+    LocalMatcher, LocalSettings, Match, PairMatch, Standing, describe, describe_signs, rank,
+};
 use crate::{
     BuildError, DenseCache, DenseKey, NegativeEvidence, Progress, RefineError, RefineInput,
     Refinement, Refiner, RefinerContext, RefinerSettings, RegionMatcher, milliseconds,
@@ -27,6 +30,8 @@ const CONCURRENT_FETCHES: usize = 8;
 pub struct LocalRefiner {
     maps: Arc<dyn MapStore>,
     blobs: Arc<dyn BlobStore>,
+    /// What was read in the images of maps.
+    texts: Arc<dyn TextStore>,
     /// Extracts dense features that the cache does not hold.
     models: LoadedModels,
     dense: Arc<DenseCache>,
@@ -47,6 +52,7 @@ pub(crate) async fn build(context: &RefinerContext) -> Result<Arc<dyn Refiner>, 
     Ok(Arc::new(LocalRefiner {
         maps: context.store.clone(),
         blobs: context.store.clone(),
+        texts: context.store.clone(),
         models: context.models.clone(),
         dense: Arc::clone(&context.dense),
         turns: Semaphore::new(context.pool.threads()),
@@ -73,13 +79,22 @@ impl Refiner for LocalRefiner {
         input: &RefineInput,
         _: &dyn Progress,
     ) -> Result<Refinement, RefineError> {
-        // Cannot fail, because the semaphore is never closed.
-        let _turn = self.turns.acquire().await;
-        let comparison = self.compare_input(input).await?;
+        let mut comparison = {
+            // Cannot fail, because the semaphore is never closed.
+            let _turn = self.turns.acquire().await;
+            self.compare_input(input).await?
+        };
+        let frame = input.frame.texts.get().await.unwrap_or_default();
+        let signs = self.signs(input, &frame, &comparison).await?;
+        if let Some(signs) = &signs {
+            let shares: Vec<f32> = comparison.pairs.iter().map(|pair| pair.score).collect();
+            comparison.order = signs::order(&comparison.order, &shares, signs);
+        }
         // The words of a description follow from the calibration. An answer in other words is better than none.
         let calibration = self.maps.calibration(&input.map).await.ok().flatten();
         let calibration = calibration.unwrap_or_default();
-        conclude(&input.candidates, &comparison, |evidence| Standing {
+        let signs = signs.map(|signs| Signs { frame: &frame, of: signs });
+        conclude(&input.candidates, &comparison, signs.as_ref(), |evidence| Standing {
             confidence: match input.frame.uninformative {
                 true => None,
                 false => evidence.and_then(|evidence| calibration.confidence(evidence)),
@@ -154,6 +169,24 @@ impl LocalRefiner {
             .await?
             .ok_or_else(|| RefineError::Permanent("the frame is missing from the store".into()))?;
         self.compare(&input.map, extractor, query, &input.candidates).await
+    }
+
+    /// What the signs say about the candidates that are present; `None` if they say nothing.
+    async fn signs(
+        &self,
+        input: &RefineInput,
+        frame: &[TextLine],
+        comparison: &Comparison,
+    ) -> Result<Option<Vec<SignEvidence>>, RefineError> {
+        if frame.is_empty() {
+            return Ok(None);
+        }
+        let present = comparison.present.iter();
+        let ids: Vec<ImageId> =
+            present.map(|&index| input.candidates[index].image_id.clone()).collect();
+        let texts = self.texts.texts(&input.map, &ids).await?;
+        let lines: Vec<_> = texts.into_iter().map(|texts| Some(texts?.lines)).collect();
+        Ok(signs::evidence(frame, &lines))
     }
 
     async fn compare(
@@ -268,10 +301,17 @@ fn no_model(error: ModelError) -> RefineError {
     }
 }
 
+/// The signs in a frame, and what they say about each candidate that is present.
+struct Signs<'a> {
+    frame: &'a [TextLine],
+    of: Vec<SignEvidence>,
+}
+
 /// Ranks the compared candidates, and puts removed ones behind them in coarse order.
 fn conclude(
     candidates: &[Candidate],
     comparison: &Comparison,
+    signs: Option<&Signs<'_>>,
     standing: impl Fn(Option<Evidence>) -> Standing,
 ) -> Result<Refinement, RefineError> {
     let Comparison { considered, present, pairs, order, took, .. } = comparison;
@@ -291,14 +331,20 @@ fn conclude(
             .enumerate()
             .map(|(of, (&index, pair))| Description {
                 image_id: candidates[index].image_id.clone(),
-                text: describe(pair, standing(agreement.evidence(of))),
+                text: match signs {
+                    Some(signs) => {
+                        let regions = describe(pair, standing(agreement.evidence(of)));
+                        format!("{regions}{}", describe_signs(signs.frame, &signs.of[of]))
+                    }
+                    None => describe(pair, standing(agreement.evidence(of))),
+                },
                 cached: false,
                 stands_in: None,
                 took_ms: per_pair.map(milliseconds),
                 usage: Usage::default(),
             })
             .collect(),
-        reasoning: reasoning(candidates, present, pairs, &ordered),
+        reasoning: reasoning(candidates, present, pairs, &ordered, signs),
         reasoning_took_ms: None,
         ordered_by: None,
         evidence: first.and_then(|first| agreement.evidence(first)),
@@ -313,30 +359,37 @@ fn conclude(
     })
 }
 
-/// Explains in one sentence why the first candidate is first.
+/// Explains in a sentence or two why the first candidate is first.
 fn reasoning(
     candidates: &[Candidate],
     present: &[usize],
     pairs: &[PairMatch],
     order: &[usize],
+    signs: Option<&Signs<'_>>,
 ) -> Option<String> {
-    let votes = |index: usize| {
-        let pair = present.iter().position(|&known| known == index)?;
-        pairs.get(pair).map(|pair| pair.score * 100.0)
-    };
+    let pair_of = |index: usize| present.iter().position(|&known| known == index);
+    let votes = |index: usize| Some(pairs.get(pair_of(index)?)?.score * 100.0);
     let first = *order.first()?;
+    let id = |index: usize| &candidates[index].image_id;
+    let has_most =
+        order.iter().all(|&other| votes(other).unwrap_or(0.0) <= votes(first).unwrap_or(0.0));
+    let lead = match has_most {
+        true => "gets the most of the frame's votes",
+        false => "is first because of its signs and the frame's votes",
+    };
     let best = format!(
-        "{} gets the most of the frame's votes: each region of the frame votes for the candidates that match it, and \
-         {:.1} % of all votes go to this one",
-        candidates[first].image_id,
+        "{} {lead}: each region of the frame votes for the candidates that match it, and {:.1} % of all votes go to this \
+         one",
+        id(first),
         votes(first)?
     );
-    Some(match order.get(1) {
-        Some(&second) => format!(
-            "{best}, {:.1} % to {}, the next best.",
-            votes(second)?,
-            candidates[second].image_id
-        ),
+    let votes = match order.get(1) {
+        Some(&second) => {
+            format!("{best}, {:.1} % to {}, the next best.", votes(second)?, id(second))
+        }
         None => format!("{best}."),
-    })
+    };
+    let shared = signs.zip(pair_of(first));
+    let shared = shared.map(|(signs, of)| describe_signs(signs.frame, &signs.of[of]));
+    Some(votes + &shared.unwrap_or_default())
 }

@@ -13,7 +13,7 @@ use uuid::Uuid;
 
 use super::super::settings::tests::defaults;
 use super::*;
-use crate::QueryFrame;
+use crate::{FrameTexts, QueryFrame};
 use whereabouts_core::{CacheLevels, CachedDescription, DescribedFrame, Secret, SimilarFrame};
 use whereabouts_core::{
     Calibration, CalibrationSettings, Candidate, CoordinateFrame, DayUsage, Descriptor,
@@ -160,6 +160,7 @@ impl Shelf {
                 digest: self.digest(self.pictures.len() - 1),
                 descriptor: None,
                 uninformative: false,
+                texts: FrameTexts::default(),
             },
             candidates: (0..candidates).map(candidate).collect(),
             priority: Priority::Normal,
