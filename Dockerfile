@@ -12,7 +12,7 @@ WORKDIR /src
 # Only the files that determine the assets, so that other changes do not download them again.
 COPY deploy/setup deploy/setup
 COPY deploy/models deploy/models
-RUN deploy/setup/assets.sh assets
+RUN deploy/setup/assets.sh --reader assets
 COPY . .
 # Caches keep crates and compiled dependencies across source changes. The sources are touched because cargo compares
 # modification times, and those of another checkout may be older than the cached build.

@@ -8,7 +8,7 @@ BINARY := target/release/whereabouts
 help: ## List the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 18
 
-demo: build ## Set up, build, index a town, localize frames in it, refine, print a report
+demo: build reader ## Set up, build, index a town, localize frames in it, refine, print a report
 	$(BINARY) demo --out demo-out
 
 build: assets nasm ## Set up and build target/release/whereabouts
@@ -90,7 +90,7 @@ format: ## Format the code
 
 bench: build reader ## Run the benchmarks against their peers (downloads some gigabytes)
 	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked --bench preprocess --bench inference \
-		--bench search --bench localize --bench refine --bench mllm --bench store --bench town --bench track --bench words
+		--bench search --bench localize --bench refine --bench mllm --bench store --bench town --bench track --bench words --bench signs
 
 load: build ## Overload test: ten times the load the server can handle
 	$(CARGO) bench --locked --bench overload
