@@ -64,7 +64,6 @@ impl Camera {
     }
 
     /// Pixel position of a point in front of the camera, and its depth in metres.
-    #[cfg(test)]
     pub fn project(&self, point: Vec3) -> Option<(f32, f32, f32)> {
         let seen = self.in_frame(point);
         (seen.z > NEAR).then(|| {

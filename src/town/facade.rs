@@ -285,11 +285,10 @@ fn shop_front(
     let width = building.at.width;
     // Only narrow piers of the wall show beside the joinery.
     let material = Material::matt(building.colour * 0.9);
-    let ground = building.ground_height();
     let frame = brand.board * 0.75;
-    let board = (ground - 0.95, ground - 0.12);
+    let board = board_of(building);
     if at.v > board.0 - 0.08 {
-        return fascia(brand, width, board, material, at, indoors);
+        return fascia(building, brand, material, at, indoors);
     }
     let joinery = material.paint(frame, at.within((0.12, width - 0.12), (0.0, board.0)));
     let door = if building.mirrored { (width - 1.45, width - 0.45) } else { (0.45, 1.45) };
@@ -301,23 +300,39 @@ fn shop_front(
     display(building, &entrance, with_pane, at, indoors)
 }
 
+/// Bottom and top of the sign board over a shop.
+fn board_of(building: &Building) -> (f32, f32) {
+    let ground = building.ground_height();
+    (ground - 0.95, ground - 0.12)
+}
+
+/// Where a text is on the sign board over a shop: left, right, bottom and top, in metres of the facade.
+pub(super) fn fascia_text(building: &Building, text: &str) -> (f32, f32, f32, f32) {
+    let (bottom, top) = board_of(building);
+    let width = building.at.width;
+    let size = 0.52_f32.min((width - 0.9) / font::text_width(text));
+    let start = (width - font::text_width(text) * size) / 2.0;
+    let baseline = (bottom + top - size) / 2.0;
+    (start, width - start, baseline, baseline + size)
+}
+
 /// The sign board over a shop, with its name.
 fn fascia(
+    building: &Building,
     brand: &'static Brand,
-    width: f32,
-    (bottom, top): (f32, f32),
     material: Material,
     at: &Glance,
     indoors: &Indoors,
 ) -> Material {
-    let sides = (0.12, width - 0.12);
-    let room = width - 0.9;
-    let size = 0.52_f32.min(room / font::text_width(brand.name));
-    let start = (width - font::text_width(brand.name) * size) / 2.0;
-    let baseline = (bottom + top - size) / 2.0;
+    let (bottom, top) = board_of(building);
+    let sides = (0.12, building.at.width - 0.12);
+    let (start, _, baseline, above) = fascia_text(building, brand.name);
+    let size = above - baseline;
     let blur = at.across.max(at.rise);
-    let letters =
-        font::ink(brand.name, (at.u - start) / size, (at.v - baseline) / size, blur / size);
+    let letters = match building.is_lettered {
+        true => font::ink(brand.name, (at.u - start) / size, (at.v - baseline) / size, blur / size),
+        false => 0.0,
+    };
     let mut face = Material::matt(brand.board).paint(brand.ink, letters);
     face.glow = face.albedo * indoors.signs;
     material

@@ -86,6 +86,8 @@ pub(super) struct Building {
     pub ground: GroundFloor,
     /// The door is at the right end of a shop front.
     pub mirrored: bool,
+    /// Whether its sign has letters.
+    pub is_lettered: bool,
     pub depth: f32,
     pub seed: u32,
 }
@@ -212,6 +214,21 @@ impl Street {
         }
         let backdrop = backdrop(&taste, &mut shared);
         Street { lots, backdrop, fixtures: lamps(), ..self }
+    }
+
+    /// The same street with nothing written on its signs.
+    pub fn without_letters(mut self) -> Street {
+        let lots = self.lots.iter_mut().filter_map(|lot| match lot {
+            Lot::Built(building) => Some(building),
+            _ => None,
+        });
+        lots.chain(&mut self.backdrop).for_each(|building| building.is_lettered = false);
+        self
+    }
+
+    /// The same street without what may stand before a sign.
+    pub fn without_furniture(self) -> Street {
+        Street { trees: Vec::new(), fixtures: Vec::new(), ..self }
     }
 
     /// Draws that belong to this street; `tag` names their purpose.
@@ -376,6 +393,7 @@ impl Terrace {
             bays: self.bays,
             ground: ground_floor(self.bays, taste.shops, dice),
             mirrored: dice.chance(0.5),
+            is_lettered: true,
             depth: self.depth,
             seed: dice.bits() as u32,
         }

@@ -21,6 +21,7 @@ mod massing;
 mod props;
 mod raster;
 mod scene;
+mod signs;
 mod styles;
 mod surface;
 mod traffic;
@@ -39,6 +40,7 @@ use light::Lighting;
 use traffic::{Bustle, Traffic};
 
 pub use light::Light;
+pub use signs::{Letters, VisibleSign};
 
 /// Maximum distance in metres between a query and a correct reference.
 ///
@@ -122,18 +124,48 @@ impl Town {
     /// Renders the map image of a place, taken by day in light traffic. `place` wraps around at
     /// [`Town::places`].
     pub fn reference(&self, place: usize) -> Shot {
-        let place = place % self.places();
-        let (street, pose) = self.survey(place);
-        let mut dice = street.dice(1_000 + place as u64);
-        let (bustle, _) = self.bustle();
-        self.photograph(place, &street, pose, Light::Day, bustle, &mut dice)
+        self.photograph(self.visit(place, None), |street| street)
     }
 
     /// Renders a later visit to a place. Each `variant` is a different visit, and any four consecutive
     /// variants cover the four lights. `place` wraps around at [`Town::places`].
     pub fn query(&self, place: usize, variant: u32) -> Shot {
+        self.photograph(self.visit(place, Some(variant)), |street| street)
+    }
+
+    /// Renders a map image, or a visit, with the signs over shops that are in it, and the pixels of all letters.
+    pub fn with_signs(
+        &self,
+        place: usize,
+        variant: Option<u32>,
+    ) -> (Shot, Vec<VisibleSign>, Letters) {
+        let of_visit = |bustle: Option<Bustle>| {
+            let visit = self.visit(place, variant);
+            Visit { bustle: bustle.unwrap_or(visit.bustle), ..visit }
+        };
+        let shot = self.photograph(of_visit(None), |street| street);
+        let blank = self.photograph(of_visit(None), Street::without_letters);
+        let letters = Letters::between(&shot.image, &blank.image);
+        let bare = |change: fn(Street) -> Street| {
+            let change = |street: Street| change(street.without_furniture());
+            self.photograph(of_visit(Some(Bustle::NONE)), change).image
+        };
+        let uncovered = Letters::between(&bare(|street| street), &bare(Street::without_letters));
+        let Visit { street, pose, .. } = of_visit(None);
+        let camera = Camera::new(&pose, self.spec.width, self.spec.height);
+        let signs = signs::signs(&street, &camera, &letters, &uncovered);
+        (shot, signs, letters)
+    }
+
+    /// The camera and the circumstances of a map image, or of a later visit.
+    fn visit(&self, place: usize, variant: Option<u32>) -> Visit {
         let place = place % self.places();
         let (street, survey) = self.survey(place);
+        let (before, later) = self.bustle();
+        let Some(variant) = variant else {
+            let dice = street.dice(1_000 + place as u64);
+            return Visit { place, street, pose: survey, light: Light::Day, bustle: before, dice };
+        };
         let mut dice = street.dice(2_000 + place as u64).fork(u64::from(variant) + 1);
         let first = street.dice(3_000 + place as u64).below(Light::ALL.len());
         let light = Light::ALL[(first + variant as usize) % Light::ALL.len()];
@@ -141,8 +173,7 @@ impl Town {
             TownScene::Streets => revisit(survey, (2.2, 1.2, 13.0), &mut dice),
             TownScene::Mall => revisit(survey, (4.0, 2.5, 18.0), &mut dice),
         };
-        let (_, bustle) = self.bustle();
-        self.photograph(place, &street, pose, light, bustle, &mut dice)
+        Visit { place, street, pose, light, bustle: later, dice }
     }
 
     /// The traffic when the map was surveyed, and at later visits.
@@ -159,15 +190,9 @@ impl Town {
         (street, pose)
     }
 
-    fn photograph(
-        &self,
-        place: usize,
-        street: &Street,
-        pose: Pose,
-        light: Light,
-        bustle: Bustle,
-        dice: &mut Dice,
-    ) -> Shot {
+    fn photograph(&self, visit: Visit, change: impl FnOnce(Street) -> Street) -> Shot {
+        let Visit { place, street, pose, light, bustle, mut dice } = visit;
+        let (street, dice) = (&change(street), &mut dice);
         let TownSpec { width, height, .. } = self.spec;
         let camera = Camera::new(&pose, width, height);
         let lighting = Lighting::new(light, street, &camera, dice);
@@ -183,6 +208,16 @@ impl Town {
             light,
         }
     }
+}
+
+/// A picture before it is taken.
+struct Visit {
+    place: usize,
+    street: Street,
+    pose: Pose,
+    light: Light,
+    bustle: Bustle,
+    dice: Dice,
 }
 
 /// The camera pose of a later visit to a place: at most so many metres along and across the street away, and turned by at

@@ -201,7 +201,8 @@ fn hanging_sign<'a>(building: &'a Building, brand: &'static Brand, into: &mut Su
     let at = building.at;
     let u = if building.mirrored { 0.35 } else { at.width - 0.35 };
     let base = PAVEMENT_HEIGHT + building.ground_height() + 0.35;
-    let paint = Paint::Sign { text: brand.name, board: brand.board, ink: brand.ink, size: 0.3 };
+    let text = if building.is_lettered { brand.name } else { "" };
+    let paint = Paint::Sign { text, board: brand.board, ink: brand.ink, size: 0.3 };
     for (thickness, from, to) in [(-0.03, -0.1, -1.25), (0.03, -1.25, -0.1)] {
         let (from, to) = (at.point(u + thickness, from, base), at.point(u + thickness, to, base));
         into.push(full(Panel::upright(from, to, 0.62), paint));
@@ -210,7 +211,7 @@ fn hanging_sign<'a>(building: &'a Building, brand: &'static Brand, into: &mut Su
 
 /// A framed board with its text centred, shrunk to fit.
 pub(super) fn sign(text: &str, board: Rgb, ink: Rgb, size: f32, at: &Glance) -> Rgb {
-    let size = size.min((at.width - 0.12) / font::text_width(text));
+    let size = size.min((at.width - 0.12) / font::text_width(text).max(0.01));
     let start = (at.width - font::text_width(text) * size) / 2.0;
     let baseline = (at.height - size) / 2.0;
     let blur = at.across.max(at.rise) / size;

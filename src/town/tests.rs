@@ -185,3 +185,29 @@ fn a_query_in_a_mall_is_near_its_place() {
         assert!(distance(&reference, &query) < SUCCESS_RADIUS_M / 2.0 + 0.5);
     }
 }
+
+#[test]
+fn the_signs_of_a_picture_are_where_its_letters_are() {
+    let town = Town::new(TownSpec { scene: TownScene::Mall, places: 8, ..TownSpec::default() });
+    let (shot, signs, letters) = town.with_signs(0, Some(0));
+    assert_eq!(shot.image, town.query(0, 0).image, "the same picture as without the truth");
+    assert_eq!(town.with_signs(0, None).0.image, town.reference(0).image);
+    let whole = signs.iter().filter(|sign| sign.is_within(640, 480) && sign.uncovered > 0.9);
+    let whole: Vec<_> = whole.collect();
+    assert!(whole.len() >= 2, "{signs:?}");
+    for sign in whole {
+        let below = sign.corners.map(|[x, y]| [x, y + 3.0 * sign.letter_height]);
+        assert!(letters.within(&sign.corners) > 20 * letters.within(&below).max(1), "{sign:?}");
+        let [top_left, _, _, bottom_left] = sign.corners;
+        assert!(top_left[1] < bottom_left[1] && sign.letter_height > 1.0);
+    }
+    assert!(signs.iter().all(|sign| (0.0..=1.0).contains(&sign.uncovered)));
+}
+
+#[test]
+fn people_and_furniture_cover_signs() {
+    let town = Town::new(TownSpec { scene: TownScene::Mall, places: 16, ..TownSpec::default() });
+    let signs = (0..16).flat_map(|place| town.with_signs(place, Some(0)).1);
+    let covered = signs.filter(|sign| sign.uncovered < 0.95).count();
+    assert!(covered > 0);
+}
