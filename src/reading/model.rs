@@ -4,6 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ort::environment::Environment;
+use ort::logging::LogLevel;
 use ort::session::Session;
 use ort::session::builder::GraphOptimizationLevel;
 use ort::value::TensorRef;
@@ -35,6 +36,8 @@ impl Model {
                 |builder| Ok(builder.with_optimization_level(GraphOptimizationLevel::Level3)?),
             )
             .and_then(|builder| Ok(builder.with_intra_threads(threads.max(1))?))
+            // The models declare shapes of outputs that their nodes contradict, which is a warning at each start.
+            .and_then(|builder| Ok(builder.with_log_level(LogLevel::Error)?))
             // Spinning threads would take cores from requests.
             .and_then(|builder| Ok(builder.with_intra_op_spinning(false)?))
             .and_then(|mut builder| builder.commit_from_file(file))
