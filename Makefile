@@ -90,7 +90,7 @@ format: ## Format the code
 
 bench: build reader ## Run the benchmarks against their peers (downloads some gigabytes)
 	PYTHON=$$(benches/peers/setup.sh) $(CARGO) bench --locked --bench preprocess --bench inference \
-		--bench search --bench localize --bench refine --bench mllm --bench store --bench town --bench track --bench words --bench signs
+		--bench search --bench localize --bench refine --bench mllm --bench store --bench town --bench track --bench words --bench signs --bench reading
 
 load: build ## Overload test: ten times the load the server can handle
 	$(CARGO) bench --locked --bench overload
