@@ -147,6 +147,7 @@ class Jobs(Console):
             ("MATCHES\nSign: top left, by its letters.\nLamp: no counterpart.\nMissing from the frame: a bench.", ["Sign: top left, by its letters."], ["Lamp: no counterpart.", "Missing from the frame: a bench."]),
             ("Both show brick. The door is green, whereas the candidate has a red one.", ["Both show brick."], ["The door is green, whereas the candidate has a red one."]),
             ("None of the 1200 regions of the query has a counterpart.", [], ["None of the 1200 regions of the query has a counterpart."]),
+            ("None of the 12 regions of the query has a counterpart. Both show the sign ‘St. Mary’ (left). The frame's ‘BAR! 24’ (top) is missing from the candidate.", ["Both show the sign ‘St. Mary’ (left)."], ["None of the 12 regions of the query has a counterpart.", "The frame's ‘BAR! 24’ (top) is missing from the candidate."]),
         ]:
             found = page.evaluate("(text) => import('/console/words.js').then(({ apart }) => apart(text))", text)
             self.assertEqual((found["agree"], found["differ"]), (agree, differ), text)

@@ -68,11 +68,13 @@ pub fn describe_signs(frame: &[TextLine], signs: &SignEvidence) -> String {
     };
     let mut said = String::new();
     if !signs.shared.is_empty() {
-        said += &format!(" Both show the sign {}.", list(&named(&signs.shared)));
+        let noun = if signs.shared.len() == 1 { "sign" } else { "signs" };
+        said += &format!(" Both show the {noun} {}.", list(&named(&signs.shared)));
     }
     if !signs.missing.is_empty() {
         let missing = list(&named(&signs.missing));
-        said += &format!(" The frame's {missing} is missing from the candidate.");
+        let verb = if signs.missing.len() == 1 { "is" } else { "are" };
+        said += &format!(" The frame's {missing} {verb} missing from the candidate.");
     }
     said
 }

@@ -286,4 +286,26 @@ mod tests {
         );
         assert_eq!(order(&[0, 1], &[f32::NAN, 0.0], &[says(0.0), says(0.0)]), [0, 1]);
     }
+
+    #[test]
+    fn a_description_names_the_signs_and_where_they_are() {
+        let frame = [sign("KAWA", 0.1), sign("BANK", 0.5), sign("TOYS", 0.9), sign("CLUB", 0.9)];
+        let says = |shared: &[usize], missing: &[usize]| {
+            let (shared, missing) = (shared.to_vec(), missing.to_vec());
+            crate::local::describe_signs(&frame, &SignEvidence { log_ratio: 0.0, shared, missing })
+        };
+        assert_eq!(says(&[0], &[]), " Both show the sign \u{2018}KAWA\u{2019} (left).");
+        assert_eq!(
+            says(&[0, 1], &[2, 3]),
+            " Both show the signs \u{2018}KAWA\u{2019} (left) and \u{2018}BANK\u{2019} (centre). The frame's \
+             \u{2018}TOYS\u{2019} (right) and \u{2018}CLUB\u{2019} (right) are missing from the candidate."
+        );
+        assert_eq!(
+            says(&[], &[1]),
+            " The frame's \u{2018}BANK\u{2019} (centre) is missing from the candidate."
+        );
+        assert_eq!(says(&[], &[]), "");
+        // Of many, three are named.
+        assert_eq!(says(&[0, 1, 2, 3], &[]).matches('\u{2018}').count(), 3);
+    }
 }

@@ -10,10 +10,13 @@ export function apart(text) {
 const sentences = (text) => text.split(/(?<=[.!?])\s+(?=\S)/).map((one) => one.trim()).filter(Boolean);
 const ended = (part) => (/[.!?]$/.test(part) ? part : `${part}.`);
 
+// A full stop of a sign, as in ‘St. Mary’, ends no sentence.
+const sentencesOfLocal = (text) => text.split(/(?<=[.!?])\s+(?=\S)(?![^‘]*’)/).filter(Boolean);
+
 function ofLocal(text) {
   const found = { agree: [], differ: [], view: null, verdict: null };
-  for (const sentence of sentences(text)) {
-    if (/^None of /.test(sentence)) found.differ.push(sentence);
+  for (const sentence of sentencesOfLocal(text)) {
+    if (/^None of /.test(sentence) || /missing from the candidate\.$/.test(sentence)) found.differ.push(sentence);
     else if (/have a counterpart|has a counterpart/.test(sentence)) {
       const [agree, differ] = sentence.split("; ");
       found.agree.push(ended(agree));
