@@ -37,7 +37,8 @@ pub(super) async fn of(
     }
     let WordsRequest { text } = object(&body).map_err(|error| {
         let detail = format!(
-            "the body is not a description: {error}; send {{\"text\": \"opposite the pharmacy\"}}, or the bytes of a picture"
+            "the body is not a description: {error}; send {{\"text\": \"opposite the pharmacy\"}}, or the bytes of a \
+             picture (with curl: -H 'Content-Type: image/jpeg' --data-binary @frame.jpg)"
         );
         Problem::new(ErrorKind::Malformed, detail)
     })?;
