@@ -355,7 +355,7 @@ mod tests {
     #[test]
     fn what_readers_and_people_get_wrong_is_found() {
         for (query, read) in [
-            ("kawa cofee", &["Kawa Coffee"][..]),
+            ("kawa coffea", &["Kawa Coffee"][..]),
             ("Kawa Coffee", &["KAWACOFFEE"]),
             ("kawa coffee", &["KAWA", "COFFEE"]),
             ("coffee kawa", &["Kawa Coffee"]),
@@ -430,7 +430,7 @@ mod tests {
             score("coffee", &["COFFEE"]),
             score("coffee", &["C0FFEE"]),
             score("coffee", &["Kawa Coffee"]),
-            score("coffee", &["Kawa Cofee"]),
+            score("coffee", &["Kawa Coffea"]),
         ];
         assert!(ranked.windows(2).all(|pair| pair[0] > pair[1]), "{ranked:?}");
     }

@@ -279,8 +279,8 @@ mod tests {
                 &["[Kawa] [Coffee]", "[Mario's]", "[Bäckerei]"],
             ),
             (
-                "ich stehe vor der Apotheke, links ist «REWE City»",
-                &["(stehe)", "Apotheke", "(links)", "[REWE] [City]"],
+                "ich stehe neben der Apotheke, links «REWE City»",
+                &["(stehe) (neben)", "Apotheke", "(links)", "[REWE] [City]"],
             ),
             (
                 "à côté de l'Hôtel d'Orsay et de la boulangerie",

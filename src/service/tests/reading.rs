@@ -238,7 +238,7 @@ async fn a_search_finds_pages_of_what_was_read_the_best_first() {
     assert_eq!(error.kind, whereabouts_api::ErrorKind::Conflict);
     assert!(error.detail.contains("5 images wait"), "{}", error.detail);
     read_all(&fixture, &map).await;
-    let all = pages("kawa cofee", 10).await;
+    let all = pages("kawa coffea", 10).await;
     let ids: Vec<&str> = all.iter().map(|found| found.image_id.as_str()).collect();
     assert_eq!(ids, ["image-0", "image-2", "image-3"]);
     assert!(all.windows(2).all(|pair| pair[0].score >= pair[1].score), "{all:?}");
@@ -247,7 +247,7 @@ async fn a_search_finds_pages_of_what_was_read_the_best_first() {
         ["KAWA", "COFFEE"]
     );
     for limit in 1..4 {
-        assert_eq!(pages("kawa cofee", limit).await, all, "{limit} in a page");
+        assert_eq!(pages("kawa coffea", limit).await, all, "{limit} in a page");
     }
     for (text, cursor) in [("", None), ("- '", None), (&*"a".repeat(101), None), ("a", Some("x"))] {
         assert!(fixture.service.images.find(&map.name, text, cursor, None).await.is_err());
