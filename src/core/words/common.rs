@@ -25,3 +25,20 @@ pub(super) fn is_place_word(word: &str) -> bool {
 pub(super) fn is_german(word: &str) -> bool {
     GERMAN.split_ascii_whitespace().any(|one| one == word)
 }
+
+/// Words by which what follows is said not to be there. Not is none of them: not far from the bank.
+const NEGATIONS: [&str; 11] =
+    ["no", "without", "neither", "nor", "none", "kein", "keine", "ohne", "sans", "sin", "senza"];
+
+/// Words that end what a negation is about.
+const CONTRASTS: [&str; 6] = ["but", "aber", "sondern", "mais", "pero", "ma"];
+
+/// Whether a word says that something is not there. `word` is in lower case, without accents and apostrophes.
+pub(super) fn is_negation(word: &str) -> bool {
+    NEGATIONS.contains(&word)
+}
+
+/// Whether a word ends what a negation is about. `word` is in lower case, without accents.
+pub(super) fn is_contrast(word: &str) -> bool {
+    CONTRASTS.contains(&word)
+}

@@ -5,6 +5,8 @@ mod common;
 mod likelihood;
 mod signs;
 
+use std::ops::Range;
+
 use super::text_search::{is_ideographic, plain};
 
 pub use self::likelihood::{Described, Fit, WordsModel};
@@ -70,6 +72,12 @@ const QUOTES: [(char, &[char]); 9] = [
     ('\'', &['\'']),
 ];
 
+/// What ends a sentence.
+const STOPS: [char; 7] = ['.', '!', '?', '\n', '。', '！', '？'];
+
+/// Stands for each character of a quotation in the rest of a text.
+const QUOTED: char = '\u{1}';
+
 /// The most characters between quotation marks. Longer passages are quotations of something other than a sign.
 const LONGEST_QUOTE: usize = 60;
 
@@ -82,16 +90,24 @@ pub fn runs(text: &str) -> Vec<Run> {
     let in_german =
         tokens.iter().flatten().filter(|token| common::is_german(&plain(&token.text))).count() >= 2;
     let mut found: Vec<(usize, Run)> = Vec::new();
+    // What is not there, from a negation to the end of its clause.
+    let mut negated: Vec<Range<usize>> = Vec::new();
     for sentence in tokens {
-        let mut is_continued = false;
-        for Token { text, at, is_first, breaks } in sentence {
+        let (mut is_continued, mut negated_from) = (false, None);
+        for Token { text, at, is_first, before } in sentence {
             let folded = folded(&text);
+            if before == Before::Mark || common::is_contrast(&folded) {
+                negated.extend(negated_from.take().map(|from| from..at));
+            }
+            if common::is_negation(&folded) {
+                negated_from = negated_from.or(Some(at));
+            }
             // A single letter is a word of a sentence, or a label on a plan.
             if common::is_function_word(&folded) || folded.len() == 1 {
                 is_continued = false;
                 continue;
             }
-            if breaks || !is_continued {
+            if before > Before::Space || !is_continued {
                 found.push((at, Run::default()));
             }
             let is_name = has_small && is_written_as_name(&text, is_first || in_german);
@@ -100,12 +116,14 @@ pub fn runs(text: &str) -> Vec<Run> {
             }
             is_continued = true;
         }
+        negated.extend(negated_from.map(|from| from..end_of_sentence(&outside, from)));
     }
     for (at, quote) in quoted {
         let word = |text: &str| Word { text: text.into(), is_name: true, is_common: false };
         let words = quote.split_whitespace().filter(|word| has_letter(word));
         found.push((at, Run { words: words.map(word).collect() }));
     }
+    found.retain(|(at, _)| !negated.iter().any(|span| span.contains(at)));
     found.sort_by_key(|(at, _)| *at);
     let mut left = MAX_WORDS;
     let mut runs = Vec::new();
@@ -123,7 +141,7 @@ fn has_letter(word: &str) -> bool {
     word.chars().any(char::is_alphanumeric)
 }
 
-/// The text with each quotation replaced by a full stop, and the quotations with where they begin.
+/// The text with each quotation replaced by [`QUOTED`], and the quotations with where they begin.
 fn split_quotes(chars: &[char]) -> (Vec<char>, Vec<(usize, String)>) {
     let mut outside = chars.to_vec();
     let mut quoted = Vec::new();
@@ -144,7 +162,7 @@ fn split_quotes(chars: &[char]) -> (Vec<char>, Vec<(usize, String)>) {
         match end {
             Some(end) if (at + 1..end).any(is_letter) => {
                 quoted.push((at, chars[at + 1..end].iter().collect()));
-                outside[at..=end].fill('\u{1}');
+                outside[at..=end].fill(QUOTED);
                 at = end + 1;
             }
             _ => at += 1,
@@ -153,20 +171,33 @@ fn split_quotes(chars: &[char]) -> (Vec<char>, Vec<(usize, String)>) {
     (outside, quoted)
 }
 
+/// Where the sentence ends that has the character at `from`.
+fn end_of_sentence(chars: &[char], from: usize) -> usize {
+    chars[from..].iter().position(|c| STOPS.contains(c)).map_or(chars.len(), |at| from + at)
+}
+
 /// A word, or a number, of a text.
 struct Token {
     text: String,
     at: usize,
     /// Whether it is the first of its sentence.
     is_first: bool,
-    /// Whether something other than a space is before it.
-    breaks: bool,
+    /// What is between it and the word before.
+    before: Before,
+}
+
+/// What is between two words.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Before {
+    Space,
+    Quote,
+    Mark,
 }
 
 /// The words, sentence by sentence.
 fn tokens(chars: &[char]) -> Vec<Vec<Token>> {
     let mut sentences = vec![Vec::new()];
-    let (mut is_first, mut breaks) = (true, false);
+    let (mut is_first, mut before) = (true, Before::Space);
     let mut at = 0;
     while at < chars.len() {
         let character = chars[at];
@@ -174,20 +205,20 @@ fn tokens(chars: &[char]) -> Vec<Vec<Token>> {
             let end = end_of_word(chars, at);
             if let Some(sentence) = sentences.last_mut() {
                 let text = chars[at..end].iter().collect();
-                sentence.push(Token { text, at, is_first, breaks });
+                sentence.push(Token { text, at, is_first, before });
             }
-            (is_first, breaks, at) = (false, false, end);
+            (is_first, before, at) = (false, Before::Space, end);
             continue;
         }
         match character {
-            '.' | '!' | '?' | '\n' | '。' | '！' | '？' => {
+            c if STOPS.contains(&c) => {
                 sentences.push(Vec::new());
-                (is_first, breaks) = (true, false);
+                (is_first, before) = (true, Before::Space);
             }
             c if c.is_whitespace() || matches!(c, '\'' | '’') => {}
-            // A quotation was here: the next word is not the first of a sentence.
-            '\u{1}' => (is_first, breaks) = (false, true),
-            _ => breaks = true,
+            // The next word is not the first of its sentence.
+            QUOTED => (is_first, before) = (false, before.max(Before::Quote)),
+            _ => before = Before::Mark,
         }
         at += 1;
     }
@@ -297,6 +328,20 @@ mod tests {
             ("a b c 1", &[]),
             ("...", &[]),
             ("\"\"", &[]),
+        ] {
+            assert_eq!(found(text), expected, "{text}");
+        }
+    }
+
+    #[test]
+    fn what_is_not_there_is_left_out() {
+        for (text, expected) in [
+            ("I see no pharmacy or bank, but KAWA is here", &["(see)", "[KAWA]"][..]),
+            ("there is no \"Kawa\" here. A bakery", &["bakery"]),
+            ("not far from MARIO'S", &["(far)", "[MARIO'S]"]),
+            ("neben dem Hotel, keine Apotheke", &["(neben)", "Hotel"]),
+            ("sans pharmacie mais une boulangerie", &["boulangerie"]),
+            ("sin farmacia", &[]),
         ] {
             assert_eq!(found(text), expected, "{text}");
         }
