@@ -25,13 +25,24 @@ pub(super) struct CacheKey<'a> {
     pub calibration: CalibrationSettings,
     /// The map's own vocabulary.
     pub vocabulary: Option<Digest>,
+    /// What reads the signs that a refiner compares.
+    pub reader: Option<Digest>,
 }
 
 impl CacheKey<'_> {
     /// Returns the text to hash.
     pub fn text(&self) -> String {
-        let Self { version, map, references, search, k, refinement, calibration, vocabulary } =
-            self;
+        let Self {
+            version,
+            map,
+            references,
+            search,
+            k,
+            refinement,
+            calibration,
+            vocabulary,
+            reader,
+        } = self;
         let search = match search {
             SearchMode::Fast => "Fast",
             SearchMode::Exact => "Exact",
@@ -52,13 +63,14 @@ impl CacheKey<'_> {
             if *model_calls > 0 { format!("\nmodel_calls: {model_calls}") } else { String::new() };
         let vocabulary =
             vocabulary.map_or_else(String::new, |digest| format!("\nvocabulary: {digest}"));
+        let reader = reader.map_or_else(String::new, |digest| format!("\nreader: {digest}"));
         let place_m = float(*place_m);
         // A cached confidence is of the evidence that was measured then.
         let evidence = Calibration::EVIDENCE;
         format!(
             "{version}\n{map}\n{references}\n{search}\n{k}\n{refinement}\nCalibrationSettings {{ \
              images: {images}, refined: {refined}, candidates: {candidates}, place_images: \
-             {place_images}, place_m: {place_m} }}{model_calls}{vocabulary}\nevidence: {evidence}"
+             {place_images}, place_m: {place_m} }}{model_calls}{vocabulary}{reader}\nevidence: {evidence}"
         )
     }
 }
@@ -99,6 +111,7 @@ mod tests {
                 refinement,
                 calibration,
                 vocabulary: None,
+                reader: None,
             }
             .text()
         };

@@ -22,8 +22,8 @@ use whereabouts_core::{
 };
 use whereabouts_index::SearchMode;
 use whereabouts_refine::{
-    AttemptPolicy, DenseKey, FrameTexts, Progress, QueryFrame, RefineError, RefineInput,
-    Refinement, Refiner,
+    AttemptPolicy, DenseKey, FrameReader, FrameTexts, Progress, QueryFrame, RefineError,
+    RefineInput, Refinement, Refiner,
 };
 use whereabouts_service::{Retrieved, Service};
 use whereabouts_store::Step;
@@ -104,6 +104,7 @@ impl Evaluator<'_> {
         descriptor: DescriptorKind,
     ) -> anyhow::Result<Vec<MethodOutcomes>> {
         let references = self.reference_map(&data.references, descriptor).await?;
+        self.read(&references.map, data.references.len()).await?;
         let calibration = self.calibrate(&references.map).await?;
         let kinds = self.refiners.iter().map(|refiner| Some(refiner.kind()));
         let methods: Vec<Method> =
@@ -143,6 +144,7 @@ impl Evaluator<'_> {
             refinement: method.refiner.map(|_| (*scene, refiner_settings.as_str())),
             calibration: self.service.calibrator.settings,
             vocabulary: references.map.vocabulary.map(|own| own.digest),
+            reader: method.refiner.and_then(|_| self.service.reading.digest()),
         }
         .text();
         let folder = work_dir.join("outcomes");
@@ -150,6 +152,22 @@ impl Evaluator<'_> {
             .with_context(|| format!("cannot create the folder {}", folder.display()))?;
         let digest = Digest::of(key.as_bytes()).hex();
         OutcomeCache::open(&folder.join(format!("{}-{}.jsonl", method.name(), &digest[..16])))
+    }
+
+    /// Reads the text in the references, if a refiner compares it with that of the frames.
+    async fn read(&self, map: &Map, images: usize) -> anyhow::Result<()> {
+        if self.reads() {
+            self.observer.begin("references to read", images);
+            self.service.reading.read_map(map, || self.observer.step()).await?;
+            self.observer.finish();
+        }
+        Ok(())
+    }
+
+    /// Whether text in pictures is compared: whether there is a reader and `local`, alone or in a cascade.
+    fn reads(&self) -> bool {
+        let compares = |refiner: &Arc<dyn Refiner>| refiner.kind() != RefinerKind::Mllm;
+        self.service.reading.is_installed() && self.refiners.iter().any(compares)
     }
 
     /// Measures the null distribution of the map. A calibration in the store is not reused: it may be of
@@ -237,7 +255,13 @@ impl Evaluator<'_> {
                 digest,
                 descriptor: Some(extraction.descriptor),
                 uninformative: extraction.information.lack().is_some(),
-                texts: FrameTexts::default(),
+                texts: match self.reads() {
+                    true => {
+                        let (reading, name) = (Arc::clone(&self.service.reading), map.name.clone());
+                        FrameTexts::of(async move { reading.read_frame(&name, &digest).await })
+                    }
+                    false => FrameTexts::default(),
+                },
             },
             candidates,
             priority: Priority::Normal,

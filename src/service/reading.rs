@@ -129,6 +129,29 @@ impl Reading {
         self.reader.is_some()
     }
 
+    /// What identifies the reader; `None` without one.
+    pub fn digest(&self) -> Option<Digest> {
+        self.reader.as_ref().map(|reader| reader.digest())
+    }
+
+    /// Reads the images of a map that were not read, now, and calls `on_read` after each.
+    ///
+    /// # Errors
+    /// The store is unavailable.
+    pub async fn read_map(&self, map: &Map, on_read: impl Fn()) -> Result<(), ServiceError> {
+        let Some(reader) = &self.reader else { return Ok(()) };
+        let mut after = None;
+        loop {
+            let page = self.store.unread(map, &reader.digest(), after.as_ref(), PAGE).await?;
+            let Some(last) = page.last() else { return Ok(()) };
+            after = Some(last.id.clone());
+            for image in &page {
+                self.read_image(reader, map, image).await?;
+                on_read();
+            }
+        }
+    }
+
     /// The thread that reads. The process waits for it before it exits.
     pub fn pool(&self) -> CpuPool {
         self.pool.clone()
