@@ -152,7 +152,7 @@ mod tests {
                 }
             }
         }
-        assert_eq!(methods, 15);
+        assert_eq!(methods, 16);
         for path in [REFLECTION, REFLECTION_ALPHA] {
             assert!(policies.of(&Method::POST, path).unwrap().streams);
         }
