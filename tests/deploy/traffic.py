@@ -15,6 +15,8 @@ URL, OUTSIDE = os.environ["URL"], os.environ["OUTSIDE"]
 LAST = (
     ("whereabouts_webhook_attempts_total", "outcome", "dead"),
     ("whereabouts_neighbours_checked_total", "found", "yes"),
+    # After the images of the map were read.
+    ("whereabouts_images_unread", "map", "town"),
 )
 
 
