@@ -15,7 +15,7 @@ URL, OUTSIDE = os.environ["URL"], os.environ["OUTSIDE"]
 LAST = (
     ("whereabouts_webhook_attempts_total", "outcome", "dead"),
     ("whereabouts_neighbours_checked_total", "found", "yes"),
-    # After the images of the map were read.
+    # After an image was read.
     ("whereabouts_images_unread", "map", "town"),
 )
 
@@ -73,6 +73,9 @@ def make():
     picture = (SCRATCH / "town/frames/frame-0004.jpg").read_bytes()
     middle = len(picture) // 2
     expect(localize_bytes(picture[:middle] + picture[middle + 2048 :]), 200)
+    # The images of the demo are read already.
+    unread = (SCRATCH / "town/frames/frame-0000.jpg").read_bytes()
+    expect(ask("POST", "/maps/town/images?id=unread", unread, Content_Type="image/jpeg"), 201)
     call_grpc()
     for _ in range(150):
         # Searches are checked only once an index exists.
