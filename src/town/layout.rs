@@ -6,13 +6,12 @@
 use super::TownScene;
 use super::camera::Pose;
 use super::dice::Dice;
+use super::furniture::{furnish, plant};
 use super::geometry::{Rgb, Vec3, vec3};
-use super::styles::{BRANDS, Brand, MALL, STYLES, Style};
+use super::styles::{BRANDS, Brand, STYLES, Style};
 
 pub(super) const PLACES_PER_STREET: usize = 8;
-const PLACE_SPACING: f32 = 17.0;
-/// Width of a shop front of a mall: two to a place, so that each place looks the same.
-const SHOP_WIDTH: f32 = PLACE_SPACING / 2.0;
+pub(super) const PLACE_SPACING: f32 = 17.0;
 const STREET_PITCH: f64 = 320.0;
 const STREETS_PER_ROW: usize = 6;
 
@@ -39,7 +38,7 @@ pub(super) struct Frontage {
 impl Frontage {
     /// Beside the street, `side` being +1 for the left of its axis and -1 for the right; `start`
     /// is the lesser x and `line` the distance from the axis.
-    fn beside(side: f32, start: f32, width: f32, line: f32) -> Frontage {
+    pub fn beside(side: f32, start: f32, width: f32, line: f32) -> Frontage {
         let left = if side > 0.0 { start } else { start + width };
         Frontage {
             origin: vec3(left, side * line, 0.0),
@@ -185,37 +184,6 @@ impl Street {
         }
     }
 
-    /// A row of equal shop fronts on both sides, which differ in their names. `building` draws what all streets of the mall
-    /// share, and `names` the names in this one.
-    fn with_shops(self, building: &Dice, mut names: Dice) -> Street {
-        let mut shared = building.fork(1);
-        let taste = Taste { shops: 1.0, ..Taste::new(&mut shared) };
-        let plan = Terrace {
-            setback: 0.0,
-            bays: 3,
-            width: SHOP_WIDTH,
-            ..Terrace::new(&taste, &mut shared)
-        };
-        let shops = ((STREET_END - STREET_START) / SHOP_WIDTH).ceil() as usize;
-        let mut lots = Vec::new();
-        for side in [1.0, -1.0] {
-            for shop in 0..shops {
-                let start = STREET_START + shop as f32 * SHOP_WIDTH;
-                let at = Frontage::beside(side, start, SHOP_WIDTH, FRONT);
-                lots.push(Lot::Built(Building {
-                    ground: GroundFloor::Shop(&MALL[names.below(MALL.len())]),
-                    // The same panes, curtains and lamps in each.
-                    colour: plan.colour,
-                    mirrored: false,
-                    seed: 0,
-                    ..plan.house(at, &taste, &mut shared)
-                }));
-            }
-        }
-        let backdrop = backdrop(&taste, &mut shared);
-        Street { lots, backdrop, fixtures: lamps(), ..self }
-    }
-
     /// The same street with nothing written on its signs.
     pub fn without_letters(mut self) -> Street {
         let lots = self.lots.iter_mut().filter_map(|lot| match lot {
@@ -271,7 +239,7 @@ impl Street {
 }
 
 /// What is seen through gaps and at the ends of a street.
-fn backdrop(taste: &Taste, dice: &mut Dice) -> Vec<Building> {
+pub(super) fn backdrop(taste: &Taste, dice: &mut Dice) -> Vec<Building> {
     let mut backdrop = Vec::new();
     for side in [1.0, -1.0] {
         back_row(side, taste, dice, &mut backdrop);
@@ -280,25 +248,14 @@ fn backdrop(taste: &Taste, dice: &mut Dice) -> Vec<Building> {
     backdrop
 }
 
-/// Lamps at equal distances, two to a place.
-fn lamps() -> Vec<(Fixture, Vec3)> {
-    let count = ((STREET_END - STREET_START) / SHOP_WIDTH) as usize;
-    let lamp = |at: usize| {
-        let side = if at.is_multiple_of(2) { 1.0 } else { -1.0 };
-        let x = STREET_START + at as f32 * SHOP_WIDTH;
-        (Fixture::Lamp, vec3(x, side * (KERB + 0.45), PAVEMENT_HEIGHT))
-    };
-    (0..count).map(lamp).collect()
-}
-
 /// Distribution of buildings in one street.
-struct Taste {
+pub(super) struct Taste {
     styles: [&'static Style; 3],
-    shops: f32,
+    pub shops: f32,
 }
 
 impl Taste {
-    fn new(dice: &mut Dice) -> Taste {
+    pub fn new(dice: &mut Dice) -> Taste {
         Taste {
             styles: [(); 3].map(|()| &STYLES[dice.below(STYLES.len())]),
             shops: dice.between(0.45, 0.85),
@@ -357,18 +314,18 @@ fn close_end(end: f32, taste: &Taste, dice: &mut Dice, into: &mut Vec<Building>)
 }
 
 /// Properties shared by neighbouring buildings of one development.
-struct Terrace {
+pub(super) struct Terrace {
     style: &'static Style,
-    colour: Rgb,
-    bays: usize,
+    pub colour: Rgb,
+    pub bays: usize,
     floors: usize,
-    width: f32,
-    setback: f32,
+    pub width: f32,
+    pub setback: f32,
     depth: f32,
 }
 
 impl Terrace {
-    fn new(taste: &Taste, dice: &mut Dice) -> Terrace {
+    pub fn new(taste: &Taste, dice: &mut Dice) -> Terrace {
         let style = dice.pick(&taste.styles);
         let bays = 2 + dice.below(3);
         Terrace {
@@ -382,7 +339,7 @@ impl Terrace {
         }
     }
 
-    fn house(&self, at: Frontage, taste: &Taste, dice: &mut Dice) -> Building {
+    pub fn house(&self, at: Frontage, taste: &Taste, dice: &mut Dice) -> Building {
         let repainted = dice.chance(0.3);
         let fresh = dice.pick(&self.style.colours);
         Building {
@@ -413,42 +370,4 @@ fn ground_floor(bays: usize, shops: f32, dice: &mut Dice) -> GroundFloor {
     } else {
         GroundFloor::Home { door_bay: dice.below(bays), door: dice.pick(&DOORS) }
     }
-}
-
-fn plant(dice: &mut Dice) -> Vec<Tree> {
-    let spacing = dice.between(13.0, 24.0);
-    let mut trees = Vec::new();
-    for side in [1.0, -1.0] {
-        let mut x = STREET_START + dice.between(0.0, spacing);
-        while x < STREET_END {
-            if dice.chance(0.55) {
-                trees.push(Tree {
-                    foot: vec3(x, side * (KERB + 0.8), PAVEMENT_HEIGHT),
-                    height: dice.between(4.2, 6.6),
-                    seed: dice.bits() as u32,
-                });
-            }
-            x += spacing + dice.around(2.5);
-        }
-    }
-    trees
-}
-
-fn furnish(dice: &mut Dice) -> Vec<(Fixture, Vec3)> {
-    const SMALL: [Fixture; 5] =
-        [Fixture::RoadSign, Fixture::PostBox, Fixture::Bin, Fixture::Bollard, Fixture::Bench];
-    let mut fixtures = Vec::new();
-    for side in [1.0, -1.0] {
-        let kerbside = |x: f32, inset: f32| vec3(x, side * (KERB + inset), PAVEMENT_HEIGHT);
-        let mut x = STREET_START + 6.0 * (1.0 + side);
-        while x < STREET_END {
-            fixtures.push((Fixture::Lamp, kerbside(x + dice.around(1.5), 0.45)));
-            if dice.chance(0.8) {
-                let kind = dice.pick(&SMALL);
-                fixtures.push((kind, kerbside(x + dice.between(3.0, 18.0), 0.6)));
-            }
-            x += 24.0;
-        }
-    }
-    fixtures
 }

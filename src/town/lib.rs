@@ -13,10 +13,12 @@ mod camera;
 mod dice;
 mod facade;
 mod font;
+mod furniture;
 mod geometry;
 mod ground;
 mod layout;
 mod light;
+mod mall;
 mod massing;
 mod props;
 mod raster;
@@ -124,13 +126,13 @@ impl Town {
     /// Renders the map image of a place, taken by day in light traffic. `place` wraps around at
     /// [`Town::places`].
     pub fn reference(&self, place: usize) -> Shot {
-        self.photograph(self.visit(place, None), |street| street)
+        self.photograph(self.visit(place, None))
     }
 
     /// Renders a later visit to a place. Each `variant` is a different visit, and any four consecutive
     /// variants cover the four lights. `place` wraps around at [`Town::places`].
     pub fn query(&self, place: usize, variant: u32) -> Shot {
-        self.photograph(self.visit(place, Some(variant)), |street| street)
+        self.photograph(self.visit(place, Some(variant)))
     }
 
     /// Renders a map image, or a visit, with the signs over shops that are in it, and the pixels of all letters.
@@ -139,19 +141,16 @@ impl Town {
         place: usize,
         variant: Option<u32>,
     ) -> (Shot, Vec<VisibleSign>, Letters) {
-        let of_visit = |bustle: Option<Bustle>| {
-            let visit = self.visit(place, variant);
-            Visit { bustle: bustle.unwrap_or(visit.bustle), ..visit }
-        };
-        let shot = self.photograph(of_visit(None), |street| street);
-        let blank = self.photograph(of_visit(None), Street::without_letters);
-        let letters = Letters::between(&shot.image, &blank.image);
-        let bare = |change: fn(Street) -> Street| {
-            let change = |street: Street| change(street.without_furniture());
-            self.photograph(of_visit(Some(Bustle::NONE)), change).image
-        };
-        let uncovered = Letters::between(&bare(|street| street), &bare(Street::without_letters));
-        let Visit { street, pose, .. } = of_visit(None);
+        let visit = || self.visit(place, variant);
+        let bare = || visit().unobstructed();
+        let shot = self.photograph(visit());
+        let letters =
+            Letters::between(&shot.image, &self.photograph(visit().without_letters()).image);
+        let uncovered = Letters::between(
+            &self.photograph(bare()).image,
+            &self.photograph(bare().without_letters()).image,
+        );
+        let Visit { street, pose, .. } = visit();
         let camera = Camera::new(&pose, self.spec.width, self.spec.height);
         let signs = signs::signs(&street, &camera, &letters, &uncovered);
         (shot, signs, letters)
@@ -190,9 +189,9 @@ impl Town {
         (street, pose)
     }
 
-    fn photograph(&self, visit: Visit, change: impl FnOnce(Street) -> Street) -> Shot {
+    fn photograph(&self, visit: Visit) -> Shot {
         let Visit { place, street, pose, light, bustle, mut dice } = visit;
-        let (street, dice) = (&change(street), &mut dice);
+        let (street, dice) = (&street, &mut dice);
         let TownSpec { width, height, .. } = self.spec;
         let camera = Camera::new(&pose, width, height);
         let lighting = Lighting::new(light, street, &camera, dice);
@@ -220,8 +219,19 @@ struct Visit {
     dice: Dice,
 }
 
-/// The camera pose of a later visit to a place: at most so many metres along and across the street away, and turned by at
-/// most so many degrees.
+impl Visit {
+    /// The same with nothing written on the signs.
+    fn without_letters(self) -> Self {
+        Self { street: self.street.without_letters(), ..self }
+    }
+
+    /// The same without people, vehicles, trees and what stands on the pavement.
+    fn unobstructed(self) -> Self {
+        Self { street: self.street.without_furniture(), bustle: Bustle::NONE, ..self }
+    }
+}
+
+/// The camera pose of a later visit to a place. The bounds are metres along and across the street, and degrees of turning.
 fn revisit(survey: Pose, (along, across, turned): (f32, f32, f32), dice: &mut Dice) -> Pose {
     let turn = dice.between(-turned, turned).to_radians();
     Pose {

@@ -191,7 +191,12 @@ pub(super) struct Brand {
     pub awning: Option<(Rgb, Rgb)>,
 }
 
-const fn brand(name: &'static str, board: u32, ink: u32, awning: Option<(u32, u32)>) -> Brand {
+pub(super) const fn brand(
+    name: &'static str,
+    board: u32,
+    ink: u32,
+    awning: Option<(u32, u32)>,
+) -> Brand {
     let awning = match awning {
         Some((one, other)) => Some((Rgb::hex(one), Rgb::hex(other))),
         None => None,
@@ -221,100 +226,3 @@ pub(super) static BRANDS: [Brand; 20] = [
     brand("SHOE BOX", 0xe9dcc6, 0x5a3420, None),
     brand("EXPRESS 24", 0xe6e6e6, 0xc0182b, Some((0xb9202e, 0xb9202e))),
 ];
-
-/// Names of the shops of a mall, in capitals because the font has no others.
-const MALL_NAMES: [&str; 80] = [
-    "AURORA",
-    "BRAMBLE",
-    "CINDER",
-    "DELPHI",
-    "EMBERLY",
-    "FALCON",
-    "GARNET",
-    "HOLLOW",
-    "INDIGO",
-    "JUNIPER",
-    "KESTREL",
-    "LANTERN",
-    "MARLOW",
-    "NIMBUS",
-    "OSPREY",
-    "PALMER",
-    "RIVET",
-    "SABLE",
-    "TAMARIN",
-    "UMBRIA",
-    "VESPER",
-    "WILLOW",
-    "YARROW",
-    "ZEPHYR",
-    "BIRCHWOOD",
-    "COPPER KEY",
-    "DRIFTWOOD",
-    "ELM HOUSE",
-    "FOXGLOVE",
-    "GOLDFINCH",
-    "HAZELNUT",
-    "IRONSIDE",
-    "JASPER",
-    "KINGFISHER",
-    "LARKSPUR",
-    "MOONRAKER",
-    "NORTHWIND",
-    "OAKHEART",
-    "PEPPERMINT",
-    "REDWOOD",
-    "SANDPIPER",
-    "THIMBLE",
-    "URBAN NEST",
-    "VELVET",
-    "WATERMILL",
-    "YELLOWTAIL",
-    "ARCADIA",
-    "BLUEBELL",
-    "CLOVERLEAF",
-    "DOVETAIL",
-    "EVERGREEN",
-    "FIREFLY",
-    "GINGERBREAD",
-    "HONEYCOMB",
-    "ISLANDER",
-    "JACARANDA",
-    "KALEIDO",
-    "LEMONADE",
-    "MULBERRY",
-    "NUTCRACKER",
-    "ORCHARD",
-    "PINEAPPLE",
-    "RASPBERRY",
-    "SNOWDROP",
-    "TURTLE",
-    "VIOLETTA",
-    "WHITECAP",
-    "BEESWAX",
-    "CHESTNUT",
-    "DANDELION",
-    "MODE 21",
-    "STUDIO 54",
-    "CLUB 77",
-    "DEPOT 9",
-    "BLUE DOOR",
-    "RED FOX",
-    "TALL TREE",
-    "GRANITE",
-    "PARASOL",
-    "CITY BANK",
-];
-
-/// The shops of a mall, which has one kind of sign board.
-pub(super) static MALL: [Brand; MALL_NAMES.len()] = mall();
-
-const fn mall() -> [Brand; MALL_NAMES.len()] {
-    let mut shops = [const { brand("", 0x2a2f35, 0xf2efe6, None) }; MALL_NAMES.len()];
-    let mut at = 0;
-    while at < shops.len() {
-        shops[at].name = MALL_NAMES[at];
-        at += 1;
-    }
-    shops
-}

@@ -21,7 +21,7 @@ impl Bustle {
     pub const SURVEY: Bustle = Bustle { parked: 0.25, walkers: 4, passing: 0.0 };
     /// An ordinary hour.
     pub const EVERYDAY: Bustle = Bustle { parked: 0.4, walkers: 9, passing: 0.35 };
-    /// Nobody at all.
+    /// No people and no vehicles.
     pub const NONE: Bustle = Bustle { parked: 0.0, walkers: 0, passing: 0.0 };
     /// A mall when its map was surveyed. No vehicle drives there.
     pub const BEFORE_OPENING: Bustle = Bustle { parked: 0.0, walkers: 2, passing: 0.0 };
