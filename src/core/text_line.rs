@@ -16,3 +16,11 @@ pub struct TextLine {
     /// picture, after its EXIF orientation was applied.
     pub corners: [[f32; 2]; 4],
 }
+
+/// Lines that say this, somewhere in a picture.
+#[cfg(test)]
+pub(crate) fn lines(texts: &[&str]) -> Vec<TextLine> {
+    let line =
+        |text: &&str| TextLine { text: (*text).into(), confidence: 0.9, corners: [[0.0; 2]; 4] };
+    texts.iter().map(line).collect()
+}

@@ -123,11 +123,9 @@ impl Described<'_> {
         for (sign, named) in self.signs.iter().enumerate() {
             let worth = |at: &SignIn| f64::from(2.0 * at.score - 1.0).clamp(0.0, 1.0);
             let read: f64 = named.images.iter().map(worth).sum();
-            let images = self.images.saturating_sub(self.unread) as f64;
-            let of_map = (read + 1.0) / (images + 1.0).max(read + 1.0);
-            let other = model.other(named);
+            let frequency = sign_frequency(read, self.images.saturating_sub(self.unread));
             for at in &named.images {
-                let ratio = other + (1.0 - other) * worth(at) / of_map;
+                let ratio = sign_ratio(model.other(named), worth(at), frequency);
                 gains[at.image].push(Gain { sign, at, ratio });
             }
         }
@@ -142,6 +140,18 @@ impl WordsModel {
     fn other(&self, sign: &Sign) -> f64 {
         if sign.is_name { self.other_names } else { self.other_words }
     }
+}
+
+/// Share of images that show a sign, P(t|map), given the sum of how well it was read in them and their number, with one more
+/// image that shows it than there is.
+pub fn sign_frequency(shown: f64, images: usize) -> f64 {
+    (shown + 1.0) / (images as f64 + 1.0).max(shown + 1.0)
+}
+
+/// How many times as probable it is that a sign is named of an image which shows it with `worth`, from 0 to 1, as of any
+/// image: λ + (1 − λ) s / P(t|map), where λ is the share `other` of signs that the image of a place does not show.
+pub fn sign_ratio(other: f64, worth: f64, frequency: f64) -> f64 {
+    other + (1.0 - other) * worth / frequency
 }
 
 /// The ratios of each image for each sign. A line is evidence once: another sign that it matches too counts as not shown.

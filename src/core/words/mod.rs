@@ -9,7 +9,7 @@ use std::ops::Range;
 
 use super::text_search::{is_ideographic, plain};
 
-pub use self::likelihood::{Described, Fit, WordsModel};
+pub use self::likelihood::{Described, Fit, WordsModel, sign_frequency, sign_ratio};
 pub use self::signs::{Sign, SignIn, find_signs};
 
 /// The most characters of a description.

@@ -40,14 +40,13 @@ pub struct SignIn {
 /// Finds the signs that a description names among the lines of images. The longest phrases are tried first, so that the
 /// words of one sign count once. A name that was read nowhere is a sign of no image.
 pub fn find_signs(runs: &[Run], images: &[&[TextLine]]) -> Vec<Sign> {
-    let mut found: BTreeMap<String, Sign> = BTreeMap::new();
-    let mut order = Vec::new();
+    let mut found: Vec<(String, Sign)> = Vec::new();
     let mut keep = |sign: Sign| {
         let key = Folded::new(&sign.text).key();
-        if !found.contains_key(&key) {
-            order.push(key.clone());
+        match found.iter_mut().find(|(known, _)| *known == key) {
+            Some((_, known)) => known.is_name |= sign.is_name,
+            None => found.push((key, sign)),
         }
-        found.entry(key).and_modify(|one| one.is_name |= sign.is_name).or_insert(sign);
     };
     for run in runs {
         let signs = match run.words.iter().any(|word| word.text.chars().any(is_ideographic)) {
@@ -59,7 +58,7 @@ pub fn find_signs(runs: &[Run], images: &[&[TextLine]]) -> Vec<Sign> {
         }
         signs.into_iter().for_each(&mut keep);
     }
-    order.into_iter().filter_map(|key| found.remove(&key)).collect()
+    found.into_iter().map(|(_, sign)| sign).collect()
 }
 
 /// The signs of a run of words, the longest first.
@@ -157,16 +156,8 @@ fn without_spaces(run: &Run, images: &[&[TextLine]]) -> Vec<Sign> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::text_line::lines;
     use crate::words::runs;
-
-    fn lines(texts: &[&str]) -> Vec<TextLine> {
-        let line = |text: &&str| TextLine {
-            text: (*text).into(),
-            confidence: 0.9,
-            corners: [[0.0; 2]; 4],
-        };
-        texts.iter().map(line).collect()
-    }
 
     /// The signs of a text with the images that show them.
     fn signs(text: &str, images: &[&[&str]]) -> Vec<(String, Vec<usize>)> {

@@ -6,6 +6,7 @@
 
 use whereabouts_core::TextLine;
 use whereabouts_core::text_search::{Folded, TextQuery};
+use whereabouts_core::words::{sign_frequency, sign_ratio};
 
 /// How much a candidate's share of the votes counts beside the signs: the power of the share.
 const VOTES: f64 = 3.0;
@@ -76,10 +77,10 @@ pub fn evidence(
             continue;
         }
         tells_apart = true;
-        let frequency = (worths.iter().flatten().sum::<f64>() + 1.0) / (read as f64 + 1.0);
+        let frequency = sign_frequency(worths.iter().flatten().sum(), read);
         for (worth, evidence) in worths.into_iter().zip(&mut found) {
             let Some(worth) = worth else { continue };
-            evidence.log_ratio += (OTHERS + (1.0 - OTHERS) * worth / frequency).ln();
+            evidence.log_ratio += sign_ratio(OTHERS, worth, frequency).ln();
             match worth > 0.0 {
                 true => evidence.shared.push(line),
                 false => evidence.missing.push(line),
